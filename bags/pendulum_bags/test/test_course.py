@@ -233,7 +233,7 @@ def test_a_recording_that_was_thinned_out_proves_nothing(
 def test_a_controller_loses_by_a_fault_of_the_bridge_and_by_no_other_stop(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: FaultError, answered: bool
 ) -> None:
-    def record_run(*_: object) -> Path:
+    def record_run(*_: object, **__: object) -> Path:
         raise error
 
     monkeypatch.setattr(winner, "record_run", record_run)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pendulum_bags.course.checks import WEIGHTS, Judgement
 from pendulum_bags.course.tasks import Tasks
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.runs.run_data import read_run
@@ -36,9 +37,10 @@ def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], 
     if name not in weights:
         raise ParameterError(f"winner is {name!r}; expected a or b")
     spreads = {}
-    for letter, r in weights.items():
-        on_run(letter)
-        spreads[letter] = spread_on_machine(folder / letter, r, tasks.noise_seed)
+    with HostPool() as hosts:
+        for letter, r in weights.items():
+            on_run(letter)
+            spreads[letter] = spread_on_machine(folder / letter, r, tasks.noise_seed, hosts)
     best = min(spreads, key=spreads.__getitem__)
     told = ", ".join(
         f"{letter.upper()} {f'leaves {value:.3g} rad' if math.isfinite(value) else 'drives the bridge into a fault'}"
@@ -47,7 +49,7 @@ def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], 
     return Judgement(name == best, f"on the emulated machine {told} (standard deviation of theta)")
 
 
-def spread_on_machine(bag: Path, r: float, seed: int) -> float:
+def spread_on_machine(bag: Path, r: float, seed: int, hosts: HostPool | None = None) -> float:
     """Return the standard deviation of theta that an LQR leaves on the emulated machine under noise of 2.5 N m [rad].
 
     It is inf where the bridge faults, which counts as a loss.
@@ -56,6 +58,7 @@ def spread_on_machine(bag: Path, r: float, seed: int) -> float:
         bag: Folder of the recording.
         r: R of the LQR [1/(N m)^2].
         seed: Of the noise.
+        hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
     """
     spec = RunSpec(
         side="hw",
@@ -66,7 +69,7 @@ def spread_on_machine(bag: Path, r: float, seed: int) -> float:
         seed=seed,
     )
     try:
-        recorded = record_run(bag, spec)
+        recorded = record_run(bag, spec, hosts=hosts)
     except PlantStoppedError as error:
         # The bridge's own fault is an answer; that somebody stopped it, or a program did not start, is none.
         if error.mode == "fault":

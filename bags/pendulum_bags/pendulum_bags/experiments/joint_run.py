@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
@@ -305,6 +306,7 @@ def record_joints(
     machine: Path,
     *,
     excitation: Mapping[str, Any] | None = None,
+    hosts: HostPool | None = None,
     on_side: Callable[[str], None] = lambda side: None,
     on_wait: Callable[[], None] = lambda: None,
 ) -> None:
@@ -317,6 +319,7 @@ def record_joints(
         settings: What to run.
         machine: Plant file that stands in for the machine.
         excitation: Parameters of the disturbance that differ from those of the noise.
+        hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
         on_side: Told each side, in words, when it begins.
         on_wait: Called while waiting.
 
@@ -334,9 +337,8 @@ def record_joints(
         on_side(words)
         stopped = ""
         try:
-            record_run(
-                folder / side, JointRun(settings, side, runs, design, excitation=excitation or {}), on_wait=on_wait
-            )
+            run = JointRun(settings, side, runs, design, excitation=excitation or {})
+            record_run(folder / side, run, on_wait=on_wait, hosts=hosts)
         except PlantStoppedError as error:
             stopped = f"went to {error.mode} ({error.reason})"
         ends[words] = _end_of(folder / side, f"/{side}", plant, stopped)

@@ -97,6 +97,7 @@ def joints(
     Example: python -m pendulum_bags experiment joints --plant acrobot --share 0.1
     """
     from pendulum_bags.comparison.compare_cli import compare
+    from pendulum_bags.experiments.host_pool import HostPool
     from pendulum_bags.experiments.joint_run import (
         JointSettings,
         design_for,
@@ -142,9 +143,18 @@ def joints(
         analysis = None
         each = _STARTING + _PACE * min(duration, DURATION)
         runs = 2.0 * rank_seeds * len(ranked)
-        with PhaseProgress(2.0 * (expected + longer) + _ANALYSING * measured + each * runs, console) as progress:
+        # Four programs a run: started once for all runs.
+        with (
+            HostPool() as hosts,
+            PhaseProgress(2.0 * (expected + longer) + _ANALYSING * measured + each * runs, console) as progress,
+        ):
             record_joints(
-                folder, settings, made, on_side=lambda side: progress.phase(side, expected), on_wait=progress.refresh
+                folder,
+                settings,
+                made,
+                hosts=hosts,
+                on_side=lambda side: progress.phase(side, expected),
+                on_wait=progress.refresh,
             )
             if measured:
                 try:
@@ -153,6 +163,7 @@ def joints(
                         multisine,
                         made,
                         design or (),
+                        hosts=hosts,
                         on_side=lambda side: progress.phase(f"{side}, multisine", longer),
                         on_analysis=lambda what: progress.phase(what, 0.5 * _ANALYSING),
                         on_wait=progress.refresh,
@@ -167,6 +178,7 @@ def joints(
                     made,
                     ranked,
                     range(seed, seed + rank_seeds),
+                    hosts=hosts,
                     on_run=lambda what: progress.phase(what, each),
                     on_wait=progress.refresh,
                 )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pendulum_bags.experiments.conductor_node import PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
@@ -185,11 +186,13 @@ def run_trials(
         FaultError: A program ended, or the plant refused or faulted; the drive is at rest when this is raised.
     """
     bags = []
-    with reserve_domain(domain) as reserved:
+    with reserve_domain(domain) as reserved, HostPool() as hosts:
         for trial in range(1, settings.trials + 1):
             expected = 4.0 + settings.expected_duration / (10.0 if settings.lockstep else 1.0)
             progress.phase(f"trial {trial} of {settings.trials}", expected)
-            bags.append(_run_trial(folder, settings, trial, reserved, progress, ask))
+            bags.append(
+                _run_trial(folder, settings, trial, reserved, hosts if settings.lockstep else None, progress, ask)
+            )
     return bags
 
 
@@ -198,12 +201,13 @@ def _run_trial(
     settings: TrialSettings,
     trial: int,
     domain: int,
+    hosts: HostPool | None,
     progress: PhaseProgress,
     ask: Callable[[str], None],
 ) -> Path:
     bag = folder / f"trial_{trial}"
     lockstep = settings.lockstep
-    with conduct(folder / "logs" / bag.name, domain, progress.refresh) as session:
+    with conduct(folder / "logs" / bag.name, domain, progress.refresh, hosts=hosts) as session:
         conductor = session.conductor
         recorder = session.record(bag, "/hw", _metadata(settings, trial), settings.storage, simulated=lockstep)
         session.processes.start_node(settings.procedure_program(trial), niceness=LOOP_NICENESS)

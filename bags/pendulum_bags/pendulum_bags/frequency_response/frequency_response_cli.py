@@ -115,6 +115,7 @@ def experiment(
     Example: python -m pendulum_bags experiment frequency_response --design "q=100,0.01 r=0.1" --design pid
     """
     from pendulum_bags.experiments.domain import check_domain
+    from pendulum_bags.experiments.host_pool import HostPool
     from pendulum_bags.experiments.lockstep import record_run
     from pendulum_bags.experiments.progress import PhaseProgress
     from pendulum_bags.experiments.run_spec import RunSpec
@@ -162,10 +163,10 @@ def experiment(
     shares = (1.0, 1.0) if realtime else (0.35, 0.15)
     expected = [6.0 + share * spec.duration for spec, share in zip(specs, shares, strict=True)]
     try:
-        with PhaseProgress(sum(expected) + 12.0, console) as progress:
+        with HostPool() as hosts, PhaseProgress(sum(expected) + 12.0, console) as progress:
             for spec, length in zip(specs, expected, strict=True):
                 progress.phase("simulation" if spec.side == "sim" else "hardware", length)
-                record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh)
+                record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh, hosts=hosts)
             progress.phase("analysing", 12.0)
             responses, told, ran = read_responses([folder])
             analysis = analyse_responses(responses, told, design or ran, scaling=scaling, margin=gap_margin)

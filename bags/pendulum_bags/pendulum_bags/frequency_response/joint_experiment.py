@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.joint_run import JointSettings, record_joints
 from pendulum_bags.frequency_response.analyse import LONGER_OF_JOINTS, analyse_responses, read_responses, write_analysis
 from pendulum_bags.frequency_response.result import Analysis
@@ -59,6 +60,7 @@ def measure_joints(
     machine: Path,
     designs: Sequence[str] = (),
     *,
+    hosts: HostPool | None = None,
     on_side: Callable[[str], None] = lambda side: None,
     on_analysis: Callable[[str], None] = lambda what: None,
     on_wait: Callable[[], None] = lambda: None,
@@ -70,6 +72,7 @@ def measure_joints(
         multisine: What to run.
         machine: Plant file that stands in for the machine.
         designs: As :func:`pendulum_bags.frequency_response.joint_designs.certify_joint_designs` reads them.
+        hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
         on_side: Told each side, in words, when it begins.
         on_analysis: Told what is done with them afterwards.
         on_wait: Called while waiting.
@@ -82,7 +85,15 @@ def measure_joints(
     """
     place = folder / FOLDER
     place.mkdir(parents=True, exist_ok=True)
-    record_joints(place, multisine.run, machine, excitation=multisine.excitation, on_side=on_side, on_wait=on_wait)
+    record_joints(
+        place,
+        multisine.run,
+        machine,
+        excitation=multisine.excitation,
+        hosts=hosts,
+        on_side=on_side,
+        on_wait=on_wait,
+    )
     on_analysis("analysing")
     responses, plant, _ = read_responses([place])
     longer = f"{LONGER_OF_JOINTS} --plant {multisine.settings.plant}"

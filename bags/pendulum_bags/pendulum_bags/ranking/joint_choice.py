@@ -86,6 +86,7 @@ def rank_joints(
     designs: Sequence[JointDesign],
     seeds: Sequence[int],
     *,
+    hosts: HostPool | None = None,
     on_run: Callable[[str], None] = lambda what: None,
     on_wait: Callable[[], None] = lambda: None,
 ) -> Ranking:
@@ -97,6 +98,7 @@ def rank_joints(
         machine: Plant file that stands in for the machine.
         designs: As :func:`rankable` returns them.
         seeds: Of the noise; one alone gives no interval.
+        hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
         on_run: Told which run begins.
         on_wait: Called while waiting.
 
@@ -109,22 +111,20 @@ def rank_joints(
     folder.mkdir(parents=True, exist_ok=True)
     linearised = design_file(folder, plant)
     costs: dict[str, dict[str, list[tuple[int, Array | None]]]] = {}
-    # Four programs a run: started once, not for each design and seed.
-    with HostPool() as hosts:
-        for number, design in enumerate(designs, 1):
-            assert design.weights is not None
-            tuning: dict[str, Any] = {"q": list(design.weights[0]), "r": design.weights[1]}
-            rows = costs.setdefault(design.name, {"sim": [], "hw": []})
-            for seed in seeds:
-                own = replace(settings, controller="lqr", seed=seed, duration=min(settings.duration, DURATION))
-                for side, runs in (("sim", settings.plant), ("hw", str(machine))):
-                    on_run(f"design {number} of {len(designs)}, {side}")
-                    bag = folder / f"design_{number}_seed_{seed}" / side
-                    run = JointRun(own, side, runs, linearised, tuning=tuning)
-                    try:
-                        record_run(bag, run, on_wait=on_wait, hosts=hosts)
-                    except PlantStoppedError:
-                        rows[side].append((seed, None))
-                    else:
-                        rows[side].append((seed, joint_cost_parts(bag, run.namespace, plant)))
+    for number, design in enumerate(designs, 1):
+        assert design.weights is not None
+        tuning: dict[str, Any] = {"q": list(design.weights[0]), "r": design.weights[1]}
+        rows = costs.setdefault(design.name, {"sim": [], "hw": []})
+        for seed in seeds:
+            own = replace(settings, controller="lqr", seed=seed, duration=min(settings.duration, DURATION))
+            for side, runs in (("sim", settings.plant), ("hw", str(machine))):
+                on_run(f"design {number} of {len(designs)}, {side}")
+                bag = folder / f"design_{number}_seed_{seed}" / side
+                run = JointRun(own, side, runs, linearised, tuning=tuning)
+                try:
+                    record_run(bag, run, on_wait=on_wait, hosts=hosts)
+                except PlantStoppedError:
+                    rows[side].append((seed, None))
+                else:
+                    rows[side].append((seed, joint_cost_parts(bag, run.namespace, plant)))
     return rank(contenders_of(costs))
