@@ -67,14 +67,14 @@ class ParameterBox:
             values = np.vstack([corners, rng.uniform(low, high, (_INSIDE, low.size))])
         else:
             # Standard errors from 95 % intervals of single parameters; the joint region reaches further.
-            half = 0.5 * (high - low) / float(scipy.stats.norm.ppf(0.975))
+            half = 0.5 * (high - low) / float(scipy.special.ndtri(0.975))
             weights, axes = np.linalg.eigh(self.correlation)
             factor = axes * np.sqrt(np.maximum(weights, 0.0))
             ball = rng.standard_normal((2 * _INSIDE, low.size))
             ball /= np.linalg.norm(ball, axis=1, keepdims=True)
             # Along each axis too: there the ellipsoid reaches furthest, and a draw hardly ever hits it.
             ball = np.vstack([ball, np.eye(low.size), -np.eye(low.size)])
-            reach = math.sqrt(float(scipy.stats.chi2.ppf(0.95, low.size)))
+            reach = math.sqrt(float(scipy.special.chdtri(low.size, 0.05)))
             centre = np.array([getattr(plant, name) for name in self.bounds])
             values = centre + reach * (ball @ factor.T) * half
         found = [plant]

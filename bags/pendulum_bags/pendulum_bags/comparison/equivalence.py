@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-import scipy
-
 from pendulum_bags.comparison.margins import Margins
 from pendulum_bags.comparison.statistics import Interval
+from pendulum_bags.distributions import normal_probability, normal_quantile
 
 __all__ = ["EquivalenceTest", "Outcome", "Verdict", "conclude", "equivalence_test"]
 
@@ -134,8 +133,8 @@ def equivalence_test(
     smallest = math.exp(farthest) if ratio else farthest
     more: int | None = 0
     if outcome is Outcome.UNDECIDED:
-        error = max(right - left, 0.0) / (2.0 * float(scipy.stats.norm.ppf(0.5 + 0.5 * interval.level)))
-        reach = float(scipy.stats.norm.ppf(0.5 + 0.5 * interval.level))
+        error = max(right - left, 0.0) / (2.0 * normal_quantile(0.5 + 0.5 * interval.level))
+        reach = normal_quantile(0.5 + 0.5 * interval.level)
         more = _runs_to_decide(estimate, bottom, top, error, runs, reach)
     return EquivalenceTest(quantity, unit, interval, low, high, outcome, more, smallest)
 
@@ -183,8 +182,8 @@ def _power(estimate: float, bottom: float, top: float, error: float, reach: floa
     inside, below, above = (estimate - bottom, top - estimate), bottom - estimate, estimate - top
     if error <= 0.0:
         return float(min(inside) > 0.0 or below > 0.0 or above > 0.0)
-    equivalent = sum(float(scipy.stats.norm.cdf(distance / error - reach)) for distance in inside) - 1.0
-    different = sum(float(scipy.stats.norm.cdf(distance / error - reach)) for distance in (below, above))
+    equivalent = sum(normal_probability(distance / error - reach) for distance in inside) - 1.0
+    different = sum(normal_probability(distance / error - reach) for distance in (below, above))
     return max(equivalent, 0.0) + different
 
 

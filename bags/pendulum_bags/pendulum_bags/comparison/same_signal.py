@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from pendulum_bags.comparison.alignment import LONGEST_LAG, Alignment, align_signals
+from pendulum_bags.distributions import student_quantile
 from pendulum_bags.runs.series import Signal
 
 __all__ = ["SharedSignal", "compare_signals"]
@@ -92,5 +92,5 @@ def _threshold(changes: int, duration: float) -> float:
         return 0.999
     # Lags within one hold are nearly one and the same trial.
     trials = 1.0 + 2.0 * LONGEST_LAG * changes / max(duration, 1e-9)
-    t = float(scipy.stats.t.isf(CHANCE / trials, changes - 2))
+    t = -float(student_quantile(CHANCE / trials, changes - 2))
     return max(LEAST_CORRELATION, t / math.sqrt(changes - 2 + t * t))

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike
 
+from pendulum_bags.distributions import kolmogorov_tail, normal_quantile, student_quantile
 from pendulum_bags.runs.correlation import autocorrelation, effective_size
 from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
@@ -255,9 +255,7 @@ def bootstrap_interval(resampled: Resampled, statistic: Callable[[Array], Array]
     low, high = np.quantile(draws, (seen, 1.0 - seen))
     variance, freedom = _variance_of(resampled, statistic, float(draws.var(ddof=1)))
     spread = max(float(draws.std(ddof=1)), 1e-300)
-    stretch = (
-        float(scipy.stats.t.ppf(1.0 - tail, freedom) / scipy.stats.norm.ppf(1.0 - seen)) * math.sqrt(variance) / spread
-    )
+    stretch = float(student_quantile(1.0 - tail, freedom)) / normal_quantile(1.0 - seen) * math.sqrt(variance) / spread
     error = math.sqrt(variance)
     return Interval(
         estimate,
@@ -313,7 +311,7 @@ def kolmogorov_smirnov(first: ArrayLike, second: ArrayLike) -> KolmogorovSmirnov
     sizes = effective_size(first), effective_size(second)
     root = math.sqrt(sizes[0] * sizes[1] / (sizes[0] + sizes[1]))
     # Stephens, JRSS B 32, 1970: this argument makes the asymptotic law good for small samples too.
-    p_value = float(scipy.stats.kstwobign.sf((root + 0.12 + 0.11 / root) * distance))
+    p_value = kolmogorov_tail((root + 0.12 + 0.11 / root) * distance)
     return KolmogorovSmirnov(distance, float(values[index]), sizes, p_value)
 
 

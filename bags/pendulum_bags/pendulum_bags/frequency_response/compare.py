@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.distributions import f_quantile, f_tail
 from pendulum_lqr.gap_metric import DEFAULT_SCALING, SignalScaling, chordal_distance, nu_gap
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.measured_response import MeasuredResponse
@@ -128,9 +128,9 @@ def compare_responses(
     # Welch and Satterthwaite: a sum of two estimated variances counts as one with so many degrees of freedom.
     freedom = variance**2 / (spread_one**4 / (first.blocks - 1.0) + spread_two**4 / (second.blocks - 1.0))
     excess = np.maximum(np.abs(two - moved) - SMALLEST * np.abs(moved), 0.0)
-    probability = scipy.stats.f.sf(excess**2 / variance, 2.0, 2.0 * freedom)
+    probability = f_tail(excess**2 / variance, 2.0, 2.0 * freedom)
     tail = 0.05 / probability.size
-    quantile = np.sqrt(scipy.stats.f.isf(tail, 2.0, 2.0 * freedom))
+    quantile = np.sqrt(f_quantile(1.0 - tail, 2.0, 2.0 * freedom))
     moves = second.driven_velocity
     ratio = two[moves] / moved[moves]
     relative = np.sqrt(variance[moves]) / np.abs(moved[moves])

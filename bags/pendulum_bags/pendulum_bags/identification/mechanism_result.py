@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.explained import REFUSED
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_choice import choose
@@ -290,7 +290,7 @@ def _intervals(found: MechanismFit) -> dict[str, Interval]:
         errors.append(np.diag(inverse @ spread @ inverse))
     largest = np.sqrt(np.maximum(np.max(errors, axis=0), 0.0)) * size
     white = np.sqrt(np.maximum(errors[0], 0.0)) * size
-    factor = float(scipy.stats.t.ppf(0.975, max(windows - len(free), 3)))
+    factor = float(student_quantile(0.975, max(windows - len(free), 3)))
     return {
         name: Interval(
             found.model[name], found.model[name] - factor * e, found.model[name] + factor * e, float(e), float(w)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.starts import bumps
@@ -68,7 +68,7 @@ def missing_torques(model: FitModel, pieces: Sequence[Piece], parts: Sequence[Ar
         values = np.concatenate(sums)
         # Each block leaves out its own mean when the spread is taken, or a large dependence would hide itself.
         spread = float(np.std(values, ddof=1) * np.sqrt(values.size)) if values.size > 5 else np.inf
-        if spread > 0.0 and abs(values.sum()) / spread > scipy.stats.t.ppf(
+        if spread > 0.0 and abs(values.sum()) / spread > student_quantile(
             1.0 - 0.5 * _LEVEL / len(_WORDS), max(values.size - 1, 1)
         ):
             found.append(words)

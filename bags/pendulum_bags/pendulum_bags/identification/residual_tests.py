@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.distributions import chi_square_tail, student_quantile
 from pendulum_bags.identification.missing import missing_torques
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.problem import Piece
@@ -92,7 +92,7 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     # The fitted window states and parameters take degrees of freedom, which shows as a small negative correlation.
     shift = (states + len(fit.chosen.free)) / samples
     statistic = samples * (samples + 2) * float(np.sum((auto[1:] + shift) ** 2 / (samples - np.arange(1, lags + 1))))
-    white_p = float(scipy.stats.chi2.sf(statistic, lags))
+    white_p = chi_square_tail(statistic, lags)
     white = white_p > 0.01
     memory = samples / effective_samples(parts, fit.pieces)
     block = int(np.clip(np.ceil(4.0 * memory), 8, max(8, min(len(s) for s in segments) // 2)))
@@ -187,7 +187,7 @@ def _depends(signals: Sequence[Array], segments: Sequence[Array], lag: int, bloc
     scale = float(np.sqrt(values @ values))
     if values.size < 3 or scale <= 0.0:
         return False
-    return bool(abs(values.sum()) / scale > scipy.stats.t.ppf(1.0 - 0.005 / tests, values.size - 1))
+    return bool(abs(values.sum()) / scale > student_quantile(1.0 - 0.005 / tests, values.size - 1))
 
 
 def _input_at_samples(piece: Piece) -> Array:

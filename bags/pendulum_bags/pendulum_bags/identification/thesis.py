@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.distributions import student_quantile, student_tail
 from pendulum_bags.runs.correlation import effective_size
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.contract.names import Event
@@ -157,7 +157,7 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
     freedom = np.maximum(independent - len(names), 1.0)
     values = np.asarray(table.params)
     t = values / np.maximum(errors, 1e-300)
-    half = scipy.stats.t.ppf(0.975, freedom) * errors
+    half = student_quantile(0.975, freedom) * errors
     with warnings.catch_warnings():
         # The table of few points says so itself, by a test of normality that has no value.
         warnings.simplefilter("ignore")
@@ -168,7 +168,7 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
         values,
         errors,
         t,
-        2.0 * scipy.stats.t.sf(np.abs(t), freedom),
+        2.0 * student_tail(np.abs(t), freedom),
         np.stack((values - half, values + half), axis=1),
         inflation,
         float(table.rsquared),
@@ -346,7 +346,7 @@ def _average(trials: Sequence[Regression]) -> tuple[dict[str, float], dict[str, 
         if len(trials) > 1:
             # The trials' scatter sees what a regression's own error does not: correlated residuals, other hands.
             scatter = float(column.std(ddof=1) / np.sqrt(len(trials)))
-            half = max(half, float(scipy.stats.t.ppf(0.975, len(trials) - 1)) * scatter)
+            half = max(half, float(student_quantile(0.975, len(trials) - 1)) * scatter)
         intervals[name] = (average[name] - half, average[name] + half)
     return average, intervals, sign
 

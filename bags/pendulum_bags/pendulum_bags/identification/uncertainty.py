@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.covariance import FREQUENCY, Errors, candidate_errors, least_scale
 from pendulum_bags.identification.model import BOUNDS, INDEX, FitModel
 from pendulum_bags.identification.output_error import OFFSETS, OutputErrorFit
@@ -82,7 +82,7 @@ def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2) -> U
     samples = sum(piece.samples for piece in fit.pieces)
     states = 2 * sum(len(piece.windows) for piece in fit.pieces)
     freedom = float(samples - states - len(names)) if tests.white else float(folds - 1)
-    quantile = float(scipy.stats.t.ppf(0.975, max(freedom, 2.0)))
+    quantile = float(student_quantile(0.975, max(freedom, 2.0)))
     intervals = {
         name: _interval(name, model, deviation[name], own.white_deviation[name], quantile)
         for name in (*names, FREQUENCY)

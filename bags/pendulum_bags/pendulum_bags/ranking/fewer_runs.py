@@ -20,10 +20,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike
 from rich.console import Console
 
+from pendulum_bags.distributions import mean_interval, student_quantile
 from pendulum_bags.ranking.contender import Contender, Interval
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.terminal import WholeTable
@@ -82,14 +82,12 @@ def narrow(hardware: ArrayLike, simulation: ArrayLike, further: ArrayLike, level
             f"got {n} hardware and {s.size} simulated runs under their seeds, and {more.size} under others; expected "
             f"at least {LEAST_PAIRS} pairs and 1 more simulated run"
         )
-    tail = 0.5 + 0.5 * level
-    mean = float(h.mean())
-    half = float(scipy.stats.t.ppf(tail, n - 1) * h.std(ddof=1) / math.sqrt(n))
-    alone = Interval(mean, mean - half, mean + half)
+    alone = Interval(*mean_interval(h, level))
+    mean = alone.value
     every = np.concatenate([s, more])
     around = s - s.mean()
     squares = float(around @ around)
-    if squares <= 0.0 or half == 0.0:
+    if squares <= 0.0 or alone.low == alone.high:
         return Narrowed(alone, alone, n, more.size, 0.0)
     slope = float(around @ h) / squares
     shift = float(every.mean() - s.mean())
@@ -99,7 +97,7 @@ def narrow(hardware: ArrayLike, simulation: ArrayLike, further: ArrayLike, level
     variance = noise + rest
     freedom = variance**2 / (noise**2 / (n - 2) + rest**2 / (every.size - 1))
     value = mean + slope * shift
-    half = float(scipy.stats.t.ppf(tail, freedom)) * math.sqrt(variance)
+    half = float(student_quantile(0.5 + 0.5 * level, freedom)) * math.sqrt(variance)
     together = Interval(value, value - half, value + half)
     return Narrowed(alone, together, n, more.size, float(np.corrcoef(h, s)[0, 1]))
 

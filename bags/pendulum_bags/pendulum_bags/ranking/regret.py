@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.distributions import student_quantile
 from pendulum_bags.ranking.contender import Contender, Interval, compared_runs
 
 __all__ = ["regret_share"]
@@ -86,5 +86,5 @@ def _limits(chosen: Contender, another: Contender, comparisons: int) -> tuple[fl
         deviation = float(np.sqrt(parts.sum()))
         # Welch and Satterthwaite.
         freedom = float(parts.sum() ** 2 / max(1e-300, np.sum(parts**2 / (np.array([own.size, other.size]) - 1.0))))
-    low, high = (float(scipy.stats.t.isf(tail, freedom)) for tail in (0.025 / comparisons, 0.025))
+    low, high = (-float(student_quantile(tail, freedom)) for tail in (0.025 / comparisons, 0.025))
     return ratio - low * deviation, ratio + high * deviation

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from rich.console import Console
 
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
+from pendulum_bags.distributions import mean_interval
 from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.studies.results import episode_of_run, group_runs
@@ -155,8 +155,7 @@ def _paired(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             continue
         for name in COMPARED:
             ratio = np.log([second[seed][name] / first[seed][name] for seed in common])
-            half = float(scipy.stats.t.ppf(0.975, len(common) - 1) * ratio.std(ddof=1) / math.sqrt(len(common)))
-            mean = float(ratio.mean())
+            mean, low, high = mean_interval(ratio)
             found.append(
                 {
                     "plant": plant,
@@ -164,8 +163,8 @@ def _paired(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                     "of": other,
                     "per": one,
                     "ratio": math.exp(mean),
-                    "low": math.exp(mean - half),
-                    "high": math.exp(mean + half),
+                    "low": math.exp(low),
+                    "high": math.exp(high),
                     "seeds": len(common),
                 }
             )

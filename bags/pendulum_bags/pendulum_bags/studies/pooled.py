@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import scipy
 from rich.console import Console
 
 from pendulum_bags.comparison import compare_folders
+from pendulum_bags.distributions import mean_interval
 from pendulum_bags.studies.study_file import Study, StudyRun
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.terminal import WholeTable
@@ -88,8 +87,5 @@ def print_table(console: Console, result: Mapping[str, Any]) -> None:
 
 def _mean(values: Sequence[float]) -> dict[str, float | None]:
     """Return mean and 95 % interval of runs that differ in their seed (Student's t)."""
-    mean = float(np.mean(values))
-    if len(values) < 2:
-        return {"mean": mean, "low": None, "high": None}
-    half = float(scipy.stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
-    return {"mean": mean, "low": mean - half, "high": mean + half}
+    mean, low, high = mean_interval(values)
+    return {"mean": mean, "low": low, "high": high} if len(values) > 1 else {"mean": mean, "low": None, "high": None}

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
+from pendulum_bags.distributions import mean_interval
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies.records import read_record
 from pendulum_bags.studies.shares import share_interval
@@ -60,14 +60,7 @@ class Group:
         if metric in SHARES:
             low, high = share_interval(int(values.sum()), values.size)
             return float(values.mean()), low, high
-        finite = values[np.isfinite(values)]
-        if finite.size == 0:
-            return math.nan, math.nan, math.nan
-        mean = float(finite.mean())
-        if finite.size < 2:
-            return mean, math.nan, math.nan
-        half = float(scipy.stats.t.ppf(0.975, finite.size - 1) * finite.std(ddof=1) / math.sqrt(finite.size))
-        return mean, mean - half, mean + half
+        return mean_interval(values[np.isfinite(values)])
 
     def worst(self, metric: str) -> tuple[float, int]:
         """Return the largest absolute value over the runs (of a share, the smallest) and its seed, to replay it."""
