@@ -178,6 +178,11 @@ class PlantClient:
         if watch:
             self.watch()
 
+    @property
+    def is_heard(self) -> bool:
+        """Whether any of its states has come, of whichever joints."""
+        return self.sample is not None or bool(self._foreign_joints)
+
     def watch(self) -> None:
         """Subscribe to the plant's states."""
         self._watching = self.conductor.node.create_subscription(

@@ -218,7 +218,7 @@ def _has_reached(plant: PlantClient, end_ns: int) -> bool:
 
 def _wait_for_end(conductor: Conductor, plant: PlantClient, duration: float) -> None:
     """Wait for the end of a run in lockstep, however slow a busy machine makes it, as long as it goes on."""
-    conductor.wait_for("the first state", lambda: plant.sample is not None or _is_finished(plant), START_TIMEOUT)
+    conductor.wait_for("the first state", lambda: plant.is_heard or _is_finished(plant), START_TIMEOUT)
     plant.look_away()
     recorder, received = RecorderClient(conductor, plant.namespace), 0
     states = f"{plant.namespace}/{names.JOINT_STATES}"
