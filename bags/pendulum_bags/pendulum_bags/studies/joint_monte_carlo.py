@@ -6,12 +6,11 @@ The plant is held upright by its own LQR, as in ``experiment joints``. Chunks, s
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.experiments.joint_run import design_for, identified_names
-from pendulum_bags.runs.run_folder import write_json
-from pendulum_bags.studies.chunks import Connect, chunk_path, open_results, read_columns, run_chunks
-from pendulum_bags.studies.monte_carlo import SEEDS, SEEDS_OF_ONE, add_runs
-from pendulum_bags.studies.shares import share_interval
+from pendulum_bags.studies.chunks import Connect
+from pendulum_bags.studies.random_runs import RandomRuns, carry_out_runs, figures_of_runs
 from pendulum_bags.studies.uncertain import share_of_interval
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_msgs_py.errors import ParameterError
@@ -38,66 +35,25 @@ _LIMIT_PER_NOISE = 10.0
 
 
 @dataclass(frozen=True)
-class JointMonteCarlo:
-    """What to draw and to run.
+class JointMonteCarlo(RandomRuns):
+    """What to draw and to run, of a plant of several joints; see :class:`RandomRuns`.
 
     Attributes:
-        plant: Preset or file of the plant that is believed in; the controller is designed on it.
-        runs: Number of closed-loop runs.
-        seed: Seed of everything.
         shares: Standard deviation of parameters as a share of their value, by name; others are known.
         amplitude: Largest noise on each driven joint [N m or N]; None for a tenth of its effort limit.
-        hold_time: Time for which a noise sample is held [s].
-        start: Largest distance of each joint's start from upright, uniform [rad or m].
-        duration: Of each run [s].
-        dt: Period of the loop [s].
-        bound: Distance from upright that no joint should leave [rad or m].
-        chunk: Runs in a chunk; part of the result's definition.
     """
 
-    plant: str
-    runs: int = 100_000
-    seed: int = 1
     shares: Mapping[str, float] = field(default_factory=dict)
     amplitude: float | None = None
-    hold_time: float = 0.01
-    start: float = 0.0
-    duration: float = 5.0
-    dt: float = 0.002
-    bound: float = 0.2
-    chunk: int = 10_000
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be run."""
-        if self.runs < 1 or self.chunk < 1:
-            raise ParameterError(f"runs is {self.runs} and chunk {self.chunk}; expected both >= 1")
-        if not 0 <= self.seed < SEEDS:
-            raise ParameterError(f"seed is {self.seed}; expected 0 to {SEEDS - 1}")
-        for name, value, least in (
-            ("bound", self.bound, 1e-9),
-            ("start", self.start, 0.0),
-            ("duration", self.duration, self.dt),
-            ("hold_time", self.hold_time, self.dt),
-            ("amplitude", 0.0 if self.amplitude is None else self.amplitude, 0.0),
-        ):
-            if not (math.isfinite(value) and value >= least):
-                raise ParameterError(f"{name} is {value}; expected a finite number >= {least:g}")
 
     @property
-    def steps(self) -> int:
-        """Steps of each run."""
-        return round(self.duration / self.dt)
+    def largest_noise(self) -> float | None:
+        """Largest noise on each driven joint [N m or N]; None where its effort limit decides."""
+        return self.amplitude
 
-    @property
-    def chunks(self) -> int:
-        """How many chunks there are."""
-        return -(-self.runs // self.chunk)
-
-    def fingerprint(self) -> str:
-        """Return a hash of all that a run depends on; how many runs there are is not among that."""
-        settings = {name: value for name, value in asdict(self).items() if name != "runs"}
-        content = json.dumps([settings, load_mechanism(self.plant).numbers], sort_keys=True)
-        return hashlib.sha256(content.encode()).hexdigest()[:16]
+    def numbers_of_plant(self) -> Any:
+        """Return all numbers of the plant."""
+        return load_mechanism(self.plant).numbers
 
 
 def joint_shares(text: str, plant: str) -> dict[str, float]:
@@ -171,10 +127,10 @@ def run_joint_monte_carlo(
     connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Run all chunks that are not on disk yet, one Parquet file each, and sum up.
+    """Run all chunks that are not on disk yet and sum up, as :func:`carry_out_runs` says.
 
     Args:
-        folder: Where the files go; a folder of the same settings is gone on with, one of fewer runs is added to.
+        folder: Where the files go.
         settings: What to run.
         connect: To a Dask cluster; by default in this process, on all cores.
         on_progress: Called with chunks done and in all.
@@ -183,13 +139,15 @@ def run_joint_monte_carlo(
         BagError: The folder holds something else, or more runs.
         ParameterError: A drawn plant has no positive inertia.
     """
-    add_runs(folder, settings.runs, settings.chunk, settings.fingerprint(), asdict(settings))
-    open_results(folder, "Monte Carlo", settings.fingerprint(), asdict(settings))
-    job = (settings, load_mechanism(settings.plant))
-    run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
-    result = _summarise(folder, settings)
-    write_json(folder / "monte_carlo.json", result)
-    return result
+    return carry_out_runs(
+        folder,
+        settings,
+        _run_chunk,
+        (settings, load_mechanism(settings.plant)),
+        partial(_summarise, folder, settings),
+        connect=connect,
+        on_progress=on_progress,
+    )
 
 
 def replay_joints(settings: JointMonteCarlo, number: int) -> tuple[dict[str, float], Array]:
@@ -202,27 +160,24 @@ def replay_joints(settings: JointMonteCarlo, number: int) -> tuple[dict[str, flo
     Returns:
         The row of the table, and positions, velocities and efforts of all joints at each step, shape (steps, 3 n).
     """
-    if not 0 <= number < settings.runs:
-        raise ParameterError(f"run is {number}; expected 0 to {settings.runs - 1}")
-    index, offset = divmod(number, settings.chunk)
+    index, place = settings.place(number)
     plant = load_mechanism(settings.plant)
-    drawn = {name: values[offset : offset + 1] for name, values in _draw(settings, index, plant).items()}
+    drawn = {name: values[place] for name, values in _draw(settings, index, plant).items()}
     result = _batch(settings, plant, drawn, None, record=True)
     assert result.trajectories is not None
     return {name: float(v[0]) for name, v in _columns(plant, drawn, result).items()}, result.trajectories[:, :, 0]
 
 
 def _draw(settings: JointMonteCarlo, index: int, plant: MechanismParameters) -> dict[str, NDArray[Any]]:
-    """Return parameters, starts and noise seeds of a chunk; it is drawn whole and then cut."""
-    first = index * settings.chunk
-    count = min(settings.chunk, settings.runs - first)
-    generator = np.random.Generator(np.random.Philox(key=[settings.seed, index]))
-    drawn: dict[str, NDArray[Any]] = {**scatter(plant, settings.shares, settings.chunk, generator)}
-    for name, goal in zip(plant.coordinates.names, plant.coordinates.goal, strict=True):
-        drawn[f"start_{name}"] = goal + settings.start * generator.uniform(-1.0, 1.0, settings.chunk)
-    drawn = {name: values[:count] for name, values in drawn.items()}
-    drawn["noise_seed"] = settings.seed * SEEDS_OF_ONE + first + np.arange(count, dtype=np.int64)
-    return drawn
+    """Return parameters, starts and noise seeds of a chunk."""
+
+    def draw(generator: np.random.Generator, count: int) -> dict[str, NDArray[Any]]:
+        drawn: dict[str, NDArray[Any]] = {**scatter(plant, settings.shares, count, generator)}
+        for name, goal in zip(plant.coordinates.names, plant.coordinates.goal, strict=True):
+            drawn[f"start_{name}"] = goal + settings.start * generator.uniform(-1.0, 1.0, count)
+        return drawn
+
+    return settings.draw(index, draw)
 
 
 def _run_chunk(
@@ -278,31 +233,11 @@ def _summarise(folder: Path, settings: JointMonteCarlo) -> dict[str, Any]:
     coordinates = load_mechanism(settings.plant).coordinates
     units = {f"{what}_{joint.name}": joint.unit for what in ("max", "std") for joint in coordinates.joints}
     units |= {f"max_effort_{coordinates.joints[i].name}": coordinates.joints[i].effort_unit for i in coordinates.driven}
-    parts: dict[str, list[Array]] = {name: [] for name in units}
-    for index in range(settings.chunks):
-        for name, column in read_columns(chunk_path(folder, index), parts).items():
-            parts[name].append(column)
-    values = {name: np.concatenate(columns) for name, columns in parts.items()}
-    # NaN stays NaN, and is not inside.
-    farthest = np.max([values[f"max_{name}"] for name in coordinates.names], axis=0)
-    inside = int((farthest <= settings.bound).sum())
-    low, high = share_interval(inside, settings.runs)
-    shares = (0.05, 0.5, 0.95, 0.999)
-    worst = np.argsort(farthest, kind="stable")[::-1][:10]
-    return {
-        "settings": asdict(settings),
-        "joints": list(coordinates.names),
-        "units": units,
-        "runs": settings.runs,
-        "not_finite": int((~np.isfinite(farthest)).sum()),
-        "probability_inside": inside / settings.runs,
-        "probability_interval": [low, high],
-        "quantiles": {
-            name: dict(zip(map(str, shares), np.quantile(column, shares).tolist(), strict=True))
-            for name, column in values.items()
-        },
-        "worst": [
-            {"run": int(run), "max_deviation": float(farthest[run]), **replay_joints(settings, int(run))[0]}
-            for run in worst
-        ],
-    }
+    figures, _ = figures_of_runs(
+        folder,
+        settings,
+        units,
+        lambda columns: np.max([columns[f"max_{name}"] for name in coordinates.names], axis=0),
+        lambda run, farthest: {"max_deviation": farthest, **replay_joints(settings, run)[0]},
+    )
+    return {**figures, "joints": list(coordinates.names), "units": units}

@@ -6,44 +6,31 @@ the number of workers nor on the order in which they finish, bit for bit.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_bags.runs.run_folder import write_json
-from pendulum_bags.studies.chunks import (
-    Connect,
-    chunk_path,
-    kept_settings,
-    open_results,
-    read_columns,
-    run_chunks,
-    write_results_marker,
-)
-from pendulum_bags.studies.shares import share_interval
+from pendulum_bags.studies.chunks import Connect
+from pendulum_bags.studies.random_runs import RandomRuns, carry_out_runs, figures_of_runs
 from pendulum_bags.studies.uncertain import VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
-from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.batch import BatchResult, simulate_batch
 
 __all__ = [
     "COLUMNS",
-    "SEEDS",
-    "SEEDS_OF_ONE",
     "MonteCarlo",
-    "add_runs",
     "draw_chunk",
     "replay",
     "run_chunk",
@@ -55,105 +42,66 @@ __all__ = [
 COLUMNS = (*VARIED, "noise_seed", "theta_0", "max_theta", "max_effort", "std_theta", "theta_end", "theta_dot_end")
 """Columns of the Parquet files; SI units."""
 
-SEEDS_OF_ONE = 10_000_000_000
-"""Distance between the noise seeds of two Monte Carlos."""
-SEEDS = 2**63 // SEEDS_OF_ONE
-"""Number of seeds that a Monte Carlo may have."""
-
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class MonteCarlo:
-    """What to draw and to run.
+class MonteCarlo(RandomRuns):
+    """What to draw and to run, of a pendulum; see :class:`RandomRuns`.
 
     Attributes:
-        plant: Preset or file of the plant that is believed in; the controller is designed on it.
-        runs: Number of closed-loop runs.
-        seed: Seed of everything.
         uncertainty: How far its parameters are known.
         q: Diagonal of Q.
         r: R.
         amplitude: Largest noise torque [N m].
-        hold_time: Time for which a noise sample is held [s].
-        start: Largest distance of the start from upright, uniform [rad].
-        duration: Of each run [s].
-        dt: Period of the loop [s].
         method: Integrator.
-        bound: Distance from upright that a run should not leave [rad].
-        chunk: Runs in a chunk; part of the result's definition.
     """
+
+    UNITS: ClassVar[tuple[str, str]] = ("rad", "N m")
 
     plant: str = "thesis"
     runs: int = 1_000_000
-    seed: int = 1
     uncertainty: Uncertainty = field(
         default_factory=lambda: Uncertainty({"inertia": 0.3, "damping": 0.05, "gravity": 0.05})
     )
     q: tuple[float, float] = (100.0, 0.01)
     r: float = 0.1
     amplitude: float = 2.5
-    hold_time: float = 0.01
-    start: float = 0.0
-    duration: float = 5.0
-    dt: float = 0.002
     method: str = "etd2"
     bound: float = 0.02
     chunk: int = 50_000
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
-        if self.runs < 1 or self.chunk < 1:
-            raise ParameterError(f"runs is {self.runs} and chunk {self.chunk}; expected both >= 1")
-        if not 0 <= self.seed < SEEDS:
-            raise ParameterError(f"seed is {self.seed}; expected 0 to {SEEDS - 1}")
-        if not (math.isfinite(self.bound) and self.bound > 0.0):
-            raise ParameterError(f"bound is {self.bound} rad; expected > 0")
-        if not (math.isfinite(self.amplitude) and self.amplitude >= 0.0):
-            raise ParameterError(f"amplitude is {self.amplitude} N m; expected >= 0")
-        if not (math.isfinite(self.duration) and self.dt > 0.0 and self.hold_time > 0.0):
-            raise ParameterError(f"duration is {self.duration} s and hold_time {self.hold_time} s; expected both > 0")
-        if not 0.0 <= self.start <= math.pi:
+        super().__post_init__()
+        if self.start > math.pi:
             raise ParameterError(f"start is {self.start} rad; expected 0 to pi")
-        if self.steps < 1:
-            raise ParameterError(f"duration is {self.duration} s; expected at least one step of {self.dt} s")
 
     @property
-    def steps(self) -> int:
-        """Steps of each run."""
-        return round(self.duration / self.dt)
+    def largest_noise(self) -> float:
+        """Largest noise torque [N m]."""
+        return self.amplitude
 
-    @property
-    def chunks(self) -> int:
-        """How many chunks there are."""
-        return -(-self.runs // self.chunk)
-
-    def fingerprint(self) -> str:
-        """Return a hash of all that a run depends on; how many runs there are is not among that."""
-        settings = {name: value for name, value in asdict(self).items() if name != "runs"}
-        content = json.dumps([settings, load_plant(self.plant)], sort_keys=True, default=asdict)
-        return hashlib.sha256(content.encode()).hexdigest()[:16]
+    def numbers_of_plant(self) -> PlantParameters:
+        """Return the plant."""
+        return load_plant(self.plant)
 
 
 def draw_chunk(settings: MonteCarlo, index: int, plant: PlantParameters | None = None) -> dict[str, NDArray[Any]]:
     """Return the plants, starts and noise seeds of a chunk, shape (n,) each.
-
-    A chunk is drawn whole and then cut, so that a run is the same however many follow it.
 
     Args:
         settings: Of the Monte Carlo.
         index: Of the chunk.
         plant: The plant that is believed in; by default the one that the settings name.
     """
-    first = index * settings.chunk
-    count = min(settings.chunk, settings.runs - first)
-    generator = np.random.Generator(np.random.Philox(key=[settings.seed, index]))
-    drawn: dict[str, NDArray[Any]] = {}
-    drawn.update(settings.uncertainty.draw(plant or load_plant(settings.plant), settings.chunk, generator))
-    drawn["theta_0"] = UPRIGHT + settings.start * generator.uniform(-1.0, 1.0, settings.chunk)
-    drawn = {name: values[:count] for name, values in drawn.items()}
-    drawn["noise_seed"] = settings.seed * SEEDS_OF_ONE + first + np.arange(count, dtype=np.int64)
-    return drawn
+    believed = plant or load_plant(settings.plant)
+
+    def draw(generator: np.random.Generator, count: int) -> dict[str, NDArray[Any]]:
+        values = settings.uncertainty.draw(believed, count, generator)
+        return {**values, "theta_0": UPRIGHT + settings.start * generator.uniform(-1.0, 1.0, count)}
+
+    return settings.draw(index, draw)
 
 
 def run_chunk(settings: MonteCarlo, index: int, threads: int | None = None) -> dict[str, NDArray[Any]]:
@@ -177,11 +125,9 @@ def replay(settings: MonteCarlo, number: int) -> tuple[dict[str, float], Array]:
     Returns:
         The row of the table, and theta [rad], theta_dot [rad/s], effort [N m] at each step, shape (steps, 3).
     """
-    if not 0 <= number < settings.runs:
-        raise ParameterError(f"run is {number}; expected 0 to {settings.runs - 1}")
-    index, offset = divmod(number, settings.chunk)
+    index, place = settings.place(number)
     plant = load_plant(settings.plant)
-    drawn = {name: values[offset : offset + 1] for name, values in draw_chunk(settings, index, plant).items()}
+    drawn = {name: values[place] for name, values in draw_chunk(settings, index, plant).items()}
     result = _batch(settings, plant, drawn, None, record=True)
     assert result.trajectories is not None
     row = {name: float(values[0]) for name, values in _columns(drawn, result).items()}
@@ -195,10 +141,10 @@ def run_monte_carlo(
     connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Run all chunks that are not on disk yet, one Parquet file each, and sum up.
+    """Run all chunks that are not on disk yet and sum up, as :func:`carry_out_runs` says.
 
     Args:
-        folder: Where the files go; a folder of the same settings is gone on with, one of fewer runs is added to.
+        folder: Where the files go.
         settings: What to run.
         connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
         on_progress: Called with chunks done and in all.
@@ -206,65 +152,28 @@ def run_monte_carlo(
     Raises:
         BagError: The folder holds something else, or more runs.
     """
-    add_runs(folder, settings.runs, settings.chunk, settings.fingerprint(), asdict(settings))
-    open_results(folder, "Monte Carlo", settings.fingerprint(), asdict(settings))
-    job = (settings, load_plant(settings.plant))
-    run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
-    result = summarise(folder, settings)
-    write_json(folder / "monte_carlo.json", result)
-    return result
-
-
-def add_runs(folder: Path, runs: int, chunk: int, fingerprint: str, settings: Mapping[str, Any]) -> None:
-    """Let a folder of fewer runs hold more: only a last chunk that was not full has to be carried out again.
-
-    Args:
-        folder: Of a Monte Carlo, or a new one.
-        runs: How many it shall hold.
-        chunk: Runs in a chunk.
-        fingerprint: Of all else that a run depends on.
-        settings: To keep beside the results.
-
-    Raises:
-        BagError: It holds more.
-    """
-    before = int(kept_settings(folder, fingerprint).get("runs", runs))
-    if before > runs:
-        raise BagError(f"folder {folder} holds a Monte Carlo of {before} runs; expected at most the {runs} of this one")
-    if before < runs:
-        if before % chunk:
-            chunk_path(folder, before // chunk).unlink(missing_ok=True)
-        write_results_marker(folder, fingerprint, settings)
+    return carry_out_runs(
+        folder,
+        settings,
+        _run_chunk,
+        (settings, load_plant(settings.plant)),
+        partial(summarise, folder, settings),
+        connect=connect,
+        on_progress=on_progress,
+    )
 
 
 def summarise(folder: Path, settings: MonteCarlo) -> dict[str, Any]:
     """Return the probability of staying inside the bound, quantiles and the worst runs, from the Parquet files."""
-    columns: dict[str, list[Array]] = {name: [] for name in ("max_theta", "max_effort", "std_theta", "theta_end")}
-    for index in range(settings.chunks):
-        table = read_columns(chunk_path(folder, index), columns)
-        for name, parts in columns.items():
-            parts.append(table[name])
-    values = {name: np.concatenate(parts) for name, parts in columns.items()}
-    inside = int((values["max_theta"] <= settings.bound).sum())
-    worst = np.argsort(values["max_theta"], kind="stable")[::-1][:10]
-    # Not a number is worse than any number.
-    lost = int((~np.isfinite(values["max_theta"])).sum())
-    low, high = share_interval(inside, settings.runs)
-    shares = (0.05, 0.5, 0.95, 0.999)
-    return {
-        "settings": asdict(settings),
-        "runs": settings.runs,
-        "not_finite": lost,
-        "probability_inside": inside / settings.runs,
-        "probability_interval": [low, high],
-        "quantiles": {
-            name: dict(zip(map(str, shares), np.quantile(column, shares).tolist(), strict=True))
-            for name, column in values.items()
-            if name != "theta_end"
-        },
-        "converged": float(np.mean(np.abs(wrap(values["theta_end"] - UPRIGHT)) < 0.1)),
-        "worst": [{"run": int(run), **replay(settings, int(run))[0]} for run in worst],
-    }
+    figures, values = figures_of_runs(
+        folder,
+        settings,
+        ("max_theta", "max_effort", "std_theta", "theta_end"),
+        lambda columns: columns["max_theta"],
+        lambda run, _: replay(settings, run)[0],
+    )
+    del figures["quantiles"]["theta_end"]
+    return {**figures, "converged": float(np.mean(np.abs(wrap(values["theta_end"] - UPRIGHT)) < 0.1))}
 
 
 def sobol(settings: MonteCarlo, *, base: int = 4096, output: str = "std_theta") -> dict[str, Any]:
