@@ -67,13 +67,7 @@ def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion
         DesignError: Not even the smallest states are caught.
     """
     n = len(plant.joints)
-    rng = np.random.default_rng(0)
-    directions = rng.standard_normal((_SAMPLES, 2 * n))
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
-    # On the edge for half of them, evenly in the volume for the rest.
-    directions[_SAMPLES // 2 :] *= rng.random((_SAMPLES - _SAMPLES // 2, 1)) ** (0.5 / n)
-    root = np.linalg.cholesky(gain.S)
-    unit = np.linalg.solve(root.T, directions.T)
+    unit = _samples_of_level_1(gain, n)
     low, high = 0.0, _FIRST**2 / float(np.max(np.diag(np.linalg.inv(gain.S))[:n]))
     while _all_caught(plant, gain, np.sqrt(high) * unit, low):
         low, high = high, 4.0 * high
@@ -86,6 +80,16 @@ def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion
         else:
             high = middle
     return CaughtRegion(_SHARE * low, _SAMPLES)
+
+
+def _samples_of_level_1(gain: Gain, n: int) -> Array:
+    """Return deviations on the edge of x' S x <= 1, and as many evenly in its volume, shape (2n, samples)."""
+    rng = np.random.default_rng(0)
+    directions = rng.standard_normal((_SAMPLES, 2 * n))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    directions[_SAMPLES // 2 :] *= rng.random((_SAMPLES - _SAMPLES // 2, 1)) ** (0.5 / n)
+    unit: Array = np.linalg.solve(np.linalg.cholesky(gain.S).T, directions.T)
+    return unit
 
 
 def _all_caught(plant: MechanismParameters, gain: Gain, deviations: Array, known: float) -> bool:

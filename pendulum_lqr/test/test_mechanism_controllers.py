@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_lqr import swing_up_cli
+from pendulum_lqr import mechanism_catch, swing_up_cli
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_lqr.mechanism_catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
@@ -50,6 +50,18 @@ def step(plant: MechanismParameters, x: Vector, effort: Vector) -> Vector:
     torque = plant.coordinates.spread(effort)
     q, v = rk4_joints(plant.mechanism.forward, along_2, x[:2], x[2:], torque, torque, torque, DT, plant.packed)
     return (*q, *v)
+
+
+@pytest.mark.parametrize("name", ["acrobot", "cart_pole"])
+def test_the_level_of_a_catch_is_that_of_trials_that_nobody_cut_short(name: str) -> None:
+    plant = load_mechanism(name)
+    catch = make_mechanism_catch(plant, (1.0, 1.0, 1.0, 1.0), 1.0)
+    samples = mechanism_catch._samples_of_level_1(catch.gain, 2)
+    # Nine tenths of what was found; the last bisection halved the way to four times as much four times.
+    found = catch.region.level / 0.9
+    for factor, caught in ((1.0, True), (1.001 * 4.0 ** (1.0 / 16.0), False)):
+        deviations = math.sqrt(factor * found) * samples
+        assert mechanism_catch._all_caught(plant, catch.gain, deviations, 0.0) is caught, factor
 
 
 def test_the_catch_takes_over_within_its_region_where_it_catches_and_lets_go_beyond_twice_that() -> None:
