@@ -28,12 +28,6 @@ pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installe
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = write_run_folder(tmp_path_factory.mktemp("browser") / "run", seed=1)
-    return write_report(folder, recordings=[], formats=[])
-
-
-@pytest.fixture(scope="module")
-def printable(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = write_run_folder(tmp_path_factory.mktemp("paper") / "run", seed=1)
     return write_report(folder, recordings=[], formats=["png"])
 
 
@@ -98,11 +92,11 @@ def test_page_is_whole_and_usable(page: Any) -> None:
 
 
 @pytest.mark.parametrize("scripts", [True, False], ids=["with scripts", "without scripts"])
-def test_paper_shows_every_figure_as_a_picture(browser: Any, printable: Path, scripts: bool) -> None:
-    assert printable.stat().st_size < 5_000_000
+def test_paper_shows_every_figure_as_a_picture(browser: Any, report: Path, scripts: bool) -> None:
+    assert report.stat().st_size < 5_000_000
     context = browser.new_context(offline=True, java_script_enabled=scripts)
     page = context.new_page()
-    page.goto(printable.resolve().as_uri())
+    page.goto(report.resolve().as_uri())
     # At once, as a browser that prints from the command line does: before any plot is drawn.
     page.emulate_media(media="print")
     figures = page.locator("figure:has(.graphs)")
