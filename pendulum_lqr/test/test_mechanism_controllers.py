@@ -64,6 +64,11 @@ def test_the_level_of_a_catch_is_that_of_trials_that_nobody_cut_short(name: str)
         assert mechanism_catch._all_caught(plant, catch.gain, deviations, 0.0) is caught, factor
 
 
+def test_an_lqr_that_asks_for_too_much_catches_no_state_and_is_refused() -> None:
+    with pytest.raises(DesignError, match="catches no state near upright"):
+        make_mechanism_catch(load_mechanism("acrobot"), (100.0, 100.0, 1.0, 1.0), 0.01)
+
+
 def test_the_catch_takes_over_within_its_region_where_it_catches_and_lets_go_beyond_twice_that() -> None:
     plant = load_mechanism("pendubot_frictionless")
     catch = make_mechanism_catch(plant, Q, R)
