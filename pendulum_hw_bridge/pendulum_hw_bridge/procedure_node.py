@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -24,7 +25,7 @@ from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.ros.simulated_time import AnsweringNode
+from pendulum_msgs_py.ros.simulated_time import live_by_stamps
 
 __all__ = ["SPECS", "ProcedureNode", "main"]
 
@@ -49,7 +50,7 @@ SPECS: tuple[ParameterSpec, ...] = (
 """All parameters of the node."""
 
 
-class ProcedureNode(AnsweringNode):
+class ProcedureNode(Node):
     """One trial: answers each state of the plant until the trial is over.
 
     Before and after the trial the answer is zero torque. In simulated time a staircase ends on its last step, held:
@@ -78,7 +79,7 @@ class ProcedureNode(AnsweringNode):
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/finish", self._on_finish)
-        self.look_at_clock_seldom()
+        live_by_stamps(self, lambda: self._newest_ns)
 
     def close(self) -> None:
         """End with zero torque while the context is still valid."""

@@ -62,7 +62,7 @@ from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.ros.running_plant import RunningPlant
-from pendulum_msgs_py.ros.simulated_time import AnsweringNode
+from pendulum_msgs_py.ros.simulated_time import live_by_stamps
 from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["NODE_SPECS", "ControllerNode", "main"]
@@ -101,7 +101,7 @@ _SAME_PERIOD = 0.02
 _MULTI_ARRAY_TOPIC = "~/commands"
 
 
-class ControllerNode(LifecycleNode, AnsweringNode, PollingNode):
+class ControllerNode(LifecycleNode, PollingNode):
     """Lifecycle node around a controller.
 
     Unconfigured: parameters are known. Inactive: the gain is designed and printed, states are heard and not answered.
@@ -156,7 +156,7 @@ class ControllerNode(LifecycleNode, AnsweringNode, PollingNode):
         self._diagnostics = Diagnostics(self, "controller")
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         self._running_plant = RunningPlant(self, self._plant)
-        self.look_at_clock_seldom()
+        live_by_stamps(self, lambda: None if self._loop is None else self._loop.newest_stamp_ns)
         # Wall time on purpose: diagnostics must come even where simulated time stands still.
         create_wall_timer(self, DIAGNOSTICS_PERIOD, self._on_timer)
         if self._settings["autostart"]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -33,7 +34,7 @@ from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.first_answer import FirstAnswer
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.ros.simulated_time import AnsweringNode
+from pendulum_msgs_py.ros.simulated_time import live_by_stamps
 from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["NODE_SPECS", "DisturbanceNode", "main"]
@@ -59,7 +60,7 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
 """Parameters of the node itself, next to those of the signal."""
 
 
-class DisturbanceNode(AnsweringNode):
+class DisturbanceNode(Node):
     """Publishes the disturbance for each new stamp of ``joint_states``.
 
     Before the start and after the end it answers with zero, so that a plant in lockstep gets its answer and a plant in
@@ -98,7 +99,7 @@ class DisturbanceNode(AnsweringNode):
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
         create_wall_timer(self, DIAGNOSTICS_PERIOD, self._publish_diagnostics)
-        self.look_at_clock_seldom()
+        live_by_stamps(self, lambda: self._loop.newest_stamp_ns)
 
     def close(self) -> None:
         """End with zero torque while the context is still valid."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -21,7 +22,7 @@ from pendulum_msgs_py.ros.convert import sample_from_bytes
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
-from pendulum_msgs_py.ros.simulated_time import AnsweringNode
+from pendulum_msgs_py.ros.simulated_time import live_by_stamps
 from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["NODE_SPECS", "EffortAdapterNode", "main"]
@@ -52,7 +53,7 @@ _JOINT_TOPIC = "joint_commands"
 _COUNTS = ("commands", "answers", "replaced", "too_old", "refused")
 
 
-class EffortAdapterNode(AnsweringNode):
+class EffortAdapterNode(Node):
     """Publishes each command of ros2_control's kind as the answer to the newest state.
 
     While there is more than one publisher of commands none is passed on: nothing in them says whose they are.
@@ -80,7 +81,7 @@ class EffortAdapterNode(AnsweringNode):
             self._topic = _JOINT_TOPIC
             self.create_subscription(JointState, self._topic, self._on_joints, qos.COMMAND_INPUT)
         create_wall_timer(self, DIAGNOSTICS_PERIOD, self._look)
-        self.look_at_clock_seldom()
+        live_by_stamps(self, lambda: self._adapter.newest_stamp_ns)
 
     def close(self) -> None:
         """End with zero torque while the context is still valid."""

@@ -212,7 +212,7 @@ class LockstepLoop:
         self._waiting_since = time.monotonic()
         self._told_waiting = False
         self._interface.publish_state(sample)
-        if self._clock_publisher is not None:
+        if self._clock_publisher is not None and self._clock_publisher.get_subscription_count():
             self._clock_publisher.publish(encode_clock(self.now_ns))
 
     def _must_wait(self) -> bool:
