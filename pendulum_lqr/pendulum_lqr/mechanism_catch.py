@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,7 +58,8 @@ def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion
     """Return the largest ellipsoid x' S x <= level from whose sampled states u = -K x, limited, comes to rest upright.
 
     The level grows until a sampled state is lost, or hits an end stop, and is bisected then; nine tenths of what is
-    found are returned.
+    found are returned. Each plant and gain is sampled once in a process: a controller that is designed anew for another
+    parameter has its region at once.
 
     Args:
         plant: The plant; dry friction, lag and delay are left out.
@@ -66,6 +68,13 @@ def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion
     Raises:
         DesignError: Not even the smallest states are caught.
     """
+    return _sampled(plant, *(tuple(map(tuple, matrix.tolist())) for matrix in (gain.K, gain.S)), tuple(gain.poles))
+
+
+@lru_cache(maxsize=32)
+def _sampled(plant: MechanismParameters, *numbers: tuple[Any, ...]) -> CaughtRegion:
+    """Return what :func:`sample_caught_region` says, of the numbers of K, S and poles."""
+    gain = Gain(*map(np.array, numbers))
     n = len(plant.joints)
     unit = _samples_of_level_1(gain, n)
     low, high = 0.0, _FIRST**2 / float(np.max(np.diag(np.linalg.inv(gain.S))[:n]))

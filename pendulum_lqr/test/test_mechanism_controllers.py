@@ -64,6 +64,16 @@ def test_the_level_of_a_catch_is_that_of_trials_that_nobody_cut_short(name: str)
         assert mechanism_catch._all_caught(plant, catch.gain, deviations, 0.0) is caught, factor
 
 
+def test_a_region_is_sampled_once_for_each_plant_and_gain(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = load_mechanism("cart_pole")
+    region = make_mechanism_catch(plant, Q, R).region
+    monkeypatch.setattr(mechanism_catch, "_all_caught", lambda *_: False)
+    assert make_mechanism_catch(load_mechanism("cart_pole"), Q, R).region == region
+    for other, r in ((plant, 1.01 * R), (plant.with_values({"cart_mass": 1.01}), R)):
+        with pytest.raises(DesignError, match="catches no state"):
+            make_mechanism_catch(other, Q, r)
+
+
 def test_an_lqr_that_asks_for_too_much_catches_no_state_and_is_refused() -> None:
     with pytest.raises(DesignError, match="catches no state near upright"):
         make_mechanism_catch(load_mechanism("acrobot"), (100.0, 100.0, 1.0, 1.0), 0.01)
