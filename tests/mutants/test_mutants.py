@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ def test_the_upper_limit_holds():
 """
 
 
+@cache
 def _found(target: Target) -> list[Mutant]:
     return [mutant for name, function in functions_of(target) for mutant in mutants_of(function, name)]
 
