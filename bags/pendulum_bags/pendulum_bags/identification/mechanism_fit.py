@@ -172,22 +172,26 @@ class _Simulator:
             self.made[key] = self.forward.mapaccum("run", steps).map(windows)
         return self.made[key]
 
-    def run(self, model: MechanismModel, data: Windows, states: Array, want: bool) -> tuple[Array, Array | None]:
-        """Return the positions, shape (w, l, n), and if wanted their sensitivities, shape (w, l, n, k + 2 n)."""
+    def motion(self, model: MechanismModel, data: Windows, states: Array) -> Array:
+        """Return the states at each sample, shape (w, l, 2 n)."""
         n, (w, size) = self.count, data.time.shape
-        mean, slope, h = data.input(model["delay"])
+        mean, _, h = data.input(model["delay"])
         flat = (mean.reshape(n, -1), h.reshape(1, -1))
         p = np.repeat(model.values[:, None], w * (size - 1), axis=1)
         later = self._many(w, size - 1)(states.T, *flat, p).full().T.reshape(w, size - 1, 2 * n)
-        path = np.concatenate((states[:, None], later), axis=1)
-        if not want or not np.isfinite(path).all():
-            return path[..., :n], None
+        return np.concatenate((states[:, None], later), axis=1)
+
+    def sensitivity(self, model: MechanismModel, data: Windows, path: Array) -> Array:
+        """Return those of the positions of a motion to parameters and start states, shape (w, l, n, k + 2 n)."""
+        n, (w, size) = self.count, data.time.shape
+        mean, slope, h = data.input(model["delay"])
+        p = np.repeat(model.values[:, None], w * (size - 1), axis=1)
         middle = (0.5 * (path[:, :-1] + path[:, 1:])).reshape(-1, 2 * n).T
         total = w * (size - 1)
         key = ("derivatives", total, 0)
         if key not in self.made:
             self.made[key] = self.derivative.map(total)
-        by_x, by_p = self.made[key](middle, flat[0], slope.reshape(n, -1), p)
+        by_x, by_p = self.made[key](middle, mean.reshape(n, -1), slope.reshape(n, -1), p)
         step = h[:, :, None, None]
         a = by_x.full().reshape(2 * n, total, 2 * n).transpose(1, 0, 2).reshape(w, size - 1, 2 * n, 2 * n) * step
         b = (
@@ -202,7 +206,7 @@ class _Simulator:
         for i in range(size - 1):
             result[:, i + 1] = gain[:, i] @ result[:, i]
             result[:, i + 1, :, : self.free] += b[:, i]
-        return path[..., :n], result[:, :, :n]
+        return result[:, :, :n]
 
 
 def fit(
@@ -234,21 +238,22 @@ def fit(
     values[index] = np.maximum(values[index], low)
     best, x = model.with_values(values), [np.array(s) for s in (states or [part.states for part in data])]
     damping, k = 1e-4, len(index)
-    cost, normal, errors = _linearise(simulator, best, data, x, weights)
+    cost, paths = _simulate(simulator, best, data, x, weights)
     if not np.isfinite(cost):
         raise DataError("the starting plant's motion leaves all bounds within a window; expected a plant that is near")
+    normal, errors = _linearise(simulator, best, data, paths, weights)
     for _ in range(most):
         step = _step(normal, values[index], size, low, damping)
         trial = values.copy()
         trial[index] = np.maximum(values[index] + step[0], low)
         candidate = best.with_values(trial)
         moved = [a + b for a, b in zip(x, step[1], strict=True)]
-        new = _cost(simulator, candidate, data, moved, weights)
+        new, paths = _simulate(simulator, candidate, data, moved, weights)
         if new < cost:
             done = (cost - new) < tolerance * cost
-            values, best, x = trial, candidate, moved
+            values, best, x, cost = trial, candidate, moved, new
             damping = max(0.2 * damping, 1e-9)
-            cost, normal, errors = _linearise(simulator, best, data, x, weights)
+            normal, errors = _linearise(simulator, best, data, paths, weights)
             if done:
                 break
         else:
@@ -265,36 +270,39 @@ def fit(
     return MechanismFit(best, tuple(free), x, cost, blocks, errors)
 
 
-def _cost(
+def _simulate(
     simulator: _Simulator, model: MechanismModel, data: Sequence[Windows], states: Sequence[Array], weights: Array
-) -> float:
-    total = 0.0
+) -> tuple[float, list[Array]]:
+    """Return the cost, inf where a motion leaves all bounds, and the motions of each recording."""
+    total, paths = 0.0, []
     for part, x in zip(data, states, strict=True):
-        path, _ = simulator.run(model, part, x, want=False)
+        path = simulator.motion(model, part, x)
+        paths.append(path)
         if not np.isfinite(path).all():
-            return np.inf
-        error = (path - part.position) * part.inside[..., None] * weights
+            return np.inf, paths
+        error = _errors(simulator, part, path) * weights
         total += float(np.sum(error**2))
-    return total
+    return total, paths
+
+
+def _errors(simulator: _Simulator, part: Windows, path: Array) -> Array:
+    errors: Array = (path[..., : simulator.count] - part.position) * part.inside[..., None]
+    return errors
 
 
 def _linearise(
-    simulator: _Simulator, model: MechanismModel, data: Sequence[Windows], states: Sequence[Array], weights: Array
-) -> tuple[float, tuple[list[Array], list[Array]], list[Array]]:
-    cost, matrices, gradients, errors = 0.0, [], [], []
-    for part, x in zip(data, states, strict=True):
-        path, sensitivity = simulator.run(model, part, x, want=True)
-        if sensitivity is None:
-            return np.inf, ([], []), []
-        plain = (path - part.position) * part.inside[..., None]
-        error = plain * weights
-        scaled = sensitivity * (part.inside[..., None] * weights)[..., None]
-        flat = scaled.reshape(len(x), -1, scaled.shape[-1])
+    simulator: _Simulator, model: MechanismModel, data: Sequence[Windows], paths: Sequence[Array], weights: Array
+) -> tuple[tuple[list[Array], list[Array]], list[Array]]:
+    """Return the normal equations about the motions, and their errors."""
+    matrices, gradients, errors = [], [], []
+    for part, path in zip(data, paths, strict=True):
+        plain = _errors(simulator, part, path)
+        scaled = simulator.sensitivity(model, part, path) * (part.inside[..., None] * weights)[..., None]
+        flat = scaled.reshape(len(path), -1, scaled.shape[-1])
         matrices.append(flat.transpose(0, 2, 1) @ flat)
-        gradients.append(np.einsum("wia,wi->wa", flat, error.reshape(len(x), -1)))
+        gradients.append(np.einsum("wia,wi->wa", flat, (plain * weights).reshape(len(path), -1)))
         errors.append(plain)
-        cost += float(np.sum(error**2))
-    return cost, (matrices, gradients), errors
+    return (matrices, gradients), errors
 
 
 def _step(
