@@ -56,6 +56,13 @@ def test_parameters_scatter_as_told_and_stay_positive() -> None:
     assert drawn["inertia"].min() > 0.0
 
 
+def test_every_run_of_every_chunk_and_of_every_monte_carlo_has_noise_of_its_own() -> None:
+    seeds = [
+        draw_chunk(replace(SMALL, seed=seed), index)["noise_seed"] for seed in (1, 2) for index in range(SMALL.chunks)
+    ]
+    assert len(np.unique(np.concatenate(seeds))) == 2 * SMALL.runs
+
+
 def test_one_run_replayed_alone_is_the_run_of_the_batch() -> None:
     columns = run_chunk(SMALL, 1)
     row, motion = replay(SMALL, 300 + 17)
