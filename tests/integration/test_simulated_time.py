@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 
 import pytest
 from rclpy.executors import SingleThreadedExecutor
@@ -17,33 +18,27 @@ from tests.graph_peer import GraphPeer
 
 
 @pytest.fixture
-def peer(domain_id: int) -> Iterator[GraphPeer]:
-    peer = GraphPeer("plant", domain=domain_id)
-    yield peer
-    peer.close()
-
-
-@pytest.fixture
-def make(peer: GraphPeer) -> Iterator[Callable[[bool], Node]]:
+def make(domain_id: int) -> Iterator[Callable[[bool], Node]]:
     nodes: list[Node] = []
+    with closing(GraphPeer("plant", domain=domain_id)) as peer:
 
-    def make(simulated: bool) -> Node:
-        given = [Parameter("use_sim_time", value=simulated)]
-        node = Node("answers", context=peer.context, parameter_overrides=given)
-        node.create_subscription(JointState, "states", lambda _: None, qos.STATE)
-        nodes.append(node)
-        return node
+        def make(simulated: bool) -> Node:
+            given = [Parameter("use_sim_time", value=simulated)]
+            node = Node("answers", context=peer.context, parameter_overrides=given)
+            node.create_subscription(JointState, "states", lambda _: None, qos.STATE)
+            nodes.append(node)
+            return node
 
-    yield make
-    for node in nodes:
-        node.destroy_node()
+        yield make
+        for node in nodes:
+            node.destroy_node()
 
 
-def test_its_time_is_the_newest_stamp_and_no_clock_wakes_it_up(peer: GraphPeer, make: Callable[[bool], Node]) -> None:
+def test_its_time_is_the_newest_stamp_and_no_clock_wakes_it_up(make: Callable[[bool], Node]) -> None:
     node, stamps = make(True), [7_250_000_000]
     live_by_stamps(node, lambda: stamps[-1] if len(stamps) > 1 else None)
     assert [each.topic_name for each in node.subscriptions] == ["/states"]
-    executor = SingleThreadedExecutor(context=peer.context)
+    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     try:
         executor.spin_once(1.0)

@@ -14,7 +14,6 @@ from pendulum_msgs_py.errors import FaultError
 from tests.fixtures import wait_for
 
 _LOGS_AND_ENDS = """
-import signal
 import sys
 print("[ERROR] [1795326665.885562565] [hw.bridge]: actuator thread did not answer within 30 s")
 print("error: actuator thread did not answer within 30 s")

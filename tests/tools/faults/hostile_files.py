@@ -60,7 +60,8 @@ def _text(name: str, text: str | bytes | Callable[[], bytes]) -> Callable[[Path]
 
     def make(folder: Path) -> Path:
         path = folder / name
-        path.write_bytes(text.encode() if isinstance(text, str) else text if isinstance(text, bytes) else text())
+        content = text() if callable(text) else text
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
         return path
 
     return make

@@ -133,8 +133,8 @@ def equivalence_test(
     smallest = math.exp(farthest) if ratio else farthest
     more: int | None = 0
     if outcome is Outcome.UNDECIDED:
-        error = max(right - left, 0.0) / (2.0 * normal_quantile(0.5 + 0.5 * interval.level))
         reach = normal_quantile(0.5 + 0.5 * interval.level)
+        error = max(right - left, 0.0) / (2.0 * reach)
         more = _runs_to_decide(estimate, bottom, top, error, runs, reach)
     return EquivalenceTest(quantity, unit, interval, low, high, outcome, more, smallest)
 

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,16 +39,10 @@ class JointMonteCarlo(RandomRuns):
 
     Attributes:
         shares: Standard deviation of parameters as a share of their value, by name; others are known.
-        amplitude: Largest noise on each driven joint [N m or N]; None for a tenth of its effort limit.
+        amplitude: None for a tenth of each driven joint's effort limit.
     """
 
     shares: Mapping[str, float] = field(default_factory=dict)
-    amplitude: float | None = None
-
-    @property
-    def largest_noise(self) -> float | None:
-        """Largest noise on each driven joint [N m or N]; None where its effort limit decides."""
-        return self.amplitude
 
     def numbers_of_plant(self) -> Any:
         """Return all numbers of the plant."""
@@ -144,7 +137,7 @@ def run_joint_monte_carlo(
         settings,
         _run_chunk,
         (settings, load_mechanism(settings.plant)),
-        partial(_summarise, folder, settings),
+        _summarise,
         connect=connect,
         on_progress=on_progress,
     )

@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -76,11 +75,6 @@ class MonteCarlo(RandomRuns):
         super().__post_init__()
         if self.start > math.pi:
             raise ParameterError(f"start is {self.start} rad; expected 0 to pi")
-
-    @property
-    def largest_noise(self) -> float:
-        """Largest noise torque [N m]."""
-        return self.amplitude
 
     def numbers_of_plant(self) -> PlantParameters:
         """Return the plant."""
@@ -157,7 +151,7 @@ def run_monte_carlo(
         settings,
         _run_chunk,
         (settings, load_plant(settings.plant)),
-        partial(summarise, folder, settings),
+        summarise,
         connect=connect,
         on_progress=on_progress,
     )

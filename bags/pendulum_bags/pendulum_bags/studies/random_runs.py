@@ -47,6 +47,7 @@ class RandomRuns(ABC):
         plant: Preset or file of the plant that is believed in; the controller is designed on it.
         runs: Number of closed-loop runs.
         seed: Seed of everything.
+        amplitude: Largest noise on each driven joint [N m or N]; None where the plant decides.
         hold_time: Time for which a noise sample is held [s].
         start: Largest distance of each joint's start from upright, uniform [rad or m].
         duration: Of each run [s].
@@ -61,6 +62,7 @@ class RandomRuns(ABC):
     plant: str
     runs: int = 100_000
     seed: int = 1
+    amplitude: float | None = None
     hold_time: float = 0.01
     start: float = 0.0
     duration: float = 5.0
@@ -81,15 +83,10 @@ class RandomRuns(ABC):
             ("start", self.start, distance, 0.0),
             ("duration", self.duration, "s", self.dt),
             ("hold_time", self.hold_time, "s", self.dt),
-            ("amplitude", self.largest_noise or 0.0, effort, 0.0),
+            ("amplitude", self.amplitude or 0.0, effort, 0.0),
         ):
             if not (math.isfinite(value) and value >= least):
                 raise ParameterError(f"{name} is {value} {unit}; expected a finite number >= {least:g}")
-
-    @property
-    @abstractmethod
-    def largest_noise(self) -> float | None:
-        """Largest noise [N m or N]; None where the plant decides."""
 
     @abstractmethod
     def numbers_of_plant(self) -> Any:
@@ -141,7 +138,7 @@ def carry_out_runs(
     settings: RandomRuns,
     run_chunk: Callable[[Any, int, int | None], Mapping[str, NDArray[Any]]],
     job: Any,
-    summarise: Callable[[], dict[str, Any]],
+    summarise: Callable[[Path, Any], dict[str, Any]],
     *,
     connect: Connect,
     on_progress: Callable[[int, int], None],
@@ -153,7 +150,7 @@ def carry_out_runs(
         settings: What to run.
         run_chunk: Runs a chunk of a job.
         job: What it needs besides the number of the chunk.
-        summarise: Returns the result, from the files.
+        summarise: Returns the result, of the folder and the settings.
         connect: To a Dask cluster.
         on_progress: Called with chunks done and in all.
 
@@ -173,7 +170,7 @@ def carry_out_runs(
         write_results_marker(folder, fingerprint, content)
     open_results(folder, "Monte Carlo", fingerprint, content)
     run_chunks(folder, run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
-    result = summarise()
+    result = summarise(folder, settings)
     write_json(folder / "monte_carlo.json", result)
     return result
 
