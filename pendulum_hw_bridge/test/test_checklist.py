@@ -55,6 +55,18 @@ class LateReader(EmulatorBackend):
         return super().read(timeout)
 
 
+class LossyNetwork(EmulatorBackend):
+    """An emulator some of whose records never come, by their number."""
+
+    lost = frozenset[int]()
+    records = 0
+
+    def read(self, timeout: float) -> Feedback | None:
+        record = super().read(timeout)
+        self.records += record is not None
+        return None if self.records in self.lost else record
+
+
 class HeldUpReader(EmulatorBackend):
     """An emulator on the wall clock whose reader alone is held up now and then, in its first stretch."""
 
@@ -185,6 +197,21 @@ def test_an_actuator_that_loses_records_is_blamed_by_a_punctual_computer() -> No
     found = checklist(busy_for=60.0, host=Pulse(0.0))
     assert passed(found)["no feedback gets lost"] is False
     assert not found.host_busy
+
+
+@pytest.mark.parametrize(("lost", "share"), [((), None), ((20, 55), None), (range(20, 2000, 50), 2.0)])
+def test_lost_records_are_judged_by_their_share_of_many(lost: Sequence[int], share: float | None) -> None:
+    parameters = load_emulator("thesis")
+    port = LossyNetwork(EmulatedX5(parameters, seed=1), SteppedClock())
+    port.lost = frozenset(lost)
+    told: list[str] = []
+    found = run_checklist(port, SETTINGS, SafetyLimits(), parameters.plant, host=Pulse(), progress=told.append)
+    line = next(item for item in found.items if item.name == "no feedback gets lost")
+    assert line.passed is (share is None)
+    assert found.ready is (share is None)
+    assert ("listening for 5 s more: records got lost" in told) is bool(lost)
+    if share is not None:
+        assert found.figures["lost"] == pytest.approx(share / 100.0, rel=0.1)
 
 
 def test_a_reader_that_is_held_up_alone_is_no_gap_of_the_module() -> None:

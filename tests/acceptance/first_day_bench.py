@@ -35,6 +35,8 @@ _BUSY = re.compile(
     r"|too busy|is silent for|not answer|\bms (old|late)\b"
     r"|NO │ (this computer keeps time|feedback |no feedback gets lost|acknowledgements )"
 )
+_MOMENT = re.compile("again: this computer was busy|more: records got lost")
+"""Lines of a checklist that listens longer; a quiet computer prints none."""
 EXIT_BUSY = 3
 
 
@@ -160,7 +162,7 @@ class Day:
             text = text.replace(str(ours), str(shown))
             text = text.replace(f"{ours >> 8:02X}:{ours & 255:02X}", f"{shown >> 8:02X}:{shown & 255:02X}")
         text = re.sub(r"\[(INFO|WARN|ERROR)\] \[[0-9.]+\] \[[\w.]+\]: ", r"[\1] ", text)
-        kept = [line.rstrip() for line in text.splitlines() if not re.search(r"again: this computer was busy", line)]
+        kept = [line.rstrip() for line in text.splitlines() if not _MOMENT.search(line)]
         return "\n".join(kept).strip("\n") + "\n"
 
     # --- the person -----------------------------------------------------------------------------------------
