@@ -14,9 +14,13 @@ from typing import Any
 
 import numba
 
+from pendulum_msgs_py.programs.kept_kernels import name_symbols_apart
 from pendulum_sim import vector_math
 
 __all__ = ["compile_tree", "tuple_loader"]
+
+# What is compiled here becomes part of kernels that are kept.
+name_symbols_apart()
 
 _OWN = ("pendulum_msgs_py", "pendulum_sim")
 _cache: dict[tuple[Any, bool, bool], Any] = {}

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import itertools
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
@@ -42,6 +45,31 @@ def law(x):
 """
 
 
+TWO_OF_ONE_NAME = (
+    """
+import math
+import sys
+import numba
+from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+
+def kernel(factor):
+    @numba.njit
+    def inner(x):
+"""
+    # So long that it is called, not written into its caller.
+    + "".join(f"        x += math.sin({i} * x)\n" for i in range(100))
+    + """
+        return factor + x
+
+    return keep_kernel(numba.njit(lambda x: inner(x) + inner(-x)), "of_one_name", factor)
+
+for argument in sys.argv[1:]:
+    made = kernel(float(argument))
+    print(made(0.0), sum(made.stats.cache_hits.values()))
+"""
+)
+
+
 def triple(x: float) -> float:
     return 3.0 * x
 
@@ -67,6 +95,34 @@ def test_what_one_has_compiled_the_next_takes_and_no_other_kernel(folder: Path) 
         (kernel(double), 2, 5),
     ):
         assert (other(argument), taken(other)) == (expected, False)
+
+
+def test_who_takes_what_two_processes_have_kept_gets_both(tmp_path: Path) -> None:
+    """By numba's count both call their inner function the same, and the linker takes the first of one name for all."""
+
+    script = tmp_path / "two_of_one_name.py"
+    script.write_text(TWO_OF_ONE_NAME, encoding="utf-8")
+
+    def run(*factors: str) -> list[str]:
+        return subprocess.run(
+            [sys.executable, script, *factors],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.splitlines()
+
+    assert run("2") == ["4.0 0"]
+    assert run("5") == ["10.0 0"]
+    assert run("2", "5") == ["4.0 1", "10.0 1"]
+
+
+def test_a_symbol_that_another_process_may_have_as_well_is_not_kept(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = kernel(double)
+    monkeypatch.setattr(numba.core.bytecode.FunctionIdentity, "_unique_ids", itertools.count(1))
+    assert counted(2.0) == 5.0
+    assert list(folder.rglob("*.nbk")) == []
 
 
 def test_nothing_is_taken_that_other_source_was_compiled_to(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,16 +9,34 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import pickle
+import re
+import secrets
 import sys
 from collections.abc import Iterable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
 from pendulum_msgs_py.whole_file import write_whole
 
-__all__ = ["KernelStore", "drop_stale_code", "keep_kernel"]
+__all__ = ["KernelStore", "drop_stale_code", "keep_kernel", "name_symbols_apart"]
+
+_COUNTED = re.compile(rb"B\dv\d{1,8}B")
+"""Part of a symbol that bears a number of numba's own count."""
+
+
+@cache
+def name_symbols_apart() -> None:
+    """Number what numba compiles at random from here on.
+
+    Numba counts, from 1 in each process, to tell functions of one name apart: functions made anew for each method or
+    mechanism. Of two processes each may keep another function under one symbol; who loads both is linked to the first
+    for all, and gets wrong numbers or writes where it must not (numba, issue 10486). A child by ``fork`` would go on
+    with its parent's count.
+    """
+    identity = sys.modules["numba.core.bytecode"].FunctionIdentity
+    identity._unique_ids = iter(partial(secrets.randbits, 64), None)
 
 
 def keep_kernel(dispatcher: Any, name: str, *choice: object) -> Any:
@@ -50,6 +68,7 @@ class KernelStore:
     def __init__(self, function: Any, name: str, choice: tuple[object, ...]) -> None:
         # Who has something compiled has numba; this package needs none otherwise.
         self._numba = sys.modules["numba.core"]
+        name_symbols_apart()
         self._folder = Path(self._numba.caching.CompileResultCacheImpl(function).locator.get_cache_path())
         self._name = name
         made_of = [function, *(each for each in choice if isinstance(each, FunctionType))]
@@ -76,10 +95,12 @@ class KernelStore:
         return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Keep a kernel, unless its code has addresses of this process."""
+        """Keep a kernel, unless its code has addresses of this process, or symbols that another may have as well."""
         if compiled.library.has_dynamic_globals or compiled.lifted:
             return
         content = self._numba.serialize.dumps(compiled._reduce())
+        if _COUNTED.search(content):
+            return
         # Whole or not at all: others may compile the same at this moment.
         with contextlib.suppress(OSError):
             write_whole(self._path(signature, compiled.library.codegen), self._head(content) + b"\n" + content)
