@@ -1,4 +1,4 @@
-"""``make test``: whole systems in real time alone, then other tests in real time beside what computes.
+"""``make test``: whole systems in real time, then other tests in real time; behind them, all the while, what computes.
 
 Tests of one file stay together, so that what a file prepares is prepared once. Named files or folders run as pytest is
 told.
@@ -32,8 +32,8 @@ _EXPERIMENTS = (
     "tests/acceptance/test_experiment.py",
     "tests/integration/test_plants_on_the_graph.py",
 )
-"""Whole systems in real time, longest first; each asks for more than one core and judges to milliseconds: nothing runs
-beside them."""
+"""Whole systems in real time, longest first; each asks for most of a core and judges to milliseconds: of its priority
+nothing runs beside it."""
 _WAITS = (
     "tests/acceptance/test_console.py",
     "tests/integration/test_plant_interface.py",
@@ -47,7 +47,7 @@ _WAITS = (
     "tests/faults/test_live_machine.py",
     "tests/integration",
 )
-"""Other tests with processes that keep a plant's time, longest first: they wait for most of it."""
+"""Other tests with processes that keep a plant's time, longest first: they wait for most of it, two at a time."""
 _SIMULATED_TIME = (
     "tests/integration/test_experiments.py",
     "tests/faults/test_security_policy.py",
@@ -93,11 +93,11 @@ def main(arguments: Sequence[str]) -> int:
         return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=PROJECT, check=False).returncode
     systems, waits, others = rooms()
     return run_parts(
-        [Part("whole systems", [*systems, *arguments], workers=1)],
         [
-            Part("in real time", [*waits, *arguments], workers=1),
-            Part("computing", [*others, *arguments], workers=2, nice=_NICE),
+            Part("whole systems", [*systems, *arguments], workers=1),
+            Part("in real time", [*waits, *arguments], workers=2),
         ],
+        [Part("computing", [*others, *arguments], workers=2, nice=_NICE)],
     )
 
 
@@ -132,7 +132,9 @@ class Part:
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the part)
 
     def start(self) -> None:
-        """Start pytest, in a session of its own: Linux shares the cores among sessions first."""
+        """Start pytest, once, in a session of its own: Linux shares the cores among sessions first."""
+        if self._popen is not None:
+            return
         reader, writer = os.pipe()
         # Within a worker's test this is no worker.
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
@@ -194,24 +196,25 @@ class Part:
                     self.outcomes[test] = max(self.outcomes.get(test, ""), outcome, key=_GRAVITY.index)
 
 
-def run_parts(*stages: Sequence[Part]) -> int:
-    """Run the parts of a stage at once, stage by stage; return the first code that is not 0.
+def run_parts(*lanes: Sequence[Part]) -> int:
+    """Run the parts of a lane one after the other, and all lanes at once; return the first code that is not 0.
 
     How far they are is printed on the way, and at the end what each has printed.
     """
     begin = told = time.monotonic()
-    parts = [part for stage in stages for part in stage]
+    parts = [part for lane in lanes for part in lane]
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     try:
-        for stage in stages:
-            for part in stage:
-                part.start()
-            while any(part.code is None for part in stage):
-                time.sleep(0.2)
-                if time.monotonic() - told >= _TELLS_EVERY:
-                    told += _TELLS_EVERY
-                    print(f"{_clock(told - begin)}  {'; '.join(map(_progress, stage))}", flush=True)
+        while any(part.code is None for part in parts):
+            for lane in lanes:
+                unfinished = [part for part in lane if part.code is None]
+                if unfinished:
+                    unfinished[0].start()
+            time.sleep(0.2)
+            if time.monotonic() - told >= _TELLS_EVERY:
+                told += _TELLS_EVERY
+                print(f"{_clock(told - begin)}  {'; '.join(map(_progress, parts))}", flush=True)
     except KeyboardInterrupt:
         print("interrupted: ending what runs", flush=True)
         _end(parts)

@@ -15,19 +15,19 @@ from tests.suite import exit_code, rooms
 _RUN = """
 import sys
 from tests.suite import Part, run_parts
-parts = [Part(name, ["-p", "tests.fixtures", name], workers=1, nice=nice) for name, nice in zip(sys.argv[1:], (0, 5))]
-raise SystemExit(run_parts(parts))
+parts = [Part(name, ["-p", "tests.fixtures", name], workers=1, nice=nice) for name, nice in zip(sys.argv[2:], (0, 5))]
+raise SystemExit(run_parts(parts) if sys.argv[1] == "in turn" else run_parts(*([part] for part in parts)))
 """
 
 
-def _parts(tmp_path: Path, *bodies: str) -> list[str]:
+def _parts(tmp_path: Path, *bodies: str, how: str = "at once") -> list[str]:
     names = []
     for number, body in enumerate(bodies):
         file = tmp_path / f"part_{number}" / f"test_part_{number}.py"
         file.parent.mkdir()
         file.write_text(body, encoding="utf-8")
         names.append(str(file))
-    return [sys.executable, "-c", _RUN, *names]
+    return [sys.executable, "-c", _RUN, how, *names]
 
 
 def test_a_failure_is_named_at_once_explained_at_the_end_and_the_exit_code(
@@ -68,6 +68,16 @@ def test_ctrl_c_ends_the_parts_and_what_their_tests_started(processes: ProcessGr
     assert program.wait(60) == pytest.ExitCode.INTERRUPTED
     assert "interrupted" in program.output
     assert processes.leftovers() == []
+
+
+def test_parts_of_a_lane_run_in_turn(processes: ProcessGroup, tmp_path: Path) -> None:
+    mark = tmp_path / "ended"
+    # Started together, the second would look before the first is done.
+    first = f"import time\n\ndef test_first():\n    time.sleep(1.0)\n    open({str(mark)!r}, 'w').close()\n"
+    second = f"import os\n\ndef test_second():\n    assert os.path.exists({str(mark)!r})\n"
+    program = processes.start_command(_parts(tmp_path, first, second, how="in turn"))
+    assert program.wait(60) == 0, program.output
+    assert program.output.splitlines()[-1].count("1 of 1") == 2
 
 
 def test_each_file_of_tests_is_in_one_part() -> None:
