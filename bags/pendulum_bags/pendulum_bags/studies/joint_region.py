@@ -1,27 +1,25 @@
 """From which starts is a plant of several joints brought to rest upright, over all that is not known of it?
 
 A grid over two of its positions or velocities, the others as upright at rest, run for many plants through the batch
-engine; chunks and files are those of :mod:`pendulum_bags.studies.region_map`. Plant 0 is the one that is believed in.
+engine; chunks and files are those of :mod:`pendulum_bags.studies.start_grid`. Plant 0 is the one that is believed in.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.experiments.joint_run import design_for
-from pendulum_bags.runs.run_folder import write_json
-from pendulum_bags.studies.chunks import Connect, chunk_path, open_results, read_columns, run_chunks, write_columns
+from pendulum_bags.studies.chunks import Connect, chunk_path, read_columns
 from pendulum_bags.studies.joint_monte_carlo import scatter
+from pendulum_bags.studies.start_grid import StartGrid, carry_out_map, inside_ellipse, share_inside
 from pendulum_lqr.design import DesignError, Gain
 from pendulum_lqr.mechanism_catch import CaughtRegion, sample_caught_region
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
@@ -34,7 +32,6 @@ __all__ = ["Axis", "JointRegion", "JointRegionResult", "run_joint_region"]
 
 Array = NDArray[np.float64]
 
-_RUNS_OF_CHUNK = 10_000
 VELOCITY = "_dot"
 """Ending of the names of velocities, as the linear model's states have it."""
 
@@ -57,46 +54,32 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class JointRegion:
-    """What to map.
+class JointRegion(StartGrid):
+    """What to map of a plant of several joints; its own LQR is designed on the plant that is believed in.
 
     Attributes:
-        plant: Preset or file of the plant that is believed in; its own LQR is designed on it.
         axes: Names of the two axes, joints or ``JOINT_dot``; empty for the positions of the first two joints.
         spans: Half widths of the grid along them [rad, m, rad/s or m/s].
         shares: Standard deviation of parameters as a share of their value, by name; others are known.
-        plants: Plants at each start, the believed one first; 1 leaves the uncertainty out.
-        points: Points along each axis; an odd number has upright at rest among them.
-        duration: Of each run [s].
-        dt: Period of the loop [s].
-        tolerance: Largest deviation of a position [rad or m] and velocity at the end that count as upright at rest.
-        seed: Seed of the plants.
     """
 
-    plant: str
+    RUNS_OF_CHUNK: ClassVar[int] = 10_000
+
+    plants: int = 10
+    points: int = 41
     axes: tuple[str, ...] = ()
     spans: tuple[float, float] = (1.0, 1.0)
     shares: Mapping[str, float] = field(default_factory=dict)
-    plants: int = 10
-    points: int = 41
-    duration: float = 8.0
-    dt: float = 0.002
-    tolerance: tuple[float, float] = (0.1, 0.2)
-    seed: int = 1
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
-        for name, value, low, high in (
-            ("plants", self.plants, 1, 1_000_000),
-            ("points", self.points, 3, 2001),
-            ("seed", self.seed, 0, 2**63 - 1),
-            ("duration", self.duration, self.dt, 1e4),
-            ("first span", self.spans[0], 1e-6, 1e4),
-            ("second span", self.spans[1], 1e-6, 1e4),
-        ):
-            if not low <= value <= high:
-                raise ParameterError(f"{name} is {value}; expected {low:g} to {high:g}")
+        super().__post_init__()
         _ = self.both
+
+    @property
+    def ranges(self) -> tuple[tuple[str, float, str, float, float], ...]:
+        """What else has a range."""
+        return (("first span", self.spans[0], "", 1e-6, 1e4), ("second span", self.spans[1], "", 1e-6, 1e4))
 
     @property
     def both(self) -> tuple[Axis, Axis]:
@@ -120,25 +103,14 @@ class JointRegion:
         )
         return first, second
 
-    @property
-    def plants_of_chunk(self) -> int:
-        """Plants in a chunk; part of the result's definition."""
-        return max(1, _RUNS_OF_CHUNK // self.points**2)
-
-    @property
-    def chunks(self) -> int:
-        """How many chunks there are."""
-        return -(-self.plants // self.plants_of_chunk)
-
     def starts(self) -> tuple[Array, Array]:
         """Return deviations from upright at rest along both axes, shape (points,) each."""
         first, second = (np.linspace(-axis.span, axis.span, self.points) for axis in self.both)
         return first, second
 
-    def fingerprint(self) -> str:
-        """Return a hash of all that the result depends on."""
-        content = json.dumps([asdict(self), load_mechanism(self.plant).numbers], sort_keys=True)
-        return hashlib.sha256(content.encode()).hexdigest()[:16]
+    def numbers_of_plant(self) -> Any:
+        """Return all numbers of the plant, for a fingerprint."""
+        return load_mechanism(self.plant).numbers
 
 
 @dataclass(frozen=True)
@@ -173,6 +145,13 @@ class JointRegionResult:
             "share_in_section": self.share_in_section if math.isfinite(self.share_in_section) else None,
         }
 
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return the map, a row for each start."""
+        first, second = np.meshgrid(*self.settings.starts())
+        names = [axis.name for axis in self.settings.both]
+        columns = {names[0]: first.ravel(), names[1]: second.ravel(), "share": self.share.ravel()}
+        return {**columns, "attracted_believed": self.believed.ravel()}
+
 
 def run_joint_region(
     folder: Path,
@@ -181,10 +160,10 @@ def run_joint_region(
     connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> JointRegionResult:
-    """Run what is not on disk yet, one Parquet file for each chunk, and write the map and its figures.
+    """Run what is not on disk yet, and write the map and its figures, as :func:`carry_out_map` does.
 
     Args:
-        folder: Where the files go; a folder of the same settings is gone on with.
+        folder: Where the files go.
         settings: What to map.
         connect: To a Dask cluster; by default in this process, on all cores.
         on_progress: Called with chunks done and in all.
@@ -193,16 +172,8 @@ def run_joint_region(
         BagError: The folder holds something else.
         ParameterError: A start lies beyond an end stop, or a drawn plant has no positive inertia.
     """
-    open_results(folder, "map", settings.fingerprint(), asdict(settings))
     job = (settings, load_mechanism(settings.plant))
-    run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
-    result = _summarise(folder, settings)
-    first, second = np.meshgrid(*settings.starts())
-    names = [axis.name for axis in settings.both]
-    columns = {names[0]: first.ravel(), names[1]: second.ravel(), "share": result.share.ravel()}
-    write_columns(folder / "map.parquet", {**columns, "attracted_believed": result.believed.ravel()})
-    write_json(folder / "region.json", result.to_json())
-    return result
+    return carry_out_map(folder, settings, _run_chunk, job, _summarise, connect=connect, on_progress=on_progress)
 
 
 def _gain(plant: MechanismParameters) -> Gain:
@@ -213,11 +184,10 @@ def _run_chunk(
     job: tuple[JointRegion, MechanismParameters], index: int, threads: int | None
 ) -> dict[str, NDArray[Any]]:
     settings, plant = job
-    first = index * settings.plants_of_chunk
-    count = min(settings.plants_of_chunk, settings.plants - first)
-    generator = np.random.Generator(np.random.Philox(key=[settings.seed, index]))
+    numbers, generator = settings.chunk(index)
+    count = len(numbers)
     drawn = scatter(plant, settings.shares, settings.plants_of_chunk, generator)
-    if first == 0:
+    if index == 0:
         for name, values in drawn.items():
             values[0] = plant.value(name)
     x, y = np.meshgrid(*settings.starts())
@@ -228,7 +198,7 @@ def _run_chunk(
     result = simulate_mechanisms(
         plant,
         variations={name: np.repeat(values[:count], size) for name, values in drawn.items()},
-        steps=max(1, round(settings.duration / settings.dt)),
+        steps=settings.steps,
         dt=settings.dt,
         position=np.tile(states[:, :n], (count, 1)),
         velocity=np.tile(states[:, n:], (count, 1)),
@@ -238,7 +208,7 @@ def _run_chunk(
     off = np.array([plant.coordinates.deviation(tuple(position)) for position in result.position])
     near = (np.abs(off) < settings.tolerance[0]).all(axis=1)
     near &= (np.abs(result.velocity) < settings.tolerance[1]).all(axis=1)
-    plants = np.repeat(np.arange(first, first + count, dtype=np.int32), size)
+    plants = np.repeat(numbers, size)
     every = {name: np.repeat(values[:count], size) for name, values in drawn.items()}
     ends = {f"end_{name}": off[:, i] for i, name in enumerate(plant.coordinates.names)}
     return {"plant": plants, **every, **ends, "attracted": near}
@@ -262,8 +232,7 @@ def _summarise(folder: Path, settings: JointRegion) -> JointRegionResult:
         return JointRegionResult(settings, hits / settings.plants, believed, None, np.empty((0, 2)), math.nan)
     at = [axis.index for axis in settings.both]
     S = np.asarray(gain.S)[np.ix_(at, at)]
-    x, y = np.meshgrid(*settings.starts())
-    inside = S[0, 0] * x * x + 2.0 * S[0, 1] * x * y + S[1, 1] * y * y <= caught.level
-    share = float(hits[inside].sum() / (settings.plants * inside.sum())) if inside.any() else math.nan
+    inside = inside_ellipse(S, caught.level, *np.meshgrid(*settings.starts()))
+    share = share_inside(hits, inside, settings.plants)
     section = sublevel_ellipse(S, caught.level)
     return JointRegionResult(settings, hits / settings.plants, believed, caught, section, share)

@@ -7,27 +7,18 @@ ellipse of the linear analysis, proven for that plant, belongs inside.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_bags.runs.run_folder import write_json
-from pendulum_bags.studies.chunks import (
-    Connect,
-    chunk_path,
-    open_results,
-    read_columns,
-    run_chunks,
-    write_columns,
-)
+from pendulum_bags.studies.chunks import Connect, chunk_path, read_columns
+from pendulum_bags.studies.start_grid import StartGrid, carry_out_map, inside_ellipse, share_inside
 from pendulum_bags.studies.uncertain import VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import Gain, output_lqr
 from pendulum_lqr.model import linearise
@@ -43,73 +34,46 @@ COLUMNS = ("plant", *VARIED, "theta_0", "theta_dot_0", "theta_end", "theta_dot_e
 """Columns of the Parquet files of the runs; SI units, ``plant`` counts the plants from 0."""
 MAP_COLUMNS = ("theta_0", "theta_dot_0", "plants", "attracted", "share", "attracted_believed", "turned")
 
-_RUNS_OF_CHUNK = 50_000
 _TWO_PI = 2.0 * math.pi
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class RegionMap:
-    """What to map.
+class RegionMap(StartGrid):
+    """What to map of a plant of one joint.
 
     Attributes:
-        plant: Preset or file of the plant that is believed in; the controller is designed on it.
         uncertainty: How far its parameters are known.
-        plants: Plants at each start, the believed one first; 1 leaves the uncertainty out.
         q: Diagonal of Q.
         r: R.
         effort_limit: Torque limit [N m]; 0 for the plant's own.
-        points: Points along each axis of the grid; an odd number has upright at rest among them.
         angle_span: Half width of the grid about upright [rad].
         velocity_span: Its half width in velocity [rad/s].
-        duration: Of each run [s].
-        dt: Period of the loop [s].
         method: Integrator.
-        tolerance: Angle from upright [rad] and velocity [rad/s] at the end below which upright is reached.
-        seed: Seed of the plants.
     """
+
+    RUNS_OF_CHUNK: ClassVar[int] = 50_000
 
     plant: str = "thesis"
     uncertainty: Uncertainty = field(
         default_factory=lambda: Uncertainty({"inertia": 0.3, "damping": 0.05, "gravity": 0.05})
     )
-    plants: int = 100
     q: tuple[float, float] = (100.0, 0.01)
     r: float = 0.1
     effort_limit: float = 0.0
-    points: int = 61
     angle_span: float = math.pi
     velocity_span: float = 10.0
-    duration: float = 8.0
-    dt: float = 0.002
     method: str = "etd2"
-    tolerance: tuple[float, float] = (0.1, 0.2)
-    seed: int = 1
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be run."""
-        for name, value, unit, low, high in (
-            ("plants", self.plants, "", 1, 1_000_000),
-            ("points", self.points, "", 3, 2001),
-            ("seed", self.seed, "", 0, 2**63 - 1),
+    @property
+    def ranges(self) -> tuple[tuple[str, float, str, float, float], ...]:
+        """What else has a range."""
+        return (
             ("angle_span", self.angle_span, " rad", 1e-6, math.pi),
             ("velocity_span", self.velocity_span, " rad/s", 1e-6, 1e4),
-            ("duration", self.duration, " s", self.dt, 1e4),
             ("effort_limit", self.effort_limit, " N m", 0.0, 1e9),
-        ):
-            if not low <= value <= high:
-                raise ParameterError(f"{name} is {value}{unit}; expected {low:g} to {high:g}{unit}")
-
-    @property
-    def plants_of_chunk(self) -> int:
-        """Plants in a chunk; part of the result's definition."""
-        return max(1, _RUNS_OF_CHUNK // self.points**2)
-
-    @property
-    def chunks(self) -> int:
-        """How many chunks there are."""
-        return -(-self.plants // self.plants_of_chunk)
+        )
 
     def grid(self) -> tuple[Array, Array]:
         """Return start angles [rad] and velocities [rad/s], shape (points,) each."""
@@ -133,10 +97,9 @@ class RegionMap:
         """Return the LQR gain."""
         return output_lqr(linearise(self.believed(), UPRIGHT), self.q, self.r)
 
-    def fingerprint(self) -> str:
-        """Return a hash of all that the result depends on."""
-        content = json.dumps([asdict(self), asdict(self.believed())], sort_keys=True)
-        return hashlib.sha256(content.encode()).hexdigest()[:16]
+    def numbers_of_plant(self) -> Any:
+        """Return all numbers of the plant, for a fingerprint."""
+        return asdict(self.believed())
 
 
 @dataclass(frozen=True)
@@ -200,6 +163,21 @@ class RegionResult:
             "still_moving": self.moving,
         }
 
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return the map, a row for each start."""
+        theta, theta_dot = np.meshgrid(self.theta, self.theta_dot)
+        plants = self.settings.plants
+        columns: dict[str, NDArray[Any]] = {
+            "theta_0": theta.ravel(),
+            "theta_dot_0": theta_dot.ravel(),
+            "plants": np.full(theta.size, plants, dtype=np.int64),
+            "attracted": np.rint(self.share * plants).astype(np.int64).ravel(),
+            "share": self.share.ravel(),
+            "attracted_believed": self.believed.ravel(),
+            "turned": self.turned.ravel(),
+        }
+        return {name: columns[name] for name in MAP_COLUMNS}
+
 
 def run_region_map(
     folder: Path,
@@ -208,10 +186,10 @@ def run_region_map(
     connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RegionResult:
-    """Run what is not on disk yet, one Parquet file for each chunk, and write the map and its figures.
+    """Run what is not on disk yet, and write the map and its figures, as :func:`carry_out_map` does.
 
     Args:
-        folder: Where the files go; a folder of the same settings is gone on with.
+        folder: Where the files go.
         settings: What to map.
         connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
         on_progress: Called with chunks done and in all.
@@ -220,23 +198,17 @@ def run_region_map(
         BagError: The folder holds something else.
     """
     job = (settings, settings.believed(), tuple(float(value) for value in settings.gain().K))
-    open_results(folder, "map", settings.fingerprint(), asdict(settings))
-    run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
-    result = _summarise(folder, settings)
-    write_columns(folder / "map.parquet", _map_columns(result))
-    write_json(folder / "region.json", result.to_json())
-    return result
+    return carry_out_map(folder, settings, _run_chunk, job, _summarise, connect=connect, on_progress=on_progress)
 
 
 def _run_chunk(
     job: tuple[RegionMap, PlantParameters, tuple[float, ...]], index: int, threads: int | None
 ) -> dict[str, NDArray[Any]]:
     settings, plant, gain = job
-    first = index * settings.plants_of_chunk
-    count = min(settings.plants_of_chunk, settings.plants - first)
-    generator = np.random.Generator(np.random.Philox(key=[settings.seed, index]))
+    numbers, generator = settings.chunk(index)
+    count = len(numbers)
     drawn = settings.uncertainty.draw(plant, count, generator)
-    if first == 0:
+    if index == 0:
         for name in VARIED:
             drawn[name][0] = getattr(plant, name)
     angles, velocities = settings.grid()
@@ -246,7 +218,7 @@ def _run_chunk(
     result = simulate_batch(
         plant,
         variations=batch_variations(plant, every),
-        steps=max(1, round(settings.duration / settings.dt)),
+        steps=settings.steps,
         dt=settings.dt,
         method=settings.method,
         theta=starts,
@@ -258,7 +230,7 @@ def _run_chunk(
         np.abs(result.theta_dot) < settings.tolerance[1]
     )
     columns: dict[str, NDArray[Any]] = {
-        "plant": np.repeat(np.arange(first, first + count, dtype=np.int32), theta.size),
+        "plant": np.repeat(numbers, theta.size),
         **every,
         "theta_0": starts,
         "theta_dot_0": speeds,
@@ -289,8 +261,7 @@ def _summarise(folder: Path, settings: RegionMap) -> RegionResult:
     level = proven_level(plant, gain, plant.effort_limit)
     theta, theta_dot = settings.grid()
     x, v = np.meshgrid(theta - UPRIGHT, theta_dot)
-    S = gain.S
-    inside = S[0, 0] * x * x + 2.0 * S[0, 1] * x * v + S[1, 1] * v * v <= level
+    inside = inside_ellipse(gain.S, level, x, v)
     return RegionResult(
         settings=settings,
         limit=plant.effort_limit,
@@ -301,22 +272,7 @@ def _summarise(folder: Path, settings: RegionMap) -> RegionResult:
         turned=rounds / settings.plants,
         moving=moving / (settings.plants * settings.points**2),
         level=level,
-        ellipse=sublevel_ellipse(S, level),
+        ellipse=sublevel_ellipse(gain.S, level),
         counterexamples=int(np.count_nonzero(inside & ~believed)),
-        share_in_ellipse=float(hits[inside].sum() / (settings.plants * inside.sum())) if inside.any() else math.nan,
+        share_in_ellipse=share_inside(hits, inside, settings.plants),
     )
-
-
-def _map_columns(result: RegionResult) -> dict[str, NDArray[Any]]:
-    theta, theta_dot = np.meshgrid(result.theta, result.theta_dot)
-    plants = result.settings.plants
-    columns: dict[str, NDArray[Any]] = {
-        "theta_0": theta.ravel(),
-        "theta_dot_0": theta_dot.ravel(),
-        "plants": np.full(theta.size, plants, dtype=np.int64),
-        "attracted": np.rint(result.share * plants).astype(np.int64).ravel(),
-        "share": result.share.ravel(),
-        "attracted_believed": result.believed.ravel(),
-        "turned": result.turned.ravel(),
-    }
-    return {name: columns[name] for name in MAP_COLUMNS}
