@@ -87,7 +87,7 @@ class TimingFigures:
         rate: By the module's clock [Hz].
         jitter: Standard deviation of the period, by the module's clock [s].
         longest_gap: Between two records, by the module's clock [s].
-        lost: Share of records that never came [-].
+        missing: How many never came [-].
         way_p99: Time on the way beyond that of the fastest, 99th percentile [s].
         way_worst: The longest [s].
         host_p99: How late this computer wakes, 99th percentile [s].
@@ -98,11 +98,16 @@ class TimingFigures:
     rate: float
     jitter: float
     longest_gap: float
-    lost: float
+    missing: int
     way_p99: float
     way_worst: float
     host_p99: float
     host_worst: float
+
+    @property
+    def lost(self) -> float:
+        """Share of records that never came [-]."""
+        return self.missing / (self.missing + self.records)
 
 
 def measure(records: Sequence[Feedback], period: float, lateness: Sequence[float]) -> TimingFigures:
@@ -117,7 +122,7 @@ def measure(records: Sequence[Feedback], period: float, lateness: Sequence[float
     way = np.array([record.stamp_ns for record in records], dtype=np.int64) - measured
     gaps = np.diff(measured) / NANOSECONDS
     way = (way - way.min()) / NANOSECONDS
-    missing = float(np.sum(np.maximum(0, np.rint(gaps[gaps > _LOST_GAP * period] / period) - 1)))
+    missing = int(np.sum(np.maximum(0, np.rint(gaps[gaps > _LOST_GAP * period] / period) - 1)))
     span = float(gaps.sum())
     # What got lost does not make the module slow: its period is that of the neighbours that both came.
     whole = gaps[gaps <= _LOST_GAP * period]
@@ -128,7 +133,7 @@ def measure(records: Sequence[Feedback], period: float, lateness: Sequence[float
         rate=(gaps.size + missing) / span if span > 0.0 else float("inf"),
         jitter=float(np.std(regular)),
         longest_gap=float(gaps.max()),
-        lost=missing / (missing + len(records)),
+        missing=missing,
         way_p99=float(np.percentile(way, 99.0)),
         way_worst=float(way.max()),
         host_p99=float(np.percentile(late, 99.0)),

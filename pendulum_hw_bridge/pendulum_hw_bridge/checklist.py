@@ -176,9 +176,10 @@ def listen(
 ) -> list[Feedback]:
     """Listen until a stretch is found in which this computer kept time, and judge that; a busy moment passes.
 
-    Where nothing but a few records were missing, a longer stretch judges their share.
+    Where nothing is wrong but that records are missing, their share is judged together with a longer stretch.
     """
     period, seconds, again = 1.0 / settings.feedback_rate, _LISTEN, ""
+    before: TimingFigures | None = None
     for _ in range(_STRETCHES):
         progress(f"listening for {seconds:g} s{again}")
         records, lateness = _stretch(port, host, seconds)
@@ -187,6 +188,10 @@ def listen(
             found.items.append(CheckItem("feedback flows", False, seen, f"{settings.feedback_rate:g} Hz"))
             return records
         figures = measure(records, period, lateness)
+        if before is not None:
+            figures = replace(
+                figures, records=before.records + figures.records, missing=before.missing + figures.missing
+            )
         lines = _timing(figures, settings, limits)
         late = figures.host_p99 > _PUNCTUAL[0] * period or figures.host_worst > _PUNCTUAL[1] * period
         refused = [line.name for line in lines if not line.passed]
@@ -194,8 +199,8 @@ def listen(
         found.host_busy = late and bool(refused)
         if found.host_busy:
             again = " again: this computer was busy"
-        elif refused == [_LOSS_ITEM] and seconds < _LISTEN_TO_LOSSES:
-            seconds, again = _LISTEN_TO_LOSSES, " more: records got lost"
+        elif refused == [_LOSS_ITEM] and before is None:
+            seconds, again, before = _LISTEN_TO_LOSSES, " more: records got lost", figures
         else:
             break
     found.items.append(_host(figures, period, busy=found.host_busy))

@@ -199,7 +199,16 @@ def test_an_actuator_that_loses_records_is_blamed_by_a_punctual_computer() -> No
     assert not found.host_busy
 
 
-@pytest.mark.parametrize(("lost", "share"), [((), None), ((20, 55), None), (range(20, 2000, 50), 2.0)])
+@pytest.mark.parametrize(
+    ("lost", "share"),
+    [
+        ((), None),
+        ((20, 55), None),
+        # As many in one second, but too many of all.
+        (range(20, 80, 8), 8 / 6.0),
+        (range(20, 2000, 50), 2.0),
+    ],
+)
 def test_lost_records_are_judged_by_their_share_of_many(lost: Sequence[int], share: float | None) -> None:
     parameters = load_emulator("thesis")
     port = LossyNetwork(EmulatedX5(parameters, seed=1), SteppedClock())
