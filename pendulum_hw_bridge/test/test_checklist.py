@@ -109,6 +109,16 @@ def checklist(
     return found
 
 
+def lossy_checklist(lost: Sequence[int]) -> tuple[Checklist, list[str]]:
+    """Return the checklist of a module some of whose records never come, and what was told on the way."""
+    parameters = load_emulator("thesis")
+    port = LossyNetwork(EmulatedX5(parameters, seed=1), SteppedClock())
+    port.lost = frozenset(lost)
+    told: list[str] = []
+    found = run_checklist(port, SETTINGS, SafetyLimits(), parameters.plant, host=Pulse(), progress=told.append)
+    return found, told
+
+
 def passed(found: Checklist) -> dict[str, bool | None]:
     return {item.name: item.passed for item in found.items}
 
@@ -210,17 +220,19 @@ def test_an_actuator_that_loses_records_is_blamed_by_a_punctual_computer() -> No
     ],
 )
 def test_lost_records_are_judged_by_their_share_of_many(lost: Sequence[int], share: float | None) -> None:
-    parameters = load_emulator("thesis")
-    port = LossyNetwork(EmulatedX5(parameters, seed=1), SteppedClock())
-    port.lost = frozenset(lost)
-    told: list[str] = []
-    found = run_checklist(port, SETTINGS, SafetyLimits(), parameters.plant, host=Pulse(), progress=told.append)
+    found, told = lossy_checklist(lost)
     line = next(item for item in found.items if item.name == "no feedback gets lost")
     assert line.passed is (share is None)
     assert found.ready is (share is None)
     assert ("listening for 5 s more: records got lost" in told) is bool(lost)
     if share is not None:
         assert found.figures["lost"] == pytest.approx(share / 100.0, rel=0.1)
+
+
+def test_a_gap_is_refused_at_once_however_regular_feedback_is_later() -> None:
+    found, told = lossy_checklist(range(20, 24))
+    assert passed(found)["feedback is regular"] is False
+    assert not any("more" in line for line in told)
 
 
 def test_a_reader_that_is_held_up_alone_is_no_gap_of_the_module() -> None:
