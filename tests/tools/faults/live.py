@@ -338,11 +338,17 @@ class LiveSystem:
             self.start(name)
 
     def rate(self, duration: float = 1.0) -> float:
-        """Listen for a while and return how many torques a second were applied [Hz]."""
-        before = len(self.applied)
-        started = time.monotonic()
-        self.listen(duration)
-        return (len(self.applied) - before) / (time.monotonic() - started)
+        """Return how many torques a second the plant applies from now on, by its own stamps [Hz].
+
+        Not by when the probe hears of them: after an attack that kept it busy, old ones wait for it.
+        """
+        since_ns = time.time_ns()
+        until_ns = since_ns + round(duration * NANOSECONDS)
+        first = len(self.applied)
+        deadline = time.monotonic() + duration + START_TIMEOUT
+        while time.monotonic() < deadline and not (self.applied and self.applied[-1].stamp_ns >= until_ns):
+            self._listen_once(0.02)
+        return sum(since_ns <= applied.stamp_ns < until_ns for applied in self.applied[first:]) / duration
 
     def publisher(self, topic: str) -> Publisher:
         """Return a publisher of the probe's on one of the plant's inputs."""
