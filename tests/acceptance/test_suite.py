@@ -80,6 +80,27 @@ def test_parts_of_a_lane_run_in_turn(processes: ProcessGroup, tmp_path: Path) ->
     assert program.output.splitlines()[-1].count("1 of 1") == 2
 
 
+@pytest.mark.skipif(not Path("/proc/self/autogroup").exists(), reason="this Linux shares its cores without sessions")
+def test_what_tests_that_compute_start_has_no_more_than_their_share_of_the_cores(
+    processes: ProcessGroup, tmp_path: Path
+) -> None:
+    body = (
+        "import subprocess, sys\n"
+        "from pathlib import Path\n"
+        "from tests.fixtures import wait_for\n\n"
+        "def test_share() -> None:\n"
+        "    program = subprocess.Popen(['sleep', '60'], start_new_session=True)\n"
+        "    share = Path(f'/proc/{program.pid}/autogroup')\n"
+        "    try:\n"
+        "        wait_for(lambda: share.read_text().endswith(' nice %d\\n'), 30, 'its share')\n"
+        "    finally:\n"
+        "        program.kill()\n"
+        "        program.wait()\n"
+    )
+    program = processes.start_command(_parts(tmp_path, body % 0, body % 5))
+    assert program.wait(60) == 0, program.output
+
+
 def test_each_file_of_tests_is_in_one_part() -> None:
     parts = rooms()
     folders = [PROJECT / "tests", *(path for top in ("", "bags/") for path in PROJECT.glob(f"{top}pendulum_*"))]

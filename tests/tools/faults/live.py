@@ -307,18 +307,23 @@ class LiveSystem:
         answer: Any = self.conductor.call(self._arming, SetBool.Request(data=on), "the answer to arming", START_TIMEOUT)
         return "" if answer.success else str(answer.message)
 
-    def bring_back(self, what: str) -> None:
+    def bring_back(self, what: str, *, heard: bool = False) -> None:
         """Wait until torque flows; a plant that was armed once and gave up is armed again, as a person would.
+
+        Args:
+            what: Is waited for, for the message.
+            heard: Wait until the probe hears the commands too.
 
         Raises:
             FaultError: It does not come back.
         """
         deadline = time.monotonic() + START_TIMEOUT
         refusal = ""
-        while not self.torque_flows():
+        while not (self.torque_flows() and (self.hears_all() or not heard)):
             if time.monotonic() > deadline:
                 raise FaultError(f"waited {START_TIMEOUT:g} s for {what}, in vain; {refusal or self.mode()}")
-            if self.plant.has_module and self._arming.service_is_ready() and (refusal := self.arm()):
+            asleep = self.plant.has_module and not self.torque_flows() and self._arming.service_is_ready()
+            if asleep and (refusal := self.arm()):
                 self.arm(False)
                 refusal = self.arm()
                 if any(each in refusal for each in _FALLEN):

@@ -99,11 +99,7 @@ class Trial:
 
 def try_fault(system: LiveSystem, fault: Fault, generator: random.Random) -> Outcome:
     """Try a fault once on a system that runs, and check what must hold after any fault."""
-    system.wait_for(
-        "torque to flow, and its commands to be heard, before the fault",
-        lambda: system.torque_flows() and system.hears_all(),
-        START_TIMEOUT,
-    )
+    system.bring_back(f"torque to flow, and its commands to be heard, before: {fault.name}", heard=True)
     # At a random moment of the loop, as faults come.
     system.listen(generator.uniform(0.05, 0.25))
     begin_ns = time.time_ns()
