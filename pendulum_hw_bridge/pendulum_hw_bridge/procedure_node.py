@@ -20,6 +20,7 @@ from pendulum_hw_bridge.procedures import hand_trials, staircase
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.contract.names import Event
+from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, trajectory_to_message
@@ -46,6 +47,7 @@ SPECS: tuple[ParameterSpec, ...] = (
         "hold", 2.0, "s", "`staircase`: time at rest on each step.", minimum=0.5, maximum=60.0, read_only=True
     ),
     ParameterSpec("autostart", False, "", "Start with the first state, without a call of ~/start.", read_only=True),
+    REALTIME_PRIORITY,
 )
 """All parameters of the node."""
 

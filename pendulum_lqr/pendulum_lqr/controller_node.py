@@ -37,6 +37,7 @@ from pendulum_lqr.joint_controller import (
 from pendulum_lqr.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joints
+from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import JointSample, Vector
 from pendulum_msgs_py.errors import PendulumError
@@ -93,6 +94,7 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
         "autoactivate", True, "", "With autostart: activate too; false configures, and waits inactive for "
         "~/change_state.", read_only=True,
     ),
+    REALTIME_PRIORITY,
 )  # fmt: skip
 """Parameters of the node itself; those of the chosen controller join them."""
 

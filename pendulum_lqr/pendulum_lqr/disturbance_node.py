@@ -24,6 +24,7 @@ from pendulum_lqr.disturbing import DisturbanceLoop
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.names import Event
+from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError
@@ -56,6 +57,7 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
         "from one to the next. Empty for the joint of a pendulum.",
         read_only=True,
     ),
+    REALTIME_PRIORITY,
 )
 """Parameters of the node itself, next to those of the signal."""
 

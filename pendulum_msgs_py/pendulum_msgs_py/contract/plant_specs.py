@@ -11,10 +11,28 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.parameters import ParameterSpec
 
-__all__ = ["LIMIT_SPECS", "LOCKSTEP_EPOCH_NS", "LOOP_SPECS", "in_units_of", "limits_from_parameters"]
+__all__ = [
+    "LIMIT_SPECS",
+    "LOCKSTEP_EPOCH_NS",
+    "LOOP_SPECS",
+    "REALTIME_PRIORITY",
+    "in_units_of",
+    "limits_from_parameters",
+]
 
 LOCKSTEP_EPOCH_NS = NANOSECONDS
 """Stamp of the first state in lockstep [ns]; a stamp of zero means "no time" to ROS tools."""
+
+REALTIME_PRIORITY = ParameterSpec(
+    "realtime_priority",
+    0,
+    "-",
+    "Priority of the process before all ordinary ones, 1 to 99 (SCHED_FIFO); 0 for the usual one.",
+    minimum=0,
+    maximum=99,
+    read_only=True,
+)
+"""Of all who keep a plant's time, or answer in it."""
 
 LOOP_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
@@ -49,6 +67,7 @@ LOOP_SPECS: tuple[ParameterSpec, ...] = (
         minimum=0.0,
         read_only=True,
     ),
+    REALTIME_PRIORITY,
 )
 
 LIMIT_SPECS: tuple[ParameterSpec, ...] = (

@@ -29,6 +29,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
+from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.programs import completion
@@ -40,6 +41,7 @@ from pendulum_msgs_py.programs.executables import (
     report_missing,
     split_ros_arguments,
 )
+from pendulum_msgs_py.programs.realtime import run_in_real_time
 from pendulum_msgs_py.ros.answers import answer_who_listens
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 from pendulum_msgs_py.ros.polled import PollingNode
@@ -155,6 +157,8 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
         # What is there now stays: the collector need not look at it again in the middle of a loop.
         gc.collect()
         gc.freeze()
+        if node.has_parameter(REALTIME_PRIORITY.name):
+            run_in_real_time(int(node.get_parameter(REALTIME_PRIORITY.name).value))
         while not stopped.done() and rclpy.ok():
             left = pace() if pace is not None else None
             if attend is not None:

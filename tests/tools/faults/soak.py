@@ -24,7 +24,7 @@ from rich.console import Console
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
-from pendulum_bags.experiments.session import LOOP_NICENESS
+from pendulum_bags.experiments.session import ANSWER_PRIORITY, PLANT_PRIORITY, start_loop
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.programs import graph
@@ -176,7 +176,11 @@ def _start(processes: ProcessSet, conductor: Conductor, folder: Path) -> list[Ch
     for program in _programs():
         # As in an experiment: who keeps deadlines goes first, who only shows goes last.
         shows = program.executable in {"viewer", "markers"}
-        processes.start_node(program, niceness=0 if shows else LOOP_NICENESS)
+        if shows:
+            processes.start_node(program)
+        else:
+            keeps_time = program.executable in {"simulator", "bridge"}
+            start_loop(processes, program, PLANT_PRIORITY if keeps_time else ANSWER_PRIORITY)
     plant = PlantClient(conductor, "/sim", "simulator", watch=False)
     bridge = PlantClient(conductor, "/hw", "bridge")
     for namespace in ("/sim", "/hw"):

@@ -57,8 +57,8 @@ def _bind(parent: int, niceness: int) -> Callable[[], None]:
         # Taking priority is a privilege; without it the run is as good as the machine is idle.
         with contextlib.suppress(PermissionError):
             os.nice(niceness)
-        # Where Linux shares the cores among sessions first (autogroup), a session stays behind as a whole.
-        if (now := os.getpriority(os.PRIO_PROCESS, 0)) > 0:
+        # Where Linux shares the cores among sessions first (autogroup), a session goes or stays behind as a whole.
+        if now := os.getpriority(os.PRIO_PROCESS, 0):
             with contextlib.suppress(OSError):
                 Path("/proc/self/autogroup").write_text(str(now), encoding="ascii")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, Rec
 from pendulum_bags.experiments.domain import check_domain
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.experiments.session import START_TIMEOUT, conduct, refuse_existing
+from pendulum_bags.experiments.session import ANSWER_PRIORITY, START_TIMEOUT, conduct, refuse_existing, start_loop
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import wrap
@@ -186,9 +186,7 @@ def play_on_running_plant(
             namespace, kind="from_bag", file=str(play.file.resolve()), duration=float(play.duration)
         )
         for program, name in ((zero, "zero_torque"), (signal, "excitation")):
-            session.processes.start_node(
-                graph.NodeProgram(program.package, program.executable, namespace, name, program.parameters)
-            )
+            start_loop(session.processes, replace(program, name=name), ANSWER_PRIORITY)
         plant.wait_until_ready(START_TIMEOUT)
         wanted = {f"{namespace}/{topic}" for topic in (names.JOINT_STATES, names.APPLIED_EFFORT, names.DISTURBANCE)}
         ears = RecorderClient(conductor, namespace)

@@ -11,7 +11,15 @@ from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, Rec
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.experiments.session import LOOP_NICENESS, START_TIMEOUT, Session, conduct, refuse_existing
+from pendulum_bags.experiments.session import (
+    ANSWER_PRIORITY,
+    PLANT_PRIORITY,
+    START_TIMEOUT,
+    Session,
+    conduct,
+    refuse_existing,
+    start_loop,
+)
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.runs.run_data import END_EVENT, START_EVENT
 from pendulum_msgs_py.contract import names
@@ -171,9 +179,9 @@ def record_run(
     ):
         recorder = session.record(bag, namespace, spec.metadata(), spec.storage, simulated=simulated)
         program = spec.plant_program(_LISTENERS + 1)
-        niceness = 0 if simulated else LOOP_NICENESS
-        for node in (spec.controller_program(), spec.disturbance_program(), program):
-            session.processes.start_node(node, niceness=niceness)
+        answering = (spec.controller_program(), spec.disturbance_program())
+        for node, priority in (*((each, ANSWER_PRIORITY) for each in answering), (program, PLANT_PRIORITY)):
+            start_loop(session.processes, node, priority, simulated=simulated)
         plant = PlantClient(session.conductor, namespace, program.node_name, watch=False)
         session.wait_until_all_hear_each_other(namespace, _RUN_LISTENERS, clock=simulated)
         session.drives(plant)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,21 @@ from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.errors import BagError, FaultError
+from pendulum_msgs_py.programs.graph import NodeProgram
+from pendulum_msgs_py.programs.realtime import may_run_in_real_time
 
-__all__ = ["LOOP_NICENESS", "START_TIMEOUT", "Session", "conduct", "refuse_existing"]
+__all__ = ["ANSWER_PRIORITY", "PLANT_PRIORITY", "START_TIMEOUT", "Session", "conduct", "refuse_existing", "start_loop"]
 
 START_TIMEOUT = 60.0
 """Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
-LOOP_NICENESS = -10
-"""Priority of those who keep deadlines over all else on the machine, where we may take it."""
+PLANT_PRIORITY = 50
+"""Real-time priority of a plant, where we may take it, as of ros2_control's controller manager."""
+ANSWER_PRIORITY = PLANT_PRIORITY - 1
+"""Real-time priority of who answers a plant's states: a design that takes a while must not keep a plant waiting."""
+_LOOP_NICENESS = -10
+"""Priority among ordinary programs of those who keep deadlines, where we may take it."""
 
 
 @dataclass
@@ -150,6 +157,22 @@ def conduct(
         except BaseException:
             session.let_go()
             raise
+
+
+def start_loop(processes: ProcessSet, program: NodeProgram, priority: int, *, simulated: bool = False) -> Child:
+    """Start a node that keeps deadlines: before all else on the machine, where we may.
+
+    Args:
+        processes: Of the run.
+        program: The node.
+        priority: Its real-time priority.
+        simulated: Time is the plant's: there are no deadlines, and nobody else is to wait.
+    """
+    if simulated:
+        return processes.start_node(program)
+    if may_run_in_real_time(priority):
+        program = replace(program, parameters={**program.parameters, REALTIME_PRIORITY.name: priority})
+    return processes.start_node(program, niceness=_LOOP_NICENESS)
 
 
 def refuse_existing(bag: Path) -> None:

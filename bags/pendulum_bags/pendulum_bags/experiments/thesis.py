@@ -17,7 +17,14 @@ from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.repeats import SHORTEST, repeat_command
 from pendulum_bags.experiments.run_spec import SIDES
-from pendulum_bags.experiments.session import LOOP_NICENESS, START_TIMEOUT, Session, conduct
+from pendulum_bags.experiments.session import (
+    ANSWER_PRIORITY,
+    PLANT_PRIORITY,
+    START_TIMEOUT,
+    Session,
+    conduct,
+    start_loop,
+)
 from pendulum_bags.experiments.settings import SETTLE_TIME, RegulationSettings
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
@@ -80,9 +87,11 @@ def _start(session: Session, folder: Path, settings: RegulationSettings) -> tupl
         for make in (settings.controller_program, settings.disturbance_program)
         for side in SIDES
     ]
-    for program in (*programs.values(), *others):
+    for program in programs.values():
         if program is not None:
-            session.processes.start_node(program, niceness=LOOP_NICENESS)
+            start_loop(session.processes, program, PLANT_PRIORITY)
+    for program in others:
+        start_loop(session.processes, program, ANSWER_PRIORITY)
     sim, hw = (
         joined[side] if program is None else PlantClient(conductor, settings.namespace(side), program.node_name)
         for side, program in programs.items()

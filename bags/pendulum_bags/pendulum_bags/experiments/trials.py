@@ -13,7 +13,7 @@ from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
-from pendulum_bags.experiments.session import LOOP_NICENESS, START_TIMEOUT, conduct
+from pendulum_bags.experiments.session import ANSWER_PRIORITY, PLANT_PRIORITY, START_TIMEOUT, conduct, start_loop
 from pendulum_bags.experiments.settings import HARDWARE
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD
@@ -210,8 +210,8 @@ def _run_trial(
     with conduct(folder / "logs" / bag.name, domain, progress.refresh, hosts=hosts) as session:
         conductor = session.conductor
         recorder = session.record(bag, "/hw", _metadata(settings, trial), settings.storage, simulated=lockstep)
-        session.processes.start_node(settings.procedure_program(trial), niceness=LOOP_NICENESS)
-        session.processes.start_node(settings.plant_program(trial, bag), niceness=LOOP_NICENESS)
+        start_loop(session.processes, settings.procedure_program(trial), ANSWER_PRIORITY, simulated=lockstep)
+        start_loop(session.processes, settings.plant_program(trial, bag), PLANT_PRIORITY, simulated=lockstep)
         plant = PlantClient(conductor, "/hw", "bridge", watch=not lockstep)
         session.drives(plant)
         session.wait_until_all_hear_each_other("/hw", _topics(settings), clock=lockstep)
