@@ -51,6 +51,7 @@ from pendulum_msgs_py.plants.plant_parameters import (
     is_mechanism,
     load_plant,
 )
+from pendulum_msgs_py.programs.realtime import as_ordinary
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import (
     problem_of_state,
@@ -262,6 +263,8 @@ class ControllerNode(LifecycleNode, PollingNode):
         given = self._parameter_overrides.get(spec.name)
         return str(spec.check(spec.default if given is None else given.value))
 
+    # A design may take seconds, in which nobody is answered: plants on the same core are not to wait for it.
+    @as_ordinary()
     def _design(self, values: Mapping[str, Any]) -> Controller | JointController:
         # As long as nobody knows the period, nobody can say whether the loop is stable at it.
         known = bool(values["period"]) or self._period_measured

@@ -3,7 +3,9 @@
 import itertools
 import json
 import math
+import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -21,6 +23,7 @@ from pendulum_lqr.disturbance import make_disturbance
 from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.programs.realtime import may_run_in_real_time
 from pendulum_msgs_py.ros import qos
 from tests.graph_peer import GraphPeer
 from tests.policies import linear_policy
@@ -90,6 +93,31 @@ def ros(*parameters: str) -> list[str]:
     for parameter in parameters:
         arguments += ["-p", parameter]
     return arguments
+
+
+@pytest.mark.skipif(not may_run_in_real_time(7), reason="this user may have no real-time priority")
+def test_a_design_while_running_makes_no_plant_wait(plant, processes):
+    # Its planner takes half a second to make.
+    told = ("controller:=nmpc", "period:=0.01", "realtime_priority:=7")
+    program = processes.start("pendulum_lqr", "controller", *ros(*told))
+    program.wait_for_output("ready", 60)
+    assert os.sched_getscheduler(program.pid) == os.SCHED_FIFO
+    seen: set[int] = set()
+    changed = threading.Event()
+
+    def look() -> None:
+        while not changed.wait(0.002):
+            seen.add(os.sched_getscheduler(program.pid))
+
+    watch = threading.Thread(target=look)
+    watch.start()
+    try:
+        assert plant.set_parameters("controller", r=2.0).successful
+    finally:
+        changed.set()
+        watch.join()
+    assert os.SCHED_OTHER in seen
+    assert os.sched_getscheduler(program.pid) == os.SCHED_FIFO
 
 
 def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(plant, processes):

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import json
 import os
 import resource
 import subprocess
 import sys
+import threading
 
 import pytest
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.programs.realtime import as_ordinary, may_run_in_real_time, priority_kept, run_in_real_time
 
 _ASK = """
 import json, os, sys, threading
@@ -29,6 +34,29 @@ after = threading.Thread(target=done.wait)
 after.start()
 threads = [int(name) for name in os.listdir("/proc/self/task")]
 print(json.dumps([[os.sched_getscheduler(one), os.sched_getparam(one).sched_priority] for one in threads]))
+done.set()
+"""
+_AS_ORDINARY = """
+import json, os, subprocess, sys, threading
+from pendulum_msgs_py.programs.realtime import as_ordinary, run_in_real_time
+
+def tell():
+    told = [os.sched_getscheduler(0), os.sched_getparam(0).sched_priority]
+    child = "import os; print(os.sched_getscheduler(0))"
+    return [*told, int(subprocess.run([sys.executable, "-c", child], capture_output=True, check=True).stdout)]
+
+done = threading.Event()
+other = threading.Thread(target=done.wait)
+other.start()
+run_in_real_time(7)
+told = [tell()]
+try:
+    with as_ordinary():
+        told += [tell(), [os.sched_getscheduler(other.native_id)]]
+        raise ValueError
+except ValueError:
+    pass
+print(json.dumps([*told, tell()]))
 done.set()
 """
 _PR_CAPBSET_DROP, _CAP_SYS_NICE = 24, 23
@@ -71,3 +99,75 @@ def test_who_may_not_have_it_is_told_how_to_get_it() -> None:
         "realtime_priority is 60; this user may have at most 0: expected 0, or a line such as "
         "'@realtime - rtprio 98' in /etc/security/limits.conf, and a new login of a member of that group"
     )
+
+
+@pytest.mark.skipif(not may_have(7), reason="this user may have no real-time priority")
+def test_work_that_takes_its_time_is_ordinary_meanwhile_and_so_is_what_it_starts() -> None:
+    done = subprocess.run([sys.executable, "-c", _AS_ORDINARY], capture_output=True, text=True, timeout=60, check=True)
+    before, meanwhile, other_thread, after = json.loads(done.stdout)
+    assert before == after == [os.SCHED_FIFO, 7, os.SCHED_FIFO]
+    assert meanwhile == [os.SCHED_OTHER, 0, os.SCHED_OTHER]
+    # The middleware still takes and sends what it has to.
+    assert other_thread == [os.SCHED_FIFO]
+
+
+def _refuse(number: int) -> object:
+    def refuse(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    return refuse
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.EINVAL, errno.EPERM])
+def test_a_system_that_refuses_it_to_all_is_told_from_a_right_that_is_missing(
+    monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """As musl does (ENOSYS), a sandbox (EINVAL), or a group of processes without time for it (EPERM)."""
+    failed: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", failed.append)
+    monkeypatch.setattr(os, "sched_setscheduler", _refuse(number))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (98, 98))
+    assert not may_run_in_real_time(50)
+    assert not failed
+    with pytest.raises(ParameterError, match=r"this system refuses it \(.+\): expected 0, or a group of processes"):
+        run_in_real_time(50)
+
+
+@pytest.mark.parametrize(
+    ("limit", "sentence"),
+    [(49, "may have at most 49: expected 49, or a line"), (50, "system refuses it"), (-1, "system refuses it")],
+)
+def test_the_limit_of_a_user_is_named_where_it_is_the_reason(
+    monkeypatch: pytest.MonkeyPatch, limit: int, sentence: str
+) -> None:
+    monkeypatch.setattr(os, "sched_setscheduler", _refuse(errno.EPERM))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (limit, limit))
+    with pytest.raises(ParameterError, match=sentence):
+        run_in_real_time(50)
+
+
+def test_a_system_without_such_priorities_says_so_and_does_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As macOS does."""
+    for name in ("sched_setscheduler", "sched_getscheduler", "sched_getparam"):
+        monkeypatch.delattr(os, name)
+    assert not may_run_in_real_time(50)
+    with pytest.raises(ParameterError, match="realtime_priority is 50; this system has none: expected 0"):
+        run_in_real_time(50)
+    with as_ordinary(), priority_kept():
+        pass
+
+
+@pytest.mark.skipif(not may_have(7), reason="this user may have no real-time priority")
+def test_who_has_lost_the_right_meanwhile_goes_on_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[int] = []
+
+    def work() -> None:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(7))
+        with as_ordinary():
+            monkeypatch.setattr(os, "sched_setscheduler", _refuse(errno.EPERM))
+        told.append(os.sched_getscheduler(0))
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    worker.join()
+    assert told == [os.SCHED_OTHER]
