@@ -14,6 +14,7 @@ import pytest
 from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, kept_pool
 from pendulum_bags.experiments.processes import ProcessSet
 from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.programs.realtime import may_run_in_real_time
 from tests.fixtures import wait_for
 
 PROGRAMS = """
@@ -73,10 +74,17 @@ def leaves_middleware(argv):
 def starts_thread(argv):
     threading.Thread(target=time.sleep, args=(0.5,)).start()
     return 0
+
+def takes_priority(argv):
+    print("found", os.sched_getscheduler(0), flush=True)
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(7))
+    if argv:
+        raise RuntimeError("the plant has gone")
+    return 0
 """
 NAMES = (
     *("tell", "fails", "leaves", "waits", "kills", "exits"),
-    *("freezes", "handles_signals", "leaves_middleware", "starts_thread"),
+    *("freezes", "handles_signals", "leaves_middleware", "starts_thread", "takes_priority"),
 )
 
 
@@ -173,6 +181,19 @@ def test_what_only_the_collector_destroys_is_gone_when_its_program_has_ended(poo
     for _ in range(2):
         assert _start(pool, tmp_path / "log", "freezes").wait(30.0) == 0
     assert (tmp_path / "log").read_text().count("the node has left the graph") == 2
+
+
+@pytest.mark.skipif(not may_run_in_real_time(7), reason="this user may have no real-time priority")
+@pytest.mark.parametrize("arguments", [(), ("fails",)])
+def test_the_priority_that_a_program_took_is_not_that_of_the_next(
+    pool: HostPool, tmp_path: Path, arguments: tuple[str, ...]
+) -> None:
+    first = _start(pool, tmp_path / "first.log", "takes_priority", *arguments)
+    assert first.wait(30.0) == len(arguments)
+    second = _start(pool, tmp_path / "second.log", "takes_priority")
+    assert second.wait(30.0) == 0
+    assert first.pid == second.pid
+    assert (tmp_path / "second.log").read_text() == f"found {os.SCHED_OTHER}\n"
 
 
 def test_a_host_that_waits_ends_by_sigterm_whatever_its_programs_did_with_it(pool: HostPool, tmp_path: Path) -> None:

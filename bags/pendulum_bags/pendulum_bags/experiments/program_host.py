@@ -26,6 +26,7 @@ from typing import Any
 
 from pendulum_bags.experiments.host_pool import AGAIN, BEGUN, LAST, HostPool, keep_pool
 from pendulum_msgs_py.programs.executables import EXIT_USAGE, run_package
+from pendulum_msgs_py.programs.realtime import priority_kept
 
 __all__ = ["main"]
 
@@ -61,7 +62,8 @@ def _run(order: Mapping[str, Any], on_begin: Callable[[], None]) -> int:
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         on_begin()
-        code = run_package(order["package"], order["arguments"])
+        with priority_kept():
+            code = run_package(order["package"], order["arguments"])
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
     except SystemExit as end:
