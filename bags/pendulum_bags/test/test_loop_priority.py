@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import resource
+import subprocess
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
+from pendulum_bags.experiments import session
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment
-from pendulum_bags.experiments.session import ANSWER_PRIORITY, PLANT_PRIORITY, start_loop
+from pendulum_bags.experiments.session import (
+    ANSWER_PRIORITY,
+    PLANT_PRIORITY,
+    RECORDER_PRIORITY,
+    Session,
+    in_real_time,
+    start_loop,
+)
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.realtime import may_run_in_real_time
 from tests.fixtures import wait_for
 
-pytestmark = pytest.mark.skipif(
+_allowed = pytest.mark.skipif(
     not may_run_in_real_time(PLANT_PRIORITY), reason="this user may have no real-time priority"
 )
+
+_PR_CAPBSET_DROP, _CAP_SYS_NICE = 24, 23
 
 
 def _policies(child: Child) -> set[tuple[int, int]]:
@@ -24,6 +38,7 @@ def _policies(child: Child) -> set[tuple[int, int]]:
     return {(os.sched_getscheduler(thread), os.sched_getparam(thread).sched_priority) for thread in threads}
 
 
+@_allowed
 def test_plants_go_before_those_who_answer_them_and_both_before_all_else(tmp_path: Path, domain_id: int) -> None:
     others = {
         ANSWER_PRIORITY: (
@@ -43,6 +58,18 @@ def test_plants_go_before_those_who_answer_them_and_both_before_all_else(tmp_pat
             wait_for(lambda one=child, p=priority: _policies(one) == {(os.SCHED_FIFO, p)}, 60.0, child.name)  # type: ignore[misc]
 
 
+@_allowed
+def test_a_recorder_goes_behind_them_and_before_all_else(tmp_path: Path, domain_id: int) -> None:
+    with ProcessSet(tmp_path, ros_environment(domain_id, tmp_path)) as processes:
+        run = Session(processes, MagicMock(), tmp_path)
+        for simulated, expected in ((False, (os.SCHED_FIFO, RECORDER_PRIORITY)), (True, (os.SCHED_OTHER, 0))):
+            child = run.record(tmp_path / f"bag_{simulated}", "/sim", {}, "mcap", simulated=simulated)
+            wait_for(lambda one=child: "ready" in one.log.read_text(), 60.0, child.name)  # type: ignore[misc]
+            assert _policies(child) == {expected}
+    assert PLANT_PRIORITY > ANSWER_PRIORITY > RECORDER_PRIORITY > 0
+
+
+@_allowed
 def test_simulated_time_makes_nobody_wait(tmp_path: Path, domain_id: int) -> None:
     node = replace(graph.disturbance("/sim"), name="simulated")
     with ProcessSet(tmp_path, ros_environment(domain_id, tmp_path)) as processes:
@@ -50,3 +77,28 @@ def test_simulated_time_makes_nobody_wait(tmp_path: Path, domain_id: int) -> Non
         assert "realtime_priority" not in " ".join(Path(f"/proc/{child.process.pid}/cmdline").read_text().split("\0"))
         wait_for(lambda: "ready" in child.log.read_text(), 60.0, "the node")
         assert _policies(child) == {(os.SCHED_OTHER, 0)}
+
+
+@pytest.mark.parametrize(("limit", "allowed"), [(0, False), (PLANT_PRIORITY - 1, False), (PLANT_PRIORITY, True)])
+def test_who_answers_does_not_go_before_a_plant_that_may_not(
+    monkeypatch: pytest.MonkeyPatch, limit: int, allowed: bool
+) -> None:
+    monkeypatch.setattr(session, "may_run_in_real_time", lambda priority: priority <= limit)
+    for priority in (ANSWER_PRIORITY, PLANT_PRIORITY):
+        parameters = in_real_time(graph.controller("/sim", period=0.01), priority).parameters
+        assert parameters == {"period": 0.01, **({"realtime_priority": priority} if allowed else {})}
+
+
+def test_a_program_that_may_not_have_what_it_was_given_was_never_ready(tmp_path: Path, domain_id: int) -> None:
+    def forbid() -> None:
+        ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, _CAP_SYS_NICE, 0, 0, 0)
+        resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+
+    command = graph.disturbance("/sim", realtime_priority=7).command()
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60.0, check=False, preexec_fn=forbid,
+        env={**os.environ, **ros_environment(domain_id, tmp_path)},
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "error: realtime_priority is 7; this user may have at most 0" in done.stderr
+    assert "ready" not in done.stdout + done.stderr

@@ -151,14 +151,15 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
             node.poll_services(timer=pace is None)
             attend = None if pace is None else node.attend
         check_closed(node.context.get_domain_id())
+        # Whoever may not have it is no plant that was ready.
+        if node.has_parameter(REALTIME_PRIORITY.name):
+            run_in_real_time(int(node.get_parameter(REALTIME_PRIORITY.name).value))
         # The first line that rclpy logs takes 30 ms; said now, it does not come in the middle of a loop.
         node.get_logger().info("ready")
         executor.add_node(node)
         # What is there now stays: the collector need not look at it again in the middle of a loop.
         gc.collect()
         gc.freeze()
-        if node.has_parameter(REALTIME_PRIORITY.name):
-            run_in_real_time(int(node.get_parameter(REALTIME_PRIORITY.name).value))
         while not stopped.done() and rclpy.ok():
             left = pace() if pace is not None else None
             if attend is not None:

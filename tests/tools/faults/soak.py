@@ -24,7 +24,13 @@ from rich.console import Console
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
-from pendulum_bags.experiments.session import ANSWER_PRIORITY, PLANT_PRIORITY, start_loop
+from pendulum_bags.experiments.session import (
+    ANSWER_PRIORITY,
+    PLANT_PRIORITY,
+    RECORDER_PRIORITY,
+    permitted,
+    start_loop,
+)
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.programs import graph
@@ -172,7 +178,8 @@ def _start(processes: ProcessSet, conductor: Conductor, folder: Path) -> list[Ch
     for namespace in ("/sim", "/hw"):
         metadata = folder / f"metadata_{namespace[1:]}.json"
         write_json(metadata, {"pendulum.run": {"experiment": "soak"}})
-        recorders.append(start_recorder(processes, folder / f"bag_{namespace[1:]}", namespace, metadata, "mcap"))
+        bag, priority = folder / f"bag_{namespace[1:]}", permitted(RECORDER_PRIORITY)
+        recorders.append(start_recorder(processes, bag, namespace, metadata, "mcap", priority=priority))
     for program in _programs():
         # As in an experiment: who keeps deadlines goes first, who only shows goes last.
         shows = program.executable in {"viewer", "markers"}

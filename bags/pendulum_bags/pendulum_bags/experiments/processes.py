@@ -17,6 +17,7 @@ from typing import Protocol
 
 from pendulum_bags.experiments.bound_process import start_bound_process
 from pendulum_bags.experiments.host_pool import HostPool
+from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs.graph import NodeProgram
 
@@ -247,7 +248,14 @@ def ros_environment(domain: int, log_folder: Path) -> dict[str, str]:
 
 
 def start_recorder(
-    processes: ProcessSet, bag: Path, namespace: str, metadata: Path, storage: str, *, log_time: str = "receive"
+    processes: ProcessSet,
+    bag: Path,
+    namespace: str,
+    metadata: Path,
+    storage: str,
+    *,
+    log_time: str = "receive",
+    priority: int = 0,
 ) -> Child:
     """Start the recorder of all topics of one plant, as the node ``recorder`` in the plant's namespace.
 
@@ -258,6 +266,7 @@ def start_recorder(
         metadata: JSON file about the run.
         storage: ``mcap`` or ``sqlite3``.
         log_time: ``receive``, or ``header`` for runs whose time is simulated.
+        priority: Its real-time priority; 0 for none.
     """
     command = [sys.executable, "-m", "pendulum_bags", "record", "-o", str(bag)]
     command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
@@ -266,4 +275,6 @@ def start_recorder(
         # What is stamped with wall time has no place in a bag whose time is simulated.
         command += ["--exclude", "^/diagnostics$|/transition_event$"]
     command += ["--ros-args", "-r", f"__ns:={namespace}"]
+    if priority:
+        command += ["-p", f"{REALTIME_PRIORITY.name}:={priority}"]
     return processes.start(f"recorder_{bag.name}", command, ends_last=True, niceness=_RECORDER_NICENESS)

@@ -18,7 +18,18 @@ from pendulum_msgs_py.errors import BagError, FaultError
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_msgs_py.programs.realtime import may_run_in_real_time
 
-__all__ = ["ANSWER_PRIORITY", "PLANT_PRIORITY", "START_TIMEOUT", "Session", "conduct", "refuse_existing", "start_loop"]
+__all__ = [
+    "ANSWER_PRIORITY",
+    "PLANT_PRIORITY",
+    "RECORDER_PRIORITY",
+    "START_TIMEOUT",
+    "Session",
+    "conduct",
+    "in_real_time",
+    "permitted",
+    "refuse_existing",
+    "start_loop",
+]
 
 START_TIMEOUT = 60.0
 """Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
@@ -26,6 +37,8 @@ PLANT_PRIORITY = 50
 """Real-time priority of a plant, where we may take it, as of ros2_control's controller manager."""
 ANSWER_PRIORITY = PLANT_PRIORITY - 1
 """Real-time priority of who answers a plant's states: a design that takes a while must not keep a plant waiting."""
+RECORDER_PRIORITY = ANSWER_PRIORITY - 1
+"""Real-time priority of a recorder: behind who has a deadline, whose messages would be lost for an ordinary one."""
 _LOOP_NICENESS = -10
 """Priority among ordinary programs of those who keep deadlines, where we may take it."""
 
@@ -60,7 +73,8 @@ class Session:
         told = self.logs / f"{bag.name}_metadata.json"
         write_json(told, dict(metadata))
         log_time = "header" if simulated else "receive"
-        return start_recorder(self.processes, bag, namespace, told, storage, log_time=log_time)
+        priority = 0 if simulated else permitted(RECORDER_PRIORITY)
+        return start_recorder(self.processes, bag, namespace, told, storage, log_time=log_time, priority=priority)
 
     def close(self, recorder: Child) -> None:
         """End a recorder now.
@@ -170,9 +184,30 @@ def start_loop(processes: ProcessSet, program: NodeProgram, priority: int, *, si
     """
     if simulated:
         return processes.start_node(program)
-    if may_run_in_real_time(priority):
-        program = replace(program, parameters={**program.parameters, REALTIME_PRIORITY.name: priority})
-    return processes.start_node(program, niceness=_LOOP_NICENESS)
+    return processes.start_node(in_real_time(program, priority), niceness=_LOOP_NICENESS)
+
+
+def in_real_time(program: NodeProgram, priority: int) -> NodeProgram:
+    """Return a node with its real-time priority, or as it is where that is not permitted.
+
+    Args:
+        program: The node.
+        priority: Its real-time priority, that of a plant at most.
+    """
+    if not permitted(priority):
+        return program
+    return replace(program, parameters={**program.parameters, REALTIME_PRIORITY.name: priority})
+
+
+def permitted(priority: int) -> int:
+    """Return a real-time priority, or 0 where we may not have that of a plant.
+
+    All or none: who answers states must not go before a plant that has to do without.
+
+    Args:
+        priority: That of a plant at most.
+    """
+    return priority if may_run_in_real_time(PLANT_PRIORITY) else 0
 
 
 def refuse_existing(bag: Path) -> None:

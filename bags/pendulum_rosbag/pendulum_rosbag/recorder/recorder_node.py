@@ -14,6 +14,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
 from pendulum_msgs_py.contract.names import EVENTS
+from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.convert import event_message
@@ -42,6 +43,7 @@ SPECS = (
         "-",
         "A note for the recording; setting it writes the event 'annotation', as the service ~/annotate does again.",
     ),
+    REALTIME_PRIORITY,
 )
 
 
