@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
+from pendulum_bags.experiments.session import RECORDER_PRIORITY, permitted
 from pendulum_rosbag.reader import read_bag
 from tests.benchmarks.console_cost import start_console
 from tests.benchmarks.two_plants import PLANTS, two_plants
@@ -26,25 +27,30 @@ class LoadedPlants:
         faults: Reasons of the plants that are in a fault at the end.
         recorded: Messages in the bag.
         lost: Messages that the recorder knows of and the bag has not.
+        real_time: Whether plants, who answers them and the recorder had real-time priority.
     """
 
     missed: dict[str, float]
     faults: list[str]
     recorded: int
     lost: int
+    real_time: bool
 
 
-def loaded_plants(duration: float) -> LoadedPlants:
+def loaded_plants(duration: float, *, real_time: bool = True) -> LoadedPlants:
     """Run both plants at 500 Hz, controlled and under noise, recorded and shown on a page, beside two busy loops.
 
     Args:
         duration: Length of the measurement [s].
+        real_time: As an experiment runs them: before all else, where this user may have that. Else as ordinary ones.
     """
-    with two_plants() as running:
+    with two_plants(real_time=real_time) as running:
         group, loops = running.group, running.loops
         bag = running.folder / "bag"
         start_console(group, running.environment, running.folder / "runs")
         recording = ("record", "-o", bag, "--regex", "^/(sim|hw)/")
+        priority = permitted(RECORDER_PRIORITY) if real_time else 0
+        recording += ("--ros-args", "-p", f"realtime_priority:={priority}")
         recorder = group.start("pendulum_rosbag", *recording, env=running.environment)
         recorder.wait_for_output("ready", _START)
         for index in range(_BUSY_LOOPS):
@@ -64,6 +70,7 @@ def loaded_plants(duration: float) -> LoadedPlants:
             faults,
             recorded=sum(count["written"] for count in counts),
             lost=sum(count["lost"] for count in counts),
+            real_time=priority > 0,
         )
 
 

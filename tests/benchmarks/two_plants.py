@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.session import ANSWER_PRIORITY, PLANT_PRIORITY, in_real_time
 from pendulum_msgs_py.programs import graph
 from tests.benchmarks.plant_listener import PlantListener, domain_environment
 from tests.fixtures import PROJECT
@@ -53,13 +54,17 @@ def patient_watchdog(rate: float) -> int:
 
 
 @contextmanager
-def two_plants() -> Iterator[TwoPlants]:
-    """Start them, the bridge armed, and end them with all that their group started."""
+def two_plants(*, real_time: bool = False) -> Iterator[TwoPlants]:
+    """Start them, the bridge armed, and end them with all that their group started.
+
+    Args:
+        real_time: Plants, and who answers them, go before all else on the machine as in an experiment, where we may.
+    """
     with tempfile.TemporaryDirectory() as scratch, reserve_domain(None) as domain:
         group, loops = ProcessGroup(Path(scratch), PROJECT), PlantListener(domain, *PLANTS)
         environment = domain_environment(domain)
         try:
-            nodes = (
+            plants = (
                 graph.simulator("/sim", rate_hz=RATE, start="top"),
                 graph.bridge(
                     "/hw",
@@ -68,9 +73,17 @@ def two_plants() -> Iterator[TwoPlants]:
                     initial_position=math.pi,
                     feedback_watchdog=patient_watchdog(RATE),
                 ),
+            )
+            answering = (
                 *(graph.controller(space, period=1.0 / RATE) for space in ("/sim", "/hw")),
                 *(graph.disturbance(space, autostart=True) for space in ("/sim", "/hw")),
             )
+            nodes = (*plants, *answering)
+            if real_time:
+                nodes = (
+                    *(in_real_time(plant, PLANT_PRIORITY) for plant in plants),
+                    *(in_real_time(program, ANSWER_PRIORITY) for program in answering),
+                )
             programs = [group.start(it.package, it.executable, *it.ros_arguments(), env=environment) for it in nodes]
             loops.wait_for_loops()
             loops.arm("/hw/bridge")
