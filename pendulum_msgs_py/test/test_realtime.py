@@ -36,6 +36,34 @@ threads = [int(name) for name in os.listdir("/proc/self/task")]
 print(json.dumps([[os.sched_getscheduler(one), os.sched_getparam(one).sched_priority] for one in threads]))
 done.set()
 """
+_BUSY = """
+import os, threading, time
+from pendulum_msgs_py.programs.realtime import run_in_real_time
+
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+late = 0.0
+begun, done = threading.Event(), threading.Event()
+
+def press():
+    global late
+    begun.wait()
+    while not done.is_set():
+        due = time.monotonic() + 0.01
+        time.sleep(0.01)
+        late = max(late, time.monotonic() - due)
+
+e_stop = threading.Thread(target=press)
+e_stop.start()
+run_in_real_time(7)
+begun.set()
+time.sleep(0.05)
+end = time.monotonic() + 0.5
+while time.monotonic() < end:
+    pass
+done.set()
+e_stop.join()
+print(late)
+"""
 _AS_ORDINARY = """
 import json, os, subprocess, sys, threading
 from pendulum_msgs_py.programs.realtime import as_ordinary, run_in_real_time
@@ -84,7 +112,21 @@ def may_have(priority: int) -> bool:
 @pytest.mark.skipif(not may_have(7), reason="this user may have no real-time priority")
 def test_all_threads_of_the_process_have_it_and_those_that_come_later() -> None:
     done = _ask(7)
-    assert json.loads(done.stdout) == [[os.SCHED_FIFO, 7]] * 3, done.stderr
+    # The loop, the thread that was there, and the one that the loop has begun since.
+    assert json.loads(done.stdout) == [[os.SCHED_FIFO, priority] for priority in (6, 7, 6)], done.stderr
+
+
+@pytest.mark.skipif(not may_have(7), reason="this user may have no real-time priority")
+def test_the_lowest_priority_is_that_of_all_threads() -> None:
+    done = _ask(1)
+    assert json.loads(done.stdout) == [[os.SCHED_FIFO, 1]] * 3, done.stderr
+
+
+@pytest.mark.skipif(not may_have(7), reason="this user may have no real-time priority")
+def test_a_busy_loop_keeps_no_other_thread_of_its_process_waiting_on_a_single_core() -> None:
+    done = subprocess.run([sys.executable, "-c", _BUSY], capture_output=True, text=True, timeout=60, check=True)
+    # It computes for half a second.
+    assert float(done.stdout) < 0.25
 
 
 def test_zero_leaves_everything_as_it_is() -> None:
@@ -105,7 +147,7 @@ def test_who_may_not_have_it_is_told_how_to_get_it() -> None:
 def test_work_that_takes_its_time_is_ordinary_meanwhile_and_so_is_what_it_starts() -> None:
     done = subprocess.run([sys.executable, "-c", _AS_ORDINARY], capture_output=True, text=True, timeout=60, check=True)
     before, meanwhile, other_thread, after = json.loads(done.stdout)
-    assert before == after == [os.SCHED_FIFO, 7, os.SCHED_FIFO]
+    assert before == after == [os.SCHED_FIFO, 6, os.SCHED_FIFO]
     assert meanwhile == [os.SCHED_OTHER, 0, os.SCHED_OTHER]
     # The middleware still takes and sends what it has to.
     assert other_thread == [os.SCHED_FIFO]

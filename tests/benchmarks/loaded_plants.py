@@ -48,9 +48,17 @@ def loaded_plants(duration: float, *, real_time: bool = True) -> LoadedPlants:
         group, loops = running.group, running.loops
         bag = running.folder / "bag"
         start_console(group, running.environment, running.folder / "runs")
-        recording = ("record", "-o", bag, "--regex", "^/(sim|hw)/")
         priority = permitted(RECORDER_PRIORITY) if real_time else 0
-        recording += ("--ros-args", "-p", f"realtime_priority:={priority}")
+        recording = (
+            "record",
+            "-o",
+            bag,
+            "--regex",
+            "^/(sim|hw)/",
+            "--ros-args",
+            "-p",
+            f"realtime_priority:={priority}",
+        )
         recorder = group.start("pendulum_rosbag", *recording, env=running.environment)
         recorder.wait_for_output("ready", _START)
         for index in range(_BUSY_LOOPS):

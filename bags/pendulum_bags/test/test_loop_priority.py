@@ -38,6 +38,10 @@ def _policies(child: Child) -> set[tuple[int, int]]:
     return {(os.sched_getscheduler(thread), os.sched_getparam(thread).sched_priority) for thread in threads}
 
 
+def _real_time(priority: int) -> set[tuple[int, int]]:
+    return {(os.SCHED_FIFO, priority), (os.SCHED_FIFO, priority - 1)}
+
+
 @_allowed
 def test_plants_go_before_those_who_answer_them_and_both_before_all_else(tmp_path: Path, domain_id: int) -> None:
     others = {
@@ -55,18 +59,21 @@ def test_plants_go_before_those_who_answer_them_and_both_before_all_else(tmp_pat
             for program in programs
         ]
         for child, priority in started:
-            wait_for(lambda one=child, p=priority: _policies(one) == {(os.SCHED_FIFO, p)}, 60.0, child.name)  # type: ignore[misc]
+            wait_for(lambda one=child, p=priority: _policies(one) == _real_time(p), 60.0, child.name)  # type: ignore[misc]
 
 
 @_allowed
 def test_a_recorder_goes_behind_them_and_before_all_else(tmp_path: Path, domain_id: int) -> None:
     with ProcessSet(tmp_path, ros_environment(domain_id, tmp_path)) as processes:
         run = Session(processes, MagicMock(), tmp_path)
-        for simulated, expected in ((False, (os.SCHED_FIFO, RECORDER_PRIORITY)), (True, (os.SCHED_OTHER, 0))):
+        for simulated, expected in ((False, _real_time(RECORDER_PRIORITY)), (True, {(os.SCHED_OTHER, 0)})):
             child = run.record(tmp_path / f"bag_{simulated}", "/sim", {}, "mcap", simulated=simulated)
             wait_for(lambda one=child: "ready" in one.log.read_text(), 60.0, child.name)  # type: ignore[misc]
-            assert _policies(child) == {expected}
-    assert PLANT_PRIORITY > ANSWER_PRIORITY > RECORDER_PRIORITY > 0
+            assert _policies(child) == expected
+
+
+def test_all_threads_of_one_group_go_before_all_of_the_next() -> None:
+    assert PLANT_PRIORITY - 1 > ANSWER_PRIORITY > ANSWER_PRIORITY - 1 > RECORDER_PRIORITY > 1
 
 
 @_allowed

@@ -35,9 +35,9 @@ START_TIMEOUT = 60.0
 """Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
 PLANT_PRIORITY = 50
 """Real-time priority of a plant, where we may take it, as of ros2_control's controller manager."""
-ANSWER_PRIORITY = PLANT_PRIORITY - 1
-"""Real-time priority of who answers a plant's states: a design that takes a while must not keep a plant waiting."""
-RECORDER_PRIORITY = ANSWER_PRIORITY - 1
+ANSWER_PRIORITY = PLANT_PRIORITY - 2
+"""Real-time priority of who answers a plant's states: behind a plant's loop too, which is one behind its process."""
+RECORDER_PRIORITY = ANSWER_PRIORITY - 2
 """Real-time priority of a recorder: behind who has a deadline, whose messages would be lost for an ordinary one."""
 _LOOP_NICENESS = -10
 """Priority among ordinary programs of those who keep deadlines, where we may take it."""
