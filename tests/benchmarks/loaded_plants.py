@@ -49,16 +49,8 @@ def loaded_plants(duration: float, *, real_time: bool = True) -> LoadedPlants:
         bag = running.folder / "bag"
         start_console(group, running.environment, running.folder / "runs")
         priority = permitted(RECORDER_PRIORITY) if real_time else 0
-        recording = (
-            "record",
-            "-o",
-            bag,
-            "--regex",
-            "^/(sim|hw)/",
-            "--ros-args",
-            "-p",
-            f"realtime_priority:={priority}",
-        )
+        in_time = ("--ros-args", "-p", f"realtime_priority:={priority}")
+        recording = ("record", "-o", bag, "--regex", "^/(sim|hw)/", *in_time)
         recorder = group.start("pendulum_rosbag", *recording, env=running.environment)
         recorder.wait_for_output("ready", _START)
         for index in range(_BUSY_LOOPS):
