@@ -11,10 +11,12 @@ import resource
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.programs import realtime
 from pendulum_msgs_py.programs.realtime import as_ordinary, may_run_in_real_time, priority_kept, run_in_real_time
 
 _ASK = """
@@ -66,6 +68,7 @@ print(late)
 """
 _AS_ORDINARY = """
 import json, os, subprocess, sys, threading
+from pendulum_msgs_py.programs import realtime
 from pendulum_msgs_py.programs.realtime import as_ordinary, run_in_real_time
 
 def tell():
@@ -213,3 +216,48 @@ def test_who_has_lost_the_right_meanwhile_goes_on_without(monkeypatch: pytest.Mo
     worker.start()
     worker.join()
     assert told == [os.SCHED_OTHER]
+
+
+def test_threads_that_begin_or_end_meanwhile_are_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
+    promoted: list[int] = []
+    done = threading.Event()
+    late = threading.Thread(target=done.wait, daemon=True)
+
+    def promote(thread: int, *_: object) -> None:
+        if not promoted:
+            late.start()
+        promoted.append(thread)
+        if thread == late.native_id:
+            raise ProcessLookupError
+
+    monkeypatch.setattr(os, "sched_setscheduler", promote)
+    run_in_real_time(7)
+    done.set()
+    late.join()
+    assert late.native_id in promoted
+
+
+def test_a_system_that_does_not_tell_its_threads_has_no_real_time(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As FreeBSD does, or a container without /proc."""
+    monkeypatch.setattr(realtime, "_TASKS", tmp_path / "task")
+    assert not may_run_in_real_time(50)
+    with pytest.raises(ParameterError, match="this system has none"):
+        run_in_real_time(50)
+
+
+def test_who_asks_whether_it_may_and_who_is_ordinary_stay_as_they_are() -> None:
+    told: list[int] = []
+
+    def work() -> None:
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        may_run_in_real_time(7)
+        told.append(os.sched_getscheduler(0))
+        with as_ordinary():
+            told.append(os.sched_getscheduler(0))
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    worker.join()
+    assert told == [os.SCHED_BATCH] * 2
