@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pendulum_msgs_py.contract.commands import COMMANDER_HOLD, CommandGate, Refusal
+from pendulum_msgs_py.contract.commands import CommandGate, Refusal
 from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.rules import COMMANDER_HOLD
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 
 _MS = 1_000_000

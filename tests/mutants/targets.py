@@ -43,6 +43,11 @@ TARGETS: tuple[Target, ...] = (
     Target("pendulum_msgs_py.contract.supervisor", ("PlantSupervisor",), _RULES),
     Target("pendulum_msgs_py.contract.handover", ("Handover",), _RULES),
     Target("pendulum_msgs_py.contract.commands", ("CommandGate",), _RULES),
+    Target(
+        "pendulum_msgs_py.contract.rules",
+        ("judge_stamp", "is_ahead", "has_expired", "has_lapsed", "age_of", "is_inside", "within", "rise_within"),
+        _RULES,
+    ),
     Target("pendulum_msgs_py.contract.drive", ("PlantLimits", "Mode"), _RULES),
     Target(
         "pendulum_hw_bridge.settings",

@@ -11,15 +11,12 @@ import math
 from collections import Counter
 from enum import Enum
 
+from pendulum_msgs_py.contract import rules
 from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.rules import ACCEPTED, FUTURE_TOLERANCE_NS, NEVER, has_expired, is_ahead, judge_stamp
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, written
 
-__all__ = ["COMMANDER_HOLD", "CommandGate", "Refusal"]
-
-COMMANDER_HOLD = 1.0
-"""Silence after which another commander may take over [s]."""
-_FUTURE_TOLERANCE_NS = 5_000_000
-"""How far ahead of the plant's clock a stamp may lie [ns]."""
+__all__ = ["CommandGate", "Refusal"]
 
 
 class Refusal(str, Enum):
@@ -37,6 +34,15 @@ class Refusal(str, Enum):
     OUT_OF_ORDER = "out_of_order"
     DUPLICATE = "duplicate"
     SECOND_COMMANDER = "second_commander"
+
+
+_REFUSALS = {
+    rules.TOO_OLD: Refusal.TOO_OLD,
+    rules.FROM_FUTURE: Refusal.FROM_FUTURE,
+    rules.SECOND_COMMANDER: Refusal.SECOND_COMMANDER,
+    rules.DUPLICATE: Refusal.DUPLICATE,
+    rules.OUT_OF_ORDER: Refusal.OUT_OF_ORDER,
+}
 
 
 class CommandGate:
@@ -101,14 +107,9 @@ class CommandGate:
         newest = self._newest
         if newest is None:
             return None
-        # Measured from the stamp and from the moment of hearing it: a clock that jumps either way only shortens it.
-        age = now_ns - newest.stamp_ns
-        silence = now_ns - self._heard_ns
         # What has grown old stays old, whatever the clock does then: a torque does not return without a command.
-        self._expired = self._expired or age > self.timeout_ns or abs(silence) > self.timeout_ns
-        # Heard a little "later than now" is not only a clock that stepped back: a plant that catches up with periods
-        # it missed decides as of each of them.
-        return None if self._expired or age < -_FUTURE_TOLERANCE_NS else newest
+        self._expired = self._expired or has_expired(newest.stamp_ns, self._heard_ns, now_ns, self.timeout_ns)
+        return None if self._expired or is_ahead(newest.stamp_ns, now_ns) else newest
 
     @property
     def newest_stamp_ns(self) -> int | None:
@@ -134,22 +135,10 @@ class CommandGate:
         for effort in command.effort:
             if not math.isfinite(effort):
                 return Refusal.NOT_FINITE
-        if now_ns - command.stamp_ns > self.timeout_ns:
-            return Refusal.TOO_OLD
-        if command.stamp_ns - now_ns > _FUTURE_TOLERANCE_NS:
-            return Refusal.FROM_FUTURE
-        newest = self._newest
-        # A clock that jumped back leaves a last command "from the future": it no longer orders anything.
-        if newest is None or newest.stamp_ns - now_ns > _FUTURE_TOLERANCE_NS:
-            return None
-        silence = now_ns - self._heard_ns
-        if command.source != self._holder and 0 <= silence <= COMMANDER_HOLD * NANOSECONDS:
-            return Refusal.SECOND_COMMANDER
-        if command.stamp_ns == newest.stamp_ns:
-            return Refusal.DUPLICATE
-        if command.stamp_ns < newest.stamp_ns:
-            return Refusal.OUT_OF_ORDER
-        return None
+        newest_ns = NEVER if self._newest is None else self._newest.stamp_ns
+        other = command.source != self._holder
+        verdict = judge_stamp(command.stamp_ns, now_ns, self.timeout_ns, newest_ns, self._heard_ns, other)
+        return None if verdict == ACCEPTED else _REFUSALS[verdict]
 
     def _judge_names(self, joints: tuple[str, ...]) -> Refusal | None:
         if not joints and len(self.joints) == 1:
@@ -191,7 +180,7 @@ class CommandGate:
             Refusal.TOO_OLD: f"header.stamp is {age:.6g} s before the plant's time; expected at most "
             f"{self.timeout_ns / NANOSECONDS:g} s",
             Refusal.FROM_FUTURE: f"header.stamp is {-age:.6g} s after the plant's time; expected at most "
-            f"{_FUTURE_TOLERANCE_NS / NANOSECONDS:g} s",
+            f"{FUTURE_TOLERANCE_NS / NANOSECONDS:g} s",
             Refusal.OUT_OF_ORDER: f"header.stamp is {-since:.6g} s before that of the command before",
             Refusal.DUPLICATE: "header.stamp is that of the command before; expected one answer to a state",
             Refusal.SECOND_COMMANDER: f"header.frame_id is {command.source!r}; {self._holder!r} commands",

@@ -16,9 +16,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from operator import add
 
-from pendulum_msgs_py.contract.commands import COMMANDER_HOLD, CommandGate, Refusal
+from pendulum_msgs_py.contract.commands import CommandGate, Refusal
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Input, Mode, PlantLimits
 from pendulum_msgs_py.contract.handover import Handover
+from pendulum_msgs_py.contract.rules import age_of, has_lapsed, is_inside, rise_within, within
 from pendulum_msgs_py.contract.trajectory import MAX_RAMP_VELOCITY, Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector, written
 from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Joint
@@ -349,8 +350,7 @@ class PlantSupervisor:
 
     def _begin_refusal(self, command: JointCommand, now_ns: int) -> str:
         """Return why a commander may not begin, or an empty string; one that commands already may ask for anything."""
-        lapsed = now_ns - self._commanded_ns > COMMANDER_HOLD * NANOSECONDS
-        if self._commanding == command.source and not lapsed:
+        if self._commanding == command.source and not has_lapsed(self._commanded_ns, now_ns):
             return ""
         largest, who, unit = self.limits.start_effort, command.source or "a controller", self.coordinates.drive_unit
         if not _largest(command.effort) <= largest:
@@ -384,11 +384,7 @@ class PlantSupervisor:
         if math.isinf(self.limits.slew) or self._last_decision_ns is None:
             return effort
         step = self.limits.slew * max(0, now_ns - self._last_decision_ns) / NANOSECONDS
-        # Away from zero alone: torque that nobody asks for any more must not stay because it may only fall slowly.
-        return tuple(
-            min(max(last, 0.0) + step, max(min(last, 0.0) - step, wanted))
-            for last, wanted in zip(self._last_effort, effort, strict=True)
-        )
+        return tuple(rise_within(last, wanted, step) for last, wanted in zip(self._last_effort, effort, strict=True))
 
     def _measurement_fault(self, now_ns: int, sample: JointSample | None) -> str:
         limits = self.limits
@@ -402,7 +398,7 @@ class PlantSupervisor:
                 f"measurement is not finite: {written(sample.position)} {of_position}, "
                 f"{written(sample.velocity)} {of_velocity}, {written(sample.effort)} {of_effort}"
             )
-        age = (now_ns - sample.stamp_ns) / NANOSECONDS
+        age = age_of(sample.stamp_ns, now_ns)
         if age < -limits.feedback_timeout:
             # It would look fresh for as long, even if no other ever came.
             return f"measurement is stamped {-age * 1e3:.0f} ms ahead of the plant's clock"
@@ -412,21 +408,23 @@ class PlantSupervisor:
                 "is the machine too busy, or the link to the actuator lost?"
             )
         _, positions, velocities, _ = sample
-        # As many as there are joints: seen above, so that each look at them may be the fastest there is.
-        for low, position, high in zip(limits.position_min, positions, limits.position_max):  # noqa: B905
-            if not low <= position <= high:
-                return self._outside(sample)
         fastest = limits.velocity
-        for velocity in velocities:
-            if not -fastest <= velocity <= fastest:
-                return self._too_fast(sample)
+        # As many as there are joints: seen above, so that the look at them may be the fastest there is.
+        for low, position, high, velocity in zip(  # noqa: B905
+            limits.position_min, positions, limits.position_max, velocities
+        ):
+            if not is_inside(low, position, high, velocity, fastest):
+                return self._outside(sample) or self._too_fast(sample)
         return ""
 
     def _outside(self, sample: JointSample) -> str:
         limits = self.limits
         joints = zip(self.coordinates.joints, limits.position_min, sample.position, limits.position_max, strict=True)
-        joint, low, position, high = next(each for each in joints if not each[1] <= each[2] <= each[3])
-        return f"position{self._of(joint)} is {position:.3f} {joint.unit}; expected inside {low} to {high} {joint.unit}"
+        for joint, low, position, high in joints:
+            if not low <= position <= high:
+                of, unit = self._of(joint), joint.unit
+                return f"position{of} is {position:.3f} {unit}; expected inside {low} to {high} {unit}"
+        return ""
 
     def _too_fast(self, sample: JointSample) -> str:
         limit = self.limits.velocity
@@ -489,7 +487,4 @@ def _clamp(values: Vector, limits: Vector) -> Vector:
             break
     else:
         return values
-    return tuple(
-        0.0 if math.isnan(value) else min(limit, max(-limit, value))
-        for value, limit in zip(values, limits, strict=True)
-    )
+    return tuple(within(value, limit) for value, limit in zip(values, limits, strict=True))

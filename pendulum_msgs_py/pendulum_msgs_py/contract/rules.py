@@ -1,0 +1,114 @@
+"""The rules of a plant as functions of numbers, for one command or one joint at a time.
+
+Gates and supervisor call them as they stand here; the loops that run compiled compile these very functions. What they
+decide is named, counted and told by who calls them.
+"""
+
+from __future__ import annotations
+
+import math
+
+from pendulum_msgs_py.contract.values import NANOSECONDS
+
+__all__ = [
+    "ACCEPTED",
+    "COMMANDER_HOLD",
+    "DUPLICATE",
+    "FROM_FUTURE",
+    "FUTURE_TOLERANCE_NS",
+    "NEVER",
+    "OUT_OF_ORDER",
+    "SECOND_COMMANDER",
+    "TOO_OLD",
+    "age_of",
+    "has_expired",
+    "has_lapsed",
+    "is_ahead",
+    "is_inside",
+    "judge_stamp",
+    "rise_within",
+    "within",
+]
+
+COMMANDER_HOLD = 1.0
+"""Silence after which another commander may take over [s]."""
+FUTURE_TOLERANCE_NS = 5_000_000
+"""How far ahead of the plant's clock a stamp may lie [ns]."""
+NEVER = -(2**63)
+"""In the place of a stamp that there is none of."""
+
+ACCEPTED, TOO_OLD, FROM_FUTURE, SECOND_COMMANDER, DUPLICATE, OUT_OF_ORDER = range(6)
+"""What :func:`judge_stamp` answers."""
+_HOLD_NS = round(COMMANDER_HOLD * NANOSECONDS)
+
+
+def judge_stamp(stamp_ns: int, now_ns: int, timeout_ns: int, newest_ns: int, heard_ns: int, other: bool) -> int:
+    """Return whether a command's stamp and sender let it pass, or the first reason why not.
+
+    Args:
+        stamp_ns: Stamp of the command [ns].
+        now_ns: The plant's clock [ns].
+        timeout_ns: Age at which a command counts for nothing [ns].
+        newest_ns: Stamp of the newest command that passed [ns], or ``NEVER``.
+        heard_ns: When that one passed, on the plant's clock [ns].
+        other: Whether it comes from somebody else than that one.
+    """
+    if now_ns - stamp_ns > timeout_ns:
+        return TOO_OLD
+    if is_ahead(stamp_ns, now_ns):
+        return FROM_FUTURE
+    # A clock that jumped back leaves a last command "from the future": it no longer orders anything.
+    if newest_ns == NEVER or is_ahead(newest_ns, now_ns):
+        return ACCEPTED
+    if other and 0 <= now_ns - heard_ns <= _HOLD_NS:
+        return SECOND_COMMANDER
+    if stamp_ns == newest_ns:
+        return DUPLICATE
+    return OUT_OF_ORDER if stamp_ns < newest_ns else ACCEPTED
+
+
+def is_ahead(stamp_ns: int, now_ns: int) -> bool:
+    """Tell whether a stamp lies further ahead of the plant's clock than clocks may differ."""
+    return stamp_ns - now_ns > FUTURE_TOLERANCE_NS
+
+
+def has_expired(stamp_ns: int, heard_ns: int, now_ns: int, timeout_ns: int) -> bool:
+    """Tell whether a command is too old to act on.
+
+    Measured from the stamp and from the moment of hearing it: a clock that jumps either way only shortens it. Heard a
+    little "later than now" is not only a clock that stepped back: a plant that catches up with periods it missed
+    decides as of each of them.
+    """
+    return now_ns - stamp_ns > timeout_ns or abs(now_ns - heard_ns) > timeout_ns
+
+
+def has_lapsed(commanded_ns: int, now_ns: int) -> bool:
+    """Tell whether who commands has been silent so long that whoever comes begins."""
+    return now_ns - commanded_ns > _HOLD_NS
+
+
+def age_of(stamp_ns: int, now_ns: int) -> float:
+    """Return the age of a stamp [s]."""
+    return (now_ns - stamp_ns) / NANOSECONDS
+
+
+def is_inside(low: float, position: float, high: float, velocity: float, fastest: float) -> bool:
+    """Tell whether a joint is inside its window and not too fast; what is no number is neither."""
+    return low <= position <= high and -fastest <= velocity <= fastest
+
+
+def within(value: float, limit: float) -> float:
+    """Return a value within a limit either way, and nothing for what is no number."""
+    if -limit <= value <= limit:
+        return value
+    if math.isnan(value):
+        return 0.0
+    return limit if value > 0.0 else -limit
+
+
+def rise_within(last: float, wanted: float, step: float) -> float:
+    """Return an effort that rises from the last one by a step at most.
+
+    Away from zero alone: torque that nobody asks for any more must not stay because it may only fall slowly.
+    """
+    return min(max(last, 0.0) + step, max(min(last, 0.0) - step, wanted))
