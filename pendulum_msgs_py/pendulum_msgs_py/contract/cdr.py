@@ -16,6 +16,7 @@ Source: OMG CDR (formal/02-06-51, section 15.3); sensor_msgs/msg/JointState.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import NamedTuple
 
 from pendulum_msgs_py.contract.names import JOINT
@@ -24,16 +25,21 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, Vector
 __all__ = [
     "MAX_SECONDS",
     "JointStateFields",
+    "MessageTemplate",
     "decode_joint_state",
     "encode_clock",
     "encode_joint_state",
     "encode_joints",
+    "template_of",
 ]
 
 MAX_SECONDS = 2**31 - 1
 """Largest ``sec`` of a ROS time stamp."""
 
 _HEADER = b"\x00\x01\x00\x00"
+_PLAIN_CDR = b"\x00\x01"
+_MARK = struct.unpack("<d", b"\xff" * 8)[0]
+"""A number whose every byte differs from those of 0."""
 _PREFIX = struct.Struct("<4xiII")
 _COUNT = struct.Struct("<I")
 _TIME = struct.Struct("<iI")
@@ -53,6 +59,20 @@ class JointStateFields(NamedTuple):
     position: Vector
     velocity: Vector
     effort: Vector
+
+
+class MessageTemplate(NamedTuple):
+    """What all messages of one sender have in common, for who compares bytes.
+
+    Attributes:
+        data: A message, stamp and numbers zero; padding zero too.
+        mask: As long: 255 where a byte has to be the same, 0 in stamp, numbers and padding.
+        value_at: Where the numbers begin: of each quantity in turn, of each joint [bytes].
+    """
+
+    data: bytes
+    mask: bytes
+    value_at: tuple[int, ...]
 
 
 def encode_joints(
@@ -112,6 +132,40 @@ def encode_joint_state(
         () if velocity is None else (velocity,),
         () if effort is None else (effort,),
     )
+
+
+def template_of(fields: JointStateFields, size: int = 0) -> MessageTemplate:
+    """Return the template of the messages that have the same sender, joints and quantities as one.
+
+    Args:
+        fields: Of the message.
+        size: Its size, trailing bytes included; 0 for none of them [bytes].
+    """
+    quantities = fields[3:]
+    counts = tuple(len(quantity) for quantity in quantities)
+    layout, words = _layout(fields.frame_id, fields.joints, *counts)
+
+    def pack(same: tuple[object, ...], values: tuple[float, ...], tell: Callable[[int], int]) -> bytes:
+        numbers, rest = [], list(values)
+        for count in counts:
+            numbers += [tell(count), *rest[:count]]
+            del rest[:count]
+        return layout.pack(0, 0, *same, *numbers)
+
+    zeros = (0.0,) * sum(counts)
+    data = pack(words, zeros, lambda count: count)
+    same = tuple(b"\xff" * len(word) if isinstance(word, bytes) else 0xFFFFFFFF for word in words)
+    mask = pack(same, zeros, lambda _: 0xFFFFFFFF)
+    head = len(_HEADER)
+    value_at = []
+    for index in range(len(zeros)):
+        marked = pack(words, (*zeros[:index], _MARK, *zeros[index + 1 :]), lambda count: count)
+        value_at.append(head + next(at for at, (a, b) in enumerate(zip(marked, data, strict=True)) if a != b))
+    trailing = bytes(max(0, size - head - layout.size))
+    # The options of the encapsulation say nothing that is read here.
+    kept = _PLAIN_CDR + bytes(head - len(_PLAIN_CDR))
+    same_head = b"\xff" * len(_PLAIN_CDR) + bytes(head - len(_PLAIN_CDR))
+    return MessageTemplate(kept + data + trailing, same_head + mask + trailing, tuple(value_at))
 
 
 def encode_clock(stamp_ns: int) -> bytes:
@@ -223,7 +277,6 @@ class _KnownLayout(NamedTuple):
     effort_alone: tuple[int, int, int]
 
 
-_PLAIN_CDR = b"\x00\x01"
 _known_layouts: dict[tuple[int, bytes], _KnownLayout] = {}
 """One layout for each size of message and of its sender's name; the first comer's, so that two do not take turns."""
 

@@ -59,6 +59,11 @@ class ArrivalSignal:
         counted = [_count(entity, self._counter) for entity in entities]
         self.works = all(counted) and self._counter <= _LAST_DESCRIPTOR
 
+    @property
+    def descriptor(self) -> int:
+        """The counter, for who waits for it by other means, where this works."""
+        return self._counter
+
     def came(self) -> bool:
         """Return whether anything may have come since this was asked last."""
         if not self.works:

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import os
 import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.service import Service
+
+from pendulum_msgs_py.ros.rcl_structures import SerializedMessage, default_allocator, loaded_rcl
 
 __all__ = ["MOST_BYTES", "RequestHeader", "TooLarge", "send_response", "take_request"]
 
@@ -55,23 +56,6 @@ class RequestHeader(ctypes.Structure):
         ("source_timestamp", ctypes.c_int64),
         ("received_timestamp", ctypes.c_int64),
         ("request_id", _RequestId),
-    ]
-
-
-class _Allocator(ctypes.Structure):
-    """``rcutils_allocator_t``."""
-
-    _fields_ = [(name, ctypes.c_void_p) for name in ("allocate", "deallocate", "reallocate", "zero_allocate", "state")]
-
-
-class _Bytes(ctypes.Structure):
-    """``rcutils_uint8_array_t``, a serialised message."""
-
-    _fields_ = [
-        ("buffer", ctypes.c_void_p),
-        ("length", ctypes.c_size_t),
-        ("capacity", ctypes.c_size_t),
-        ("allocator", _Allocator),
     ]
 
 
@@ -120,7 +104,7 @@ def send_response(service: Service, send: Callable[[Any, Any], None], response: 
     kind = _kind(service.srv_type.Response)
     data = serialize_message(response)
     held = ctypes.create_string_buffer(data, len(data))
-    lent = _Bytes(ctypes.addressof(held), len(data), len(data), rcl.rcutils_get_default_allocator())
+    lent = SerializedMessage(ctypes.addressof(held), len(data), len(data), default_allocator())
     with service.handle:
         message = kind.create()
         try:
@@ -174,23 +158,19 @@ def _address(capsule: Any) -> int:
 @functools.cache
 def _rcl() -> Any:
     """Return the very library that rclpy has loaded, or None where it has not all that is called here."""
+    rcl = loaded_rcl()
     try:
-        # By its handle, what it is linked to is found as well: the middleware and its memory.
-        rcl = ctypes.CDLL("librcl.so", mode=os.RTLD_NOW | os.RTLD_NOLOAD)
-        pointer = ctypes.c_void_p
         for name in ("rcl_take_request_with_info", "rcl_send_response", "rmw_serialize", "rmw_deserialize"):
-            getattr(rcl, name).argtypes = [pointer, pointer, pointer]
+            getattr(rcl, name).argtypes = [ctypes.c_void_p] * 3
             getattr(rcl, name).restype = ctypes.c_int
-        rcl.rcutils_get_default_allocator.argtypes, rcl.rcutils_get_default_allocator.restype = [], _Allocator
-        rcl.rcutils_uint8_array_fini.argtypes = [pointer]
         rcl.rcutils_reset_error.argtypes, rcl.rcutils_reset_error.restype = [], None
-    except (AttributeError, OSError):
+    except AttributeError:
         return None
     return rcl
 
 
 def _serialized(rcl: Any, kind: _Kind, message: int) -> bytes | TooLarge:
-    made = _Bytes(None, 0, 0, rcl.rcutils_get_default_allocator())
+    made = SerializedMessage(None, 0, 0, default_allocator())
     try:
         _expect(rcl, rcl.rmw_serialize(message, kind.support, ctypes.byref(made)), "request was not understood")
         if made.length > MOST_BYTES:

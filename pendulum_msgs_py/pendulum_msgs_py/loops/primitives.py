@@ -1,0 +1,163 @@
+"""What compiled loops are made of: time, waiting, messages. Imported by the compiler's process alone.
+
+The functions of rcl are called as ``pendulum_rcl_...``: who loads a loop says where they are, so that they are those of
+the library that rclpy has loaded (:mod:`pendulum_msgs_py.ros.direct`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import llvmlite.binding as llvm
+import numba
+import numpy as np
+from numba import types
+
+from pendulum_msgs_py.contract.values import NANOSECONDS
+
+__all__ = [
+    "FAILED",
+    "NOTHING",
+    "ORDINARY",
+    "OTHER",
+    "compiled",
+    "entry",
+    "has_listeners",
+    "publish",
+    "sleep_until",
+    "steady_ns",
+    "take_one",
+    "wait_for",
+    "wall_ns",
+]
+
+_int, _address = types.int32, types.uintp
+_take = types.ExternalFunction("pendulum_rcl_take", _int(_address, _address, _address, _address))
+_publish = types.ExternalFunction("pendulum_rcl_publish", _int(_address, _address, _address))
+_count = types.ExternalFunction("pendulum_rcl_count", _int(_address, _address))
+_memcpy = types.ExternalFunction("memcpy", _address(_address, _address, _address))
+_get_time = types.ExternalFunction("clock_gettime", _int(_int, _address))
+_sleep = types.ExternalFunction("clock_nanosleep", _int(_int, _int, _address, _address))
+_poll = types.ExternalFunction("ppoll", _int(_address, types.uint64, _address, _address))
+_read = types.ExternalFunction("read", types.int64(_int, _address, _address))
+# Compiled here, called elsewhere: the linker in between only wants them to have an address.
+for _symbol in ("pendulum_rcl_take", "pendulum_rcl_publish", "pendulum_rcl_count"):
+    llvm.add_symbol(_symbol, 1)
+
+_WALL, _STEADY, _ABSOLUTE, _READABLE = 0, 1, 1, 1
+"""``CLOCK_REALTIME``, ``CLOCK_MONOTONIC``, ``TIMER_ABSTIME``, ``POLLIN``."""
+_STAMP_AT, _HEADER = 4, 4
+NOTHING, ORDINARY, OTHER, FAILED = range(4)
+"""What :func:`take_one` found: no message, one as expected, one that Python has to look at, or an error of rcl."""
+_TAKE_FAILED = 401
+"""``RCL_RET_SUBSCRIPTION_TAKE_FAILED``: there is none."""
+
+
+def compiled(function: Any) -> Any:
+    """Return a function compiled as Python would run it: not one operation fused or reordered."""
+    return numba.njit(error_model="numpy")(function)
+
+
+def entry(layout: np.dtype[Any]) -> Any:
+    """Return a decorator for the function of a loop, of one record."""
+    signature = types.int64(numba.from_dtype(layout))
+    return numba.njit(signature, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
+@compiled
+def steady_ns(time: Any) -> Any:
+    """Return the time of the monotonic clock [ns]."""
+    _get_time(_STEADY, time.now.ctypes.data)
+    return time.now[0] * NANOSECONDS + time.now[1]
+
+
+@compiled
+def wall_ns(time: Any) -> Any:
+    """Return the system time [ns]."""
+    _get_time(_WALL, time.now.ctypes.data)
+    return time.now[0] * NANOSECONDS + time.now[1]
+
+
+@compiled
+def sleep_until(time: Any, steady: Any) -> None:
+    """Sleep until a time of the monotonic clock [ns], or a signal."""
+    time.until[0] = steady // NANOSECONDS
+    time.until[1] = steady % NANOSECONDS
+    _sleep(_STEADY, _ABSOLUTE, time.until.ctypes.data, 0)
+
+
+@compiled
+def wait_for(time: Any, counter: Any, longest: Any) -> Any:
+    """Wait until an event counter has been added to, and empty it; return whether it was.
+
+    Args:
+        time: Record of ``TIME``.
+        counter: Its descriptor, which does not block.
+        longest: Longest wait [ns].
+    """
+    time.poll[0] = counter
+    time.poll[1] = _READABLE
+    time.until[0] = longest // NANOSECONDS
+    time.until[1] = longest % NANOSECONDS
+    if longest <= 0 or _poll(time.poll.ctypes.data, 1, time.until.ctypes.data, 0) <= 0:
+        return False
+    return _read(counter, time.until.ctypes.data, 8) == 8
+
+
+@compiled
+def matches(source: Any) -> Any:
+    """Read what was taken where it is as expected: stamp and numbers; return whether it is."""
+    size = source.size
+    if size == 0 or source.message[1] != size:
+        return False
+    _memcpy(source.data.ctypes.data, source.message[0], size)
+    different = np.uint8(0)
+    for index in range(size):
+        different |= (source.data[index] ^ source.template[index]) & source.mask[index]
+    if different != 0:
+        return False
+    _memcpy(source.stamp.ctypes.data, source.data.ctypes.data + np.uintp(_STAMP_AT), 8)
+    if source.stamp[1] >= NANOSECONDS:
+        return False
+    # The seconds are signed.
+    seconds = np.int64(source.stamp[0])
+    if seconds >= 2**31:
+        return False
+    source.stamp_ns = seconds * NANOSECONDS + np.int64(source.stamp[1])
+    values = source.value.ctypes.data
+    for index in range(source.value.shape[0]):
+        if source.value_at[index] > 0:
+            at = source.data.ctypes.data + np.uintp(source.value_at[index])
+            _memcpy(values + np.uintp(8 * index), at, 8)
+    return True
+
+
+@compiled
+def take_one(source: Any) -> Any:
+    """Take the oldest message of an input; return ``NOTHING``, ``ORDINARY``, ``OTHER`` or ``FAILED``."""
+    message, info = source.message.ctypes.data, source.info.ctypes.data
+    code = _take(source.subscription, message, info, 0)
+    if code == _TAKE_FAILED:
+        return NOTHING
+    if code != 0:
+        return FAILED
+    return ORDINARY if matches(source) else OTHER
+
+
+@compiled
+def publish(output: Any, stamp_ns: Any) -> Any:
+    """Publish the numbers of an output under a stamp [ns]; return whether the middleware took them."""
+    output.stamp[0] = np.uint32(stamp_ns // NANOSECONDS)
+    output.stamp[1] = np.uint32(stamp_ns % NANOSECONDS)
+    data = output.data.ctypes.data
+    _memcpy(data + np.uintp(_STAMP_AT), output.stamp.ctypes.data, 8)
+    for index in range(output.values):
+        at = data + np.uintp(output.value_at[index])
+        _memcpy(at, output.value.ctypes.data + np.uintp(8 * index), 8)
+    return _publish(output.publisher, output.message.ctypes.data, 0) == 0
+
+
+@compiled
+def has_listeners(output: Any) -> Any:
+    """Tell whether anybody is matched with an output."""
+    return _count(output.publisher, output.matched.ctypes.data) == 0 and output.matched[0] > 0

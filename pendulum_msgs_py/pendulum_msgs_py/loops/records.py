@@ -1,0 +1,102 @@
+"""What a compiled loop reads and writes: records with names, of numbers and of the bytes of messages.
+
+The layouts are numpy's, so that Python and compiled code see one memory. Messages have a fixed layout: a template that
+the bytes must equal but for stamp and numbers (:func:`pendulum_msgs_py.contract.cdr.template_of`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_msgs_py.contract.cdr import MessageTemplate
+
+__all__ = ["INPUT", "MESSAGE", "MOST_BYTES", "MOST_VALUES", "OUTPUT", "TIME", "expect_template", "set_template"]
+
+MOST_BYTES = 512
+"""Longest message that a loop reads or writes itself [bytes]; longer ones are Python's."""
+MOST_VALUES = 3
+"""Numbers in a message: position, velocity and effort of one joint."""
+
+TIME = np.dtype([("now", "i8", (2,)), ("until", "i8", (2,)), ("poll", "i4", (2,))], align=True)
+"""Where the C library puts the time, and is told one, in seconds and nanoseconds; a ``struct pollfd``."""
+
+MESSAGE = np.dtype(
+    [("buffer", "u8"), ("length", "u8"), ("capacity", "u8"), ("allocator", "u8", (5,))],
+    align=True,
+)
+"""``rcutils_uint8_array_t``: a serialised message."""
+
+INPUT = np.dtype(
+    [
+        ("subscription", "u8"),
+        ("message", "u8", (MESSAGE.itemsize // 8,)),
+        # rmw_message_info_t: when it was sent and when it came [ns], and more that nobody asks for.
+        ("info", "i8", (16,)),
+        ("size", "i8"),
+        ("template", "u1", (MOST_BYTES,)),
+        ("mask", "u1", (MOST_BYTES,)),
+        ("data", "u1", (MOST_BYTES,)),
+        ("value_at", "i8", (MOST_VALUES,)),
+        ("value", "f8", (MOST_VALUES,)),
+        ("stamp", "u4", (2,)),
+        ("stamp_ns", "i8"),
+        ("most", "i8"),
+    ],
+    align=True,
+)
+"""A subscription, the message that is expected there, and what the newest one said.
+
+``size`` is 0 where none is expected: whatever comes is Python's. ``most`` bounds the messages of one look.
+"""
+
+OUTPUT = np.dtype(
+    [
+        ("publisher", "u8"),
+        ("message", "u8", (MESSAGE.itemsize // 8,)),
+        ("size", "i8"),
+        ("data", "u1", (MOST_BYTES,)),
+        ("value_at", "i8", (MOST_VALUES,)),
+        ("value", "f8", (MOST_VALUES,)),
+        ("values", "i8"),
+        ("stamp", "u4", (2,)),
+        ("matched", "u8", (1,)),
+    ],
+    align=True,
+)
+"""A publisher, and the message that goes out there."""
+
+
+def expect_template(source: NDArray[Any], template: MessageTemplate | None) -> None:
+    """Say which message is expected of an input.
+
+    Args:
+        source: Record of :data:`INPUT`.
+        template: None where whatever comes is Python's.
+    """
+    source["size"] = 0
+    if template is None or len(template.data) > MOST_BYTES or len(template.value_at) > MOST_VALUES:
+        return
+    size = len(template.data)
+    source["template"][:size] = np.frombuffer(template.data, dtype=np.uint8)
+    source["mask"][:size] = np.frombuffer(template.mask, dtype=np.uint8)
+    source["value_at"][: len(template.value_at)] = template.value_at
+    source["size"] = size
+
+
+def set_template(output: NDArray[Any], template: MessageTemplate) -> None:
+    """Say which message goes out.
+
+    Args:
+        output: Record of :data:`OUTPUT`; its own message points at the bytes in it.
+        template: Of the message.
+    """
+    size = len(template.data)
+    output["data"][:size] = np.frombuffer(template.data, dtype=np.uint8)
+    output["value_at"][: len(template.value_at)] = template.value_at
+    output["values"] = len(template.value_at)
+    output["size"] = size
+    data_at = output["data"].ctypes.data
+    output["message"][:3] = (data_at, size, MOST_BYTES)

@@ -1,0 +1,82 @@
+"""Compiles the project's scalar functions with numba, from the very code that is also interpreted.
+
+Equations and rules stand once, in plain Python with ``math``. :func:`compile_tree` takes such a function with
+everything it calls and returns it compiled; on request with another module in the place of one that it uses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from types import FunctionType, ModuleType
+from typing import Any
+
+import numba
+
+from pendulum_msgs_py.programs.kept_kernels import name_symbols_apart
+
+__all__ = ["compile_tree", "tuple_loader"]
+
+# What is compiled here becomes part of kernels that are kept.
+name_symbols_apart()
+
+_OWN = "pendulum_"
+_NO_SUBSTITUTES: Mapping[ModuleType, ModuleType] = {}
+_cache: dict[tuple[Any, ...], Any] = {}
+
+
+def compile_tree(
+    function: Callable[..., Any],
+    *,
+    exact: bool = False,
+    inline: bool = False,
+    substitutes: Mapping[ModuleType, ModuleType] = _NO_SUBSTITUTES,
+) -> Any:
+    """Return a function, and those it calls, compiled.
+
+    Args:
+        function: A plain function of this project that uses scalars, tuples and ``math``.
+        exact: Give the very bits that Python gives; else a fused multiply-add may change the last one.
+        inline: Write each function into its caller: machine code that is told no functions can be kept on disk.
+        substitutes: Modules that are found in the place of those that the functions name.
+    """
+    key = (function, exact, inline, *substitutes.items())
+    if key not in _cache:
+        assert isinstance(function, FunctionType)
+        scope = dict(function.__globals__)
+        for name in function.__code__.co_names:
+            value = scope.get(name)
+            if isinstance(value, FunctionType) and value.__module__.startswith(_OWN):
+                scope[name] = compile_tree(value, exact=exact, inline=inline, substitutes=substitutes)
+            elif isinstance(value, ModuleType) and value in substitutes:
+                scope[name] = substitutes[value]
+        copy = FunctionType(function.__code__, scope, function.__name__, function.__defaults__, function.__closure__)
+        # Of fastmath nothing but contraction is allowed. C code calls none of these: a wrapper for it would only cost
+        # time to compile.
+        allowed = False if exact else {"contract"}
+        _cache[key] = numba.njit(copy, fastmath=allowed, error_model="numpy", forceinline=inline, no_cfunc_wrapper=True)
+    return _cache[key]
+
+
+@cache
+def tuple_loader(length: int, stride: int) -> Any:
+    """Return a compiled function (array, start) -> (array[start], array[start + stride], ...).
+
+    Args:
+        length: Values to load, >= 1; compiled code needs to know it.
+        stride: Distance between two of them.
+    """
+    offset = (length - 1) * stride
+    if length == 1:
+
+        def load(array: Any, start: int) -> Any:
+            return (array[start],)
+
+    else:
+        others = tuple_loader(length - 1, stride)
+
+        def load(array: Any, start: int) -> Any:
+            # Not (*others, x): compilers of Python 3.10 to 3.12 spell that differently, and numba follows late.
+            return others(array, start) + (array[start + offset],)  # noqa: RUF005
+
+    return numba.njit(load, forceinline=True, no_cfunc_wrapper=True)
