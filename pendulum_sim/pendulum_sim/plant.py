@@ -17,11 +17,20 @@ from pendulum_msgs_py.dynamics import rigid_energy
 from pendulum_msgs_py.dynamics.steps import actuator_torque
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, advance_dry, is_dry
-from pendulum_sim.integrators import Coefficients, PlantTuple, get_integrator
+from pendulum_sim.dry_friction import LAG, PACKED, acceleration_with_friction, advance_dry, is_dry
+from pendulum_sim.integrators import Acceleration, Coefficients, PlantTuple, Step, get_integrator
 from pendulum_sim.stability import check_stability
 
-__all__ = ["DelayLine", "Plant", "PlantState", "RigidPlant", "command_within", "pack", "period_segments"]
+__all__ = [
+    "DelayLine",
+    "Plant",
+    "PlantState",
+    "RigidPlant",
+    "advance_rigid",
+    "command_within",
+    "pack",
+    "period_segments",
+]
 
 _MAX_DELAY_STEPS = 100_000
 
@@ -80,17 +89,17 @@ class DelayLine:
             raise ParameterError(f"transport_delay is {delay} s; expected at most {_MAX_DELAY_STEPS * dt} s")
         self.whole = math.floor(periods)
         self.fraction = periods - self.whole
-        self._line: deque[float] = deque(maxlen=self.whole + 2)
+        self.line: deque[float] = deque(maxlen=self.whole + 2)
         self.clear()
 
     def clear(self) -> None:
         """Fill the line with zero torque."""
-        self._line.extend([0.0] * (self.whole + 2))
+        self.line.extend([0.0] * (self.whole + 2))
 
     def push(self, command: float) -> tuple[float, float]:
         """Take the command of this period; return those before and after its broken part [N m]."""
-        self._line.append(command)
-        return self._line[0], self._line[1]
+        self.line.append(command)
+        return self.line[0], self.line[1]
 
 
 def period_segments(dt: float, fraction: float, substeps: int) -> list[tuple[bool, float]]:
@@ -117,6 +126,51 @@ def pack(parameters: PlantParameters) -> PlantTuple:
     return tuple(float(getattr(parameters, name)) for name in PACKED)
 
 
+def advance_rigid(
+    step: Step,
+    coefficients_of: object,
+    acceleration: Acceleration,
+    theta: float,
+    theta_dot: float,
+    torque: float,
+    command: float,
+    push: float,
+    h: float,
+    c: Coefficients,
+    plant: PlantTuple,
+    dry: bool,
+) -> tuple[float, float, float]:
+    """Return (theta, theta_dot, torque of the actuator) of a rigid link after h, under one command.
+
+    Args:
+        step: Step function of the integrator.
+        coefficients_of: Its coefficient function, for steps cut short by an event.
+        acceleration: :func:`pendulum_sim.dry_friction.acceleration_with_friction`, compiled or not.
+        theta: Angle [rad].
+        theta_dot: Velocity [rad/s].
+        torque: Torque of the actuator at the start [N m].
+        command: Commanded torque during the step [N m].
+        push: Torque on the link itself [N m].
+        h: Step [s].
+        c: Coefficients for h.
+        plant: Parameters, packed.
+        dry: Whether it has dry friction, :func:`pendulum_sim.dry_friction.is_dry`.
+    """
+    lag = plant[LAG]
+    if dry:
+        theta, theta_dot = advance_dry(
+            step, coefficients_of, acceleration, theta, theta_dot, torque, command, push, h, c, plant
+        )
+        return theta, theta_dot, actuator_torque(torque, command, h, lag)
+    torque_0 = command if lag == 0.0 else torque
+    torque_mid = actuator_torque(torque, command, 0.5 * h, lag)
+    torque = actuator_torque(torque, command, h, lag)
+    theta, theta_dot = step(
+        acceleration, theta, theta_dot, torque_0 + push, torque_mid + push, torque + push, 0.0, h, c, plant
+    )
+    return theta, theta_dot, torque
+
+
 class RigidPlant:
     """One rigid link: the equation of the thesis, and dry friction, lag and delay where it has them.
 
@@ -140,18 +194,17 @@ class RigidPlant:
         self.method = method
         self._step = integrator.step
         self._coefficients_of = integrator.coefficients
-        self._delay = DelayLine(parameters.transport_delay, dt)
+        self.delay = DelayLine(parameters.transport_delay, dt)
         rate = parameters.damping / parameters.inertia
-        self._segments: Sequence[tuple[bool, float, Coefficients]] = [
+        self.segments: Sequence[tuple[bool, float, Coefficients]] = [
             (newer, h, integrator.coefficients(rate, h))
-            for newer, h in period_segments(dt, self._delay.fraction, substeps)
+            for newer, h in period_segments(dt, self.delay.fraction, substeps)
         ]
-        check_stability(integrator, parameters, dt, substeps, max(h for _, h, _ in self._segments))
-        self._packed = pack(parameters)
+        check_stability(integrator, parameters, dt, substeps, max(h for _, h, _ in self.segments))
+        self.packed = pack(parameters)
         self._limit = parameters.effort_limit
-        self._dry = is_dry(self._packed)
-        self._lag = parameters.actuator_time_constant
-        self._steps = 0
+        self.dry = is_dry(self.packed)
+        self.steps = 0
         self.theta = 0.0
         self.theta_dot = 0.0
         self.effort = 0.0
@@ -159,7 +212,7 @@ class RigidPlant:
     @property
     def state(self) -> PlantState:
         """The present state."""
-        return PlantState(self._steps * self.dt, self.theta, self.theta_dot, self.effort)
+        return PlantState(self.steps * self.dt, self.theta, self.theta_dot, self.effort)
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
         """Start anew, the actuator without torque and no command on its way.
@@ -173,8 +226,8 @@ class RigidPlant:
         """
         check_start(theta, theta_dot)
         self.theta, self.theta_dot, self.effort = float(theta), float(theta_dot), 0.0
-        self._steps = 0
-        self._delay.clear()
+        self.steps = 0
+        self.delay.clear()
         return self.state
 
     def step(self, effort: float, push: float = 0.0) -> PlantState:
@@ -187,48 +240,26 @@ class RigidPlant:
         Raises:
             ParameterError: One of them is not finite (nothing moves then).
         """
-        older, newer = self._delay.push(command_within(self._limit, effort, push))
+        older, newer = self.delay.push(command_within(self._limit, effort, push))
         theta, theta_dot, torque = self.theta, self.theta_dot, self.effort
-        lag = self._lag
-        for is_newer, h, c in self._segments:
-            command = newer if is_newer else older
-            if self._dry:
-                theta, theta_dot = advance_dry(
-                    self._step,
-                    self._coefficients_of,
-                    acceleration_with_friction,
-                    theta,
-                    theta_dot,
-                    torque,
-                    command,
-                    push,
-                    h,
-                    c,
-                    self._packed,
-                )
-                torque = actuator_torque(torque, command, h, lag)
-                continue
-            if lag == 0.0:
-                torque_0 = torque_mid = torque = command
-            else:
-                torque_0 = torque
-                torque_mid = actuator_torque(torque, command, 0.5 * h, lag)
-                torque = actuator_torque(torque, command, h, lag)
-            theta, theta_dot = self._step(
+        for is_newer, h, c in self.segments:
+            theta, theta_dot, torque = advance_rigid(
+                self._step,
+                self._coefficients_of,
                 acceleration_with_friction,
                 theta,
                 theta_dot,
-                torque_0 + push,
-                torque_mid + push,
-                torque + push,
-                0.0,
+                torque,
+                newer if is_newer else older,
+                push,
                 h,
                 c,
-                self._packed,
+                self.packed,
+                self.dry,
             )
         self.theta, self.theta_dot, self.effort = theta, theta_dot, torque
-        self._steps += 1
-        return PlantState(self._steps * self.dt, theta, theta_dot, torque)
+        self.steps += 1
+        return PlantState(self.steps * self.dt, theta, theta_dot, torque)
 
     @property
     def energy(self) -> float:

@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.contract.plant_specs import (
+    COMPILED,
     LIMIT_SPECS,
     LOCKSTEP_EPOCH_NS,
     LOOP_SPECS,
@@ -26,12 +27,14 @@ from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector
 from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.loops.machine_code import NoMachineCodeError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism
 from pendulum_msgs_py.programs.executables import report_error
 from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.compiled_periods import CompiledPeriods
 from pendulum_msgs_py.ros.convert import sample_from_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
@@ -41,6 +44,7 @@ from pendulum_msgs_py.ros.runner import run_node
 from pendulum_sim.engines import OWN, Engine
 from pendulum_sim.guarded_plant import PaceWatch, StallWatch
 from pendulum_sim.joint_plant import joint_plant, random_start
+from pendulum_sim.loop_plant import loop_plant
 from pendulum_sim.sensors import SENSOR_SPECS, Sensors
 from pendulum_sim.servo import PositionServo
 
@@ -48,6 +52,8 @@ __all__ = ["SPECS", "SimulatorNode", "main", "run_engine"]
 
 _SENSOR_PREFIX = "sensor."
 _ONE_FOR_ALL = [0.0]
+_LONGEST_COMPILED = 0.005
+"""Longest period that is worth it, and that whoever stops the plant waits for [s]."""
 _LEAST_PERIODS = 2.0
 """Age in periods that a command may reach at least."""
 
@@ -65,6 +71,7 @@ _SHARED_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("armed_at_start", True, "", "Arm without being asked; nothing real moves here.", read_only=True),
     ParameterSpec("paused", False, "", "Start paused, until ~/pause or ~/step says otherwise.", read_only=True),
     *LOOP_SPECS,
+    COMPILED,
     *LIMIT_SPECS,
     *(replace(spec, name=_SENSOR_PREFIX + spec.name, read_only=True) for spec in SENSOR_SPECS),
 )
@@ -123,7 +130,7 @@ class SimulatorNode(PollingNode):
             self,
             self._supervisor,
             (lambda: self._loop.now_ns if self._loop else LOCKSTEP_EPOCH_NS) if self._lockstep else wall,
-            polled=not self._lockstep,
+            polled=True,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
             on_command=self._on_command if self._lockstep else None,
@@ -142,6 +149,7 @@ class SimulatorNode(PollingNode):
         else:
             self._loop = RealtimeLoop(self._interface, self._advance, self._statistics, wall)
             self._stamp_ns = wall()
+        self._loop.compiled, self._told_loop = self._compile(period_ns)
         self._loop.paused = values["paused"]
         self._check_start(values)
         self._restart(*self._start_state(values))
@@ -164,6 +172,30 @@ class SimulatorNode(PollingNode):
         self._interface.safe_stop("simulator ends")
         self._interface.publish_applied(self._stamp_ns, self._no_effort)
         self._interface.close()
+
+    def _compile(self, period_ns: int) -> tuple[CompiledPeriods | None, str]:
+        """Return what runs ordinary periods compiled, or None, and how to tell of it."""
+        try:
+            if not self._settings["compiled"]:
+                raise NoMachineCodeError("compiled is false")
+            if not self._lockstep and self._dt > _LONGEST_COMPILED:
+                raise NoMachineCodeError(f"a period is longer than {_LONGEST_COMPILED:g} s")
+            if not self._sensors.ideal:
+                raise NoMachineCodeError("sensors are not ideal")
+            periods = CompiledPeriods(
+                self._interface,
+                loop_plant(self._simulation.plant),
+                period_ns,
+                clock=None if self._lockstep else self._wall,
+                clock_publisher=self._loop.clock_publisher if self._lockstep else None,
+                done=self._note_periods,
+            )
+        except NoMachineCodeError as error:
+            return None, f"interpreted: {error}"
+        return periods, "compiled"
+
+    def _note_periods(self, stamp_ns: int) -> None:
+        self._state, self._stamp_ns = self._plant.state, stamp_ns
 
     # --- the loop ------------------------------------------------------------------------------------------
 
@@ -363,6 +395,7 @@ class SimulatorNode(PollingNode):
             PLANT_PARAMETERS: self._told_plant,
             "method": self._simulation.method,
             "clock": values["clock"],
+            "loop": self._told_loop,
             "paused": self._loop.paused,
             "samples_dropped": self._sensors.dropped,
         }

@@ -127,7 +127,7 @@ def test_a_symbol_that_another_process_may_have_as_well_is_not_kept(
 
 def test_nothing_is_taken_that_other_source_was_compiled_to(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kernel(double)(2.0)
-    monkeypatch.setattr(kept_kernels, "source_of", lambda package: "changed")
+    monkeypatch.setattr(kept_kernels, "_source_of", lambda package: "changed")
     changed, after = kernel(double), kernel(double)
     assert (changed(2.0), taken(changed)) == (5.0, False)
     assert (after(2.0), taken(after)) == (5.0, True)
@@ -142,7 +142,7 @@ def test_what_another_version_kept_is_not_read_where_its_modules_are_gone(
     head, _, _ = file.read_bytes().partition(b"\n")
     content = b"cpendulum_msgs_py.no_longer_there\nkernel\n."
     file.write_bytes(head.split()[0] + b" " + hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
-    monkeypatch.setattr(kept_kernels, "source_of", lambda package: "of another version")
+    monkeypatch.setattr(kept_kernels, "_source_of", lambda package: "of another version")
     changed = kernel(double)
     assert (changed(2.0), taken(changed)) == (5.0, False)
 
@@ -176,7 +176,7 @@ def test_a_module_of_somebody_else_is_known_by_its_source(
     theirs = importlib.import_module("their_law")
     kernel(theirs.law)(2.0)
     (tmp_path / "their_law.py").write_text(THEIRS.format(factor=30.0), encoding="utf-8")
-    kept_kernels.source_of.cache_clear()
+    kept_kernels._source_of.cache_clear()
     importlib.invalidate_caches()
     changed = kernel(importlib.reload(theirs).law)
     assert (changed(2.0), taken(changed)) == (61.0, False)

@@ -12,6 +12,7 @@ from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.parameters import ParameterSpec
 
 __all__ = [
+    "COMPILED",
     "LIMIT_SPECS",
     "LOCKSTEP_EPOCH_NS",
     "LOOP_SPECS",
@@ -33,6 +34,15 @@ REALTIME_PRIORITY = ParameterSpec(
     read_only=True,
 )
 """Of all who keep a plant's time, or answer in it."""
+
+COMPILED = ParameterSpec(
+    "compiled",
+    True,
+    "",
+    "Run ordinary periods in compiled code where it can be had; diagnostics say which.",
+    read_only=True,
+)
+"""Likewise."""
 
 LOOP_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(

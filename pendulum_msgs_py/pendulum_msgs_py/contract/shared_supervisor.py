@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from pendulum_msgs_py.contract.commands import Refusal
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
@@ -39,11 +41,36 @@ class SharedSupervisor(PlantSupervisor):
         follows: bool = True,
     ) -> None:
         self._lock = threading.RLock()
+        self._counting = threading.Lock()
+        self._waiting = ctypes.c_int64(0)
         self._prepare = prepare
         self._withdraw = withdraw
         self._measure = measure
         self._not_prepared = ""
         super().__init__(limits, preflight=lambda: self._not_prepared, coordinates=coordinates, follows=follows)
+
+    @property
+    def waiting_at(self) -> int:
+        """Address of an ``int64`` that counts who waits for :meth:`alone` to end, for compiled code to look at."""
+        return ctypes.addressof(self._waiting)
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep everybody else from the supervisor; who comes in the meantime is counted and waits."""
+        with self._lock:
+            yield
+
+    @contextlib.contextmanager
+    def _in_turn(self) -> Iterator[None]:
+        """Take the lock, and let compiled code that has it know that somebody wants it."""
+        with self._counting:
+            self._waiting.value += 1
+        try:
+            with self._lock:
+                yield
+        finally:
+            with self._counting:
+                self._waiting.value -= 1
 
     def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
         """Offer a message of an input."""
@@ -52,27 +79,27 @@ class SharedSupervisor(PlantSupervisor):
 
     def set_commander_conflict(self, conflict: str) -> None:
         """Report several publishers behind one name."""
-        with self._lock:
+        with self._in_turn():
             super().set_commander_conflict(conflict)
 
     def accept_trajectory(self, trajectory: Trajectory, now_ns: int, sample: JointSample) -> str:
         """Start to follow a trajectory."""
         # Points are made here, where nobody waits: under the lock they would keep the actuator and the e-stop.
         trajectory = trajectory.from_position(sample.position[0])
-        with self._lock:
+        with self._in_turn():
             return super().accept_trajectory(trajectory, now_ns, sample)
 
     def arm(self, now_ns: int, sample: JointSample | None) -> str:
         """Have the strategy set and confirmed, then arm."""
         if self.mode is not Mode.DISARMED:
-            with self._lock:
+            with self._in_turn():
                 return super().arm(now_ns, sample)
         self._not_prepared = self._prepare()
         if self._not_prepared:
             return self._not_prepared
         if self._measure is not None:
             now_ns, sample = self._measure()
-        with self._lock:
+        with self._in_turn():
             refusal = super().arm(now_ns, sample)
         if refusal:
             self._withdraw()
@@ -80,22 +107,22 @@ class SharedSupervisor(PlantSupervisor):
 
     def disarm(self, now_ns: int, reason: str = "disarmed on request") -> None:
         """Release the drive."""
-        with self._lock:
+        with self._in_turn():
             super().disarm(now_ns, reason)
 
     def e_stop(self, now_ns: int, reason: str = "e-stop pressed") -> None:
         """Latch the e-stop."""
-        with self._lock:
+        with self._in_turn():
             super().e_stop(now_ns, reason)
 
     def e_stop_reset(self, now_ns: int) -> str:
         """Leave the e-stop for disarmed."""
-        with self._lock:
+        with self._in_turn():
             return super().e_stop_reset(now_ns)
 
     def fault(self, reason: str, now_ns: int) -> None:
         """Go to the fault state."""
-        with self._lock:
+        with self._in_turn():
             super().fault(reason, now_ns)
 
     def decide(self, now_ns: int, sample: JointSample | None) -> Drive:

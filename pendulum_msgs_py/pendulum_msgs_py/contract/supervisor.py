@@ -229,6 +229,11 @@ class PlantSupervisor:
         names = self.coordinates.names
         return f"plant has {', '.join(names)} and follows no trajectory; one that does has one joint alone"
 
+    @staticmethod
+    def commanded_by(source: str) -> str:
+        """Return the reason of a plant that does what somebody commands."""
+        return f"commanded by {source or 'an unnamed node'}"
+
     # --- inside --------------------------------------------------------------------------------------------
 
     def _keep_pace(self, now_ns: int) -> None:
@@ -279,7 +284,7 @@ class PlantSupervisor:
                 self._last_effort = self._applied
                 self._last_decision_ns = self._commanded_ns = now_ns
                 self._commanding = command.source
-                self._enter(Mode.EFFORT, f"commanded by {command.source or 'an unnamed node'}", now_ns)
+                self._enter(Mode.EFFORT, self.commanded_by(command.source), now_ns)
                 return None
         return self._hold(handover, remaining, position, velocity, push)
 
@@ -336,7 +341,7 @@ class PlantSupervisor:
         self.saturated_periods += saturated
         self._last_effort = effort
         self._last_decision_ns = now_ns
-        self.reason = f"commanded by {command.source or 'an unnamed node'}"
+        self.reason = self.commanded_by(command.source)
         return Drive(
             DriveKind.EFFORT,
             effort,

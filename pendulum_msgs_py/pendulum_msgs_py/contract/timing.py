@@ -24,11 +24,12 @@ class SteadyWallClock:
         self, wall: Callable[[], int] = time.time_ns, monotonic: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self._monotonic = monotonic
-        self._offset = wall() - monotonic()
+        self.ahead_ns = wall() - monotonic()
+        """How far this clock is ahead of the monotonic one [ns]."""
 
     def __call__(self) -> int:
         """Return the time [ns]."""
-        return self._monotonic() + self._offset
+        return self._monotonic() + self.ahead_ns
 
 
 class RingOfTimes:

@@ -1,7 +1,7 @@
 """Machine code of loops: compiled once by numba in a process of its own, kept on disk, loaded without numba.
 
-To import numba takes a program half a second of the processor and 60 MB; to load what it has compiled takes a tenth of
-the one and half of the other. A loop is one function of one record of numbers (:mod:`numpy.dtype`), which all that it
+To import numba takes a program half a second of the processor and 60 MB; to load what it has compiled takes neither.
+A loop is one function of one record of numbers (:mod:`numpy.dtype`), which all that it
 reads and writes is in, and of symbols that its caller names.
 """
 
@@ -13,11 +13,9 @@ import fcntl
 import hashlib
 import importlib
 import importlib.metadata
-import importlib.util
 import json
 import os
 import platform
-import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -28,7 +26,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.programs.kept_kernels import source_of
+from pendulum_msgs_py.loops.object_file import link, undefined_symbols
 from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["Loop", "NoMachineCodeError", "compile_loop", "load_loop"]
@@ -66,11 +64,10 @@ def load_loop(builder: str, *choice: str, symbols: Mapping[str, int]) -> Loop:
 
 @cache
 def _load(builder: str, choice: tuple[str, ...], symbols: tuple[tuple[str, int], ...]) -> Loop:
-    if sys.platform != "linux" or struct.calcsize("P") != 8:
-        raise NoMachineCodeError(f"compiled loops are for Linux of 64 bits; this is {platform.platform()}")
-    for library in ("numba", "llvmlite"):
-        if importlib.util.find_spec(library) is None:
-            raise NoMachineCodeError(f"{library} is not installed")
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        raise NoMachineCodeError(
+            f"loops are compiled on Linux for x86_64; this is {sys.platform}, {platform.machine()}"
+        )
     path = _path(builder, choice)
     kept = _read(path)
     if kept is None:
@@ -79,35 +76,31 @@ def _load(builder: str, choice: tuple[str, ...], symbols: tuple[tuple[str, int],
         if kept is None:
             raise NoMachineCodeError(f"{path} cannot be read back")
     head, code = kept
-    return _Linked(head["name"], head["symbols"], code, dict(symbols))
+    return _LoadedLoop(head["name"], code, dict(symbols))
 
 
-class _Linked:
-    """Machine code in this process."""
+class _LoadedLoop:
+    """Machine code in this process.
 
-    def __init__(self, name: str, needed: list[str], code: bytes, symbols: dict[str, int]) -> None:
-        import llvmlite.binding as llvm
+    Args:
+        name: Of its function.
+        code: Object file.
+        symbols: Addresses of what it calls.
+    """
 
+    def __init__(self, name: str, code: bytes, symbols: Mapping[str, int]) -> None:
         known = {**_addresses(), **symbols}
-        missing = [symbol for symbol in needed if not known.get(symbol)]
+        missing = sorted(symbol for symbol in undefined_symbols(code) if not known.get(symbol))
         if missing:
             raise NoMachineCodeError(f"{', '.join(missing)} is not there to be called")
-        llvm.initialize_native_target()
-        llvm.initialize_native_asmprinter()
-        for symbol in needed:
-            llvm.add_symbol(symbol, known[symbol])
-        machine = llvm.Target.from_default_triple().create_target_machine(jit=True)
-        # The engine owns the memory that the code is in: it lives as long as the loop.
-        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-        self._engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(code))
-        self._engine.finalize_object()
-        address = self._engine.get_function_address(name)
-        if not address:
-            raise NoMachineCodeError(f"the code has no function {name}")
+        try:
+            self._code = link(code, known)
+        except (OSError, ValueError) as error:
+            raise NoMachineCodeError(f"the code cannot be loaded: {error}") from error
         # Numba's convention (its manual, "calling conventions"): status = f(result, exception, arguments). Called
         # through ctypes, without Python's lock.
         pointer = ctypes.c_void_p
-        self._call = ctypes.CFUNCTYPE(ctypes.c_int32, pointer, pointer, pointer)(address)
+        self._call = ctypes.CFUNCTYPE(ctypes.c_int32, pointer, pointer, pointer)(self._code.addresses[name])
 
     def __call__(self, record: NDArray[Any]) -> int:
         result, exception = ctypes.c_int64(), ctypes.c_void_p()
@@ -133,29 +126,38 @@ def _addresses() -> dict[str, int]:
 
 
 def _path(builder: str, choice: tuple[str, ...]) -> Path:
-    """Return where the code of a loop is kept: a file for each choice, source, compiler and kind of processor."""
-    import llvmlite.binding as llvm
-
+    """Return where the code of a loop is kept: a file for each choice, compiler and kind of processor."""
     module, _, function = builder.partition(":")
-    packages = sorted({"pendulum_msgs_py", module.partition(".")[0]})
-    for package in packages:
-        importlib.import_module(package)
-    versions = [importlib.metadata.version(each) for each in ("numba", "llvmlite", "numpy")]
-    processor = [llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()]
-    known = json.dumps([builder, choice, [source_of(each) for each in packages], versions, processor, sys.version])
+    package = module.partition(".")[0]
+    try:
+        versions = [importlib.metadata.version(each) for each in ("numba", "llvmlite", "numpy")]
+    except importlib.metadata.PackageNotFoundError as error:
+        raise NoMachineCodeError(f"{error.name} is not installed") from error
+    known = json.dumps([builder, choice, versions, _processor(), sys.version])
     digest = hashlib.sha256(known.encode()).hexdigest()[:24]
-    home = Path(str(sys.modules[packages[-1]].__file__)).parent / "__pycache__"
+    home = Path(str(importlib.import_module(package).__file__)).parent / "__pycache__"
     if not os.access(home if home.exists() else home.parent, os.W_OK):
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pendulum"
-    return home / f"{function}-{'-'.join(choice)}-{digest}.loop"
+    return home / f"{'-'.join((function, *choice, digest))}.loop"
+
+
+@cache
+def _processor() -> str:
+    """Return what the kernel tells of the first processor that matters to a compiler: its model, and what it can do."""
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").partition("\n\n")[0].splitlines()
+        return "\n".join(line for line in lines if line.startswith(("model name", "flags")))
+    return platform.processor()
 
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes] | None:
-    """Return what is known of the code and the code itself; None where none is kept, or what is kept is damaged."""
+    """Return what is known of the code and the code itself; None where it is damaged, of other source, or not there."""
     with contextlib.suppress(OSError, ValueError, KeyError):
         line, _, code = path.read_bytes().partition(b"\n")
         head = json.loads(line)
-        if head["digest"] == hashlib.sha256(code).hexdigest():
+        if head["digest"] == _digest(code) and all(
+            _digest(Path(source).read_bytes()) == digest for source, digest in head["sources"].items()
+        ):
             return head, code
     return None
 
@@ -209,37 +211,17 @@ def compile_loop(path: Path, builder: str, *choice: str) -> None:
     code = compiled.library._get_compiled_object()
     head = {
         "name": compiled.fndesc.llvm_func_name,
-        "symbols": sorted(undefined_symbols(code)),
-        "digest": hashlib.sha256(code).hexdigest(),
+        "digest": _digest(code),
+        # All that was imported to build it: nothing else can have changed it.
+        "sources": {path: _digest(Path(path).read_bytes()) for path in _own_sources()},
     }
     write_whole(path, json.dumps(head).encode() + b"\n" + code)
 
 
-_ELF = b"\x7fELF\x02\x01"
-"""Magic of an object file of 64 bits, little endian (System V ABI, chapter 4)."""
-_HEADER = struct.Struct("<40xQ10xHHH")
-_SECTION = struct.Struct("<IIQQQQII16x")
-_SYMBOL = struct.Struct("<IBBHQQ")
-_SYMBOL_TABLE = 2
+def _own_sources() -> list[str]:
+    modules = [module for name, module in sorted(sys.modules.items()) if name.startswith("pendulum_")]
+    return [str(module.__file__) for module in modules if getattr(module, "__file__", None)]
 
 
-def undefined_symbols(code: bytes) -> set[str]:
-    """Return the names that an object file leaves to be found by who loads it.
-
-    Raises:
-        ValueError: It is no such file.
-    """
-    if not code.startswith(_ELF):
-        raise ValueError(f"object file begins with {code[:6]!r}; expected {_ELF!r}")
-    table_at, size, count, _ = _HEADER.unpack_from(code)
-    sections = [_SECTION.unpack_from(code, table_at + size * index) for index in range(count)]
-    found = set()
-    for _, kind, _, _, at, length, link, _ in sections:
-        if kind != _SYMBOL_TABLE:
-            continue
-        names_at = sections[link][4]
-        for offset in range(at, at + length, _SYMBOL.size):
-            name, _, _, section, _, _ = _SYMBOL.unpack_from(code, offset)
-            if section == 0 and name:
-                found.add(code[names_at + name : code.index(b"\0", names_at + name)].decode())
-    return found
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -21,6 +21,7 @@ __all__ = [
     "ORDINARY",
     "OTHER",
     "compiled",
+    "copy",
     "entry",
     "has_listeners",
     "publish",
@@ -62,6 +63,12 @@ def entry(layout: np.dtype[Any]) -> Any:
     """Return a decorator for the function of a loop, of one record."""
     signature = types.int64(numba.from_dtype(layout))
     return numba.njit(signature, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
+@compiled
+def copy(to: Any, at: Any, size: Any) -> None:
+    """Copy bytes from one address to another."""
+    _memcpy(to, at, size)
 
 
 @compiled

@@ -20,7 +20,7 @@ from typing import Any
 
 from pendulum_msgs_py.whole_file import write_whole
 
-__all__ = ["KernelStore", "drop_stale_code", "keep_kernel", "name_symbols_apart", "source_of"]
+__all__ = ["KernelStore", "drop_stale_code", "keep_kernel", "name_symbols_apart"]
 
 _COUNTED = re.compile(rb"B\dv\d{1,8}B")
 """Part of a symbol that bears a number of numba's own count."""
@@ -75,7 +75,7 @@ class KernelStore:
         packages = sorted({"pendulum_msgs_py", *(each.__module__.partition(".")[0] for each in made_of)})
         versions = (sys.version, sys.modules["numba"].__version__, sys.modules["llvmlite"].__version__)
         self._known = (name, packages, tuple(map(_words, choice)), versions)
-        self._source = _digest("".join(map(source_of, packages)).encode())
+        self._source = _digest("".join(map(_source_of, packages)).encode())
 
     @property
     def cache_path(self) -> str:
@@ -136,7 +136,7 @@ def _digest(content: bytes) -> bytes:
 
 
 @cache
-def source_of(package: str) -> str:
+def _source_of(package: str) -> str:
     """Return what identifies all Python source of a package, or of a module that stands alone."""
     module = sys.modules[package]
     folders = [Path(each) for each in getattr(module, "__path__", ())]

@@ -40,12 +40,13 @@ class CommanderWatch:
         self._looking = threading.Lock()
         self._checked_ns = 0
         self._contradicted_ns: int | None = None
-        self._own_stamps: deque[int] = deque(maxlen=_OWN_STATES)
+        self.own_stamps: deque[int] = deque(maxlen=_OWN_STATES)
+        """Stamps of states that this plant published, the newest first [ns]."""
         self._foreign_ns: int | None = None
 
     def note_state(self, stamp_ns: int) -> None:
         """Remember the stamp of a state that this plant publishes [ns]."""
-        self._own_stamps.appendleft(stamp_ns)
+        self.own_stamps.appendleft(stamp_ns)
 
     def suspect_twins(self, command: JointCommand, now_ns: int) -> None:
         """Look at the graph at once when a state is answered in two ways: two commanders may share a name.
@@ -67,7 +68,7 @@ class CommanderWatch:
 
         A controller that stamps with the time of day is none, as long as nobody else publishes states.
         """
-        if command.stamp_ns not in self._own_stamps:
+        if command.stamp_ns not in self.own_stamps:
             self._foreign_ns = time.monotonic_ns()
             self._check_soon(self._foreign_ns)
 

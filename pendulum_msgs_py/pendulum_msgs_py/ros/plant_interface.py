@@ -74,6 +74,11 @@ class PlantInterface:
         published_ns: System time at which it was, in which DDS notes arrivals too [ns].
         hardware_id: Which device this is, for diagnostics.
         arrived_ns: System time at which the message being handled reached this process, for polled inputs [ns].
+        polled: Whether torque inputs wait.
+        inputs: Subscription of each input.
+        commander_watch: Who commands, as far as the graph tells.
+        state_publisher: Publishes states.
+        applied_publisher: Publishes what was applied.
     """
 
     def __init__(
@@ -97,6 +102,7 @@ class PlantInterface:
         self._armed_ns = 0
         self.arrived_ns = 0
         self.on_command = on_command
+        self.polled = polled
         self.hardware_id = "none"
         self.refused_trajectories: Counter[str] = Counter()
         self._joints = supervisor.coordinates.names
@@ -105,27 +111,28 @@ class PlantInterface:
         self._told_mode: tuple[Mode, bool, bool] | None = None
         self._mode_lines = Throttle(_LEAST_BETWEEN_LINES)
         self._told_refusals = 0
-        self._commanders = CommanderWatch(node, supervisor)
+        self.commander_watch = CommanderWatch(node, supervisor)
         self._seconds_at_check = 0
         self._second_commander = False
         self._stopping = False
-        self._states = node.create_publisher(JointState, names.JOINT_STATES, qos.STATE)
-        self._applied = node.create_publisher(JointState, names.APPLIED_EFFORT, qos.STATE)
+        self.state_publisher = node.create_publisher(JointState, names.JOINT_STATES, qos.STATE)
+        self.applied_publisher = node.create_publisher(JointState, names.APPLIED_EFFORT, qos.STATE)
         self._events = node.create_publisher(String, names.EVENTS, qos.EVENTS)
         self._diagnostics = Diagnostics(node, "plant")
         inputs = [Input.EFFORT_COMMAND, Input.DISTURBANCE] + ([Input.PUSH] if push else [])
         self._polled: list[tuple[PolledInput, Callable[..., None]]] = []
         self._torques: ArrivalSignal | None = None
-        self._inputs = {}
+        self._accepted: dict[Input, bytes] = {}
+        self.inputs = {}
         self._receivers = {kind: self._receiver(kind) for kind in inputs}
         for kind in inputs:
             receive = self._receivers[kind]
             if polled:
                 source = node.create_polled_input(JointState, kind.value, qos.COMMAND_INPUT)
                 self._polled.append((source, receive))
-                self._inputs[kind] = source.subscription
+                self.inputs[kind] = source.subscription
             else:
-                self._inputs[kind] = node.create_subscription(
+                self.inputs[kind] = node.create_subscription(
                     JointState, kind.value, receive, qos.COMMAND_INPUT, raw=True
                 )
         self._trajectories = node.create_polled_input(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
@@ -146,9 +153,11 @@ class PlantInterface:
         for source, receive in self._polled:
             source.take(receive)
 
-    def watch_inputs(self) -> None:
+    def watch_inputs(self) -> ArrivalSignal:
         """Have the middleware say when a torque comes, where inputs are polled, for who waits for them."""
-        self._torques = ArrivalSignal([source.subscription for source, _ in self._polled])
+        if self._torques is None:
+            self._torques = ArrivalSignal([source.subscription for source, _ in self._polled])
+        return self._torques
 
     def wait_for_inputs(self, timeout: float) -> None:
         """Take the torques that came since the last look, or wait for one [s], where inputs are watched."""
@@ -156,14 +165,23 @@ class PlantInterface:
         if self._torques.wait(timeout):
             self.take_inputs()
 
+    def receive(self, kind: Input, data: bytes, arrived_ns: int) -> None:
+        """Receive a torque that somebody else has taken, where inputs are polled."""
+        self._receivers[kind](data, arrived_ns)
+
+    def pop_accepted(self) -> dict[Input, bytes]:
+        """Return the newest message that was accepted at each input since this was asked last."""
+        accepted, self._accepted = self._accepted, {}
+        return accepted
+
     def publish_state(self, sample: JointSample) -> None:
         """Publish a state and remember it as the newest."""
         self.sample = sample
-        self._commanders.note_state(sample.stamp_ns)
+        self.commander_watch.note_state(sample.stamp_ns)
         stamp_ns, position, velocity, effort = sample
         data = encode_joints(stamp_ns, "", self._joints, position, velocity, effort)
         self.published_ns = time.time_ns()
-        self._states.publish(data)
+        self.state_publisher.publish(data)
 
     def decide(self, now_ns: int | None = None) -> Drive:
         """Return what to do now, by the supervisor's rules; says on the log when the answer changes."""
@@ -178,10 +196,10 @@ class PlantInterface:
         """Publish the efforts that were really applied from the state with this stamp on, and remember them."""
         self.supervisor.report_applied(effort)
         # Building and publishing what nobody hears would be a tenth of the loop.
-        if self._applied.get_subscription_count():
-            self._applied.publish(encode_joints(stamp_ns, "", self._driven, (), (), effort))
+        if self.applied_publisher.get_subscription_count():
+            self.applied_publisher.publish(encode_joints(stamp_ns, "", self._driven, (), (), effort))
         if self._stopping:
-            self._applied.wait_for_all_acked(qos.LAST_WORDS)
+            self.applied_publisher.wait_for_all_acked(qos.LAST_WORDS)
 
     def publish_event(self, name: str, **details: object) -> None:
         """Publish an event at the plant's time."""
@@ -192,11 +210,11 @@ class PlantInterface:
     @property
     def state_subscribers(self) -> int:
         """How many subscriptions are matched with ``joint_states``."""
-        return self._states.get_subscription_count()
+        return self.state_publisher.get_subscription_count()
 
     def commanders(self, kind: Input) -> int:
         """Return how many publishers are matched with an input."""
-        return self._inputs[kind].get_publisher_count()
+        return self.inputs[kind].get_publisher_count()
 
     def e_stop(self, reason: str) -> None:
         """Latch the e-stop; from any thread, waiting for nobody."""
@@ -226,7 +244,7 @@ class PlantInterface:
             "saturated_periods": supervisor.saturated_periods,
             "requests": "told by the middleware" if self.node.told_of_requests else "looked for",
         }
-        for kind in self._inputs:
+        for kind in self.inputs:
             gate = supervisor.gates[kind]
             values[f"{kind.value}.accepted"] = gate.accepted
             for refusal, count in sorted(gate.refused.items()):
@@ -250,10 +268,12 @@ class PlantInterface:
             command = command_from_bytes(data)
             problem = problem_of_command(data) if command is None else ""
             refusal = supervisor.offer(kind, command, self.clock(), problem)
+            if refusal is None:
+                self._accepted[kind] = data
             if refusal is Refusal.DUPLICATE and kind is Input.EFFORT_COMMAND and command is not None:
-                self._commanders.suspect_twins(command, self.clock())
+                self.commander_watch.suspect_twins(command, self.clock())
             if refusal is None and kind is Input.EFFORT_COMMAND and command is not None:
-                self._commanders.suspect_second_plant(command)
+                self.commander_watch.suspect_second_plant(command)
                 self._note_round_trip(command)
             if refusal is None and self.on_command is not None and command is not None:
                 self.on_command(kind, command)
@@ -315,7 +335,7 @@ class PlantInterface:
 
     def _on_arm(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if request.data:
-            self._commanders.check()
+            self.commander_watch.check()
             was_armed = self.supervisor.mode.armed
             refusal = self.supervisor.arm(self.clock(), self.sample)
             if not was_armed:
@@ -337,7 +357,7 @@ class PlantInterface:
         return response
 
     def _on_housekeeping(self) -> None:
-        self._commanders.check()
+        self.commander_watch.check()
         seconds = sum(gate.refused[Refusal.SECOND_COMMANDER] for gate in self.supervisor.gates.values())
         self._second_commander = seconds > self._seconds_at_check
         self._seconds_at_check = seconds
@@ -370,7 +390,7 @@ class PlantInterface:
             self.publish_event(Event.PLANT_MODE, mode=supervisor.mode.value, reason=supervisor.reason)
 
     def _tell_refusals(self) -> None:
-        gates = {kind: self.supervisor.gates[kind] for kind in self._inputs}
+        gates = {kind: self.supervisor.gates[kind] for kind in self.inputs}
         refused = sum(sum(gate.refused.values()) for gate in gates.values())
         if refused > self._told_refusals:
             details = ", ".join(

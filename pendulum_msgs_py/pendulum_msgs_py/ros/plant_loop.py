@@ -16,6 +16,7 @@ from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector
 from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.compiled_periods import SLICE, CompiledPeriods
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 
 __all__ = ["LockstepLoop", "RealtimeLoop", "Stepper"]
@@ -47,6 +48,7 @@ class RealtimeLoop:
     Attributes:
         paused: Somebody wants the plant to wait.
         halted: The plant has no next state; it says so itself, in a step.
+        compiled: Runs ordinary periods, or None.
     """
 
     def __init__(
@@ -59,13 +61,21 @@ class RealtimeLoop:
         self._deadline_ns = clock() + statistics.period_ns
         self.paused = False
         self.halted = False
+        self.compiled: CompiledPeriods | None = None
 
     def run_due(self) -> float:
         """Do what is due; return the time until the next deadline [s]."""
         now = self._clock()
+        period = self._statistics.period_ns
+        if self.compiled is not None and now >= self._deadline_ns and not (self.paused or self.halted):
+            # Until the first deadline after it whatever else waits has its turn.
+            done = self.compiled.run(self._deadline_ns - period)
+            self._deadline_ns = done.now_ns + period
+            if done.message is not None:
+                self._interface.receive(*done.message)
+            now = self._clock()
         if now >= self._deadline_ns:
             self._interface.take_inputs()
-            period = self._statistics.period_ns
             if self.paused or self.halted:
                 self._deadline_ns = now
             else:
@@ -118,6 +128,8 @@ class LockstepLoop:
     Attributes:
         paused: Somebody wants the plant to wait.
         halted: The plant has no next state; it says so itself, in a step.
+        compiled: Runs ordinary steps, or None.
+        clock_publisher: Publishes ``/clock``, or None.
     """
 
     def __init__(
@@ -147,10 +159,14 @@ class LockstepLoop:
         self.finished = False
         self.paused = False
         self.halted = False
-        self._clock_publisher = (
+        self.clock_publisher = (
             interface.node.create_publisher(ClockMessage, names.CLOCK, qos.CLOCK) if publish_clock else None
         )
         self._next_look = 0.0
+        self._turns = 0
+        self.compiled: CompiledPeriods | None = None
+        if interface.polled:
+            interface.watch_inputs()
 
     def __call__(self) -> int:
         """Return the simulated time [ns]: the loop is the plant's clock."""
@@ -169,11 +185,46 @@ class LockstepLoop:
 
         Its runner calls this after each event; answers alone make the pace where they are waited for.
         """
+        if self._turns:
+            self._turns -= 1
+            return 0.0
+        if self._interface.polled:
+            self._interface.take_inputs()
+            if self.started and self._must_wait() and not (self.paused or self.halted or self.finished):
+                self._wait_for_answers()
         now = time.monotonic()
         if now >= self._next_look:
             self._look()
             self._next_look = now + (_LOOK_WAITING if self.started and self._must_wait() else _LOOK_FREE)
         return self._next_look - now
+
+    def _wait_for_answers(self) -> None:
+        """Take answers and step, for a while; then others have their turn: timers, services, parameters."""
+        end = time.monotonic() + SLICE
+        self._turns = _TURNS
+        while (left := end - time.monotonic()) > 0.0 and self._must_wait() and not self.finished:
+            if not self._run_compiled(left):
+                self._interface.wait_for_inputs(left)
+
+    def _run_compiled(self, longest: float) -> bool:
+        """Take ordinary steps [s]; return whether there was anything to do."""
+        if self.compiled is None:
+            return False
+        done = self.compiled.run(
+            self.now_ns, longest=longest, expected=self._inputs, answered=self._answered, last_ns=self._last_ns
+        )
+        self.now_ns, self._answered = done.now_ns, set(done.answered)
+        self.steps += done.periods
+        if done.periods:
+            self._note_publication()
+        if done.message is not None:
+            self._interface.receive(*done.message)
+        elif self._inputs <= self._answered:
+            # All have answered, and what they make of it is not ordinary.
+            self.advance()
+        else:
+            return done.periods > 0
+        return True
 
     def answered(self, kind: Input, command: JointCommand) -> None:
         """Take note of an accepted command; steps when it was the last one missing."""
@@ -207,13 +258,16 @@ class LockstepLoop:
         if self.started:
             self.advance()
 
-    def _publish(self, sample: JointSample) -> None:
-        self._answered.clear()
+    def _note_publication(self) -> None:
         self._waiting_since = time.monotonic()
         self._told_waiting = False
+
+    def _publish(self, sample: JointSample) -> None:
+        self._answered.clear()
+        self._note_publication()
         self._interface.publish_state(sample)
-        if self._clock_publisher is not None and self._clock_publisher.get_subscription_count():
-            self._clock_publisher.publish(encode_clock(self.now_ns))
+        if self.clock_publisher is not None and self.clock_publisher.get_subscription_count():
+            self.clock_publisher.publish(encode_clock(self.now_ns))
 
     def _must_wait(self) -> bool:
         return self._interface.supervisor.mode is Mode.EFFORT and not self._inputs <= self._answered
@@ -258,5 +312,7 @@ _LOOK_FREE = 0.001
 """Wall time between two steps that nobody has to answer, and between two looks for those who will [s]."""
 _LOOK_WAITING = 0.1
 """Wall time between two looks for answers that are overdue [s]."""
+_TURNS = 4
+"""Calls after a slice in which a runner attends to an event each: more than timers have in a slice."""
 _PATIENCE = 1.0
 """Wall time without an answer after which a state is published again [s]."""

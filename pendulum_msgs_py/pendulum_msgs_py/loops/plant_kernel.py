@@ -1,0 +1,227 @@
+"""Ordinary periods of a plant of one joint, for compiled code: take torques, decide, step, publish.
+
+Everything is looked at before anything is changed: where a period or a message is not an ordinary one, the loop ends
+with it untouched, and Python does it by the same rules.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pendulum_msgs_py.contract import rules
+from pendulum_msgs_py.contract.rules import ACCEPTED, NEVER
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.loops.plant_record import (
+    DISTURBANCE,
+    EFFORT,
+    ENDED,
+    INPUTS,
+    MESSAGE_WAITS,
+    MOST_PERIODS,
+    OWN_STAMPS,
+    UNUSUAL,
+    plant_record,
+)
+from pendulum_msgs_py.loops.primitives import (
+    NOTHING,
+    ORDINARY,
+    compiled,
+    copy,
+    entry,
+    has_listeners,
+    publish,
+    sleep_until,
+    steady_ns,
+    take_one,
+    wait_for,
+    wall_ns,
+)
+from pendulum_msgs_py.loops.trees import compile_tree
+
+__all__ = ["plant_loop"]
+
+_judge_stamp = compile_tree(rules.judge_stamp, exact=True)
+_has_expired = compile_tree(rules.has_expired, exact=True)
+_has_lapsed = compile_tree(rules.has_lapsed, exact=True)
+_is_ahead = compile_tree(rules.is_ahead, exact=True)
+_age_of = compile_tree(rules.age_of, exact=True)
+_is_inside = compile_tree(rules.is_inside, exact=True)
+_within = compile_tree(rules.within, exact=True)
+_rise_within = compile_tree(rules.rise_within, exact=True)
+_IS_READ = -1
+
+
+@compiled
+def _somebody_waits(s: Any) -> Any:
+    copy(s.waiting.ctypes.data, s.waiting_at, 8)
+    return s.waiting[0] != 0
+
+
+@compiled
+def _accept(source: Any, gate: Any, now_ns: Any) -> Any:
+    """Take an expected message's torque where it passes every rule; return whether it does."""
+    if not math.isfinite(source.value[0]) or gate.newest_ns == NEVER:
+        return False
+    verdict = _judge_stamp(source.stamp_ns, now_ns, gate.timeout_ns, gate.newest_ns, gate.heard_ns, False)
+    if verdict != ACCEPTED:
+        return False
+    gate.newest_ns = source.stamp_ns
+    gate.heard_ns = now_ns
+    gate.effort = source.value[0]
+    gate.expired = 0
+    gate.accepted += 1
+    return True
+
+
+@compiled
+def _is_answer(s: Any, stamp_ns: Any) -> Any:
+    """Tell whether a stamp is that of a state of ours: from the newest on, which it nearly always is."""
+    for back in range(OWN_STAMPS):  # noqa: SIM110  (compiled code knows no any())
+        if s.own_stamp_ns[(s.own_newest - back) % OWN_STAMPS] == stamp_ns:
+            return True
+    return False
+
+
+@compiled
+def _time_ns(s: Any) -> Any:
+    return s.now_ns if s.lockstep else steady_ns(s.time) + s.wall_ahead_ns
+
+
+@compiled
+def _take_inputs(s: Any) -> Any:
+    """Take the torques that have come; return the input at which a message waits for Python, or ``_IS_READ``."""
+    for index in range(INPUTS):
+        source = s.inputs[index]
+        for _ in range(source.most):
+            found = take_one(source)
+            if found == NOTHING:
+                break
+            if found != ORDINARY:
+                return index
+            if index == EFFORT:
+                if not _is_answer(s, source.stamp_ns) or not _accept(source, s.rules.command, _time_ns(s)):
+                    return index
+                # Like those of the interpreted loop: system time, as DDS notes arrivals in.
+                if not s.lockstep and source.stamp_ns == s.sample_ns and s.latencies < MOST_PERIODS:
+                    s.latency_ns[s.latencies] = source.info[1] - s.published_ns
+                    s.latencies += 1
+            elif index == DISTURBANCE:
+                if not _accept(source, s.rules.disturbance, _time_ns(s)):
+                    return index
+            else:
+                return index
+            if source.stamp_ns == s.now_ns:
+                s.answered |= 1 << index
+    return _IS_READ
+
+
+@compiled
+def _decide(s: Any, now_ns: Any) -> Any:
+    """Decide as the supervisor does; return whether this is an ordinary decision: if not, nothing was changed."""
+    r = s.rules
+    age = _age_of(s.sample_ns, now_ns)
+    if age < -r.feedback_timeout or age > r.feedback_timeout:
+        return False
+    if not (math.isfinite(s.position) and math.isfinite(s.velocity) and math.isfinite(s.effort)):
+        return False
+    if not _is_inside(r.lowest, s.position, r.highest, s.velocity, r.fastest):
+        return False
+    command, disturbance = r.command, r.disturbance
+    if command.expired or _has_expired(command.newest_ns, command.heard_ns, now_ns, command.timeout_ns):
+        return False
+    if _is_ahead(command.newest_ns, now_ns) or _has_lapsed(r.commanded_ns, now_ns):
+        return False
+    beside = 0.0
+    if disturbance.newest_ns != NEVER:
+        if _has_expired(disturbance.newest_ns, disturbance.heard_ns, now_ns, disturbance.timeout_ns):
+            disturbance.expired = 1
+        if not disturbance.expired and not _is_ahead(disturbance.newest_ns, now_ns):
+            beside = disturbance.effort
+    total = command.effort + beside
+    wanted = _within(total, r.limit)
+    r.saturated += wanted != total
+    if not math.isinf(r.slew):
+        wanted = _rise_within(r.last_effort, wanted, r.slew * max(0, now_ns - r.decided_ns) / NANOSECONDS)
+    r.last_effort = wanted
+    r.decided_ns = r.commanded_ns = now_ns
+    r.decisions += 1
+    return True
+
+
+def plant_loop(layout: Any, step: Any) -> Any:
+    """Return the loop for a kind of plant, compiled.
+
+    Args:
+        layout: Of the plant's part of the record.
+        step: Compiled ``step(plant, effort)``: goes on for one period under an effort, sets ``theta``, ``theta_dot``
+            and ``torque`` of its record.
+    """
+
+    @compiled
+    def advance(s: Any) -> Any:
+        """Do one period from a decision to its publication; return whether it was done."""
+        until_ns = s.now_ns + s.period_ns
+        # In lockstep a decision is as of the state that was answered, in real time as of the deadline.
+        if not _decide(s, s.now_ns if s.lockstep else until_ns):
+            return False
+        before_ns = s.sample_ns
+        applied = s.rules.last_effort
+        step(s.plant, applied)
+        s.now_ns = s.sample_ns = until_ns
+        s.position, s.velocity, s.effort = s.plant.theta, s.plant.theta_dot, s.plant.torque
+        s.answered = 0
+        # The state first: somebody waits to answer it.
+        out = s.states
+        out.value[0], out.value[1], out.value[2] = s.position, s.velocity, s.effort
+        s.published_ns = wall_ns(s.time)
+        publish(out, until_ns)
+        s.own_newest = (s.own_newest + 1) % OWN_STAMPS
+        s.own_stamp_ns[s.own_newest] = until_ns
+        if s.has_clock and has_listeners(s.clock):
+            publish(s.clock, until_ns)
+        if has_listeners(s.applied):
+            s.applied.value[0] = applied
+            publish(s.applied, before_ns)
+        s.periods += 1
+        return True
+
+    @compiled
+    def in_real_time(s: Any) -> Any:
+        while s.periods < MOST_PERIODS and steady_ns(s.time) < s.end_ns:
+            deadline_ns = s.now_ns + s.period_ns
+            sleep_until(s.time, deadline_ns - s.wall_ahead_ns)
+            late_ns = _time_ns(s) - deadline_ns
+            if late_ns < 0 or late_ns >= s.period_ns or _somebody_waits(s):
+                return UNUSUAL
+            waits = _take_inputs(s)
+            if waits != _IS_READ:
+                return MESSAGE_WAITS + waits
+            if not advance(s):
+                return UNUSUAL
+            s.late_ns[s.periods - 1] = late_ns
+        return ENDED
+
+    @compiled
+    def in_lockstep(s: Any) -> Any:
+        while True:
+            if _somebody_waits(s):
+                return UNUSUAL
+            waits = _take_inputs(s)
+            if waits != _IS_READ:
+                return MESSAGE_WAITS + waits
+            if s.answered & s.expected == s.expected:
+                # The last step tells that it was.
+                if s.now_ns + s.period_ns >= s.last_ns or not advance(s):
+                    return UNUSUAL
+                continue
+            left_ns = s.end_ns - steady_ns(s.time)
+            if left_ns <= 0:
+                return ENDED
+            wait_for(s.time, s.counter, left_ns)
+
+    @entry(plant_record(layout))
+    def run(s: Any) -> Any:
+        return in_lockstep(s) if s.lockstep else in_real_time(s)
+
+    return run

@@ -1,0 +1,231 @@
+"""Ordinary periods of a plant of one joint, run by compiled code for some milliseconds at a time.
+
+What is not ordinary (a command that is refused, silence, a transition, a service) is Python's: the loop ends before it,
+and the supervisor, the gates and the plant have the state that they would have, to the last bit.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterable
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_msgs_py.contract.cdr import JointStateFields, MessageTemplate, encode_clock, template_of
+from pendulum_msgs_py.contract.ordinary import lend, take_back
+from pendulum_msgs_py.contract.rules import NEVER
+from pendulum_msgs_py.contract.supervisor import Input
+from pendulum_msgs_py.contract.timing import SteadyWallClock
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
+from pendulum_msgs_py.loops.machine_code import load_loop
+from pendulum_msgs_py.loops.plant_record import (
+    DISTURBANCE,
+    EFFORT,
+    MESSAGE_WAITS,
+    OWN_STAMPS,
+    PUSH,
+    plant_record,
+)
+from pendulum_msgs_py.loops.records import expect_template, set_template
+from pendulum_msgs_py.ros.convert import fields_from_bytes
+from pendulum_msgs_py.ros.direct import DirectTopics, rcl_symbols
+from pendulum_msgs_py.ros.plant_interface import PlantInterface
+from pendulum_msgs_py.ros.qos import COMMAND_INPUT
+
+__all__ = ["SLICE", "CompiledPeriods", "CompiledPlant", "Slice"]
+
+SLICE = 0.02
+"""Longest time that compiled code runs before services, timers and parameters have their turn [s]."""
+_INPUTS = {Input.EFFORT_COMMAND: EFFORT, Input.DISTURBANCE: DISTURBANCE, Input.PUSH: PUSH}
+_KINDS = {index: kind for kind, index in _INPUTS.items()}
+_NO_END = 2**62
+
+
+class Slice(NamedTuple):
+    """What became of a slice.
+
+    Attributes:
+        now_ns: The plant's time, that of its newest state [ns].
+        periods: How many were done.
+        answered: In lockstep: inputs that have answered the newest state.
+        message: A message that was taken and is Python's to receive: its input, its bytes, when it came [ns].
+    """
+
+    now_ns: int
+    periods: int
+    answered: Collection[Input]
+    message: tuple[Input, bytes, int] | None
+
+
+class CompiledPlant(Protocol):
+    """A plant that compiled code can step."""
+
+    @property
+    def builder(self) -> str:
+        """Builds its loop, ``module:function``."""
+
+    @property
+    def choice(self) -> tuple[str, ...]:
+        """Which variant of it."""
+
+    @property
+    def layout(self) -> np.dtype[Any]:
+        """Layout of its part of the record."""
+
+    def lend(self, record: NDArray[Any]) -> None:
+        """Write its state into its part of the record."""
+
+    def take_back(self, record: NDArray[Any]) -> None:
+        """Take over the state that a loop has left."""
+
+
+class CompiledPeriods:
+    """The loop of one plant.
+
+    Args:
+        interface: The plant on the graph, its inputs polled.
+        plant: The plant.
+        period_ns: Period [ns].
+        clock: Wall time in real time; None in lockstep.
+        clock_publisher: Publishes ``/clock``, or None.
+        done: Called after periods with the stamp of the newest state [ns].
+
+    Raises:
+        NoMachineCodeError: The loop cannot be had here.
+    """
+
+    def __init__(
+        self,
+        interface: PlantInterface,
+        plant: CompiledPlant,
+        period_ns: int,
+        *,
+        clock: SteadyWallClock | None,
+        clock_publisher: Any = None,
+        done: Callable[[int], None],
+    ) -> None:
+        self._interface = interface
+        self._plant = plant
+        self._clock = clock
+        self._done = done
+        self._loop = load_loop(plant.builder, *plant.choice, symbols=rcl_symbols())
+        self._memory = np.zeros(1, dtype=plant_record(plant.layout))
+        self._record = record = self._memory[0]
+        self._topics = DirectTopics()
+        self._templates: dict[Input, MessageTemplate | None] = {}
+        for kind, index in _INPUTS.items():
+            self._topics.add_input(record["inputs"][index], interface.inputs[kind], COMMAND_INPUT.depth)
+        coordinates = interface.supervisor.coordinates
+        one = (0.0,)
+        state = JointStateFields(0, "", coordinates.names, one, one, one)
+        effort = JointStateFields(0, "", coordinates.driven_names, (), (), one)
+        for name, publisher, template in (
+            ("states", interface.state_publisher, template_of(state)),
+            ("applied", interface.applied_publisher, template_of(effort)),
+            ("clock", clock_publisher, MessageTemplate(encode_clock(0), b"", ())),
+        ):  # fmt: skip
+            if publisher is not None:
+                self._topics.add_output(record[name], publisher)
+                set_template(record[name], template)
+        record["has_clock"] = clock_publisher is not None
+        record["waiting_at"] = interface.supervisor.waiting_at
+        record["lockstep"] = clock is None
+        record["period_ns"] = period_ns
+        record["counter"] = -1 if clock is not None else interface.watch_inputs().descriptor
+
+    def run(
+        self,
+        now_ns: int,
+        *,
+        longest: float = SLICE,
+        expected: Collection[Input] = (),
+        answered: Collection[Input] = (),
+        last_ns: int | None = None,
+    ) -> Slice:
+        """Run ordinary periods from one on.
+
+        Args:
+            now_ns: The plant's time, that of its newest state [ns].
+            longest: Longest time to do so [s].
+            expected: In lockstep: inputs that have to answer a state.
+            answered: Those that have answered the newest.
+            last_ns: In lockstep: the time at which the plant stops stepping [ns].
+        """
+        interface, record, supervisor = self._interface, self._record, self._interface.supervisor
+        sample = interface.sample
+        if sample is None:
+            return Slice(now_ns, 0, answered, None)
+        self._expect_messages()
+        with supervisor.alone():
+            if not lend(supervisor, record["rules"]):
+                return Slice(now_ns, 0, answered, None)
+            self._plant.lend(record["plant"])
+            record["now_ns"] = now_ns
+            record["expected"], record["answered"] = _bits(expected), _bits(answered)
+            record["last_ns"] = _NO_END if last_ns is None else last_ns
+            record["sample_ns"], (record["position"],), (record["velocity"],), (record["effort"],) = sample
+            record["wall_ahead_ns"] = 0 if self._clock is None else self._clock.ahead_ns
+            record["published_ns"] = interface.published_ns
+            record["end_ns"] = time.monotonic_ns() + round(longest * NANOSECONDS)
+            record["periods"] = record["latencies"] = 0
+            self._lend_stamps()
+            with self._topics.held():
+                why = self._loop(self._memory)
+            take_back(supervisor, record["rules"])
+            periods = int(record["periods"])
+            if periods:
+                self._take_back(periods)
+        message = None
+        if why >= MESSAGE_WAITS:
+            kind = _KINDS[why - MESSAGE_WAITS]
+            source = record["inputs"][_INPUTS[kind]]
+            message = kind, DirectTopics.message(source), int(source["info"][1])
+        has_answered = int(record["answered"])
+        return Slice(
+            int(record["now_ns"]),
+            periods,
+            [kind for kind, index in _INPUTS.items() if has_answered >> index & 1],
+            message,
+        )
+
+    def _expect_messages(self) -> None:
+        """Expect the messages that Python accepted last, of each input."""
+        for kind, data in self._interface.pop_accepted().items():
+            fields = fields_from_bytes(data)
+            template = None if fields is None else template_of(fields, len(data))
+            if template != self._templates.get(kind):
+                self._templates[kind] = template
+                expect_template(self._record["inputs"][_INPUTS[kind]], template)
+
+    def _lend_stamps(self) -> None:
+        stamps = self._interface.commander_watch.own_stamps
+        ring = self._record["own_stamp_ns"]
+        ring[:] = NEVER
+        ring[: len(stamps)] = list(stamps)[::-1]
+        self._record["own_newest"] = len(stamps) - 1
+
+    def _take_back(self, periods: int) -> None:
+        record, interface = self._record, self._interface
+        self._plant.take_back(record["plant"])
+        stamp_ns, period_ns = int(record["now_ns"]), int(record["period_ns"])
+        interface.sample = JointSample.of_one(
+            stamp_ns, float(record["position"]), float(record["velocity"]), float(record["effort"])
+        )
+        interface.published_ns = int(record["published_ns"])
+        for back in range(min(periods, OWN_STAMPS) - 1, -1, -1):
+            interface.commander_watch.note_state(stamp_ns - back * period_ns)
+        statistics = interface.statistics
+        if statistics is not None and self._clock is not None:
+            first_ns = stamp_ns - (periods - 1) * period_ns
+            for index, late_ns in enumerate(record["late_ns"][:periods].tolist()):
+                deadline_ns = first_ns + index * period_ns
+                statistics.cycle(deadline_ns + late_ns, deadline_ns)
+            for latency_ns in record["latency_ns"][: int(record["latencies"])].tolist():
+                statistics.round_trip(latency_ns)
+        self._done(stamp_ns)
+
+
+def _bits(inputs: Iterable[Input]) -> int:
+    return sum(1 << _INPUTS[kind] for kind in inputs)
