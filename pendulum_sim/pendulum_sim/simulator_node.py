@@ -399,6 +399,8 @@ class SimulatorNode(PollingNode):
             "paused": self._loop.paused,
             "samples_dropped": self._sensors.dropped,
         }
+        if self._loop.compiled is not None:
+            figures["periods_compiled"] = self._loop.compiled.periods
         if self._lockstep:
             figures.update(self._loop.diagnostics())
         return figures

@@ -25,7 +25,15 @@ _PERIOD_NS = 2_000_000
 _SECOND = 1_000_000_000
 _ME = "/peer"
 
-_COUNTED = ("mode", "reason", "commander", "refused_commander", "starved_periods", "saturated_periods", "lockstep_steps")
+_COUNTED = (
+    "mode",
+    "reason",
+    "commander",
+    "refused_commander",
+    "starved_periods",
+    "saturated_periods",
+    "lockstep_steps",
+)
 
 
 def _command(stamp: int, effort: float, source: str = _ME, joints: tuple[str, ...] = (JOINT,)) -> bytes:
@@ -110,6 +118,9 @@ def _run(folder: Path, *, compiled: bool, **parameters: object) -> tuple[list[by
             peer.until(lambda: peer.diagnostics.get("lockstep_steps") == str(_STEPS), "the last diagnostics")
             loop = peer.diagnostics["loop"]
             assert loop == ("compiled" if compiled else "interpreted: compiled is false")
+            assert ("periods_compiled" in peer.diagnostics) is compiled
+            # Most of them: a step after which somebody sent what is not ordinary is Python's, and so is the last.
+            assert _STEPS // 2 < int(peer.diagnostics.get("periods_compiled", _STEPS)) <= _STEPS
             counters = {
                 key: value
                 for key, value in peer.diagnostics.items()

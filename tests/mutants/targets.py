@@ -48,6 +48,16 @@ TARGETS: tuple[Target, ...] = (
         ("judge_stamp", "is_ahead", "has_expired", "has_lapsed", "age_of", "is_inside", "within", "rise_within"),
         _RULES,
     ),
+    Target(
+        "pendulum_msgs_py.loops.plant_rules",
+        ("accept", "decide"),
+        ("pendulum_msgs_py/test/test_plant_rules_on_records.py",),
+    ),
+    Target(
+        "pendulum_msgs_py.contract.ordinary",
+        ("lend", "take_back", "_may_act", "_lend_gate", "_take_gate_back"),
+        ("pendulum_msgs_py/test/test_plant_rules_on_records.py",),
+    ),
     Target("pendulum_msgs_py.contract.drive", ("PlantLimits", "Mode"), _RULES),
     Target(
         "pendulum_hw_bridge.settings",

@@ -6,12 +6,9 @@ with it untouched, and Python does it by the same rules.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
-from pendulum_msgs_py.contract import rules
-from pendulum_msgs_py.contract.rules import ACCEPTED, NEVER
-from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.loops import plant_rules
 from pendulum_msgs_py.loops.plant_record import (
     DISTURBANCE,
     EFFORT,
@@ -41,14 +38,8 @@ from pendulum_msgs_py.loops.trees import compile_tree
 
 __all__ = ["plant_loop"]
 
-_judge_stamp = compile_tree(rules.judge_stamp, exact=True)
-_has_expired = compile_tree(rules.has_expired, exact=True)
-_has_lapsed = compile_tree(rules.has_lapsed, exact=True)
-_is_ahead = compile_tree(rules.is_ahead, exact=True)
-_age_of = compile_tree(rules.age_of, exact=True)
-_is_inside = compile_tree(rules.is_inside, exact=True)
-_within = compile_tree(rules.within, exact=True)
-_rise_within = compile_tree(rules.rise_within, exact=True)
+_accept = compile_tree(plant_rules.accept, exact=True)
+_decide = compile_tree(plant_rules.decide, exact=True)
 _IS_READ = -1
 
 
@@ -56,22 +47,6 @@ _IS_READ = -1
 def _somebody_waits(s: Any) -> Any:
     copy(s.waiting.ctypes.data, s.waiting_at, 8)
     return s.waiting[0] != 0
-
-
-@compiled
-def _accept(source: Any, gate: Any, now_ns: Any) -> Any:
-    """Take an expected message's torque where it passes every rule; return whether it does."""
-    if not math.isfinite(source.value[0]) or gate.newest_ns == NEVER:
-        return False
-    verdict = _judge_stamp(source.stamp_ns, now_ns, gate.timeout_ns, gate.newest_ns, gate.heard_ns, False)
-    if verdict != ACCEPTED:
-        return False
-    gate.newest_ns = source.stamp_ns
-    gate.heard_ns = now_ns
-    gate.effort = source.value[0]
-    gate.expired = 0
-    gate.accepted += 1
-    return True
 
 
 @compiled
@@ -114,39 +89,6 @@ def _take_inputs(s: Any) -> Any:
             if source.stamp_ns == s.now_ns:
                 s.answered |= 1 << index
     return _IS_READ
-
-
-@compiled
-def _decide(s: Any, now_ns: Any) -> Any:
-    """Decide as the supervisor does; return whether this is an ordinary decision: if not, nothing was changed."""
-    r = s.rules
-    age = _age_of(s.sample_ns, now_ns)
-    if age < -r.feedback_timeout or age > r.feedback_timeout:
-        return False
-    if not (math.isfinite(s.position) and math.isfinite(s.velocity) and math.isfinite(s.effort)):
-        return False
-    if not _is_inside(r.lowest, s.position, r.highest, s.velocity, r.fastest):
-        return False
-    command, disturbance = r.command, r.disturbance
-    if command.expired or _has_expired(command.newest_ns, command.heard_ns, now_ns, command.timeout_ns):
-        return False
-    if _is_ahead(command.newest_ns, now_ns) or _has_lapsed(r.commanded_ns, now_ns):
-        return False
-    beside = 0.0
-    if disturbance.newest_ns != NEVER:
-        if _has_expired(disturbance.newest_ns, disturbance.heard_ns, now_ns, disturbance.timeout_ns):
-            disturbance.expired = 1
-        if not disturbance.expired and not _is_ahead(disturbance.newest_ns, now_ns):
-            beside = disturbance.effort
-    total = command.effort + beside
-    wanted = _within(total, r.limit)
-    r.saturated += wanted != total
-    if not math.isinf(r.slew):
-        wanted = _rise_within(r.last_effort, wanted, r.slew * max(0, now_ns - r.decided_ns) / NANOSECONDS)
-    r.last_effort = wanted
-    r.decided_ns = r.commanded_ns = now_ns
-    r.decisions += 1
-    return True
 
 
 def plant_loop(layout: Any, step: Any) -> Any:

@@ -92,6 +92,9 @@ class CompiledPeriods:
         clock_publisher: Publishes ``/clock``, or None.
         done: Called after periods with the stamp of the newest state [ns].
 
+    Attributes:
+        periods: How many it has done.
+
     Raises:
         NoMachineCodeError: The loop cannot be had here.
     """
@@ -110,6 +113,7 @@ class CompiledPeriods:
         self._plant = plant
         self._clock = clock
         self._done = done
+        self.periods = 0
         self._loop = load_loop(plant.builder, *plant.choice, symbols=rcl_symbols())
         self._memory = np.zeros(1, dtype=plant_record(plant.layout))
         self._record = record = self._memory[0]
@@ -176,6 +180,7 @@ class CompiledPeriods:
             take_back(supervisor, record["rules"])
             periods = int(record["periods"])
             if periods:
+                self.periods += periods
                 self._take_back(periods)
         message = None
         if why >= MESSAGE_WAITS:
