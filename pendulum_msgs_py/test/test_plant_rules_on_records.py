@@ -152,6 +152,32 @@ def test_who_has_been_silent_for_too_long_begins_anew() -> None:
     assert decide(record, _NOW + NANOSECONDS)
 
 
+def test_what_is_lent_again_counts_from_nothing() -> None:
+    supervisor = _armed(PlantLimits((0.1,)))
+    record = _lent(supervisor, JointSample.of_one(_NOW, 1.0, 0.0))
+    record.inputs[0].stamp_ns, record.inputs[0].value[0] = _NOW + _MS, 0.5
+    assert accept(record.inputs[0], record.rules.command, _NOW + _MS)
+    assert decide(record, _NOW + _MS)
+    assert lend(supervisor, record.rules)
+    assert (record.rules.saturated, record.rules.decisions, record.rules.command.accepted) == (0, 0, 0)
+
+
+def test_a_disturbance_that_had_grown_old_before_is_lent_so() -> None:
+    supervisor = _armed(PlantLimits((2.0,)))
+    assert supervisor.gates[Input.DISTURBANCE].fresh(_NOW + 60 * _MS) is None
+    record = _lent(supervisor, JointSample.of_one(_NOW + _MS, 1.0, 0.0))
+    assert decide(record, _NOW + _MS)
+    assert record.rules.last_effort == 0.5
+
+
+def test_a_loop_that_decided_nothing_changes_nothing() -> None:
+    supervisor = _armed()
+    record = _lent(supervisor, JointSample.of_one(_NOW, 1.0, 0.0))
+    record.rules.last_effort, record.rules.commanded_ns, record.rules.decided_ns = 9.0, 1, 1
+    take_back(supervisor, record.rules)
+    assert _state(supervisor) == _state(_armed())
+
+
 @settings(max_examples=300, deadline=None)
 @given(stamp=_times, later=_times, effort=_numbers)
 @example(stamp=2 * _MS, later=2 * _MS, effort=1.0)

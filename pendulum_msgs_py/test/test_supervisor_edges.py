@@ -433,3 +433,12 @@ def test_a_limit_of_nothing_at_all_is_refused(limits: dict[str, float]) -> None:
 )
 def test_a_small_limit_is_one(limits: dict[str, float]) -> None:
     assert PlantLimits(**{"effort": (5.0,), **limits})
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_effort_beyond_a_small_limit_keeps_its_sign(sign: float) -> None:
+    supervisor = PlantSupervisor(PlantLimits((0.5,)))
+    sample = JointSample.of_one(0, 0.0, 0.0)
+    assert supervisor.arm(0, sample) == ""
+    assert supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(0, 0.7 * sign, "/me"), 0) is None
+    assert supervisor.decide(0, sample).effort == (0.5 * sign,)

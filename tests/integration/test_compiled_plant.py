@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
@@ -73,7 +74,7 @@ def _answer(k: int, stamp: int) -> bytes:
     return _as_others_write_it(stamp, torque) if k % 41 == 7 else _command(stamp, torque)
 
 
-def _run(folder: Path, *, compiled: bool, **parameters: object) -> tuple[list[bytes], list[bytes], dict[str, str]]:
+def _run(folder: Path, *, compiled: bool, **parameters: Any) -> tuple[list[bytes], list[bytes], dict[str, str]]:
     """Answer each state as the script says; return all states, all efforts that were applied, and the counters."""
     states: list[bytes] = []
     applied: list[bytes] = []
@@ -139,7 +140,7 @@ def _run(folder: Path, *, compiled: bool, **parameters: object) -> tuple[list[by
     [{}, {"plant": "dfki"}, {"method": "rk4", "substeps": 3, "effort_slew_limit": 200.0, "velocity_limit": 100.0}],
     ids=["thesis", "dry friction", "substeps, slew"],
 )
-def test_a_run_is_the_same_compiled_and_interpreted(tmp_path: Path, parameters: dict[str, object]) -> None:
+def test_a_run_is_the_same_compiled_and_interpreted(tmp_path: Path, parameters: dict[str, Any]) -> None:
     interpreted = _run(tmp_path / "interpreted", compiled=False, **parameters)
     compiled = _run(tmp_path / "compiled", compiled=True, **parameters)
     assert len(compiled[0]) == _STEPS
