@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_msgs_py.loops.machine_code import NoMachineCodeError
 from pendulum_sim.dry_friction import PACKED
@@ -55,27 +54,31 @@ class LoopPlant:
         self.choice = (plant.method,)
         self.layout = LAYOUT
 
-    def lend(self, record: NDArray[Any]) -> None:
-        """Write parameters and state into a record of :data:`LAYOUT`."""
+    def describe(self, record: Any) -> None:
+        """Write what stays as it is into a record of :data:`LAYOUT`: parameters, and the sub-steps of a period."""
         plant = self.plant
-        record["theta"], record["theta_dot"], record["torque"] = plant.theta, plant.theta_dot, plant.effort
-        record["steps"], record["limit"], record["dry"] = plant.steps, plant.parameters.effort_limit, plant.dry
-        line = plant.delay.line
-        record["line"][: len(line)] = line
-        record["waits"] = len(line)
-        record["segments"] = len(plant.segments)
+        record.limit, record.dry = plant.parameters.effort_limit, plant.dry
+        record.waits = len(plant.delay.line)
+        record.segments = len(plant.segments)
         for index, (is_newer, length, coefficients) in enumerate(plant.segments):
-            record["newer"][index], record["length"][index] = is_newer, length
+            record.newer[index], record.length[index] = is_newer, length
             first = index * MOST_COEFFICIENTS
-            record["coefficients"][first : first + len(coefficients)] = coefficients
-        record["packed"] = plant.packed
+            record.coefficients[first : first + len(coefficients)] = coefficients
+        record.packed[:] = plant.packed
 
-    def take_back(self, record: NDArray[Any]) -> None:
+    def lend(self, record: Any) -> None:
+        """Write the state."""
+        plant = self.plant
+        record.theta, record.theta_dot, record.torque = plant.theta, plant.theta_dot, plant.effort
+        record.steps = plant.steps
+        record.line[: len(plant.delay.line)] = tuple(plant.delay.line)
+
+    def take_back(self, record: Any) -> None:
         """Take over the state that a loop has left."""
         plant = self.plant
-        plant.theta, plant.theta_dot, plant.effort = (float(record[name]) for name in ("theta", "theta_dot", "torque"))
-        plant.steps = int(record["steps"])
-        plant.delay.line.extend(record["line"][: len(plant.delay.line)].tolist())
+        plant.theta, plant.theta_dot, plant.effort = record.theta, record.theta_dot, record.torque
+        plant.steps = record.steps
+        plant.delay.line.extend(record.line[: len(plant.delay.line)])
 
 
 def loop_plant(plant: object) -> LoopPlant:

@@ -10,7 +10,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.commands import CommandGate
 from pendulum_msgs_py.contract.rules import NEVER
@@ -53,12 +52,12 @@ ORDINARY = np.dtype(
 """What an ordinary decision depends on and changes."""
 
 
-def lend(supervisor: PlantSupervisor, record: NDArray[Any]) -> bool:
+def lend(supervisor: PlantSupervisor, record: Any) -> bool:
     """Write the state of a supervisor into a record; return whether its next period may be an ordinary one.
 
     Args:
         supervisor: Nobody else uses it until it is taken back.
-        record: Of :data:`ORDINARY`.
+        record: Of :data:`ORDINARY`, its fields by attribute.
     """
     commands, disturbances = supervisor.gates[Input.EFFORT_COMMAND], supervisor.gates[Input.DISTURBANCE]
     ordinary = (
@@ -75,29 +74,28 @@ def lend(supervisor: PlantSupervisor, record: NDArray[Any]) -> bool:
     if not ordinary:
         return False
     limits = supervisor.limits
-    _lend_gate(commands, record["command"])
-    _lend_gate(disturbances, record["disturbance"])
-    (record["limit"],) = limits.effort
-    record["slew"], record["fastest"] = limits.slew, limits.velocity
-    record["feedback_timeout"] = limits.feedback_timeout
-    (record["lowest"],), (record["highest"],) = limits.position_min, limits.position_max
-    record["commanded_ns"] = supervisor._commanded_ns
-    record["decided_ns"] = supervisor._last_decision_ns
-    (record["last_effort"],) = supervisor._last_effort
-    record["saturated"] = record["decisions"] = 0
+    _lend_gate(commands, record.command)
+    _lend_gate(disturbances, record.disturbance)
+    (record.limit,) = limits.effort
+    record.slew, record.fastest, record.feedback_timeout = limits.slew, limits.velocity, limits.feedback_timeout
+    (record.lowest,), (record.highest,) = limits.position_min, limits.position_max
+    record.commanded_ns = supervisor._commanded_ns
+    record.decided_ns = supervisor._last_decision_ns
+    (record.last_effort,) = supervisor._last_effort
+    record.saturated = record.decisions = 0
     return True
 
 
-def take_back(supervisor: PlantSupervisor, record: NDArray[Any]) -> None:
+def take_back(supervisor: PlantSupervisor, record: Any) -> None:
     """Take over what the periods since it was lent have changed."""
-    _take_gate_back(supervisor.gates[Input.EFFORT_COMMAND], record["command"])
-    _take_gate_back(supervisor.gates[Input.DISTURBANCE], record["disturbance"])
-    if not record["decisions"]:
+    _take_gate_back(supervisor.gates[Input.EFFORT_COMMAND], record.command)
+    _take_gate_back(supervisor.gates[Input.DISTURBANCE], record.disturbance)
+    if not record.decisions:
         return
-    supervisor.saturated_periods += int(record["saturated"])
-    supervisor._commanded_ns = int(record["commanded_ns"])
-    supervisor._last_time_ns = supervisor._last_decision_ns = int(record["decided_ns"])
-    supervisor._last_effort = (float(record["last_effort"]),)
+    supervisor.saturated_periods += int(record.saturated)
+    supervisor._commanded_ns = int(record.commanded_ns)
+    supervisor._last_time_ns = supervisor._last_decision_ns = int(record.decided_ns)
+    supervisor._last_effort = (float(record.last_effort),)
     supervisor.report_applied(supervisor._last_effort)
 
 
@@ -106,23 +104,23 @@ def _may_act(gate: CommandGate) -> bool:
     return gate._newest is not None and not gate._expired
 
 
-def _lend_gate(gate: CommandGate, record: NDArray[Any]) -> None:
+def _lend_gate(gate: CommandGate, record: Any) -> None:
     newest = gate._newest
-    record["timeout_ns"] = gate.timeout_ns
-    record["newest_ns"] = NEVER if newest is None else newest.stamp_ns
-    record["heard_ns"] = gate._heard_ns
-    record["effort"] = math.nan if newest is None else newest.effort[0]
-    record["expired"] = gate._expired
-    record["accepted"] = 0
+    record.timeout_ns = gate.timeout_ns
+    record.newest_ns = NEVER if newest is None else newest.stamp_ns
+    record.heard_ns = gate._heard_ns
+    record.effort = math.nan if newest is None else newest.effort[0]
+    record.expired = gate._expired
+    record.accepted = 0
 
 
-def _take_gate_back(gate: CommandGate, record: NDArray[Any]) -> None:
+def _take_gate_back(gate: CommandGate, record: Any) -> None:
     # It may have grown old without a new one.
-    gate._expired = bool(record["expired"])
-    if not record["accepted"]:
+    gate._expired = bool(record.expired)
+    if not record.accepted:
         return
     newest = gate._newest
     assert newest is not None, "a loop took a command where no layout was known"
-    gate._newest = JointCommand(int(record["newest_ns"]), (float(record["effort"]),), newest.source, newest.joints)
-    gate._heard_ns = int(record["heard_ns"])
-    gate.accepted += int(record["accepted"])
+    gate._newest = JointCommand(int(record.newest_ns), (float(record.effort),), newest.source, newest.joints)
+    gate._heard_ns = int(record.heard_ns)
+    gate.accepted += int(record.accepted)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -45,6 +45,15 @@ class RingOfTimes:
         """Keep one duration [ns]."""
         self._values[self._count % self._size] = duration_ns
         self._count += 1
+
+    def extend(self, durations_ns: Sequence[int]) -> None:
+        """Keep several durations, the oldest first [ns]."""
+        kept = durations_ns[-self._size :]
+        begin = (self._count + len(durations_ns) - len(kept)) % self._size
+        until_end = min(len(kept), self._size - begin)
+        self._values[begin : begin + until_end] = array("q", kept[:until_end])
+        self._values[: len(kept) - until_end] = array("q", kept[until_end:])
+        self._count += len(durations_ns)
 
     @property
     def count(self) -> int:
@@ -120,6 +129,14 @@ class LoopStatistics:
             self._window_start_ns = now_ns
         self.cycles += 1
         self._window_cycles += 1
+
+    def punctual_cycles(self, late_ns: Sequence[int], first_ns: int) -> None:
+        """Record cycles of which none was late by a period: how late each was, and when the first ran [ns]."""
+        self.jitter.extend(late_ns)
+        if self.cycles == 0:
+            self._window_start_ns = first_ns
+        self.cycles += len(late_ns)
+        self._window_cycles += len(late_ns)
 
     def round_trip(self, duration_ns: int) -> None:
         """Record the time from the publication of a state until the command that answers it is there [ns]."""

@@ -27,11 +27,12 @@ from pendulum_msgs_py.loops.primitives import (
     copy,
     entry,
     has_listeners,
+    is_called,
     publish,
     sleep_until,
     steady_ns,
     take_one,
-    wait_for,
+    wait_for_any,
     wall_ns,
 )
 from pendulum_msgs_py.loops.trees import compile_tree
@@ -136,6 +137,8 @@ def plant_loop(layout: Any, step: Any) -> Any:
             late_ns = _time_ns(s) - deadline_ns
             if late_ns < 0 or late_ns >= s.period_ns or _somebody_waits(s):
                 return UNUSUAL
+            if is_called(s.time, s.calls):
+                return ENDED
             waits = _take_inputs(s)
             if waits != _IS_READ:
                 return MESSAGE_WAITS + waits
@@ -158,9 +161,9 @@ def plant_loop(layout: Any, step: Any) -> Any:
                     return UNUSUAL
                 continue
             left_ns = s.end_ns - steady_ns(s.time)
-            if left_ns <= 0:
+            if left_ns <= 0 or is_called(s.time, s.calls):
                 return ENDED
-            wait_for(s.time, s.counter, left_ns)
+            wait_for_any(s.time, s.counter, s.calls, left_ns)
 
     @entry(plant_record(layout))
     def run(s: Any) -> Any:

@@ -48,6 +48,7 @@ def plant_record(plant: np.dtype[Any]) -> np.dtype[Any]:
             ("waiting_at", "u8"),
             ("waiting", "i8", (1,)),
             ("counter", "i4"),
+            ("calls", "i4", (2,)),
             ("lockstep", "i8"),
             ("expected", "i8"),
             ("answered", "i8"),

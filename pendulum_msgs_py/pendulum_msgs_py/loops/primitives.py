@@ -24,11 +24,13 @@ __all__ = [
     "copy",
     "entry",
     "has_listeners",
+    "is_called",
     "publish",
     "sleep_until",
     "steady_ns",
     "take_one",
     "wait_for",
+    "wait_for_any",
     "wall_ns",
 ]
 
@@ -91,6 +93,34 @@ def sleep_until(time: Any, steady: Any) -> None:
     time.until[0] = steady // NANOSECONDS
     time.until[1] = steady % NANOSECONDS
     _sleep(_STEADY, _ABSOLUTE, time.until.ctypes.data, 0)
+
+
+@compiled
+def is_called(time: Any, calls: Any) -> Any:
+    """Tell whether one of two event counters has been added to, without a wait; they stay as they are."""
+    time.poll[0], time.poll[2] = calls[0], calls[1]
+    time.poll[1] = time.poll[3] = _READABLE
+    time.until[0] = time.until[1] = 0
+    return _poll(time.poll.ctypes.data, 2, time.until.ctypes.data, 0) > 0
+
+
+@compiled
+def wait_for_any(time: Any, counter: Any, calls: Any, longest: Any) -> None:
+    """Wait until one of three event counters has been added to, and empty the first.
+
+    Args:
+        time: Record of ``TIME``.
+        counter: Descriptor of the first, which does not block.
+        calls: Those of the others.
+        longest: Longest wait [ns].
+    """
+    time.poll[0], time.poll[2], time.poll[4] = counter, calls[0], calls[1]
+    time.poll[1] = time.poll[3] = time.poll[5] = _READABLE
+    time.until[0] = longest // NANOSECONDS
+    time.until[1] = longest % NANOSECONDS
+    if longest > 0 and _poll(time.poll.ctypes.data, 3, time.until.ctypes.data, 0) > 0:
+        # What it counted does not matter, nor whether it was this one.
+        _read(counter, time.until.ctypes.data, 8)
 
 
 @compiled

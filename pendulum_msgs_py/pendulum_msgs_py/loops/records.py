@@ -6,6 +6,8 @@ the bytes must equal but for stamp and numbers (:func:`pendulum_msgs_py.contract
 
 from __future__ import annotations
 
+import ctypes
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,15 +15,25 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.cdr import MessageTemplate
 
-__all__ = ["INPUT", "MESSAGE", "MOST_BYTES", "MOST_VALUES", "OUTPUT", "TIME", "expect_template", "set_template"]
+__all__ = [
+    "INPUT",
+    "MESSAGE",
+    "MOST_BYTES",
+    "MOST_VALUES",
+    "OUTPUT",
+    "TIME",
+    "expect_template",
+    "set_template",
+    "structure_of",
+]
 
 MOST_BYTES = 512
 """Longest message that a loop reads or writes itself [bytes]; longer ones are Python's."""
 MOST_VALUES = 3
 """Numbers in a message: position, velocity and effort of one joint."""
 
-TIME = np.dtype([("now", "i8", (2,)), ("until", "i8", (2,)), ("poll", "i4", (2,))], align=True)
-"""Where the C library puts the time, and is told one, in seconds and nanoseconds; a ``struct pollfd``."""
+TIME = np.dtype([("now", "i8", (2,)), ("until", "i8", (2,)), ("poll", "i4", (6,))], align=True)
+"""Where the C library puts the time, and is told one, in seconds and nanoseconds; three times ``struct pollfd``."""
 
 MESSAGE = np.dtype(
     [("buffer", "u8"), ("length", "u8"), ("capacity", "u8"), ("allocator", "u8", (5,))],
@@ -67,6 +79,38 @@ OUTPUT = np.dtype(
     align=True,
 )
 """A publisher, and the message that goes out there."""
+
+
+_NUMBERS = {
+    "i8": ctypes.c_int64,
+    "u8": ctypes.c_uint64,
+    "f8": ctypes.c_double,
+    "i4": ctypes.c_int32,
+    "u4": ctypes.c_uint32,
+    "u1": ctypes.c_uint8,
+}
+
+
+@cache
+def structure_of(layout: np.dtype[Any]) -> type[ctypes.Structure]:
+    """Return the structure of a layout: Python reads and writes its fields by attribute, in a third of numpy's time."""
+
+    def kind_of(field: np.dtype[Any]) -> Any:
+        base, shape = field.base, field.shape
+        kind = structure_of(base) if base.names else _NUMBERS[base.str[1:]]
+        for length in reversed(shape):
+            kind = kind * length
+        return kind
+
+    assert layout.fields is not None
+    assert layout.names is not None
+    fields = [(name, kind_of(layout.fields[name][0])) for name in layout.names]
+    structure = type("Record", (ctypes.Structure,), {"_fields_": fields})
+    if ctypes.sizeof(structure) != layout.itemsize:
+        raise TypeError(
+            f"structure has {ctypes.sizeof(structure)} bytes; expected {layout.itemsize}, as its layout has"
+        )
+    return structure
 
 
 def expect_template(source: NDArray[Any], template: MessageTemplate | None) -> None:

@@ -61,8 +61,13 @@ class ArrivalSignal:
 
     @property
     def descriptor(self) -> int:
-        """The counter, for who waits for it by other means, where this works."""
-        return self._counter
+        """The counter, for who waits for it by other means; -1, which poll(2) passes over, where this does not work."""
+        return self._counter if self.works else -1
+
+    def wake(self) -> None:
+        """Have whoever waits look, though nothing has come; from any thread."""
+        if self.works:
+            os.eventfd_write(self._counter, 1)
 
     def came(self) -> bool:
         """Return whether anything may have come since this was asked last."""

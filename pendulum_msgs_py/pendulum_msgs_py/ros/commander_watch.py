@@ -48,6 +48,10 @@ class CommanderWatch:
         """Remember the stamp of a state that this plant publishes [ns]."""
         self.own_stamps.appendleft(stamp_ns)
 
+    def note_states(self, newest_ns: int, period_ns: int, count: int) -> None:
+        """Remember the stamps of states that this plant published one period after the other [ns]."""
+        self.own_stamps.extendleft(range(newest_ns - (count - 1) * period_ns, newest_ns + 1, period_ns))
+
     def suspect_twins(self, command: JointCommand, now_ns: int) -> None:
         """Look at the graph at once when a state is answered in two ways: two commanders may share a name.
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Collection, Iterable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.cdr import JointStateFields, MessageTemplate, encode_clock, template_of
 from pendulum_msgs_py.contract.ordinary import lend, take_back
@@ -28,7 +27,7 @@ from pendulum_msgs_py.loops.plant_record import (
     PUSH,
     plant_record,
 )
-from pendulum_msgs_py.loops.records import expect_template, set_template
+from pendulum_msgs_py.loops.records import expect_template, set_template, structure_of
 from pendulum_msgs_py.ros.convert import fields_from_bytes
 from pendulum_msgs_py.ros.direct import DirectTopics, rcl_symbols
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
@@ -36,8 +35,8 @@ from pendulum_msgs_py.ros.qos import COMMAND_INPUT
 
 __all__ = ["SLICE", "CompiledPeriods", "CompiledPlant", "Slice"]
 
-SLICE = 0.02
-"""Longest time that compiled code runs before services, timers and parameters have their turn [s]."""
+SLICE = 0.1
+"""Longest time that compiled code runs before timers and other messages have their turn [s]; a call ends it at once."""
 _INPUTS = {Input.EFFORT_COMMAND: EFFORT, Input.DISTURBANCE: DISTURBANCE, Input.PUSH: PUSH}
 _KINDS = {index: kind for kind, index in _INPUTS.items()}
 _NO_END = 2**62
@@ -74,10 +73,13 @@ class CompiledPlant(Protocol):
     def layout(self) -> np.dtype[Any]:
         """Layout of its part of the record."""
 
-    def lend(self, record: NDArray[Any]) -> None:
-        """Write its state into its part of the record."""
+    def describe(self, record: Any) -> None:
+        """Write what stays as it is into its part of the record, by attribute."""
 
-    def take_back(self, record: NDArray[Any]) -> None:
+    def lend(self, record: Any) -> None:
+        """Write its state."""
+
+    def take_back(self, record: Any) -> None:
         """Take over the state that a loop has left."""
 
 
@@ -116,7 +118,9 @@ class CompiledPeriods:
         self.periods = 0
         self._loop = load_loop(plant.builder, *plant.choice, symbols=rcl_symbols())
         self._memory = np.zeros(1, dtype=plant_record(plant.layout))
-        self._record = record = self._memory[0]
+        # For what is written once numpy's view will do; what is written in each slice has a faster one.
+        self._entries = record = self._memory[0]
+        self._record = structure_of(self._memory.dtype).from_buffer(self._memory)
         self._topics = DirectTopics()
         self._templates: dict[Input, MessageTemplate | None] = {}
         for kind, index in _INPUTS.items():
@@ -138,6 +142,8 @@ class CompiledPeriods:
         record["lockstep"] = clock is None
         record["period_ns"] = period_ns
         record["counter"] = -1 if clock is not None else interface.watch_inputs().descriptor
+        record["own_stamp_ns"] = NEVER
+        plant.describe(self._record.plant)
 
     def run(
         self,
@@ -163,37 +169,31 @@ class CompiledPeriods:
             return Slice(now_ns, 0, answered, None)
         self._expect_messages()
         with supervisor.alone():
-            if not lend(supervisor, record["rules"]):
+            if not lend(supervisor, record.rules):
                 return Slice(now_ns, 0, answered, None)
-            self._plant.lend(record["plant"])
-            record["now_ns"] = now_ns
-            record["expected"], record["answered"] = _bits(expected), _bits(answered)
-            record["last_ns"] = _NO_END if last_ns is None else last_ns
-            record["sample_ns"], (record["position"],), (record["velocity"],), (record["effort"],) = sample
-            record["wall_ahead_ns"] = 0 if self._clock is None else self._clock.ahead_ns
-            record["published_ns"] = interface.published_ns
-            record["end_ns"] = time.monotonic_ns() + round(longest * NANOSECONDS)
-            record["periods"] = record["latencies"] = 0
+            self._plant.lend(record.plant)
+            record.now_ns, record.expected, record.answered = now_ns, _bits(expected), _bits(answered)
+            record.last_ns = _NO_END if last_ns is None else last_ns
+            record.sample_ns, (record.position,), (record.velocity,), (record.effort,) = sample
+            record.wall_ahead_ns = 0 if self._clock is None else self._clock.ahead_ns
+            record.published_ns = interface.published_ns
+            record.end_ns = time.monotonic_ns() + round(longest * NANOSECONDS)
+            record.calls[:] = interface.calls
+            record.periods = record.latencies = 0
             self._lend_stamps()
             with self._topics.held():
                 why = self._loop(self._memory)
-            take_back(supervisor, record["rules"])
-            periods = int(record["periods"])
-            if periods:
-                self.periods += periods
-                self._take_back(periods)
+            take_back(supervisor, record.rules)
+            if record.periods:
+                self._take_back(record.periods)
         message = None
         if why >= MESSAGE_WAITS:
             kind = _KINDS[why - MESSAGE_WAITS]
-            source = record["inputs"][_INPUTS[kind]]
+            source = self._entries["inputs"][_INPUTS[kind]]
             message = kind, DirectTopics.message(source), int(source["info"][1])
-        has_answered = int(record["answered"])
-        return Slice(
-            int(record["now_ns"]),
-            periods,
-            [kind for kind, index in _INPUTS.items() if has_answered >> index & 1],
-            message,
-        )
+        has_answered = record.answered
+        newest = [kind for kind, index in _INPUTS.items() if has_answered >> index & 1]
+        return Slice(record.now_ns, record.periods, newest, message)
 
     def _expect_messages(self) -> None:
         """Expect the messages that Python accepted last, of each input."""
@@ -202,33 +202,28 @@ class CompiledPeriods:
             template = None if fields is None else template_of(fields, len(data))
             if template != self._templates.get(kind):
                 self._templates[kind] = template
-                expect_template(self._record["inputs"][_INPUTS[kind]], template)
+                expect_template(self._entries["inputs"][_INPUTS[kind]], template)
 
     def _lend_stamps(self) -> None:
-        stamps = self._interface.commander_watch.own_stamps
-        ring = self._record["own_stamp_ns"]
-        ring[:] = NEVER
-        ring[: len(stamps)] = list(stamps)[::-1]
-        self._record["own_newest"] = len(stamps) - 1
+        stamps, record = self._interface.commander_watch.own_stamps, self._record
+        if stamps and record.own_stamp_ns[record.own_newest] != stamps[0]:
+            # Python has published since.
+            record.own_stamp_ns[: len(stamps)] = tuple(reversed(stamps))
+            record.own_newest = len(stamps) - 1
 
     def _take_back(self, periods: int) -> None:
         record, interface = self._record, self._interface
-        self._plant.take_back(record["plant"])
-        stamp_ns, period_ns = int(record["now_ns"]), int(record["period_ns"])
-        interface.sample = JointSample.of_one(
-            stamp_ns, float(record["position"]), float(record["velocity"]), float(record["effort"])
-        )
-        interface.published_ns = int(record["published_ns"])
-        for back in range(min(periods, OWN_STAMPS) - 1, -1, -1):
-            interface.commander_watch.note_state(stamp_ns - back * period_ns)
+        self.periods += periods
+        self._plant.take_back(record.plant)
+        stamp_ns, period_ns = record.now_ns, record.period_ns
+        interface.sample = JointSample.of_one(stamp_ns, record.position, record.velocity, record.effort)
+        interface.published_ns = record.published_ns
+        interface.commander_watch.note_states(stamp_ns, period_ns, min(periods, OWN_STAMPS))
         statistics = interface.statistics
         if statistics is not None and self._clock is not None:
-            first_ns = stamp_ns - (periods - 1) * period_ns
-            for index, late_ns in enumerate(record["late_ns"][:periods].tolist()):
-                deadline_ns = first_ns + index * period_ns
-                statistics.cycle(deadline_ns + late_ns, deadline_ns)
-            for latency_ns in record["latency_ns"][: int(record["latencies"])].tolist():
-                statistics.round_trip(latency_ns)
+            late_ns = record.late_ns[:periods]
+            statistics.punctual_cycles(late_ns, stamp_ns - (periods - 1) * period_ns + late_ns[0])
+            statistics.latency.extend(record.latency_ns[: record.latencies])
         self._done(stamp_ns)
 
 

@@ -165,6 +165,11 @@ class PlantInterface:
         if self._torques.wait(timeout):
             self.take_inputs()
 
+    @property
+    def calls(self) -> tuple[int, int]:
+        """Event counters of what ends a slice of compiled code: requests and trajectories; -1 where there is none."""
+        return self.node.request_descriptor, self._trajectories.descriptor
+
     def receive(self, kind: Input, data: bytes, arrived_ns: int) -> None:
         """Receive a torque that somebody else has taken, where inputs are polled."""
         self._receivers[kind](data, arrived_ns)

@@ -312,7 +312,7 @@ _LOOK_FREE = 0.001
 """Wall time between two steps that nobody has to answer, and between two looks for those who will [s]."""
 _LOOK_WAITING = 0.1
 """Wall time between two looks for answers that are overdue [s]."""
-_TURNS = 4
+_TURNS = 12
 """Calls after a slice in which a runner attends to an event each: more than timers have in a slice."""
 _PATIENCE = 1.0
 """Wall time without an answer after which a state is published again [s]."""

@@ -52,6 +52,11 @@ class PolledInput:
         """Have the middleware say when something comes, for an owner who looks often at what seldom comes."""
         self._signal = ArrivalSignal([self.subscription])
 
+    @property
+    def descriptor(self) -> int:
+        """The event counter to which each message adds, where somebody watches; else -1."""
+        return -1 if self._signal is None else self._signal.descriptor
+
     def came(self) -> bool:
         """Return whether anything may have come since this was asked last; always, where nobody watches."""
         return self._signal is None or self._signal.came()
@@ -103,6 +108,16 @@ class PollingNode(Node):
     def told_of_requests(self) -> bool:
         """Whether the middleware says when a request has come; otherwise each service is looked at every 10 ms."""
         return self._requests is not None and self._requests.works
+
+    @property
+    def request_descriptor(self) -> int:
+        """The event counter to which each request adds; -1 where there is none."""
+        return -1 if self._requests is None else self._requests.descriptor
+
+    def wake(self) -> None:
+        """Have the node's thread look for requests, and for what else it does between two slices; from any thread."""
+        if self._requests is not None:
+            self._requests.wake()
 
     def poll_services(self, *, timer: bool = True) -> None:
         """Attend to the services that there are at a bounded rate from now on, one request after the other.

@@ -133,14 +133,16 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
         return report_error(ParameterError(f"ROS arguments are not understood: {_sentence(error)}"))
     executor = EventsExecutor()
     stopped = Future(executor=None)
+    node: Node | None = None
 
     def stop() -> None:
         if not stopped.done():
             stopped.set_result(None)
         executor.wake()
+        if isinstance(node, PollingNode):
+            node.wake()
 
     threading.Thread(target=_watch_signals, args=(signals, stop), daemon=True).start()
-    node: Node | None = None
     exit_code = 0
     try:
         node = _make(make_node, stop)
