@@ -72,3 +72,28 @@ def test_of_many_lines_one_a_second_is_told_and_none_is_forgotten() -> None:
     # What is new is told at once.
     assert throttle.ask(5.2) is None
     assert throttle.ask(5.3, urgent=True) == 1
+
+
+@given(st.lists(st.lists(st.integers(0, 10**9), max_size=9), max_size=6), st.integers(1, 7))
+def test_durations_kept_several_at_a_time_are_those_kept_one_by_one(parts: list[list[int]], size: int) -> None:
+    one_by_one, several = RingOfTimes(size), RingOfTimes(size)
+    for part in parts:
+        several.extend(part)
+        for duration in part:
+            one_by_one.add(duration)
+    assert several.count == one_by_one.count
+    assert list(several._values) == list(one_by_one._values)
+
+
+def test_cycles_told_several_at_a_time_are_those_told_one_by_one() -> None:
+    one_by_one, several = LoopStatistics(_MS), LoopStatistics(_MS)
+    late = [1000 * k for k in range(40)]
+    for part in (late[:25], late[25:]):
+        begin = late.index(part[0])
+        several.punctual_cycles(part, begin * _MS + part[0])
+    for k, each in enumerate(late):
+        one_by_one.cycle(k * _MS + each, k * _MS)
+    summaries = [each.summary(40 * _MS) for each in (several, one_by_one)]
+    told = [{key: value for key, value in each.items() if not math.isnan(value)} for each in summaries]
+    assert told[0] == told[1]
+    assert "jitter_p99_us" in told[0]

@@ -25,7 +25,7 @@ _SYMBOL = struct.Struct("<IBBHQQ")
 _RELOCATION = struct.Struct("<QQq")
 _ADDRESS = struct.Struct("<Q")
 _SYMBOL_TABLE, _RELOCATIONS, _EMPTY, _UNWINDING = 2, 4, 8, 0x70000001
-_ALLOCATED = 2
+_WRITABLE, _ALLOCATED = 1, 2
 _UNDEFINED, _COMMON = 0, 0xFFF2
 _ABSOLUTE = 1
 _READ_AND_EXECUTE = mmap.PROT_READ | mmap.PROT_EXEC
@@ -52,7 +52,7 @@ class _Symbol(NamedTuple):
 
 
 class LinkedCode:
-    """Code in memory that can be executed, and no longer written; it stays there as long as this object.
+    """Code in memory that can be executed and not written; it stays there as long as this object.
 
     Attributes:
         addresses: Where its symbols are.
@@ -86,7 +86,7 @@ def link(code: bytes, known: Mapping[str, int]) -> LinkedCode:
     """
     sections = _sections(code)
     symbols = _symbols(code, sections)
-    places, size = _places(sections, symbols)
+    places, constant, size = _places(sections, symbols)
     memory = mmap.mmap(-1, size, prot=mmap.PROT_READ | mmap.PROT_WRITE)
     base = ctypes.addressof(ctypes.c_char.from_buffer(memory))
     for index, at in places.items():
@@ -97,7 +97,7 @@ def link(code: bytes, known: Mapping[str, int]) -> LinkedCode:
     for section in sections:
         if section.kind == _RELOCATIONS and section.info in places:
             _relocate(code, section, memory, places[section.info], addresses)
-    if ctypes.CDLL(None, use_errno=True).mprotect(ctypes.c_void_p(base), ctypes.c_size_t(size), _READ_AND_EXECUTE):
+    if ctypes.CDLL(None, use_errno=True).mprotect(ctypes.c_void_p(base), ctypes.c_size_t(constant), _READ_AND_EXECUTE):
         raise OSError(ctypes.get_errno(), "memory cannot be made executable")
     found = {symbol.name: address for symbol, address in zip(symbols, addresses, strict=True) if address}
     return LinkedCode(memory, found)
@@ -128,22 +128,36 @@ def _symbols(code: bytes, sections: list[_Section]) -> list[_Symbol]:
     return list(read())
 
 
-def _places(sections: list[_Section], symbols: list[_Symbol]) -> tuple[dict[int | str, int], int]:
-    """Return where each section that is loaded comes, and each common symbol by its name; and the size of all."""
+def _places(sections: list[_Section], symbols: list[_Symbol]) -> tuple[dict[int | str, int], int, int]:
+    """Return where each section that is loaded comes, and each common symbol by its name.
+
+    Pages with code come first, and the size of these; then those with what code may write, and the size of all.
+    """
     places: dict[int | str, int] = {}
+
+    def place(key: int | str, size: int, alignment: int, end: int) -> int:
+        places[key] = end + -end % max(1, alignment)
+        return places[key] + size
+
+    # Nothing is ever thrown through a loop, so how to unwind its stack may be left out.
+    loaded = [
+        (index, section)
+        for index, section in enumerate(sections)
+        if section.flags & _ALLOCATED and section.size and section.kind != _UNWINDING
+    ]
     end = 0
-    for index, section in enumerate(sections):
-        # Nothing is ever thrown through a loop, so how to unwind its stack may be left out.
-        if section.flags & _ALLOCATED and section.size and section.kind != _UNWINDING:
-            end += -end % max(1, section.alignment)
-            places[index] = end
-            end += section.size
+    for index, section in loaded:
+        if not section.flags & _WRITABLE:
+            end = place(index, section.size, section.alignment, end)
+    constant = end = end + -end % mmap.PAGESIZE
+    for index, section in loaded:
+        if section.flags & _WRITABLE:
+            end = place(index, section.size, section.alignment, end)
     for symbol in symbols:
         if symbol.section == _COMMON:
-            end += -end % max(1, symbol.value)  # of a common symbol, the value is its alignment
-            places[symbol.name] = end
-            end += symbol.size
-    return places, end + -end % mmap.PAGESIZE
+            # Its value is its alignment.
+            end = place(symbol.name, symbol.size, symbol.value, end)
+    return places, constant, end + -end % mmap.PAGESIZE
 
 
 def _address_of(symbol: _Symbol, places: Mapping[int | str, int], base: int, known: Mapping[str, int]) -> int:
