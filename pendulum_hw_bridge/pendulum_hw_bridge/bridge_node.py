@@ -114,7 +114,7 @@ class BridgeNode(LifecycleNode, PollingNode):
             if self._lockstep
             else self._port_clock.now_ns,
             push=values["backend"] in EMULATED_BACKENDS,
-            polled=not self._lockstep,
+            polled=True,
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,

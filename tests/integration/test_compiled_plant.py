@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -150,3 +152,39 @@ def test_a_run_is_the_same_compiled_and_interpreted(tmp_path: Path, parameters: 
     assert compiled[2] == interpreted[2]
     assert int(compiled[2]["effort_command.refused.second_commander"]) > 0
     assert int(compiled[2]["saturated_periods"]) > 0
+
+
+def test_in_real_time_it_runs_compiled_and_answers_whoever_calls(
+    processes: ProcessGroup, domain_id: int, tmp_path: Path
+) -> None:
+    plant = graph.simulator("/sim", rate_hz=250.0, initial_theta=3.0)
+    with closing(PlantPeer("/sim", torque=0.5)) as peer:
+        program = processes.start(plant.package, plant.executable, *plant.ros_arguments())
+        peer.until(lambda: int(peer.diagnostics.get("periods_compiled", 0)) > 200, "compiled periods", 120.0)
+        first = peer.diagnostics
+        peer.spin(2.0)
+        last = peer.diagnostics
+        cycles, compiled, accepted = (
+            int(last[key]) - int(first[key]) for key in ("cycles", "periods_compiled", "effort_command.accepted")
+        )
+        assert compiled > 0.5 * cycles > 0.0
+        assert accepted > 0.5 * cycles
+        assert float(last["command_latency_p50_us"]) > 0.0
+        # A service has its turn at once, in the middle of a slice.
+        begun = time.monotonic()
+        assert peer.call(SetBool, "simulator/pause", SetBool.Request(data=True)).success
+        assert time.monotonic() - begun < 2.0
+        assert peer.call(SetBool, "simulator/pause", SetBool.Request(data=False)).success
+        # So have silence and a stop.
+        peer.until(lambda: int(peer.diagnostics["periods_compiled"]) > int(last["periods_compiled"]) + 100, "going on")
+        peer.torque = None
+        peer.until(lambda: peer.diagnostics["reason"] == "no fresh command: zero torque", "zero torque")
+        peer.torque = 0.5
+        peer.until(lambda: peer.diagnostics["reason"] == "commanded by peer", "torque again")
+        assert peer.ask("e_stop").success
+        peer.until(lambda: peer.diagnostics["mode"] == "e_stop", "the stop")
+        stopped = peer.diagnostics["periods_compiled"]
+        peer.spin(0.3)
+        assert peer.diagnostics["periods_compiled"] == stopped
+        program.interrupt()
+        assert program.wait(20.0) == 0
