@@ -21,7 +21,7 @@ from pendulum_msgs_py.ros.arrivals import ArrivalSignal
 from pendulum_msgs_py.ros.requests import MOST_BYTES, TooLarge, take_request
 from pendulum_msgs_py.ros.timers import create_wall_timer
 
-__all__ = ["REST_AFTER_READING", "PolledInput", "PollingNode"]
+__all__ = ["REST_AFTER_READING", "PolledInput", "PollingNode", "WaitedInput"]
 
 REST_AFTER_READING = 4.0
 """Time without a look after something big was read, in the time that it took the processor: a fifth of it at most."""
@@ -78,6 +78,56 @@ class PolledInput:
         with self.subscription.handle:
             while (taken := self._take(self._type, True)) is not None:
                 yield taken
+
+
+class WaitedInput(PolledInput):
+    """A subscription to raw messages that its owner waits for, where the middleware says when one comes.
+
+    Where it does not, on other systems or with another middleware, an executor hands the messages over as ever, and
+    there is nothing to wait for.
+
+    Args:
+        subscription: Of a :class:`PollingNode`, raw; ``receive`` is its callback.
+        depth: Messages that it keeps; also the most that one look takes.
+        receive: Gets each message, serialised, in the thread that owns the node.
+        signal: Of this subscription alone.
+    """
+
+    def __init__(
+        self, subscription: Subscription, depth: int, receive: Callable[[bytes], object], signal: ArrivalSignal
+    ) -> None:
+        super().__init__(subscription, depth)
+        self._signal = signal
+        self._arrivals = signal
+        self._receive = receive
+
+    @property
+    def works(self) -> bool:
+        """Whether its owner waits for it; otherwise the executor attends to it."""
+        return self._arrivals.works
+
+    @property
+    def descriptor(self) -> int:
+        """The event counter that the middleware adds to, where this works."""
+        return self._arrivals.descriptor
+
+    def serve(self, longest: float) -> bool:
+        """Hand over what has come, and what comes within a time; return whether anything did.
+
+        Args:
+            longest: Time after which nothing more is waited for [s].
+        """
+        ends, any_came = time.monotonic() + longest, False
+        while True:
+            for _ in self._looks:
+                taken = self._take(self._type, True)
+                if taken is None:
+                    break
+                any_came = True
+                self._receive(taken[0])
+            left = ends - time.monotonic()
+            if left <= 0.0 or not self._arrivals.wait(left):
+                return any_came
 
 
 class PollingNode(Node):
@@ -181,6 +231,24 @@ class PollingNode(Node):
         subscription = self.create_subscription(message_type, topic, _never_called, profile, raw=True)
         self._polled |= {subscription}
         return PolledInput(subscription, profile.depth)
+
+    def create_waited_input(
+        self, message_type: type, topic: str, profile: QoSProfile, receive: Callable[[bytes], object]
+    ) -> WaitedInput:
+        """Return an input that the owner of the node's thread waits for, where the middleware says when one comes.
+
+        Args:
+            message_type: Of the topic.
+            topic: Its name.
+            profile: Quality of service.
+            receive: Gets each message, serialised: from :meth:`WaitedInput.serve`, or from the executor where the
+                middleware does not tell.
+        """
+        subscription = self.create_subscription(message_type, topic, receive, profile, raw=True)
+        signal = ArrivalSignal([subscription])
+        if signal.works:
+            self._polled |= {subscription}
+        return WaitedInput(subscription, profile.depth, receive, signal)
 
     def destroy_polled_input(self, polled: PolledInput) -> None:
         """Let go of an input."""

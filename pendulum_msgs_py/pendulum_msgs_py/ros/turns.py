@@ -1,0 +1,33 @@
+"""Turns of a node that waits for an input itself, and of the executor that has its timers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+__all__ = ["LONGEST_SLICE", "Turns"]
+
+LONGEST_SLICE = 0.02
+"""Longest time in which nobody but the input is attended to [s]: a request waits no longer than that."""
+_EVENTS_AFTER_SLICE = 3
+"""Events that the executor may attend to after each slice: 150 a second at least, for timers of 60."""
+
+
+class Turns:
+    """Lets an input and an executor take turns, for :class:`pendulum_msgs_py.ros.runner.Paced`.
+
+    Args:
+        serve: Attends to the input for a time at most [s]; returns whether anything came.
+    """
+
+    def __init__(self, serve: Callable[[float], bool]) -> None:
+        self._serve = serve
+        self._left = 0
+
+    def run_due(self) -> float:
+        """Attend to the input, or leave the turn to the executor; return the time until this wants another turn [s]."""
+        if self._left:
+            self._left -= 1
+        else:
+            # Where nothing comes nothing is in a hurry, and each look at the executor costs.
+            self._left = _EVENTS_AFTER_SLICE - 1 if self._serve(LONGEST_SLICE) else 0
+        return 0.0
