@@ -5,12 +5,23 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Any, cast
 
+from pendulum_lqr.answer_rules import (
+    DUPLICATE,
+    FROM_FUTURE,
+    LONGEST,
+    NEVER,
+    NEW,
+    OUT_OF_ORDER,
+    STALE,
+    is_saturated,
+    judge_state,
+)
 from pendulum_lqr.interface import Controller, JointController
-from pendulum_msgs_py.contract.angles import from_upright
+from pendulum_msgs_py.contract.angles import deviation_from_upright
 from pendulum_msgs_py.contract.timing import RingOfTimes
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample, Vector, written
 
@@ -29,6 +40,14 @@ class StateRefusal(str, Enum):
     NO_ANSWER = "no_answer"
 
 
+_REFUSALS = {
+    STALE: StateRefusal.STALE,
+    FROM_FUTURE: StateRefusal.FROM_FUTURE,
+    DUPLICATE: StateRefusal.DUPLICATE,
+    OUT_OF_ORDER: StateRefusal.OUT_OF_ORDER,
+}
+
+
 class AnswerLoop:
     """Answers each new state once and keeps count.
 
@@ -38,6 +57,16 @@ class AnswerLoop:
         simulated_time: Stamps are those of a simulator, so that their age says nothing and they may start anew.
         send: Called with a state and the efforts that answer it [N m or N], before anything is counted.
         monotonic: Clock for the compute time [ns].
+
+    Attributes:
+        controller: The controller.
+        simulated_time: Whether stamps are those of a simulator.
+        newest: The newest state that was answered, or could not be; None before the first.
+        kept_answer: The efforts that answered it [N m or N], or None.
+        start_ns: Stamp of the first state since a restart [ns]; None before it.
+        timeout_ns: Age beyond which a state is not answered [ns].
+        age: Ages of the states that were answered [ns].
+        compute_time: Times in which they were [ns].
     """
 
     def __init__(
@@ -60,24 +89,26 @@ class AnswerLoop:
         self.last_reason = ""
         self.age = RingOfTimes()
         self.compute_time = RingOfTimes()
-        self._newest: JointSample | None = None
-        self._answer: Vector | None = None
+        self.newest: JointSample | None = None
+        self.kept_answer: Vector | None = None
         self._send = send
         self._monotonic = monotonic
-        self._timeout_ns = math.inf if simulated_time else state_timeout * NANOSECONDS
-        self._start_ns: int | None = None
+        self._timeout = state_timeout
+        # Whole nanoseconds, as ages are.
+        self.timeout_ns = math.floor(min(LONGEST, state_timeout * NANOSECONDS))
+        self.start_ns: int | None = None
         self._window = (0, 0, 0)
 
     @property
     def newest_stamp_ns(self) -> int | None:
         """Stamp of the newest state that was answered, or could not be [ns]; None before the first."""
-        return None if self._newest is None else self._newest.stamp_ns
+        return None if self.newest is None else self.newest.stamp_ns
 
     def restart(self) -> None:
         """Forget the past: the next state is the first one."""
         self.controller.reset()
-        self._newest = None
-        self._start_ns = None
+        self.newest = None
+        self.start_ns = None
         self.last_effort = self._nothing
 
     def replace(self, controller: Controller | JointController) -> None:
@@ -97,7 +128,9 @@ class AnswerLoop:
         else:
             one = controller.command
             self._limits = (controller.effort_limit,)
-            self._command = lambda t, sample: (one(t, (from_upright(sample.position[0]), sample.velocity[0])),)
+            self._command = lambda t, sample: (
+                one(t, (deviation_from_upright(sample.position[0]), sample.velocity[0])),
+            )
         self._nothing = (0.0,) * len(self._limits)
 
     def answer(self, sample: JointSample | None, now_ns: int, problem: str = "") -> Vector | None:
@@ -115,17 +148,17 @@ class AnswerLoop:
             # A plant in lockstep repeats a state when the answer did not reach it: the same answer again, if any.
             if sample is None or refusal is not StateRefusal.DUPLICATE or not self.simulated_time:
                 return None
-            if self._answer is not None:
-                self._send(sample, self._answer)
-            return self._answer
+            if self.kept_answer is not None:
+                self._send(sample, self.kept_answer)
+            return self.kept_answer
         assert sample is not None
-        if self._start_ns is None:
-            self._start_ns = sample.stamp_ns
-        self._newest, self._answer = sample, None
+        if self.start_ns is None:
+            self.start_ns = sample.stamp_ns
+        self.newest, self.kept_answer = sample, None
         began = self._monotonic()
         reason = ""
         try:
-            effort = self._command((sample.stamp_ns - self._start_ns) / NANOSECONDS, sample)
+            effort = self._command((sample.stamp_ns - self.start_ns) / NANOSECONDS, sample)
         except (ArithmeticError, ValueError, RuntimeError) as error:
             # A solver that gives up must not end the node: without an answer the plant's timeout makes it zero.
             effort, reason = (math.nan,), f"{type(error).__name__}: {error}"
@@ -135,7 +168,7 @@ class AnswerLoop:
             self.refused[StateRefusal.NO_ANSWER] += 1
             return None
         ended = self._monotonic()
-        self.last_effort = self._answer = effort
+        self.last_effort = self.kept_answer = effort
         # Somebody waits for it, and in a process that has just woken up counting takes several times as long as later.
         self._send(sample, effort)
         self.compute_time.add(ended - began)
@@ -143,10 +176,37 @@ class AnswerLoop:
             self.age.add(now_ns - sample.stamp_ns)
         self.answered += 1
         for value, limit in zip(effort, self._limits, strict=True):
-            if abs(value) >= limit:
+            if is_saturated(value, limit):
                 self.saturated += 1
                 break
         return effort
+
+    def count(
+        self,
+        sample: JointSample,
+        effort: Vector,
+        *,
+        answered: int,
+        saturated: int,
+        ages_ns: Sequence[int],
+        compute_times_ns: Sequence[int],
+    ) -> None:
+        """Count answers that went out already.
+
+        Args:
+            sample: The newest state that was answered.
+            effort: Its answer [N m or N].
+            answered: How many were answered.
+            saturated: How many of the answers were at a limit.
+            ages_ns: Their states' ages [ns].
+            compute_times_ns: Times that they took [ns].
+        """
+        self.newest, self.kept_answer, self.last_effort = sample, effort, effort
+        self.answered += answered
+        self.saturated += saturated
+        self.compute_time.extend(compute_times_ns)
+        if not self.simulated_time:
+            self.age.extend(ages_ns)
 
     def summary(self, now_ns: int) -> Mapping[str, object]:
         """Return the figures for diagnostics; rate and saturation are those since the last summary.
@@ -185,27 +245,27 @@ class AnswerLoop:
             return StateRefusal.MALFORMED
         if not all(map(math.isfinite, sample.position + sample.velocity)):
             return StateRefusal.NOT_FINITE
-        if not self.simulated_time:
-            age = now_ns - sample.stamp_ns
-            if age > self._timeout_ns:
-                return StateRefusal.STALE
-            if age < -self._timeout_ns:
-                return StateRefusal.FROM_FUTURE
-        newest = self._newest
-        if newest is None or sample.stamp_ns > newest.stamp_ns:
+        newest = self.newest
+        found = judge_state(
+            sample.stamp_ns,
+            sample.stamp_ns if self.simulated_time else now_ns,
+            self.timeout_ns,
+            NEVER if newest is None else newest.stamp_ns,
+        )
+        if found == NEW:
             return None
         # Angle and velocity alone: what the torque sensor shows is no part of the state.
-        if self.simulated_time and sample[:3] != newest[:3]:
+        if self.simulated_time and newest is not None and sample[:3] != newest[:3]:
             # One writer's messages never overtake each other, so simulated time that goes back, or another state under
             # the same stamp, is a simulation that began anew, however short the one before it was.
             self.restarts += 1
             self.restart()
             return None
-        return StateRefusal.DUPLICATE if sample.stamp_ns == newest.stamp_ns else StateRefusal.OUT_OF_ORDER
+        return _REFUSALS[found]
 
     def _problem(self, refusal: StateRefusal, sample: JointSample, now_ns: int) -> str:
         age = (now_ns - sample.stamp_ns) / NANOSECONDS
-        limit = f"expected at most {self._timeout_ns / NANOSECONDS:g} s"
+        limit = f"expected at most {self._timeout:g} s"
         if refusal is StateRefusal.NOT_FINITE:
             where, speed = written(sample.position), written(sample.velocity)
             if len(sample.position) > 1:  # each in its own unit

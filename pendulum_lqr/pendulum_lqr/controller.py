@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, cast
 
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.joint_controller import JOINT_CONTROLLERS
+from pendulum_lqr.law import Law, clamped, deviation
 from pendulum_lqr.loop_check import require_stable
 from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator, make_velocity_estimator
-from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, suggestion, validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -26,6 +26,7 @@ __all__ = [
     "CONTROLLERS",
     "BaseController",
     "EstimatedVelocity",
+    "LawController",
     "SoftStart",
     "controller_class",
     "controller_parameters",
@@ -177,13 +178,46 @@ class BaseController:
 
     def clamp(self, effort: float) -> float:
         """Return the torque within the limit [N m]."""
-        limit = self.effort_limit
-        return limit if effort > limit else (max(effort, -limit))
+        return clamped(effort, self.effort_limit)
 
     def error(self, angle: float) -> float:
         """Return the deviation of an angle (from upright) from the set-point, the short way round [rad]."""
-        deviation = angle - self.set_point
-        return deviation if -math.pi <= deviation < math.pi else wrap(deviation)
+        return deviation(angle, self.set_point)
+
+
+class LawController(BaseController):
+    """A controller that is one pure function of numbers: its node can answer states by it in compiled code.
+
+    Args:
+        law: The function, of a module; it begins with ``effort_limit`` and ``set_point`` among its numbers.
+        effort_limit: Largest torque [N m].
+        set_point: Angle to hold, from upright [rad].
+        numbers: The law's own numbers, at most ``MOST_NUMBERS - OWN``.
+        memory: What it remembers, at first, at most ``MOST_MEMORY``.
+
+    Attributes:
+        law: The function.
+        numbers: All of its numbers.
+        memory: What it remembers.
+    """
+
+    def __init__(
+        self,
+        law: Law,
+        effort_limit: float,
+        set_point: float,
+        numbers: Iterable[float],
+        memory: Iterable[float] = (),
+    ) -> None:
+        super().__init__(effort_limit, set_point)
+        self.law = law
+        # Plain floats: indexing an array of two on every state costs more than the law itself.
+        self.numbers = tuple(float(number) for number in (effort_limit, set_point, *numbers))
+        self.memory = [float(value) for value in memory]
+
+    def command(self, t: float, x: Sequence[float]) -> float:
+        """Return the torque [N m] that the law has for the state."""
+        return self.law(t, x[0], x[1], self.memory, self.numbers)
 
 
 class EstimatedVelocity(BaseController):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.loop_check import MOST_GROWTH, growth
@@ -12,7 +12,16 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["ASSUMED_PERIOD", "PeriodWatch", "differs", "rate_problem", "require_period", "settles", "uses_period"]
+__all__ = [
+    "ASSUMED_PERIOD",
+    "PeriodWatch",
+    "differs",
+    "goes_on",
+    "rate_problem",
+    "require_period",
+    "settles",
+    "uses_period",
+]
 
 ASSUMED_PERIOD = 0.01
 """Period of a design whose states nobody has heard yet [s]: that of the thesis's loop."""
@@ -41,20 +50,36 @@ class PeriodWatch:
 
     def __init__(self, *, exact: bool = False) -> None:
         self._exact = exact
-        self._newest_ns: int | None = None
+        self.newest_ns: int | None = None
+        """Stamp of the newest state [ns]; None before the first."""
         self._intervals_ns: deque[int] = deque(maxlen=1 if exact else _WINDOW)
 
     def add(self, stamp_ns: int) -> bool:
         """Take the stamp of a state [ns]; return whether the plant began anew, so that what was measured is void."""
-        newest, self._newest_ns = self._newest_ns, stamp_ns
+        newest, self.newest_ns = self.newest_ns, stamp_ns
         if newest is None or stamp_ns == newest:
             return False
         interval = stamp_ns - newest
-        if 0 < interval < _GAP_NS:
+        if goes_on(interval):
             self._intervals_ns.append(interval)
             return False
         self._intervals_ns.clear()
         return True
+
+    def extend(self, stamps_ns: Sequence[int]) -> None:
+        """Take the stamps of states that went on from each other, the oldest first [ns]."""
+        most = self._intervals_ns.maxlen
+        assert most is not None
+        newest = stamps_ns[-most - 1 :]
+        if len(newest) < len(stamps_ns):
+            self.newest_ns = newest[0]
+        for stamp_ns in newest:
+            self.add(stamp_ns)
+
+    @property
+    def only_interval_ns(self) -> int | None:
+        """The one interval that says it all in simulated time [ns]; None in real time, or before it is known."""
+        return self._intervals_ns[0] if self._exact and self._intervals_ns else None
 
     @property
     def period(self) -> float | None:
@@ -62,6 +87,11 @@ class PeriodWatch:
         if len(self._intervals_ns) < (1 if self._exact else _ENOUGH):
             return None
         return float(f"{statistics.median(self._intervals_ns) / NANOSECONDS:.3g}")
+
+
+def goes_on(interval_ns: int) -> bool:
+    """Tell whether a state so long after another goes on from it [ns], and is not that of a plant that began anew."""
+    return 0 < interval_ns < _GAP_NS
 
 
 def differs(measured: float, designed: float) -> bool:

@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any, ClassVar
 
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controller import LawController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import Gain, output_lqr
+from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["Lqr"]
+__all__ = ["Lqr", "lqr_law"]
+
+_HOLD, _K0, _K1 = range(OWN, OWN + 3)
 
 
-class Lqr(BaseController):
+def lqr_law(
+    _t: float, angle: float, velocity: float, _memory: MutableSequence[float], numbers: Sequence[float]
+) -> float:
+    """Return u* - K (x - x*) within the limit [N m]; see :data:`pendulum_lqr.law.Law`."""
+    error = deviation(angle, numbers[SET_POINT])
+    return clamped(numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity, numbers[EFFORT_LIMIT])
+
+
+class Lqr(LawController):
     """Continuous LQR, sampled: the controller of the thesis.
 
     Where the plant has states that are not measured, K is the best gain on angle and velocity.
@@ -32,11 +43,9 @@ class Lqr(BaseController):
     PARAMETERS: ClassVar[tuple[ParameterSpec, ...]] = (Q, R, FEEDFORWARD)
 
     def __init__(self, gain: Gain, effort_limit: float, set_point: float = 0.0, hold: float = 0.0) -> None:
-        super().__init__(effort_limit, set_point)
+        super().__init__(lqr_law, effort_limit, set_point, (hold, *gain.K))
         self.gain = gain
         self.hold = hold
-        # Plain floats: indexing an array of two on every state costs more than the law itself.
-        self._k0, self._k1 = (float(value) for value in gain.K)
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Lqr:
@@ -45,11 +54,7 @@ class Lqr(BaseController):
         hold = model.effort if p["feedforward"] else 0.0
         return cls(output_lqr(model, p["q"], p["r"]), p["effort_limit"], p["set_point"], hold)
 
-    def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque [N m]."""
-        return self.clamp(self.hold - self._k0 * self.error(x[0]) - self._k1 * x[1])
-
     def describe(self) -> str:
         """Return gain and poles."""
         poles = ", ".join(f"{pole:.4g}" for pole in self.gain.poles)
-        return f"K = [{self._k0:.6f}, {self._k1:.6f}], poles {poles} 1/s"
+        return f"K = [{self.gain.K[0]:.6f}, {self.gain.K[1]:.6f}], poles {poles} 1/s"

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any
 
 import numpy as np
 
 from pendulum_lqr.analysis import delayed_spectral_radius
-from pendulum_lqr.controllers.lqr import Lqr
+from pendulum_lqr.controller import LawController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import DesignError, Gain, output_lqr
+from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.model import LinearModel, friction_effort, linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["LqrFriction"]
+__all__ = ["LqrFriction", "lqr_friction_law"]
+
+_HOLD, _K0, _K1, _FRICTION, _WIDTH = range(OWN, OWN + 5)
 
 _RESERVE = 2.0
 """Factor by which the steepest gain may still grow before the sampled loop is unstable, where it is chosen here."""
@@ -27,7 +30,17 @@ _LARGEST = 0.5
 """Most of the torque limit that friction may be fed forward with."""
 
 
-class LqrFriction(Lqr):
+def lqr_friction_law(
+    _t: float, angle: float, velocity: float, _memory: MutableSequence[float], numbers: Sequence[float]
+) -> float:
+    """Return the LQR's torque less that of a smooth sign, within the limit [N m]; see :data:`pendulum_lqr.law.Law`."""
+    error = deviation(angle, numbers[SET_POINT])
+    against = numbers[_FRICTION] * math.tanh(error / numbers[_WIDTH])
+    wanted = numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity - against
+    return clamped(wanted, numbers[EFFORT_LIMIT])
+
+
+class LqrFriction(LawController):
     """u = u* - K (x - x*) - c tanh((theta - theta*) / w), with c below the friction that the plant has.
 
     Back to the set-point the pendulum moves against its deviation: the smooth sign is that of the way, not that of
@@ -75,7 +88,9 @@ class LqrFriction(Lqr):
         set_point: float = 0.0,
         hold: float = 0.0,
     ) -> None:
-        super().__init__(gain, effort_limit, set_point, hold)
+        super().__init__(lqr_friction_law, effort_limit, set_point, (hold, *gain.K, friction, width))
+        self.gain = gain
+        self.hold = hold
         self.friction = friction
         self.width = width
 
@@ -94,15 +109,9 @@ class LqrFriction(Lqr):
         hold = model.effort if p["feedforward"] else 0.0
         return cls(gain, friction, width, p["effort_limit"], p["set_point"], hold)
 
-    def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque [N m]."""
-        error = self.error(x[0])
-        against = self.friction * math.tanh(error / self.width)
-        return self.clamp(self.hold - self._k0 * error - self._k1 * x[1] - against)
-
     def describe(self) -> str:
         """Return gain, what is compensated, and what to watch for."""
-        text = f"K = [{self._k0:.6f}, {self._k1:.6f}]"
+        text = f"K = [{self.gain.K[0]:.6f}, {self.gain.K[1]:.6f}]"
         if self.friction == 0.0:
             return f"{text}, no dry friction to compensate"
         return (

@@ -8,7 +8,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["UPRIGHT", "from_upright", "wrap"]
+__all__ = ["UPRIGHT", "deviation_from_upright", "from_upright", "wrap", "wrap_angle"]
 
 UPRIGHT = math.pi
 """Angle of the inverted pendulum [rad]."""
@@ -34,12 +34,22 @@ def wrap(angle: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
         # The modulo of a tiny negative number rounds up to the modulus itself.
         turned = np.where(turned >= math.pi, -math.pi, turned)
         return np.where((angle >= -math.pi) & (angle < math.pi), angle, turned)
+    return wrap_angle(angle)
+
+
+def wrap_angle(angle: float) -> float:
+    """Return what :func:`wrap` does of one angle [rad], for loops that run compiled, too."""
     if -math.pi <= angle < math.pi:
         return angle
     if math.isinf(angle):
         return math.nan
     wrapped = (angle + math.pi) % _TWO_PI - math.pi
     return -math.pi if wrapped >= math.pi else wrapped
+
+
+def deviation_from_upright(theta: float) -> float:
+    """Return what :func:`from_upright` does of one angle [rad], likewise."""
+    return wrap_angle(theta - UPRIGHT)
 
 
 @overload

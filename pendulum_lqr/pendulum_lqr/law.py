@@ -1,0 +1,36 @@
+"""Laws of controllers as functions of numbers: interpreted here, compiled in loops that run compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, MutableSequence, Sequence
+
+from pendulum_msgs_py.contract.angles import wrap_angle
+
+__all__ = ["EFFORT_LIMIT", "MOST_MEMORY", "MOST_NUMBERS", "OWN", "SET_POINT", "Law", "clamped", "deviation"]
+
+Law = Callable[[float, float, float, MutableSequence[float], Sequence[float]], float]
+"""``law(t, angle, velocity, memory, numbers)`` -> torque [N m].
+
+The time since the first state [s], the angle from upright [rad] and the velocity [rad/s] are those of a state, all
+finite; ``numbers`` are what was designed, ``memory`` is what the law keeps from state to state and changes in place.
+It is compiled as it stands, so it uses numbers, ``math``, indices and functions of this project that do likewise.
+"""
+
+EFFORT_LIMIT, SET_POINT, OWN = range(3)
+"""Where the limit [N m] and the set-point [rad, from upright] stand among a law's numbers, and where its own begin."""
+MOST_NUMBERS, MOST_MEMORY = 320, 128
+"""Of a law that is compiled."""
+
+
+def clamped(effort: float, limit: float) -> float:
+    """Return a torque within a limit [N m]; what is no number stays none."""
+    if effort > limit:
+        return limit
+    if effort < -limit:  # not by max(), whose answer for what is no number differs where it is compiled
+        return -limit
+    return effort
+
+
+def deviation(angle: float, set_point: float) -> float:
+    """Return the deviation of an angle from a set-point, the short way round [rad]."""
+    return wrap_angle(angle - set_point)
