@@ -18,6 +18,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from pendulum_lqr.answering import AnswerLoop
+from pendulum_lqr.compiled_controller import CompiledController
 from pendulum_lqr.controller import (
     CONTROLLERS,
     BaseController,
@@ -37,7 +38,7 @@ from pendulum_lqr.joint_controller import (
 from pendulum_lqr.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joints
-from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
+from pendulum_msgs_py.contract.plant_specs import COMPILED, REALTIME_PRIORITY
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import JointSample, Vector
 from pendulum_msgs_py.errors import PendulumError
@@ -53,6 +54,7 @@ from pendulum_msgs_py.plants.plant_parameters import (
 )
 from pendulum_msgs_py.programs.realtime import as_ordinary
 from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.compiled_answers import AnsweredInput
 from pendulum_msgs_py.ros.convert import (
     problem_of_state,
     sample_from_bytes,
@@ -96,6 +98,7 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
         "~/change_state.", read_only=True,
     ),
     REALTIME_PRIORITY,
+    COMPILED,
 )  # fmt: skip
 """Parameters of the node itself; those of the chosen controller join them."""
 
@@ -157,13 +160,26 @@ class ControllerNode(LifecycleNode, PollingNode):
             self._command_publisher = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
         self._first_answer = FirstAnswer(self, self._command_publisher)
         self._diagnostics = Diagnostics(self, "controller")
-        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
+        source = self.create_waited_input(JointState, names.JOINT_STATES, qos.NEWEST_STATE, self._on_state)
+        refusal = "" if self._settings["compiled"] else "compiled is false"
+        if self._multi_array:
+            refusal = refusal or "command_type is multi_array"
+        self._answers = AnsweredInput(
+            source, self._on_state, CompiledController(self._pending, self._watch, self._may_lend, refusal)
+        )
+        self._answers.compile(
+            self._command_publisher, sender=self._full_name, joint=self._driven[0], ahead_ns=self._now.ahead_ns
+        )
         self._running_plant = RunningPlant(self, self._plant)
         live_by_stamps(self, lambda: None if self._loop is None else self._loop.newest_stamp_ns)
         # Wall time on purpose: diagnostics must come even where simulated time stands still.
         create_wall_timer(self, DIAGNOSTICS_PERIOD, self._on_timer)
         if self._settings["autostart"]:
             self._autostart()
+
+    def run_due(self) -> float | None:
+        """Answer states for some milliseconds, or leave the turn to others; return when to be called again [s]."""
+        return self._answers.run_due()
 
     # --- lifecycle -----------------------------------------------------------------------------------------
 
@@ -214,6 +230,11 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._send_zero()
         self._command_publisher.wait_for_all_acked(qos.LAST_WORDS)
         self._publish_diagnostics()
+
+    def _may_lend(self) -> AnswerLoop | None:
+        """Return what answers states, where nothing is left to be done before an answer; else None."""
+        ready = self._active and self._period_known and (self._first_answer.gone or not self._simulated_time)
+        return self._loop if ready else None
 
     # --- callbacks -----------------------------------------------------------------------------------------
 
@@ -394,6 +415,7 @@ class ControllerNode(LifecycleNode, PollingNode):
             values["effort_limit"] = _limit(self._loop.controller)
             values.update(self._loop.summary(time.monotonic_ns()))
         measured = self._watch.period
+        values["loop"] = self._answers.loop
         values["period"] = self._period
         values["measured_period"] = math.nan if measured is None else measured
         other_rate = measured is not None and self._uses_period() and differs(measured, self._period)

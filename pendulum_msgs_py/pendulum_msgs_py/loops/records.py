@@ -121,6 +121,8 @@ def expect_template(source: NDArray[Any], template: MessageTemplate | None) -> N
         template: None where whatever comes is Python's.
     """
     source["size"] = 0
+    # What a message does not tell reads as zero, whatever the one before told.
+    source["value_at"], source["value"] = 0, 0.0
     if template is None or len(template.data) > MOST_BYTES or len(template.value_at) > MOST_VALUES:
         return
     size = len(template.data)

@@ -27,6 +27,11 @@ class FirstAnswer:
         self._publisher = publisher
         self._left = _TRIES
 
+    @property
+    def gone(self) -> bool:
+        """Whether answers may go out without being asked about."""
+        return not self._left
+
     def may_go(self) -> bool:
         """Ask before an answer; costs nothing once it was true."""
         if self._left:

@@ -43,6 +43,7 @@ class PolledInput:
 
     def __init__(self, subscription: Subscription, depth: int) -> None:
         self.subscription = subscription
+        self.depth = depth
         self._take = subscription.handle.take_message
         self._type = subscription.msg_type
         self._looks = range(depth)

@@ -8,8 +8,8 @@ __all__ = ["LONGEST_SLICE", "Turns"]
 
 LONGEST_SLICE = 0.02
 """Longest time in which nobody but the input is attended to [s]: a request waits no longer than that."""
-_EVENTS_AFTER_SLICE = 3
-"""Events that the executor may attend to after each slice: 150 a second at least, for timers of 60."""
+_EVENTS_AFTER_SLICE = 2
+"""Events that the executor may attend to after each slice: 100 a second at least."""
 
 
 class Turns:

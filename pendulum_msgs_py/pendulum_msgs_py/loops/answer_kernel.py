@@ -1,0 +1,51 @@
+"""The compiled loop that answers each message of an input, for the compiler's process alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pendulum_msgs_py.loops.answer_record import ENDED, FAILED, LEFT, MOST_ANSWERS, answer_record
+from pendulum_msgs_py.loops.primitives import NOTHING, ORDINARY, OTHER, compiled, entry, steady_ns, take_one, wait_for
+
+__all__ = ["answer_loop", "count_answer"]
+
+
+def answer_loop(own: np.dtype[Any], answer: Any) -> Any:
+    """Return the loop, compiled.
+
+    Args:
+        own: Layout of what answers depend on and change.
+        answer: Compiled function ``answer(s, arrived_ns)`` that answers the message which was taken and counts the
+            answer, or returns False before it has changed anything: the message is Python's then. The time is that of
+            the monotonic clock [ns].
+    """
+
+    @entry(answer_record(own))
+    def run(s: Any) -> Any:
+        while True:
+            found = take_one(s.state)
+            if found == OTHER:
+                return LEFT
+            now_ns = steady_ns(s.time)
+            if found == ORDINARY:
+                if not answer(s, now_ns):
+                    return LEFT
+                if s.answers >= MOST_ANSWERS or now_ns >= s.end_ns:
+                    return ENDED
+            elif found != NOTHING:
+                return FAILED
+            elif not wait_for(s.time, s.counter, s.end_ns - now_ns):
+                return ENDED
+
+    return run
+
+
+@compiled
+def count_answer(s: Any, stamp_ns: Any, age_ns: Any, compute_ns: Any) -> None:
+    """Count an answer that went out, with its times [ns]."""
+    s.stamp_ns[s.answers] = stamp_ns
+    s.age_ns[s.answers] = age_ns
+    s.compute_ns[s.answers] = compute_ns
+    s.answers += 1

@@ -1,0 +1,74 @@
+"""The record of a loop that answers each message of an input by one of an output."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from pendulum_msgs_py.loops.records import INPUT, OUTPUT, TIME
+
+__all__ = ["ENDED", "FAILED", "LEFT", "MOST_ANSWERS", "Answerer", "LoopKind", "answer_record"]
+
+MOST_ANSWERS = 1024
+"""Answers of one slice, whose times are kept one by one."""
+ENDED, LEFT, FAILED = range(3)
+"""Why a slice ended: its time is over, a message is left to Python, or rcl could not take one."""
+
+
+@dataclass(frozen=True)
+class LoopKind:
+    """Which loop answers.
+
+    Attributes:
+        own: Layout of what its answers depend on and change.
+        builder: Builds it, ``module:function``.
+        choice: Which variant of it.
+    """
+
+    own: np.dtype[Any]
+    builder: str
+    choice: tuple[str, ...]
+
+
+class Answerer(Protocol):
+    """Who answers, and lends a loop what it needs for it.
+
+    Attributes:
+        kind: The loop; None where there is none.
+        refusal: Why it cannot answer as things are; empty where it can.
+    """
+
+    kind: LoopKind | None
+    refusal: str
+
+    def lend(self, own: Any) -> bool:
+        """Write what answers depend on into a record; return False where the next message is Python's anyway."""
+
+    def take_back(self, record: Any) -> None:
+        """Take over what one answer or more have changed; the record is the loop's whole one."""
+
+
+def answer_record(own: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the layout of a loop that answers.
+
+    Args:
+        own: Layout of what its answers depend on and change.
+    """
+    return np.dtype(
+        [
+            ("time", TIME),
+            ("counter", "i4"),
+            ("wall_ahead_ns", "i8"),
+            ("end_ns", "i8"),
+            ("state", INPUT),
+            ("answer", OUTPUT),
+            ("answers", "i8"),
+            ("stamp_ns", "i8", (MOST_ANSWERS,)),
+            ("age_ns", "i8", (MOST_ANSWERS,)),
+            ("compute_ns", "i8", (MOST_ANSWERS,)),
+            ("own", own),
+        ],
+        align=True,
+    )
