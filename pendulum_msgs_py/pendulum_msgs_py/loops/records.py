@@ -97,7 +97,7 @@ def structure_of(layout: np.dtype[Any]) -> type[ctypes.Structure]:
 
     def kind_of(field: np.dtype[Any]) -> Any:
         base, shape = field.base, field.shape
-        kind = structure_of(base) if base.names else _NUMBERS[base.str[1:]]
+        kind: Any = structure_of(base) if base.names else _NUMBERS[base.str[1:]]
         for length in reversed(shape):
             kind = kind * length
         return kind

@@ -120,7 +120,7 @@ class CompiledPeriods:
         self._memory = np.zeros(1, dtype=plant_record(plant.layout))
         # For what is written once numpy's view will do; what is written in each slice has a faster one.
         self._entries = record = self._memory[0]
-        self._record = structure_of(self._memory.dtype).from_buffer(self._memory)
+        self._record: Any = structure_of(self._memory.dtype).from_buffer(self._memory.data)
         self._topics = DirectTopics()
         self._templates: dict[Input, MessageTemplate | None] = {}
         for kind, index in _INPUTS.items():
