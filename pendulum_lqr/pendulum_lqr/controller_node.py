@@ -164,9 +164,8 @@ class ControllerNode(LifecycleNode, PollingNode):
         refusal = "" if self._settings["compiled"] else "compiled is false"
         if self._multi_array:
             refusal = refusal or "command_type is multi_array"
-        self._answers = AnsweredInput(
-            source, self._on_state, CompiledController(self._pending, self._watch, self._may_lend, refusal)
-        )
+        answerer = CompiledController(self._pending, self._watch, self._may_lend, refusal)
+        self._answers = AnsweredInput(source, self._on_state, answerer, lambda: self.request_descriptor)
         self._answers.compile(
             self._command_publisher, sender=self._full_name, joint=self._driven[0], ahead_ns=self._now.ahead_ns
         )

@@ -7,7 +7,17 @@ from typing import Any
 import numpy as np
 
 from pendulum_msgs_py.loops.answer_record import ENDED, FAILED, LEFT, MOST_ANSWERS, answer_record
-from pendulum_msgs_py.loops.primitives import NOTHING, ORDINARY, OTHER, compiled, entry, steady_ns, take_one, wait_for
+from pendulum_msgs_py.loops.primitives import (
+    NOTHING,
+    ORDINARY,
+    OTHER,
+    compiled,
+    entry,
+    is_called,
+    steady_ns,
+    take_one,
+    wait_for_any,
+)
 
 __all__ = ["answer_loop", "count_answer"]
 
@@ -36,8 +46,10 @@ def answer_loop(own: np.dtype[Any], answer: Any) -> Any:
                     return ENDED
             elif found != NOTHING:
                 return FAILED
-            elif not wait_for(s.time, s.counter, s.end_ns - now_ns):
+            elif now_ns >= s.end_ns or is_called(s.time, s.calls):
                 return ENDED
+            else:
+                wait_for_any(s.time, s.counter, s.calls, s.end_ns - now_ns)
 
     return run
 

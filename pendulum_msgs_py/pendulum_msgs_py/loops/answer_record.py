@@ -14,7 +14,7 @@ __all__ = ["ENDED", "FAILED", "LEFT", "MOST_ANSWERS", "Answerer", "LoopKind", "a
 MOST_ANSWERS = 1024
 """Answers of one slice, whose times are kept one by one."""
 ENDED, LEFT, FAILED = range(3)
-"""Why a slice ended: its time is over, a message is left to Python, or rcl could not take one."""
+"""Why a slice ended: its time is over or somebody calls, a message is left to Python, or rcl could not take one."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,8 @@ def answer_record(own: np.dtype[Any]) -> np.dtype[Any]:
         [
             ("time", TIME),
             ("counter", "i4"),
+            # Event counters of what ends a slice, -1 for none.
+            ("calls", "i4", (2,)),
             ("wall_ahead_ns", "i8"),
             ("end_ns", "i8"),
             ("state", INPUT),

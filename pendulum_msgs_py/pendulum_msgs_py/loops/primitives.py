@@ -29,7 +29,6 @@ __all__ = [
     "sleep_until",
     "steady_ns",
     "take_one",
-    "wait_for",
     "wait_for_any",
     "wall_ns",
 ]
@@ -121,24 +120,6 @@ def wait_for_any(time: Any, counter: Any, calls: Any, longest: Any) -> None:
     if longest > 0 and _poll(time.poll.ctypes.data, 3, time.until.ctypes.data, 0) > 0:
         # What it counted does not matter, nor whether it was this one.
         _read(counter, time.until.ctypes.data, 8)
-
-
-@compiled
-def wait_for(time: Any, counter: Any, longest: Any) -> Any:
-    """Wait until an event counter has been added to, and empty it; return whether it was.
-
-    Args:
-        time: Record of ``TIME``.
-        counter: Its descriptor, which does not block.
-        longest: Longest wait [ns].
-    """
-    time.poll[0] = counter
-    time.poll[1] = _READABLE
-    time.until[0] = longest // NANOSECONDS
-    time.until[1] = longest % NANOSECONDS
-    if longest <= 0 or _poll(time.poll.ctypes.data, 1, time.until.ctypes.data, 0) <= 0:
-        return False
-    return _read(counter, time.until.ctypes.data, 8) == 8
 
 
 @compiled

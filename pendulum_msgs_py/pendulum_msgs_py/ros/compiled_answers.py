@@ -16,14 +16,18 @@ from rclpy.publisher import Publisher
 
 from pendulum_msgs_py.contract.cdr import JointStateFields, MessageTemplate, decode_joint_state, template_of
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from pendulum_msgs_py.loops.answer_record import FAILED, LEFT, Answerer, LoopKind, answer_record
+from pendulum_msgs_py.loops.answer_record import ENDED, FAILED, LEFT, Answerer, LoopKind, answer_record
 from pendulum_msgs_py.loops.machine_code import NoMachineCodeError, load_loop
 from pendulum_msgs_py.loops.records import expect_template, set_template
 from pendulum_msgs_py.ros.direct import DirectTopics, rcl_symbols
 from pendulum_msgs_py.ros.polled import WaitedInput
-from pendulum_msgs_py.ros.turns import Turns
+from pendulum_msgs_py.ros.turns import INTERPRETED_SLICE, Turns
 
 __all__ = ["AnsweredInput"]
+
+
+_WHILE_CALLED = 0.005
+"""The same while somebody calls, whose turn comes within 10 ms [s]."""
 
 
 class AnsweredInput:
@@ -33,9 +37,18 @@ class AnsweredInput:
         source: The input; who receives its messages answers those that are Python's.
         receive: Receives them.
         answerer: Who answers.
+        called: Returns the event counter of what ends a slice of compiled code, such as
+            :attr:`pendulum_msgs_py.ros.polled.PollingNode.request_descriptor`; -1 for none.
     """
 
-    def __init__(self, source: WaitedInput, receive: Callable[[bytes], object], answerer: Answerer) -> None:
+    def __init__(
+        self,
+        source: WaitedInput,
+        receive: Callable[[bytes], object],
+        answerer: Answerer,
+        called: Callable[[], int] = lambda: -1,
+    ) -> None:
+        self._called = called
         self._source = source
         self._receive = receive
         self._answerer = answerer
@@ -75,8 +88,8 @@ class AnsweredInput:
         while (left := ends - time.monotonic()) > 0.0:
             loop = self._loop
             if loop is None or not self._answerer.lend(loop.own):
-                return self._source.serve(left) or came
-            data = loop.run(left)
+                return self._source.serve(min(left, INTERPRETED_SLICE)) or came
+            data = loop.run(left, self._called())
             if loop.record["answers"]:
                 came = True
                 self._answerer.take_back(loop.record)
@@ -86,6 +99,10 @@ class AnsweredInput:
                 loop.expect(data)
             if loop.failed:
                 self._loop, self._why = None, loop.failed
+            if loop.ended:
+                # Where somebody calls, it may be some time before they have their turn.
+                left = ends - time.monotonic()
+                return (left > 0.0 and self._source.serve(min(left, _WHILE_CALLED))) or came
         return came
 
 
@@ -102,6 +119,7 @@ class _Loop:
         if not source.works:
             raise NoMachineCodeError("the middleware does not say when a message comes")
         self.failed = ""
+        self.ended = False
         self._run = load_loop(kind.builder, *kind.choice, symbols=rcl_symbols())
         self._memory = np.zeros(1, dtype=answer_record(kind.own))
         self.record: Any = self._memory[0]
@@ -115,12 +133,14 @@ class _Loop:
         self.record["counter"] = source.descriptor
         self.record["wall_ahead_ns"] = ahead_ns
 
-    def run(self, longest: float) -> bytes | None:
-        """Answer what comes within a time [s], or until a message is Python's, and return that."""
+    def run(self, longest: float, called: int) -> bytes | None:
+        """Answer what comes within a time [s], or until somebody calls or a message is Python's, and return that."""
         self.record["answers"] = 0
+        self.record["calls"] = called, -1
         self.record["end_ns"] = time.monotonic_ns() + round(longest * NANOSECONDS)
         with self._topics.held():
             why = self._run(self._memory)
+        self.ended = why == ENDED
         if why == FAILED:
             self.failed = "rcl could not take a message"
         return DirectTopics.message(self.record["state"]) if why == LEFT else None

@@ -22,6 +22,7 @@ from pendulum_msgs_py.loops.machine_code import load_loop
 from pendulum_msgs_py.loops.plant_record import (
     DISTURBANCE,
     EFFORT,
+    ENDED,
     MESSAGE_WAITS,
     OWN_STAMPS,
     PUSH,
@@ -32,11 +33,10 @@ from pendulum_msgs_py.ros.convert import fields_from_bytes
 from pendulum_msgs_py.ros.direct import DirectTopics, rcl_symbols
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.ros.qos import COMMAND_INPUT
+from pendulum_msgs_py.ros.turns import LONGEST_SLICE
 
-__all__ = ["SLICE", "CompiledPeriods", "CompiledPlant", "Slice"]
+__all__ = ["CompiledPeriods", "CompiledPlant", "Slice"]
 
-SLICE = 0.1
-"""Longest time that compiled code runs before timers and other messages have their turn [s]; a call ends it at once."""
 _INPUTS = {Input.EFFORT_COMMAND: EFFORT, Input.DISTURBANCE: DISTURBANCE, Input.PUSH: PUSH}
 _KINDS = {index: kind for kind, index in _INPUTS.items()}
 _NO_END = 2**62
@@ -50,12 +50,14 @@ class Slice(NamedTuple):
         periods: How many were done.
         answered: In lockstep: inputs that have answered the newest state.
         message: A message that was taken and is Python's to receive: its input, its bytes, when it came [ns].
+        ended: It went on until its time was over or somebody called; others have their turn.
     """
 
     now_ns: int
     periods: int
     answered: Collection[Input]
-    message: tuple[Input, bytes, int] | None
+    message: tuple[Input, bytes, int] | None = None
+    ended: bool = False
 
 
 class CompiledPlant(Protocol):
@@ -149,7 +151,7 @@ class CompiledPeriods:
         self,
         now_ns: int,
         *,
-        longest: float = SLICE,
+        longest: float = LONGEST_SLICE,
         expected: Collection[Input] = (),
         answered: Collection[Input] = (),
         last_ns: int | None = None,
@@ -166,11 +168,11 @@ class CompiledPeriods:
         interface, record, supervisor = self._interface, self._record, self._interface.supervisor
         sample = interface.sample
         if sample is None:
-            return Slice(now_ns, 0, answered, None)
+            return Slice(now_ns, 0, answered)
         self._expect_messages()
         with supervisor.alone():
             if not lend(supervisor, record.rules):
-                return Slice(now_ns, 0, answered, None)
+                return Slice(now_ns, 0, answered)
             self._plant.lend(record.plant)
             record.now_ns, record.expected, record.answered = now_ns, _bits(expected), _bits(answered)
             record.last_ns = _NO_END if last_ns is None else last_ns
@@ -193,7 +195,7 @@ class CompiledPeriods:
             message = kind, DirectTopics.message(source), int(source["info"][1])
         has_answered = record.answered
         newest = [kind for kind, index in _INPUTS.items() if has_answered >> index & 1]
-        return Slice(record.now_ns, record.periods, newest, message)
+        return Slice(record.now_ns, record.periods, newest, message, why == ENDED)
 
     def _expect_messages(self) -> None:
         """Expect the messages that Python accepted last, of each input."""

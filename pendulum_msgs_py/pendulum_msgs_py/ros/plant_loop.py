@@ -16,8 +16,9 @@ from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode
 from pendulum_msgs_py.contract.timing import LoopStatistics, SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector
 from pendulum_msgs_py.ros import qos
-from pendulum_msgs_py.ros.compiled_periods import SLICE, CompiledPeriods
+from pendulum_msgs_py.ros.compiled_periods import CompiledPeriods, Slice
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
+from pendulum_msgs_py.ros.turns import INTERPRETED_SLICE, Turns
 
 __all__ = ["LockstepLoop", "RealtimeLoop", "Stepper"]
 
@@ -163,7 +164,7 @@ class LockstepLoop:
             interface.node.create_publisher(ClockMessage, names.CLOCK, qos.CLOCK) if publish_clock else None
         )
         self._next_look = 0.0
-        self._turns = 0
+        self._turns = Turns(self._wait_for_answers)
         self.compiled: CompiledPeriods | None = None
         if interface.polled:
             interface.watch_inputs()
@@ -185,32 +186,35 @@ class LockstepLoop:
 
         Its runner calls this after each event; answers alone make the pace where they are waited for.
         """
-        if self._turns:
-            self._turns -= 1
-            return 0.0
-        if self._interface.polled:
-            self._interface.take_inputs()
-            if self.started and self._must_wait() and not (self.paused or self.halted or self.finished):
-                self._wait_for_answers()
+        interface, waits = self._interface, False
+        if interface.polled:
+            interface.take_inputs()
+            waits = self.started and self._must_wait() and not (self.paused or self.halted or self.finished)
+            if waits:
+                self._turns.run_due()
         now = time.monotonic()
         if now >= self._next_look:
             self._look()
             self._next_look = now + (_LOOK_WAITING if self.started and self._must_wait() else _LOOK_FREE)
-        return self._next_look - now
+        return 0.0 if waits else self._next_look - now
 
-    def _wait_for_answers(self) -> None:
-        """Take answers and step, for a while; then others have their turn: timers, services, parameters."""
-        end = time.monotonic() + SLICE
-        self._turns = _TURNS
+    def _wait_for_answers(self, longest: float) -> bool:
+        """Take answers and step, for a time at most [s]; return whether any step was taken."""
+        before, end = self.steps, time.monotonic() + (longest if self.compiled is not None else INTERPRETED_SLICE)
         while (left := end - time.monotonic()) > 0.0 and self._must_wait() and not self.finished:
-            if not self._run_compiled(left):
-                self._interface.wait_for_inputs(left)
+            if self.compiled is not None:
+                steps = self.steps
+                done = self._run_compiled(self.compiled, left)
+                if done.ended:
+                    break
+                if self.steps > steps or done.message is not None:
+                    continue
+            self._interface.wait_for_inputs(min(left, INTERPRETED_SLICE))
+        return self.steps > before
 
-    def _run_compiled(self, longest: float) -> bool:
-        """Take ordinary steps [s]; return whether there was anything to do."""
-        if self.compiled is None:
-            return False
-        done = self.compiled.run(
+    def _run_compiled(self, compiled: CompiledPeriods, longest: float) -> Slice:
+        """Take ordinary steps for a time at most [s], and let Python do what comes then."""
+        done = compiled.run(
             self.now_ns, longest=longest, expected=self._inputs, answered=self._answered, last_ns=self._last_ns
         )
         self.now_ns, self._answered = done.now_ns, set(done.answered)
@@ -222,9 +226,7 @@ class LockstepLoop:
         elif self._inputs <= self._answered:
             # All have answered, and what they make of it is not ordinary.
             self.advance()
-        else:
-            return done.periods > 0
-        return True
+        return done
 
     def answered(self, kind: Input, command: JointCommand) -> None:
         """Take note of an accepted command; steps when it was the last one missing."""
@@ -312,7 +314,5 @@ _LOOK_FREE = 0.001
 """Wall time between two steps that nobody has to answer, and between two looks for those who will [s]."""
 _LOOK_WAITING = 0.1
 """Wall time between two looks for answers that are overdue [s]."""
-_TURNS = 12
-"""Calls after a slice in which a runner attends to an event each: more than timers have in a slice."""
 _PATIENCE = 1.0
 """Wall time without an answer after which a state is published again [s]."""

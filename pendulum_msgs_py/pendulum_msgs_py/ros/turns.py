@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["LONGEST_SLICE", "Turns"]
+__all__ = ["INTERPRETED_SLICE", "LONGEST_SLICE", "Turns"]
 
-LONGEST_SLICE = 0.02
-"""Longest time in which nobody but the input is attended to [s]: a request waits no longer than that."""
-_EVENTS_AFTER_SLICE = 2
-"""Events that the executor may attend to after each slice: 100 a second at least."""
+LONGEST_SLICE = 0.1
+"""Longest time in which nobody but the input is attended to [s]; a request ends it, where it is looked for."""
+INTERPRETED_SLICE = 0.02
+"""The same where Python waits for the input, and looks for nothing else [s]."""
+_EVENTS_AFTER_SLICE = 12
+"""Events that the executor may attend to after each slice: 120 a second at least, twice what timers make."""
 
 
 class Turns:
