@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
-from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state, encode_joints
+from pendulum_msgs_py.contract.cdr import encode_joint_state, encode_joints
+from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message
 from tests.graph_peer import GraphPeer
+from tests.processes import ProcessGroup
 
-STATE = {"position": math.pi + 0.01, "velocity": 0.1, "effort": 0.0}
+STATE: dict[str, Any] = {"position": math.pi + 0.01, "velocity": 0.1, "effort": 0.0}
 SECOND = 1_000_000_000
 COUNTS = ("answered", "restarts", "effort", "measured_period")
 
@@ -26,7 +29,9 @@ class Twins(GraphPeer):
 
     def __init__(self) -> None:
         super().__init__("plant")
-        self.states, self.answers, self.said = [], ([], []), [{}, {}]
+        self.states: list[Any] = []
+        self.answers: tuple[list[bytes], list[bytes]] = ([], [])
+        self.said: list[dict[str, str]] = [{}, {}]
         for index, space in enumerate(("/a", "/b")):
             self.states.append(self.node.create_publisher(JointState, f"{space}/joint_states", qos.STATE))
             self.node.create_subscription(
@@ -70,7 +75,7 @@ def twins(domain_id: int) -> Iterator[Twins]:
     peer.close()
 
 
-def start(twins: Twins, processes, *parameters: str) -> None:
+def start(twins: Twins, processes: ProcessGroup, *parameters: str) -> None:
     given = [word for parameter in parameters for word in ("-p", parameter)]
     programs = [
         processes.start(
@@ -99,7 +104,7 @@ def check(twins: Twins) -> None:
     assert counted[0] == counted[1]
 
 
-def test_in_real_time_both_answer_and_refuse_alike(twins: Twins, processes) -> None:
+def test_in_real_time_both_answer_and_refuse_alike(twins: Twins, processes: ProcessGroup) -> None:
     start(twins, processes, "state_timeout:=2.0")
     # Whoever's reader is not matched yet misses the first.
     twins.until(lambda: [each.publish(encode_joint_state(time.time_ns(), **STATE)) for each in twins.states]
@@ -110,7 +115,6 @@ def test_in_real_time_both_answer_and_refuse_alike(twins: Twins, processes) -> N
     before = twins.counted()
     for count in range(20):
         twins.send(encode_joint_state(time.time_ns(), **(STATE | {"velocity": 0.01 * count})))
-    name = decode_joint_state(twins.answers[0][-1]).joints[0]
     newest = time.time_ns()
     twins.send(encode_joint_state(newest, **STATE))
     for data in (
@@ -125,7 +129,7 @@ def test_in_real_time_both_answer_and_refuse_alike(twins: Twins, processes) -> N
     ):
         # An interval that goes back is a plant that began anew: what was measured is measured again.
         twins.send(data, answered=False)
-    for data in (
+    made: tuple[Callable[[int], bytes], ...] = (
         lambda now: encode_joint_state(now, **(STATE | {"position": 1e300})),
         lambda now: encode_joint_state(now, **(STATE | {"position": -0.0, "velocity": -0.0})),
         lambda now: encode_joint_state(now, **(STATE | {"effort": math.nan})),
@@ -133,13 +137,14 @@ def test_in_real_time_both_answer_and_refuse_alike(twins: Twins, processes) -> N
         lambda now: encode_joint_state(now, **STATE),
         lambda now: encode_joint_state(now, frame_id="somebody", **STATE),
         lambda now: encode_joint_state(now, **STATE) + b"\x01\x02\x03",
-        lambda now: encode_joints(now, "", ("x", name), (1.0, 3.0), (0.0, 0.5), (0.0, 0.0)),
+        lambda now: encode_joints(now, "", ("x", JOINT), (1.0, 3.0), (0.0, 0.5), (0.0, 0.0)),
         in_rclpys_layout,
         lambda now: encode_joint_state(now, frame_id="x" * 1_000_000, **STATE),
         lambda now: encode_joint_state(now, **(STATE | {"position": 2.0})),
-    ):
-        twins.send(data(time.time_ns()))
-        twins.send(data(time.time_ns()))
+    )
+    for make in made:
+        twins.send(make(time.time_ns()))
+        twins.send(make(time.time_ns()))
     for _ in range(30):
         twins.send(encode_joint_state(time.time_ns(), **STATE))
     a, b = ([data.replace(space, b"/x/controller") for data in answers]
@@ -152,7 +157,7 @@ def test_in_real_time_both_answer_and_refuse_alike(twins: Twins, processes) -> N
     assert len({int(each["answered"]) - int(first["answered"]) for first, each in zip(before, after, strict=True)}) == 1
 
 
-def test_in_simulated_time_both_begin_anew_and_repeat_alike(twins: Twins, processes) -> None:
+def test_in_simulated_time_both_begin_anew_and_repeat_alike(twins: Twins, processes: ProcessGroup) -> None:
     start(twins, processes, "use_sim_time:=true")
     for run in range(3):
         for step in range(40):
