@@ -1,9 +1,14 @@
 """Fixtures for every test of the repository, beside a package or under ``tests/``: one definition for all."""
 
+import gc
 import importlib
 import os
 
 from hypothesis import settings
+
+# What is collected stays: the collector of garbage need not look at thousands of tests, neither while they come nor
+# while they run.
+gc.disable()
 
 pytest_plugins = ["tests.fixtures"]
 
@@ -29,3 +34,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.register_profile("explore", max_examples=1000, deadline=None)
 settings.load_profile("repeatable")
+
+
+def pytest_collection_finish() -> None:
+    """Leave all that is there now to itself, and collect the garbage of what runs."""
+    gc.freeze()
+    gc.enable()
