@@ -131,7 +131,7 @@ class Part:
         self._arguments = arguments
         self._workers = min(workers, os.cpu_count() or 1)
         self._nice = nice
-        self._held_back: set[int] = set()
+        self._looked_at: set[int] = set()
         self._popen: subprocess.Popen[bytes] | None = None
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the part)
 
@@ -174,16 +174,16 @@ class Part:
         """
         if not self._nice or self._popen is None or self.code is not None:
             return
-        with contextlib.suppress(psutil.NoSuchProcess):
-            started = psutil.Process(self._popen.pid).children(recursive=True)
-            for pid in (self._popen.pid, *(one.pid for one in started)):
-                if pid in self._held_back:
-                    continue
-                # Refused to who asks often without being root: the next look asks again.
-                with contextlib.suppress(OSError):
-                    if os.getsid(pid) == pid:
-                        Path(f"/proc/{pid}/autogroup").write_text(str(self._nice), encoding="ascii")
-                    self._held_back.add(pid)
+        every = set(psutil.pids())
+        # A number that is free again may come back as another process.
+        self._looked_at &= every
+        for pid in every - self._looked_at:
+            # Refused to who asks often without being root: the next look asks again.
+            with contextlib.suppress(OSError, psutil.Error):
+                ancestors = {parent.pid for parent in psutil.Process(pid).parents()}
+                if self._popen.pid in {pid, *ancestors} and os.getsid(pid) == pid:
+                    Path(f"/proc/{pid}/autogroup").write_text(str(self._nice), encoding="ascii")
+                self._looked_at.add(pid)
 
     def send(self, number: int) -> None:
         """Send a signal to all of its processes, as a terminal does on Ctrl-C; what tests started ends with them."""
