@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ __all__ = [
     "DISTURBANCE_SPECS",
     "Disturbance",
     "DisturbanceKind",
+    "UniformNoise",
     "from_bag",
     "make_disturbance",
     "torques",
@@ -116,14 +118,27 @@ def from_bag(elapsed_ns: ArrayLike, values: ArrayLike) -> Disturbance:
     return torque
 
 
+@dataclass(frozen=True)
+class UniformNoise:
+    """Independent samples, uniform in [-amplitude, amplitude].
+
+    Attributes:
+        seed: Of the samples.
+        amplitude: Largest torque [N m].
+        hold_ns: How long each is held [ns].
+    """
+
+    seed: int
+    amplitude: float
+    hold_ns: int
+
+    def __call__(self, time_ns: int) -> float:
+        """Return the torque so long after the start [N m]."""
+        return 0.0 if time_ns < 0 else float(noise.uniform(self.seed, time_ns // self.hold_ns, self.amplitude))
+
+
 def _uniform(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
-    """Independent samples, uniform in [-amplitude, amplitude]."""
-    amplitude, seed = p["amplitude"], p["seed"]
-
-    def torque(time_ns: int) -> float:
-        return 0.0 if time_ns < 0 else float(noise.uniform(seed, time_ns // hold_ns, amplitude))
-
-    return torque
+    return UniformNoise(p["seed"], p["amplitude"], hold_ns)
 
 
 def _gaussian(p: Mapping[str, Any], hold_ns: int) -> Disturbance:

@@ -14,26 +14,28 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from pendulum_lqr.compiled_disturbance import CompiledDisturbance
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS, Disturbance, from_bag, make_disturbance
 from pendulum_lqr.disturbing import DisturbanceLoop
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.names import Event
-from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
+from pendulum_msgs_py.contract.plant_specs import COMPILED, REALTIME_PRIORITY
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, read_text
 from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.compiled_answers import AnsweredInput
 from pendulum_msgs_py.ros.convert import event_message, stamp_of_state
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.first_answer import FirstAnswer
 from pendulum_msgs_py.ros.parameters import NodeParameters
+from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.ros.simulated_time import live_by_stamps
 from pendulum_msgs_py.ros.timers import create_wall_timer
@@ -57,12 +59,13 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
         "from one to the next. Empty for the joint of a pendulum.",
         read_only=True,
     ),
+    COMPILED,
     REALTIME_PRIORITY,
 )
 """Parameters of the node itself, next to those of the signal."""
 
 
-class DisturbanceNode(Node):
+class DisturbanceNode(PollingNode):
     """Publishes the disturbance for each new stamp of ``joint_states``.
 
     Before the start and after the end it answers with zero, so that a plant in lockstep gets its answer and a plant in
@@ -99,9 +102,20 @@ class DisturbanceNode(Node):
         self._diagnostics = Diagnostics(self, "disturbance")
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
+        source = self.create_waited_input(JointState, names.JOINT_STATES, qos.NEWEST_STATE, self._on_state)
+        answerer = CompiledDisturbance(
+            self._loops,
+            lambda: self._first_answer.gone or not self._simulated_time,
+            "" if self._settings["compiled"] else "compiled is false",
+        )
+        self._answers = AnsweredInput(source, self._on_state, answerer, lambda: self.request_descriptor)
+        self._answers.compile(self._torque_publisher, sender=self._full_name, joint=self._joints[0], ahead_ns=0)
         create_wall_timer(self, DIAGNOSTICS_PERIOD, self._publish_diagnostics)
         live_by_stamps(self, lambda: self._loop.newest_stamp_ns)
+
+    def run_due(self) -> float | None:
+        """Answer states for some milliseconds, or leave the turn to others; return when to be called again [s]."""
+        return self._answers.run_due()
 
     def close(self) -> None:
         """End with zero torque while the context is still valid."""
@@ -184,6 +198,7 @@ class DisturbanceNode(Node):
 
     def _publish_diagnostics(self) -> None:
         values: dict[str, object] = {spec.name: self._settings[spec.name] for spec in DISTURBANCE_SPECS}
+        values["loop"] = self._answers.loop
         values.update(self._loop.summary(time.monotonic_ns()))
         for joint, loop in zip(self._joints[1:], self._loops[1:], strict=True):
             values[f"torque.{joint}"] = loop.last_torque
