@@ -11,6 +11,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Annotated
 
+import psutil
 import pytest
 import typer
 
@@ -122,6 +123,64 @@ def test_an_interrupt_is_not_lost_where_python_drops_what_is_raised(where: str) 
     assert run.returncode == EXIT_INTERRUPTED
     assert rest == b"went on\n"
     assert error == b"interrupted\n"
+
+
+_STARTED_DEAF = """
+import signal, subprocess, sys, time, types
+import typer
+from importlib.machinery import ModuleSpec
+from pendulum_msgs_py.programs.executables import cli_main, run_package
+
+app = typer.Typer()
+
+@app.command()
+def waits():
+    child = "import signal; print(signal.getsignal(signal.SIGINT) is signal.SIG_IGN)"
+    print("child deaf:", subprocess.check_output([sys.executable, "-c", child], text=True).strip())
+    print("waiting", flush=True)
+    time.sleep(20.0)
+
+def main(_):
+    return cli_main(app, [])
+
+table = types.ModuleType("arm.executables")
+table.EXECUTABLES = {"node": "arm.node:main"}
+node = types.ModuleType("arm.node")
+node.main = main
+arm = types.ModuleType("arm")
+arm.__spec__ = ModuleSpec("arm", None)
+sys.modules.update({"arm": arm, "arm.executables": table, "arm.node": node})
+sys.exit(run_package("arm", ["node"]) if sys.argv[1] == "module" else main([]))
+"""
+
+
+@pytest.mark.parametrize("way", ["module", "console script"])
+def test_a_program_hears_ctrl_c_though_a_shell_started_it_in_the_background(way: str) -> None:
+    # No job control: the shell starts it with SIGINT ignored.
+    script = '"$@" & wait $!'
+    command = ["sh", "-c", script, "sh", sys.executable, "-c", _STARTED_DEAF, way]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as shell:
+        assert shell.stdout is not None
+        assert shell.stdout.readline() == b"child deaf: False\n"
+        assert shell.stdout.readline() == b"waiting\n"
+        (program,) = psutil.Process(shell.pid).children()
+        program.send_signal(signal.SIGINT)
+        _, error = shell.communicate(timeout=50.0)
+    assert shell.returncode == EXIT_INTERRUPTED
+    assert error == b"interrupted\n"
+
+
+def test_a_handler_of_sigint_that_is_set_already_stays(package: Callable[..., None]) -> None:
+    def handler(number: int, frame: types.FrameType | None) -> None:
+        del number, frame
+
+    package(lambda _: 0)
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        run_package("arm", ["node"])
+        assert signal.getsignal(signal.SIGINT) is handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _app() -> typer.Typer:

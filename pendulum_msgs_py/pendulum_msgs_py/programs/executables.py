@@ -119,10 +119,10 @@ def run_program(target: str, arguments: Sequence[str], *, called_as: str = "") -
         arguments: Its own.
         called_as: How it was started, for its help; empty for ``python -m``.
     """
+    keep_interrupts()
     importlib.import_module("pendulum_msgs_py.programs.one_thread")
     module_name, function_name = target.split(":")
     _called_as.append(called_as)
-    keep_interrupts()
     try:
         main = getattr(importlib.import_module(module_name), function_name)
         return int(main(list(arguments)) or 0)
@@ -166,6 +166,8 @@ def cli_main(
         name: Program name for the help text, such as ``python -m pendulum_lqr design``.
         takes_ros_arguments: Arguments from ``--ros-args`` on belong to ROS; the command finds them in ``context.obj``.
     """
+    # Once more: a console script calls us, and nothing else of this module.
+    keep_interrupts()
     # Imported late: a node that has no command line should not pay for typer and rich.
     import typer.main
 

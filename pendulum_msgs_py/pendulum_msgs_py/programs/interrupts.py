@@ -1,4 +1,4 @@
-"""Ctrl-C is not lost where Python drops what is raised: in destructors, callbacks of weak references and of C."""
+"""Ctrl-C is not lost: where a shell says so, and in destructors and callbacks, where Python drops what is raised."""
 
 from __future__ import annotations
 
@@ -14,7 +14,15 @@ _MOMENT = 0.01
 
 
 def keep_interrupts() -> None:
-    """Raise a KeyboardInterrupt again that Python would print as ignored, and go on."""
+    """Raise KeyboardInterrupt where this process was started deaf to it, and again where Python would drop it.
+
+    Without job control, as in a script, a shell starts what it puts into the background with SIGINT ignored. Python
+    leaves that as it is, and hands it on to all that it starts. An experiment would then go on, plants armed, whoever
+    asks it to stop, and a child that is asked to end before it has a handler of its own would run on.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    if in_main and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     before = sys.unraisablehook
     if getattr(before, "keeps_interrupts", False):
         return
