@@ -49,6 +49,8 @@ $(INSTALLED): $(VENV)/.%: requirements/%.txt | $(VENV)/.made
 $(VENV)/.linked: $(VENV)/.run $(LINKED)
 	@echo "linking $(PACKAGES) into $(VENV)"
 	@$(PIP) install --no-deps --no-build-isolation --config-settings editable_mode=compat $(addprefix --editable ./,$(PACKAGES))
+	@echo "compiling the loops of plant, controller and noise (some ten seconds)"
+	@$(PY) -m pendulum_msgs_py.loops.compile_loop
 	@touch $@
 
 experiment: $(VENV)/.linked # Run the thesis's experiment on simulator and emulated hardware, and compare them (OUT=DIR ARGS=...)

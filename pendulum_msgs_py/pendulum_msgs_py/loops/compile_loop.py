@@ -1,11 +1,47 @@
-"""The compiler's process: ``python -m pendulum_msgs_py.loops.compile_loop FILE MODULE:BUILDER [CHOICE ...]``."""
+"""The compiler's process: ``python -m pendulum_msgs_py.loops.compile_loop FILE MODULE:BUILDER [CHOICE ...]``.
+
+Without arguments it keeps the loops that experiments run, so that no program has to wait for them.
+"""
 
 from __future__ import annotations
 
+import os
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from pendulum_msgs_py.loops.machine_code import compile_loop
+from pendulum_msgs_py.loops.machine_code import NoMachineCodeError, compile_loop, keep_loop
+
+__all__ = ["COMMON"]
+
+COMMON = (
+    ("pendulum_sim.loop_kernel:rigid_loop", "etd4"),
+    ("pendulum_sim.loop_kernel:rigid_loop", "euler"),
+    ("pendulum_lqr.controller_kernel:law_loop", "pendulum_lqr.controllers.lqr:lqr_law"),
+    ("pendulum_lqr.disturbance_kernel:uniform_loop",),
+)
+"""Those of the thesis's experiment: the plant by our integrator and by the thesis's, its controller, its noise."""
+
+
+def _keep_common() -> None:
+    def keep(loop: tuple[str, ...]) -> None:
+        try:
+            keep_loop(*loop)
+        # Programs say so themselves, and run interpreted.
+        except NoMachineCodeError as error:
+            print(f"note: {' '.join(loop)} is not compiled: {error}", file=sys.stderr)
+
+    began = time.monotonic()
+    # Each is compiled by a process of its own.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(keep, COMMON))
+    if (spent := time.monotonic() - began) > 1.0:
+        print(f"compiled the loops of {len(COMMON)} programs in {spent:.0f} s")
+
 
 if __name__ == "__main__":
-    compile_loop(Path(sys.argv[1]), *sys.argv[2:])
+    if len(sys.argv) == 1:
+        _keep_common()
+    else:
+        compile_loop(Path(sys.argv[1]), *sys.argv[2:])

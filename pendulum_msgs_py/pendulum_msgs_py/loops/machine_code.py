@@ -29,7 +29,7 @@ from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.loops.object_file import link, undefined_symbols
 from pendulum_msgs_py.whole_file import write_whole
 
-__all__ = ["Loop", "NoMachineCodeError", "compile_loop", "load_loop"]
+__all__ = ["Loop", "NoMachineCodeError", "compile_loop", "keep_loop", "load_loop"]
 
 Loop = Callable[[NDArray[Any]], int]
 """Runs on one record, an array of shape (1,); returns what the loop returns."""
@@ -68,6 +68,18 @@ def _load(builder: str, choice: tuple[str, ...], symbols: tuple[tuple[str, int],
         raise NoMachineCodeError(
             f"loops are compiled on Linux for x86_64; this is {sys.platform}, {platform.machine()}"
         )
+    head, code = keep_loop(builder, *choice)
+    return _LoadedLoop(head["name"], code, dict(symbols))
+
+
+def keep_loop(builder: str, *choice: str) -> tuple[dict[str, Any], bytes]:
+    """Return what is kept of a loop, and its code; where none is kept, or of other source, it is compiled first.
+
+    Args: as in :func:`load_loop`.
+
+    Raises:
+        NoMachineCodeError: It cannot be had here.
+    """
     path = _path(builder, choice)
     kept = _read(path)
     if kept is None:
@@ -75,8 +87,7 @@ def _load(builder: str, choice: tuple[str, ...], symbols: tuple[tuple[str, int],
         kept = _read(path)
         if kept is None:
             raise NoMachineCodeError(f"{path} cannot be read back")
-    head, code = kept
-    return _LoadedLoop(head["name"], code, dict(symbols))
+    return kept
 
 
 class _LoadedLoop:
@@ -138,7 +149,8 @@ def _path(builder: str, choice: tuple[str, ...]) -> Path:
     home = Path(str(importlib.import_module(package).__file__)).parent / "__pycache__"
     if not os.access(home if home.exists() else home.parent, os.W_OK):
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pendulum"
-    return home / f"{'-'.join((function, *choice, digest))}.loop"
+    name = "-".join((function, *choice, digest)).replace(":", ".")
+    return home / f"{name}.loop"
 
 
 @cache
