@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import platform
 import struct
@@ -113,3 +114,17 @@ def test_a_symbol_that_nobody_knows_is_refused() -> None:
 def test_a_file_that_is_cut_short_is_refused(size: int) -> None:
     with pytest.raises(ValueError, match="begins with"):
         link(_object()[:size], {"value": 1})
+
+
+def test_no_cut_and_no_damaged_byte_of_its_tables_is_more_than_refused() -> None:
+    whole = _object()
+    for size in range(64, len(whole)):
+        with pytest.raises(ValueError, match="object file"):
+            link(whole[:size], {"value": 1})
+    # Only what says how the file is made: code that is damaged is kept out by its digest.
+    for at in [*range(18, 64), *range(_ADD_ONE + len(_CODE), len(whole))]:
+        for value in (0, 0x7F, 0xFF):
+            damaged = whole[:at] + bytes([value]) + whole[at + 1 :]
+            for use in (undefined_symbols, lambda code: link(code, {"value": 1})):
+                with contextlib.suppress(ValueError, OSError):
+                    use(damaged)

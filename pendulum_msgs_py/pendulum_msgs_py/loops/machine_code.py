@@ -101,17 +101,20 @@ class _LoadedLoop:
 
     def __init__(self, name: str, code: bytes, symbols: Mapping[str, int]) -> None:
         known = {**_addresses(), **symbols}
-        missing = sorted(symbol for symbol in undefined_symbols(code) if not known.get(symbol))
-        if missing:
-            raise NoMachineCodeError(f"{', '.join(missing)} is not there to be called")
         try:
+            missing = sorted(symbol for symbol in undefined_symbols(code) if not known.get(symbol))
+            if missing:
+                raise NoMachineCodeError(f"{', '.join(missing)} is not there to be called")
             self._code = link(code, known)
+            address = self._code.addresses[name]
+        except KeyError as error:
+            raise NoMachineCodeError(f"the code has no function {error}") from error
         except (OSError, ValueError) as error:
             raise NoMachineCodeError(f"the code cannot be loaded: {error}") from error
         # Numba's convention (its manual, "calling conventions"): status = f(result, exception, arguments). Called
         # through ctypes, without Python's lock.
         pointer = ctypes.c_void_p
-        self._call = ctypes.CFUNCTYPE(ctypes.c_int32, pointer, pointer, pointer)(self._code.addresses[name])
+        self._call = ctypes.CFUNCTYPE(ctypes.c_int32, pointer, pointer, pointer)(address)
 
     def __call__(self, record: NDArray[Any]) -> int:
         result, exception = ctypes.c_int64(), ctypes.c_void_p()
@@ -164,10 +167,11 @@ def _processor() -> str:
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes] | None:
     """Return what is known of the code and the code itself; None where it is damaged, of other source, or not there."""
-    with contextlib.suppress(OSError, ValueError, KeyError):
+    # Whatever somebody else has written there, it is not ours.
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
         line, _, code = path.read_bytes().partition(b"\n")
         head = json.loads(line)
-        if head["digest"] == _digest(code) and all(
+        if head["digest"] == _digest(code) and isinstance(head["name"], str) and all(
             _digest(Path(source).read_bytes()) == digest for source, digest in head["sources"].items()
         ):
             return head, code

@@ -8,6 +8,7 @@ Source: System V ABI, chapters 4 and 5; its AMD64 supplement, table 4.9 (``R_X86
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import mmap
 import struct
@@ -69,8 +70,9 @@ def undefined_symbols(code: bytes) -> set[str]:
     Raises:
         ValueError: It is no such file.
     """
-    sections = _sections(code)
-    return {symbol.name for symbol in _symbols(code, sections) if symbol.section == _UNDEFINED and symbol.name}
+    with _damage_is_told():
+        sections = _sections(code)
+        return {symbol.name for symbol in _symbols(code, sections) if symbol.section == _UNDEFINED and symbol.name}
 
 
 def link(code: bytes, known: Mapping[str, int]) -> LinkedCode:
@@ -84,6 +86,11 @@ def link(code: bytes, known: Mapping[str, int]) -> LinkedCode:
         ValueError: It is not of this kind, or something that it needs is not known.
         OSError: This system lets no program make code.
     """
+    with _damage_is_told():
+        return _link(code, known)
+
+
+def _link(code: bytes, known: Mapping[str, int]) -> LinkedCode:
     sections = _sections(code)
     symbols = _symbols(code, sections)
     places, constant, size = _places(sections, symbols)
@@ -101,6 +108,15 @@ def link(code: bytes, known: Mapping[str, int]) -> LinkedCode:
         raise OSError(ctypes.get_errno(), "memory cannot be made executable")
     found = {symbol.name: address for symbol, address in zip(symbols, addresses, strict=True) if address}
     return LinkedCode(memory, found)
+
+
+@contextlib.contextmanager
+def _damage_is_told() -> Iterator[None]:
+    """Turn whatever a file that is cut or damaged leads to into a ``ValueError``."""
+    try:
+        yield
+    except (struct.error, LookupError, OverflowError, MemoryError) as error:
+        raise ValueError(f"object file is damaged: {error}") from error
 
 
 def _sections(code: bytes) -> list[_Section]:
