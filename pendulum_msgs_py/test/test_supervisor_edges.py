@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+import threading
+import time
 
 import pytest
 
+from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import Trajectory, from_points
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
@@ -442,3 +446,18 @@ def test_an_effort_beyond_a_small_limit_keeps_its_sign(sign: float) -> None:
     assert supervisor.arm(0, sample) == ""
     assert supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(0, 0.7 * sign, "/me"), 0) is None
     assert supervisor.decide(0, sample).effort == (0.5 * sign,)
+
+
+def test_who_has_waited_for_the_supervisor_is_next() -> None:
+    # Nothing but the lock's own fairness would decide else, and it has none: a plant would act once more.
+    for _ in range(20):
+        supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+        waiting = ctypes.c_int64.from_address(supervisor.waiting_at)
+        with supervisor.alone():
+            stop = threading.Thread(target=supervisor.e_stop, args=(0,))
+            stop.start()
+            while not waiting.value:
+                time.sleep(0.0)
+        assert supervisor.mode is Mode.E_STOP
+        stop.join()
+        assert not waiting.value

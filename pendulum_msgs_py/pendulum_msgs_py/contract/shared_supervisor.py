@@ -15,6 +15,9 @@ from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 
 __all__ = ["SharedSupervisor"]
 
+_LONGEST_COURTESY = 0.005
+"""Longest time that whoever had the supervisor alone leaves to those who have waited [s]."""
+
 
 class SharedSupervisor(PlantSupervisor):
     """A plant supervisor whose every step is taken under one lock, and that has the drive prepared before arming.
@@ -41,7 +44,7 @@ class SharedSupervisor(PlantSupervisor):
         follows: bool = True,
     ) -> None:
         self._lock = threading.RLock()
-        self._counting = threading.Lock()
+        self._counting = threading.Condition()
         self._waiting = ctypes.c_int64(0)
         self._prepare = prepare
         self._withdraw = withdraw
@@ -56,9 +59,13 @@ class SharedSupervisor(PlantSupervisor):
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
-        """Keep everybody else from the supervisor; who comes in the meantime is counted and waits."""
+        """Keep everybody else from the supervisor; who comes in the meantime is counted, waits, and is next."""
         with self._lock:
             yield
+        # A lock is whose who asks first, and we are awake: without this an e-stop waits for one more decision.
+        if self._waiting.value:
+            with self._counting:
+                self._counting.wait_for(lambda: not self._waiting.value, _LONGEST_COURTESY)
 
     @contextlib.contextmanager
     def _in_turn(self) -> Iterator[None]:
@@ -71,6 +78,7 @@ class SharedSupervisor(PlantSupervisor):
         finally:
             with self._counting:
                 self._waiting.value -= 1
+                self._counting.notify_all()
 
     def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
         """Offer a message of an input."""
