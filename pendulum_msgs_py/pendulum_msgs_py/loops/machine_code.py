@@ -171,8 +171,10 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes] | None:
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
         line, _, code = path.read_bytes().partition(b"\n")
         head = json.loads(line)
-        if head["digest"] == _digest(code) and isinstance(head["name"], str) and all(
-            _digest(Path(source).read_bytes()) == digest for source, digest in head["sources"].items()
+        if (
+            head["digest"] == _digest(code)
+            and isinstance(head["name"], str)
+            and all(_digest(Path(source).read_bytes()) == digest for source, digest in head["sources"].items())
         ):
             return head, code
     return None
