@@ -180,6 +180,8 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
             exit_code = 1
     finally:
         exit_code = _close(node, executor) or exit_code
+        # Whoever still could stop it, such as the thread that hears signals, keeps nothing of it alive.
+        node = None
         # The interpreter gives signals their default back while it ends, and a launcher repeats the terminal's SIGINT:
         # a node that has ended properly would then count as killed.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
