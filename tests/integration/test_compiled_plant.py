@@ -9,10 +9,12 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
+from rcl_interfaces.srv import GetParameters
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joints
@@ -186,5 +188,46 @@ def test_in_real_time_it_runs_compiled_and_answers_whoever_calls(
         stopped = peer.diagnostics["periods_compiled"]
         peer.spin(0.3)
         assert peer.diagnostics["periods_compiled"] == stopped
+        program.interrupt()
+        assert program.wait(20.0) == 0
+
+
+def test_in_lockstep_it_waits_at_rest_while_somebody_asks_and_stops_at_once(
+    processes: ProcessGroup, domain_id: int
+) -> None:
+    plant = graph.simulator("/sim", clock="lockstep", initial_theta=3.0)
+    with closing(PlantPeer("/sim", torque=0.5)) as peer:
+        program = processes.start(plant.package, plant.executable, *plant.ros_arguments())
+        peer.until(lambda: int(peer.diagnostics.get("periods_compiled", 0)) > 100, "compiled steps", 120.0)
+        # Nobody answers any more: there is nothing to do but to answer who asks, which a request waits 10 ms for.
+        peer.torque = None
+        peer.spin(0.5)
+        asked = peer.node.create_client(GetParameters, "simulator/get_parameters")
+        peer.until(asked.service_is_ready, "the service")
+        used, begun, answers = psutil.Process(program.pid).cpu_times(), time.monotonic(), 0
+        while time.monotonic() - begun < 1.5:
+            future = asked.call_async(GetParameters.Request(names=["rate_hz"]))
+            peer.until(future.done, "an answer")
+            answers += 1
+        busy = psutil.Process(program.pid).cpu_times().user - used.user
+        # A request costs less than a millisecond.
+        assert busy < 0.25 + 0.002 * answers, f"{busy:.2f} s of the processor for {answers} answers"
+        pressed = peer.node.create_client(Trigger, "simulator/e_stop")
+        peer.until(pressed.service_is_ready, "the e-stop")
+        waited = []
+        for _ in range(9):
+            # It goes on, and waits again: in compiled code, which has the supervisor.
+            peer.torque = 0.5
+            peer._on_state(peer.states[-1])
+            peer.spin(0.1)
+            peer.torque = None
+            peer.spin(0.13)
+            begun = time.monotonic()
+            future = pressed.call_async(Trigger.Request())
+            peer.until(future.done, "the e-stop's answer")
+            waited.append(time.monotonic() - begun)
+            assert peer.ask("e_stop_reset").success
+            assert peer.arm().success
+        assert sorted(waited)[len(waited) // 2] < 0.03, waited
         program.interrupt()
         assert program.wait(20.0) == 0

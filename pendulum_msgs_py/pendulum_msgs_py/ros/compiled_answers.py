@@ -21,13 +21,9 @@ from pendulum_msgs_py.loops.machine_code import NoMachineCodeError, load_loop
 from pendulum_msgs_py.loops.records import expect_template, set_template
 from pendulum_msgs_py.ros.direct import DirectTopics, rcl_symbols
 from pendulum_msgs_py.ros.polled import WaitedInput
-from pendulum_msgs_py.ros.turns import INTERPRETED_SLICE, Turns
+from pendulum_msgs_py.ros.turns import INTERPRETED_SLICE, WHILE_CALLED, Turns
 
 __all__ = ["AnsweredInput"]
-
-
-_WHILE_CALLED = 0.005
-"""The same while somebody calls, whose turn comes within 10 ms [s]."""
 
 
 class AnsweredInput:
@@ -102,7 +98,7 @@ class AnsweredInput:
             if loop.ended:
                 # Where somebody calls, it may be some time before they have their turn.
                 left = ends - time.monotonic()
-                return (left > 0.0 and self._source.serve(min(left, _WHILE_CALLED))) or came
+                return (left > 0.0 and self._source.serve(min(left, WHILE_CALLED))) or came
         return came
 
 

@@ -223,6 +223,8 @@ class PlantInterface:
 
     def e_stop(self, reason: str) -> None:
         """Latch the e-stop; from any thread, waiting for nobody."""
+        # Compiled code that waits for an answer has the supervisor, and sees nothing but its counters.
+        self.node.wake()
         self.supervisor.e_stop(self.clock(), reason)
         self._pressed.set()
 

@@ -18,7 +18,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSam
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.compiled_periods import CompiledPeriods, Slice
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
-from pendulum_msgs_py.ros.turns import INTERPRETED_SLICE, Turns
+from pendulum_msgs_py.ros.turns import INTERPRETED_SLICE, WHILE_CALLED, Turns
 
 __all__ = ["LockstepLoop", "RealtimeLoop", "Stepper"]
 
@@ -200,13 +200,16 @@ class LockstepLoop:
 
     def _wait_for_answers(self, longest: float) -> bool:
         """Take answers and step, for a time at most [s]; return whether any step was taken."""
-        before, end = self.steps, time.monotonic() + (longest if self.compiled is not None else INTERPRETED_SLICE)
+        before, compiled = self.steps, self.compiled
+        end = time.monotonic() + (longest if compiled is not None else INTERPRETED_SLICE)
         while (left := end - time.monotonic()) > 0.0 and self._must_wait() and not self.finished:
-            if self.compiled is not None:
+            if compiled is not None:
                 steps = self.steps
-                done = self._run_compiled(self.compiled, left)
+                done = self._run_compiled(compiled, left)
                 if done.ended:
-                    break
+                    # Somebody calls, and it may be some time before they have their turn: Python waits meanwhile.
+                    compiled, end = None, min(end, time.monotonic() + WHILE_CALLED)
+                    continue
                 if self.steps > steps or done.message is not None:
                     continue
             self._interface.wait_for_inputs(min(left, INTERPRETED_SLICE))
