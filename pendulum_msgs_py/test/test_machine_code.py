@@ -64,3 +64,14 @@ def test_code_that_is_no_code_of_ours_is_refused(kept: Path, code: bytes) -> Non
     kept.write_bytes(_kept(_head(code), code))
     with pytest.raises(NoMachineCodeError, match="cannot be loaded"):
         load_loop(_BUILDER, symbols={})
+
+
+def test_a_user_without_a_home_gets_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nobody() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(machine_code.os, "access", lambda *_: False)
+    monkeypatch.setattr(Path, "home", nobody)
+    with pytest.raises(NoMachineCodeError, match="no folder for machine code"):
+        machine_code._path("pendulum_msgs_py.loops.nothing:nothing", ())

@@ -151,7 +151,10 @@ def _path(builder: str, choice: tuple[str, ...]) -> Path:
     digest = hashlib.sha256(known.encode()).hexdigest()[:24]
     home = Path(str(importlib.import_module(package).__file__)).parent / "__pycache__"
     if not os.access(home if home.exists() else home.parent, os.W_OK):
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pendulum"
+        try:
+            home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pendulum"
+        except RuntimeError as error:  # a user whom nobody knows, as in a container
+            raise NoMachineCodeError(f"no folder for machine code: {error}") from error
     name = "-".join((function, *choice, digest)).replace(":", ".")
     return home / f"{name}.loop"
 
