@@ -103,7 +103,7 @@ def plant_loop(layout: Any, step: Any) -> Any:
 
     @compiled
     def advance(s: Any) -> Any:
-        """Do one period from a decision to its publication; return whether it was done."""
+        """Do one period from a decision to its publication; return whether it was done, and its state is out."""
         until_ns = s.now_ns + s.period_ns
         # In lockstep a decision is as of the state that was answered, in real time as of the deadline.
         if not _decide(s, s.now_ns if s.lockstep else until_ns):
@@ -118,7 +118,7 @@ def plant_loop(layout: Any, step: Any) -> Any:
         out = s.states
         out.value[0], out.value[1], out.value[2] = s.position, s.velocity, s.effort
         s.published_ns = wall_ns(s.time)
-        publish(out, until_ns)
+        is_out = publish(out, until_ns)
         s.own_newest = (s.own_newest + 1) % OWN_STAMPS
         s.own_stamp_ns[s.own_newest] = until_ns
         if s.has_clock and has_listeners(s.clock):
@@ -127,7 +127,7 @@ def plant_loop(layout: Any, step: Any) -> Any:
             s.applied.value[0] = applied
             publish(s.applied, before_ns)
         s.periods += 1
-        return True
+        return is_out
 
     @compiled
     def in_real_time(s: Any) -> Any:
@@ -142,9 +142,9 @@ def plant_loop(layout: Any, step: Any) -> Any:
             waits = _take_inputs(s)
             if waits != _IS_READ:
                 return MESSAGE_WAITS + waits
+            s.late_ns[s.periods] = late_ns
             if not advance(s):
                 return UNUSUAL
-            s.late_ns[s.periods - 1] = late_ns
         return ENDED
 
     @compiled
