@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import platform
+import struct
 import sys
 import time
 from collections import deque
@@ -62,7 +63,7 @@ class Rcl:
             return _NONE_LEFT
         self._kept = waiting.popleft()
         place = structure_of(MESSAGE).from_address(message)
-        place.buffer, place.length = ctypes.cast(self._kept, _ADDRESS).value, len(self._kept)
+        place.buffer, place.length = ctypes.cast(ctypes.c_char_p(self._kept), _ADDRESS).value, len(self._kept)
         return _OK
 
     def publish(self, publisher: int, message: int, _allocation: int) -> int:
@@ -202,6 +203,28 @@ def test_a_command_that_answers_no_state_of_ours_is_pythons(plant: Plant, stamp:
     plant.rcl.waiting[EFFORT].append(plant.answer(9.0, plant.record.now_ns + stamp))
     assert plant.run() == MESSAGE_WAITS + EFFORT
     assert plant.record.rules.command.effort == 0.5
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data: data.replace(_ME.encode(), b"/peeR"),
+        lambda data: data.replace(JOINT.encode(), JOINT.upper().encode()),
+        lambda data: data + bytes(4),
+        lambda data: data[:-8],
+        # The same time, written as nobody may.
+        lambda data: data[:4] + struct.pack("<II", *_carried(*struct.unpack_from("<II", data, 4))) + data[12:],
+    ],
+    ids=["another sender", "another joint", "longer", "shorter", "too many nanoseconds"],
+)
+def test_what_is_not_as_expected_is_pythons(plant: Plant, change: Callable[[bytes], bytes]) -> None:
+    plant.rcl.waiting[EFFORT].append(change(plant.answer(2.0)))
+    assert plant.run() == MESSAGE_WAITS + EFFORT
+    assert plant.record.rules.command.effort == 0.5
+
+
+def _carried(seconds: int, nanoseconds: int) -> tuple[int, int]:
+    return seconds - 1, nanoseconds + 1_000_000_000
 
 
 def test_a_push_is_pythons_whatever_was_expected(plant: Plant) -> None:
