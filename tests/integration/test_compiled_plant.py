@@ -163,6 +163,11 @@ def test_in_real_time_it_runs_compiled_and_answers_whoever_calls(
     with closing(PlantPeer("/sim", torque=0.5)) as peer:
         program = processes.start(plant.package, plant.executable, *plant.ros_arguments())
         peer.until(lambda: int(peer.diagnostics.get("periods_compiled", 0)) > 200, "compiled periods", 120.0)
+        # Neither the compiler nor what it is made of is in a program that runs what it has compiled.
+        mapped = Path(f"/proc/{program.pid}/maps").read_text(encoding="utf-8")
+        assert "rclpy" in mapped
+        assert "llvmlite" not in mapped
+        assert "numba" not in mapped
         first = peer.diagnostics
         peer.spin(2.0)
         last = peer.diagnostics

@@ -188,6 +188,8 @@ def _compile_apart(path: Path, builder: str, choice: tuple[str, ...]) -> None:
     with _alone(path):
         if _read(path) is not None:
             return
+        # Whoever starts a program for the first time should not take it for one that hangs.
+        print(f"compiling {builder} {' '.join(choice)}: ten seconds or so, this once", file=sys.stderr, flush=True)
         command = [sys.executable, "-m", _COMPILER, str(path), builder, *choice]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE, check=False)

@@ -6,12 +6,10 @@ the library that rclpy has loaded (:mod:`pendulum_msgs_py.ros.direct`).
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
-import llvmlite.binding as llvm
-import numba
 import numpy as np
-from numba import types
 
 from pendulum_msgs_py.contract.values import NANOSECONDS
 
@@ -32,6 +30,11 @@ __all__ = [
     "wait_for_any",
     "wall_ns",
 ]
+
+# Whoever compiles has them: simulator and control. This package needs neither, and a recorder has none.
+numba = importlib.import_module("numba")
+llvm = importlib.import_module("llvmlite.binding")
+types = numba.types
 
 _int, _address = types.int32, types.uintp
 _take = types.ExternalFunction("pendulum_rcl_take", _int(_address, _address, _address, _address))

@@ -6,17 +6,18 @@ everything it calls and returns it compiled; on request with another module in t
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping
 from functools import cache
 from types import FunctionType, ModuleType
 from typing import Any
 
-import numba
-
 from pendulum_msgs_py.programs.kept_kernels import name_symbols_apart
 
 __all__ = ["compile_tree", "tuple_loader"]
 
+# Whoever compiles has it: simulator and control. This package needs it nowhere else.
+numba = importlib.import_module("numba")
 # What is compiled here becomes part of kernels that are kept.
 name_symbols_apart()
 
