@@ -22,6 +22,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from pendulum_bags.experiments.session import NO_REALTIME
 from tests.fixtures import PROJECT
 from tests.suite_events import PIPE
 
@@ -99,7 +100,7 @@ def main(arguments: Sequence[str]) -> int:
     systems, waits, others = rooms()
     return run_parts(
         [
-            Part("whole systems", [*systems, *arguments], workers=1),
+            Part("whole systems", [*systems, *arguments], workers=1, realtime=True),
             Part("in real time", [*waits, *arguments], workers=2),
         ],
         [Part("computing", [*others, *arguments], workers=2, nice=_NICE)],
@@ -123,9 +124,13 @@ class Part:
         arguments: Pytest's own.
         workers: How many files run at a time, but not more than there are cores.
         nice: Priority as of ``nice``; 0 is the usual one, more is less.
+        realtime: Experiments may take real-time priority: whatever else keeps time meanwhile is kept from it.
     """
 
-    def __init__(self, name: str, arguments: Sequence[str], *, workers: int, nice: int = 0) -> None:
+    def __init__(
+        self, name: str, arguments: Sequence[str], *, workers: int, nice: int = 0, realtime: bool = False
+    ) -> None:
+        self._realtime = realtime
         self.name = name
         self.collected = 0
         self.outcomes: dict[str, str] = {}
@@ -144,6 +149,8 @@ class Part:
         reader, writer = os.pipe()
         # Within a worker's test this is no worker.
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
+        if not self._realtime:
+            environment[NO_REALTIME] = "1"
         command = [sys.executable, "-m", "pytest", "-p", "tests.suite_events", "-n", str(self._workers)]
         self._popen = subprocess.Popen(
             [*command, "--dist", "loadfile", "--no-loadscope-reorder", *self._arguments],

@@ -16,6 +16,7 @@ from pendulum_bags.experiments import session
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment
 from pendulum_bags.experiments.session import (
     ANSWER_PRIORITY,
+    NO_REALTIME,
     PLANT_PRIORITY,
     RECORDER_PRIORITY,
     Session,
@@ -31,6 +32,12 @@ _allowed = pytest.mark.skipif(
 )
 
 _PR_CAPBSET_DROP, _CAP_SYS_NICE = 24, 23
+
+
+@pytest.fixture(autouse=True)
+def nothing_forbidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let experiments take the priority, though the tests run beside others that keep time."""
+    monkeypatch.delenv(NO_REALTIME, raising=False)
 
 
 def _policies(child: Child) -> set[tuple[int, int]]:
@@ -84,6 +91,13 @@ def test_simulated_time_makes_nobody_wait(tmp_path: Path, domain_id: int) -> Non
         assert "realtime_priority" not in " ".join(Path(f"/proc/{child.process.pid}/cmdline").read_text().split("\0"))
         wait_for(lambda: "ready" in child.log.read_text(), 60.0, "the node")
         assert _policies(child) == {(os.SCHED_OTHER, 0)}
+
+
+def test_who_shares_the_computer_can_do_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = graph.controller("/sim", period=0.01)
+    assert "realtime_priority" in in_real_time(program, PLANT_PRIORITY).parameters
+    monkeypatch.setenv(NO_REALTIME, "1")
+    assert in_real_time(program, PLANT_PRIORITY) == program
 
 
 @pytest.mark.parametrize(("limit", "allowed"), [(0, False), (PLANT_PRIORITY - 1, False), (PLANT_PRIORITY, True)])

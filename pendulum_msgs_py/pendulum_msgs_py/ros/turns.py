@@ -6,14 +6,14 @@ from collections.abc import Callable
 
 __all__ = ["INTERPRETED_SLICE", "LONGEST_SLICE", "WHILE_CALLED", "Turns"]
 
-LONGEST_SLICE = 0.1
+LONGEST_SLICE = 0.2
 """Longest time in which nobody but the input is attended to [s]; a request ends it, where it is looked for."""
 INTERPRETED_SLICE = 0.02
 """The same where Python waits for the input, and looks for nothing else [s]."""
 WHILE_CALLED = 0.005
 """The same while somebody calls, who may have to wait for their turn: compiled code ends at once then [s]."""
-_EVENTS_AFTER_SLICE = 12
-"""Events that the executor may attend to after each slice: 120 a second at least, twice what timers make."""
+_EVENTS_AFTER_SLICE = 16
+"""Events that the executor may attend to after each slice: 80 a second at least, and timers make 55."""
 
 
 class Turns:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,7 @@ from pendulum_msgs_py.programs.realtime import may_run_in_real_time
 
 __all__ = [
     "ANSWER_PRIORITY",
+    "NO_REALTIME",
     "PLANT_PRIORITY",
     "RECORDER_PRIORITY",
     "START_TIMEOUT",
@@ -39,6 +41,8 @@ ANSWER_PRIORITY = PLANT_PRIORITY - 2
 """Real-time priority of who answers a plant's states: behind a plant's loop too, which is one behind its process."""
 RECORDER_PRIORITY = ANSWER_PRIORITY - 2
 """Real-time priority of a recorder: behind who has a deadline, whose messages would be lost for an ordinary one."""
+NO_REALTIME = "PENDULUM_NO_REALTIME"
+"""Variable of the environment with which experiments take no real-time priority."""
 _LOOP_NICENESS = -10
 """Priority among ordinary programs of those who keep deadlines, where we may take it."""
 
@@ -202,11 +206,16 @@ def in_real_time(program: NodeProgram, priority: int) -> NodeProgram:
 def permitted(priority: int) -> int:
     """Return a real-time priority, or 0 where we may not have that of a plant.
 
+    Nor do we take it where ``PENDULUM_NO_REALTIME`` is set: experiments at once on one computer would keep each other,
+    and whatever else is to be punctual there, from running.
+
     All or none: who answers states must not go before a plant that has to do without.
 
     Args:
         priority: That of a plant at most.
     """
+    if os.environ.get(NO_REALTIME):
+        return 0
     return priority if may_run_in_real_time(PLANT_PRIORITY) else 0
 
 
