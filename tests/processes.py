@@ -124,6 +124,7 @@ class ProcessGroup:
         env: Mapping[str, str] | None = None,
         cwd: Path | None = None,
         typed: bool = False,
+        niceness: int = 0,
     ) -> RunningProgram:
         """Start ``python -m package executable arguments`` in a process group of its own.
 
@@ -134,9 +135,11 @@ class ProcessGroup:
             env: Variables to add to the environment of this process.
             cwd: Folder to start in instead of the repository.
             typed: Whether the test types into it.
+            niceness: Priority to give away, or to take where it is negative and permitted.
         """
         command = [sys.executable, "-m", package, executable, *map(str, arguments)]
-        return self.start_command(command, name=f"{package} {executable}", env=env, cwd=cwd, typed=typed)
+        name = f"{package} {executable}"
+        return self.start_command(command, name=name, env=env, cwd=cwd, typed=typed, niceness=niceness)
 
     def start_command(
         self,
@@ -146,6 +149,7 @@ class ProcessGroup:
         env: Mapping[str, str] | None = None,
         cwd: Path | None = None,
         typed: bool = False,
+        niceness: int = 0,
     ) -> RunningProgram:
         """Start any command in a process group of its own."""
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -163,8 +167,9 @@ class ProcessGroup:
                 start_new_session=True,
             )
         # What runs behind others (the suite's computing part) stays there: among sessions it is theirs that counts.
-        if nice := os.getpriority(os.PRIO_PROCESS, 0):
+        if nice := os.getpriority(os.PRIO_PROCESS, 0) + niceness:
             with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, popen.pid, nice)
                 Path(f"/proc/{popen.pid}/autogroup").write_text(str(nice), encoding="ascii")
         program = RunningProgram(name, popen, log)
         self._popens.append(popen)

@@ -191,7 +191,10 @@ class Part:
             with contextlib.suppress(OSError, psutil.Error):
                 ancestors = {parent.pid for parent in psutil.Process(pid).parents()}
                 if self._popen.pid in {pid, *ancestors} and os.getsid(pid) == pid:
-                    Path(f"/proc/{pid}/autogroup").write_text(str(self._nice), encoding="ascii")
+                    group = Path(f"/proc/{pid}/autogroup")
+                    # Who stepped further back by itself stays there.
+                    if int(group.read_text(encoding="ascii").split()[-1]) < self._nice:
+                        group.write_text(str(self._nice), encoding="ascii")
                 self._looked_at.add(pid)
 
     def send(self, number: int) -> None:

@@ -112,6 +112,7 @@ def browser() -> Iterator[Any]:
 
 def _open(browser: Any, address: str, width: int = 1280, height: int = 860, **options: Any) -> Any:
     page = browser.new_page(viewport={"width": width, "height": height}, **options)
+    page.set_default_timeout(60_000)
     page.goto(address)
     page.wait_for_selector("[data-plant='/sim'] .armed_effort", timeout=60_000)
     return page

@@ -153,7 +153,7 @@ def test_a_run_whose_bridge_stood_still_is_measured_again_and_ctrl_c_leaves_read
     time.sleep(2.0 * EMULATOR_LIFETIME)
     bridge.resume()
     program.wait_for_output(r"^This machine stood still \((.*)\); measuring again, run 2 of at most 3\.$", 60)
-    program.wait_for_output(r"ramp up(?s:.*)ramp up", 120)
+    program.wait_for_output(r"measuring again(?s:.*)ramp up", 120)
     program.interrupt()
 
     assert program.wait(30) == 130

@@ -86,12 +86,13 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
         return wait_for(conductor, what, *arguments, **more)
 
     monkeypatch.setattr(Conductor, "wait_for", noted)
-    monkeypatch.setattr(lockstep, "_PATIENCE", 0.5)
+    # Longer than a busy machine needs for ten states, shorter than the run.
+    monkeypatch.setattr(lockstep, "_PATIENCE", 1.5)
     # The conductor knows the state of one joint only, and looks away from any.
-    spec = JointRun(JointSettings("cart_pole", duration=8.0), "sim", "cart_pole", "cart_pole")
+    spec = JointRun(JointSettings("cart_pole", duration=12.0), "sim", "cart_pole", "cart_pole")
     lockstep.record_run(tmp_path / "whole", spec)
     # Patience counts from the last look; the run takes longer than it.
-    assert waits.count("the end of a run of 8 s of simulated time") >= 2
+    assert waits.count("the end of a run of 12 s of simulated time") >= 2
 
     def freeze() -> None:
         if "the end of a run of 20 s of simulated time" in waits:

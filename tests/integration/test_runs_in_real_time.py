@@ -12,7 +12,7 @@ import pytest
 
 from pendulum_bags.experiments.conductor_node import PlantClient
 from pendulum_bags.experiments.processes import Child
-from pendulum_bags.experiments.session import conduct
+from pendulum_bags.experiments.session import LOOP_NICENESS, conduct
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError, PlantStoppedError
@@ -104,7 +104,9 @@ def test_a_rehearsal_with_a_lab_file_checks_asks_and_moves_the_machine_of_the_fi
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    processes.start("pendulum_hw_bridge", "emulator", "--address", address).wait_for_output("listens on", 60.0)
+    # A module has a processor of its own.
+    module = processes.start("pendulum_hw_bridge", "emulator", "--address", address, niceness=LOOP_NICENESS)
+    module.wait_for_output("listens on", 60.0)
     lab = tmp_path / "lab.yaml"
     lab.write_text(
         f"format: pendulum_lab/1\nmodule: {{backend: emulator_process, emulator_address: '{address}'}}\n"

@@ -155,7 +155,7 @@ def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes, name:
     controller.wait_for_output(rf"{name} for plant acrobot_frictionless: swing-up of .*sampled from", 240)
     _start_lockstep(processes, "acrobot_frictionless", 8.0, "rate_hz:=250.0")
     # The event may come before the states that wait here.
-    peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 9, "the last state, after 8 s", 90.0)
+    peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 9, "the last state, after 8 s", 200.0)
     # A plant knows of a listener before the listener knows of the plant, so the first states may be missed here.
     assert np.abs(peer.states[0].position).max() < 0.01
     turned = (np.array(peer.states[-1].position) - [math.pi, 0.0] + math.pi) % (2.0 * math.pi) - math.pi
@@ -171,7 +171,7 @@ def test_a_cart_swings_its_pole_up_by_energy_in_lockstep_within_its_track_and_it
     )
     controller.wait_for_output(r"energy_swing_up for plant cart_pole: pumps by cart within 1\.62 m", 60)
     _start_lockstep(processes, "cart_pole", 9.0, "rate_hz:=100.0")
-    peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 10, "the last state, after 9 s", 90.0)
+    peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 10, "the last state, after 9 s", 200.0)
     # The first states may be missed here.
     assert np.abs(peer.states[0].position).max() < 0.3
     cart, pole = peer.states[-1].position

@@ -17,6 +17,7 @@ from std_srvs.srv import SetBool
 
 from pendulum_bags.experiments.conductor_node import Conductor
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
+from pendulum_bags.experiments.session import LOOP_NICENESS
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
@@ -160,7 +161,8 @@ class LiveSystem:
         elif name == MODULE:
             child = self._start_module()
         else:
-            child = self.processes.start_node(self.program(name, **{**self._parameters.get(name, {}), **changes}))
+            program = self.program(name, **{**self._parameters.get(name, {}), **changes})
+            child = self.processes.start_node(program, niceness=LOOP_NICENESS)
         self.children[name] = child
         return child
 
@@ -187,7 +189,7 @@ class LiveSystem:
         path = self.folder / f"truth_{self._modules}.csv"
         command = [sys.executable, "-m", "pendulum_hw_bridge", "emulator", "--address", self._address]
         command += ["--position", "3.1416", "--truth", str(path)]
-        child = self.processes.start(f"emulator_{self._modules}", command)
+        child = self.processes.start(f"emulator_{self._modules}", command, niceness=LOOP_NICENESS)
         self._truth = ModuleTruth(path)
         return child
 

@@ -21,6 +21,7 @@ from pendulum_msgs_py.programs.realtime import may_run_in_real_time
 
 __all__ = [
     "ANSWER_PRIORITY",
+    "LOOP_NICENESS",
     "NO_REALTIME",
     "PLANT_PRIORITY",
     "RECORDER_PRIORITY",
@@ -43,7 +44,7 @@ RECORDER_PRIORITY = ANSWER_PRIORITY - 2
 """Real-time priority of a recorder: behind who has a deadline, whose messages would be lost for an ordinary one."""
 NO_REALTIME = "PENDULUM_NO_REALTIME"
 """Variable of the environment with which experiments take no real-time priority."""
-_LOOP_NICENESS = -10
+LOOP_NICENESS = -10
 """Priority among ordinary programs of those who keep deadlines, where we may take it."""
 
 
@@ -188,7 +189,7 @@ def start_loop(processes: ProcessSet, program: NodeProgram, priority: int, *, si
     """
     if simulated:
         return processes.start_node(program)
-    return processes.start_node(in_real_time(program, priority), niceness=_LOOP_NICENESS)
+    return processes.start_node(in_real_time(program, priority), niceness=LOOP_NICENESS)
 
 
 def in_real_time(program: NodeProgram, priority: int) -> NodeProgram:
