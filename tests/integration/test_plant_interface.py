@@ -28,8 +28,8 @@ from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup, RunningProgram
 
 PERIODS_TO_ZERO = 15
-"""Periods of 10 ms, counted by the plant, in which torque may last: a command counts for 50 ms, and is on its way for a
-few."""
+"""Periods, 10 ms or 5, counted by the plant, in which torque may last: a command counts for 50 ms, and is on its way
+for a few."""
 _PLANT = Path(__file__).with_name("tiny_plant.py")
 
 
@@ -110,21 +110,21 @@ def _start(processes: ProcessGroup, *arguments: str) -> RunningProgram:
     return processes.start_command([sys.executable, str(_PLANT), *arguments], name="tiny_plant")
 
 
+_AS_TINY_PLANT = ("--ros-args", "-r", "__node:=tiny_plant", "-p", "armed_at_start:=false")
+
+
 def _start_mujoco(processes: ProcessGroup, folder: Path) -> RunningProgram:
     """Start a model file that nobody wrote for us, under the tiny plant's name and limit."""
     model = folder / "lab.xml"
     model.write_text(_MODEL, encoding="utf-8")
-    arguments = (
-        "-r",
-        "__node:=tiny_plant",
-        "-p",
-        f"model:={model}",
-        "-p",
-        "rate_hz:=100.0",
-        "-p",
-        "armed_at_start:=false",
-    )
-    return processes.start("pendulum_sim", "mujoco", "--ros-args", *arguments)
+    return processes.start("pendulum_sim", "mujoco", *_AS_TINY_PLANT, "-p", f"model:={model}", "-p", "rate_hz:=100.0")
+
+
+def _start_simulator(processes: ProcessGroup, compiled: bool) -> RunningProgram:
+    """Start a pendulum under the tiny plant's name and limit, its periods compiled or not."""
+    # Python takes longer periods itself.
+    settings = ("-p", "rate_hz:=200.0", "-p", "effort_limit:=5.0", "-p", f"compiled:={str(compiled).lower()}")
+    return processes.start("pendulum_sim", "simulator", *_AS_TINY_PLANT, *settings)
 
 
 _MODEL = """
@@ -150,7 +150,7 @@ def plant(processes: ProcessGroup, peer: Peer) -> RunningProgram:
     return _await(peer, _start(processes))
 
 
-@pytest.fixture(scope="module", params=["tiny_plant", "mujoco"])
+@pytest.fixture(scope="module", params=["tiny_plant", "mujoco", "compiled", "interpreted"])
 def running_plant(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:
     """Start a plant for all the tests that leave it as sound as they found it, and who speaks to it."""
     if request.param == "mujoco":
@@ -160,10 +160,19 @@ def running_plant(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempP
     with own_domain(folder):
         peer = Peer()
         try:
-            _await(peer, _start(processes) if request.param == "tiny_plant" else _start_mujoco(processes, folder))
+            if request.param == "tiny_plant":
+                program = _start(processes)
+            elif request.param == "mujoco":
+                program = _start_mujoco(processes, folder)
+            else:
+                program = _start_simulator(processes, request.param == "compiled")
+            _await(peer, program)
             # As a plant starts: whoever uses it first finds this, too.
             assert peer.diagnostics["mode"] == "disarmed"
             yield peer
+            if "loop" in peer.diagnostics:
+                assert peer.diagnostics["loop"].startswith(request.param)
+                assert (int(peer.diagnostics.get("periods_compiled", 0)) > 100) == (request.param == "compiled")
         finally:
             peer.close()
             assert processes.close() == []
