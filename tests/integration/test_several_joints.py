@@ -2,71 +2,30 @@
 
 from __future__ import annotations
 
-import json
 import math
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
-from std_srvs.srv import SetBool, Trigger
-from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.ros import qos
 from pendulum_rosbag.reader import read_bag
-from tests.graph_peer import GraphPeer
+from tests.joints_peer import JointsPeer
 from tests.policies import lqr_policy
 from tests.refusals import Refused, not_refused
 
 JOINTS = ["shoulder", "elbow"]
 
 
-class Peer(GraphPeer):
-    """Hears one plant and answers each of its states with what it is told to."""
-
-    def __init__(self) -> None:
-        super().__init__("peer", namespace="sim")
-        self.states: list[JointState] = []
-        self.applied: list[JointState] = []
-        self.events: list[dict] = []
-        self.diagnostics: dict[str, str] = {}
-        self.answer: dict[str, Any] | None = None
-        self.commands = self.node.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
-        self.trajectories = self.node.create_publisher(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
-        self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE)
-        self.node.create_subscription(JointState, names.APPLIED_EFFORT, self.applied.append, qos.STATE)
-        self.node.create_subscription(
-            String, names.EVENTS, lambda message: self.events.append(json.loads(message.data)), qos.EVENTS
-        )
-        self.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, 10)
-
-    def _on_state(self, message: JointState) -> None:
-        self.states.append(message)
-        if self.answer is not None:
-            command = JointState(**self.answer)
-            command.header.stamp, command.header.frame_id = message.header.stamp, "peer"
-            self.commands.publish(command)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name.endswith(": plant"):
-                self.diagnostics = {pair.key: pair.value for pair in status.values}
-
-    def known(self) -> str:
-        return f"; diagnostics {self.diagnostics}"
-
-
 @pytest.fixture
-def peer(domain_id: int) -> Iterator[Peer]:
-    peer = Peer()
+def peer(domain_id: int) -> Iterator[JointsPeer]:
+    peer = JointsPeer()
     yield peer
     peer.close()
 
@@ -83,7 +42,7 @@ def _start_lockstep(processes, plant: str, duration: float, *parameters: str):
 
 
 def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_back(
-    peer: Peer, processes, tmp_path: Path
+    peer: JointsPeer, processes, tmp_path: Path
 ) -> None:
     recorder = processes.start("pendulum_rosbag", "record", "-o", str(tmp_path / "bag"), "--regex", "^/sim/")
     recorder.wait_for_output("ready", 30)
@@ -142,7 +101,7 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
 
 
 @pytest.mark.parametrize("name", ["tvlqr", "ilqr"])
-def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes, name: str) -> None:
+def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: JointsPeer, processes, name: str) -> None:
     controller = _start(
         processes,
         "pendulum_lqr",
@@ -164,7 +123,7 @@ def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: Peer, processes, name:
 
 
 def test_a_cart_swings_its_pole_up_by_energy_in_lockstep_within_its_track_and_its_motors_limit(
-    peer: Peer, processes
+    peer: JointsPeer, processes
 ) -> None:
     controller = _start(
         processes, "pendulum_lqr", "controller", "plant:=cart_pole", "controller:=energy_swing_up", "use_sim_time:=true"
@@ -182,7 +141,9 @@ def test_a_cart_swings_its_pole_up_by_energy_in_lockstep_within_its_track_and_it
     assert max(abs(applied.effort[0]) for applied in peer.applied) <= 10.0
 
 
-def test_mpc_takes_the_period_of_the_states_and_stops_a_cart_before_the_end_of_its_track(peer: Peer, processes) -> None:
+def test_mpc_takes_the_period_of_the_states_and_stops_a_cart_before_the_end_of_its_track(
+    peer: JointsPeer, processes
+) -> None:
     controller = _start(
         processes, "pendulum_lqr", "controller", "plant:=cart_pole", "controller:=mpc", "use_sim_time:=true"
     )
@@ -202,7 +163,7 @@ def test_mpc_takes_the_period_of_the_states_and_stops_a_cart_before_the_end_of_i
 
 
 def test_a_policy_holds_a_cart_pole_in_lockstep_and_gives_up_where_it_was_never_trained(
-    peer: Peer, processes, tmp_path: Path
+    peer: JointsPeer, processes, tmp_path: Path
 ) -> None:
     plant = load_mechanism("cart_pole")
     path = write_policy(tmp_path / "policy.npz", lqr_policy(plant))
@@ -237,64 +198,6 @@ def test_a_policy_holds_a_cart_pole_in_lockstep_and_gives_up_where_it_was_never_
     assert simulator.wait(20.0) == 0
     _start_lockstep(processes, "cart_pole", 1.0, "initial_position:=[0.55, 3.19]")
     controller.wait_for_output(r"gave up after 0\.000 s: position of cart 0\.55 m", 60)
-
-
-def _until_counted(peer: Peer, key: str, before: int) -> None:
-    peer.until(lambda: int(peer.diagnostics.get(key, 0)) > before, f"{peer.answer} refused as {key}")
-
-
-@pytest.mark.parametrize("node", ["simulator", "bridge"])
-def test_commands_for_other_joints_move_nothing_and_are_counted_and_the_e_stop_ends_all(
-    peer: Peer, processes, node: str
-) -> None:
-    own: tuple[str, ...]
-    if node == "simulator":
-        own = ("pendulum_sim", "simulator", "rate_hz:=100.0")
-    else:
-        own = (
-            "pendulum_hw_bridge",
-            "bridge",
-            "feedback_rate:=50.0",
-            "feedback_watchdog:=50",
-            "command_lifetime:=2.0",
-            "start_effort_limit:=0.0",
-            "starvation_limit:=0.0",
-            "velocity_limit:=0.0",
-        )
-    _start(processes, *own, "plant:=double_pendulum", "command_timeout:=0.5")
-    peer.until(lambda: len(peer.states) > 3, "states")
-    if node == "bridge":
-        armed = peer.call(SetBool, "bridge/arm", SetBool.Request(data=True))
-        assert armed.success, armed.message
-    assert [list(state.name) for state in peer.states] == [JOINTS] * len(peer.states)
-    wrong: list[tuple[dict[str, Any], str]] = [
-        ({"name": ["elbow", "shoulder"], "effort": [1.0, 2.0]}, "other_joint"),
-        ({"name": ["shoulder", "knee"], "effort": [1.0, 2.0]}, "other_joint"),
-        ({"name": ["elbow", "elbow"], "effort": [1.0, 2.0]}, "other_joint"),
-        ({"name": ["elbow"], "effort": [1.0]}, "not_one_joint"),
-        ({"name": JOINTS, "effort": [1.0]}, "not_one_joint"),
-        ({"name": [], "effort": [1.0, 2.0]}, "not_one_joint"),
-        ({"name": JOINTS, "effort": [1.0, math.nan]}, "not_finite"),
-    ]
-    for answer, reason in wrong:
-        key = f"effort_command.refused.{reason}"
-        before = int(peer.diagnostics.get(key, 0))
-        peer.answer = answer
-        _until_counted(peer, key, before)
-    peer.answer = None
-    assert all(list(message.name) == JOINTS and list(message.effort) == [0.0, 0.0] for message in peer.applied)
-
-    peer.trajectories.publish(JointTrajectory(joint_names=JOINTS))
-    refused = peer.until(lambda: [e for e in peer.events if e["name"] == names.Event.TRAJECTORY_REFUSED], "the refusal")
-    assert "follows no trajectory" in refused[0]["reason"]
-
-    peer.answer = {"name": JOINTS, "effort": [1.0, -9.0]}
-    peer.until(lambda: list(peer.applied[-1].effort) == [1.0, -6.0], "torque within each joint's limit")
-    assert peer.call(Trigger, f"{node}/e_stop", Trigger.Request()).success
-    peer.until(lambda: list(peer.applied[-1].effort) == [0.0, 0.0], "no torque")
-    count = len(peer.applied)
-    peer.until(lambda: len(peer.applied) > count + 20, "more periods")
-    assert all(list(message.effort) == [0.0, 0.0] for message in peer.applied[count:])
 
 
 SIMULATOR, CONTROLLER, DISTURBANCE, BRIDGE = (

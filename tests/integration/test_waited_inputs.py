@@ -74,7 +74,7 @@ def test_the_executor_hands_over_where_the_middleware_does_not_tell(
     assert heard == [STATE]
 
 
-@pytest.mark.parametrize(("came", "others"), [(True, 16), (False, 1)])
+@pytest.mark.parametrize(("came", "others"), [(True, 3), (False, 1)])
 def test_each_slice_is_followed_by_a_few_turns_of_the_executor(came: bool, others: int) -> None:
     slices: list[float] = []
 
@@ -82,7 +82,7 @@ def test_each_slice_is_followed_by_a_few_turns_of_the_executor(came: bool, other
         slices.append(longest)
         return came
 
-    turns = Turns(serve)
+    turns = Turns(serve, 3)
     for count in range(1, 4):
         for _ in range(others):
             assert turns.run_due() == 0.0

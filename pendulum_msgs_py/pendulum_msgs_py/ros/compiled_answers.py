@@ -25,6 +25,10 @@ from pendulum_msgs_py.ros.turns import INTERPRETED_SLICE, WHILE_CALLED, Turns
 
 __all__ = ["AnsweredInput"]
 
+_EVENTS_AFTER_SLICE = 3
+"""Events that the executor may attend to after each slice: 15 a second at least. Who answers has a timer of 1 Hz; its
+services are attended to apart."""
+
 
 class AnsweredInput:
     """An input whose messages are answered one by one, by compiled code where it can be had.
@@ -50,7 +54,7 @@ class AnsweredInput:
         self._answerer = answerer
         self._loop: _Loop | None = None
         self._why = ""
-        self._turns = Turns(self._serve)
+        self._turns = Turns(self._serve, _EVENTS_AFTER_SLICE)
 
     def compile(self, publisher: Publisher, *, sender: str, joint: str, ahead_ns: int) -> None:
         """Have the loop that the answerer wants, if any; where it was never needed before, that takes seconds.

@@ -164,7 +164,7 @@ class LockstepLoop:
             interface.node.create_publisher(ClockMessage, names.CLOCK, qos.CLOCK) if publish_clock else None
         )
         self._next_look = 0.0
-        self._turns = Turns(self._wait_for_answers)
+        self._turns = Turns(self._wait_for_answers, _EVENTS_AFTER_SLICE)
         self.compiled: CompiledPeriods | None = None
         if interface.polled:
             interface.watch_inputs()
@@ -313,6 +313,8 @@ class LockstepLoop:
             self._publish(interface.sample)
 
 
+_EVENTS_AFTER_SLICE = 16
+"""Events that the executor may attend to after each slice: 80 a second at least, and a plant's timers make 51."""
 _LOOK_FREE = 0.001
 """Wall time between two steps that nobody has to answer, and between two looks for those who will [s]."""
 _LOOK_WAITING = 0.1

@@ -12,8 +12,6 @@ INTERPRETED_SLICE = 0.02
 """The same where Python waits for the input, and looks for nothing else [s]."""
 WHILE_CALLED = 0.005
 """The same while somebody calls, who may have to wait for their turn: compiled code ends at once then [s]."""
-_EVENTS_AFTER_SLICE = 16
-"""Events that the executor may attend to after each slice: 80 a second at least, and timers make 55."""
 
 
 class Turns:
@@ -21,10 +19,13 @@ class Turns:
 
     Args:
         serve: Attends to the input for a time at most [s]; returns whether anything came.
+        events: Events that the executor may attend to after each slice, one at least. It must not fall behind what its
+            node makes of them, and each look for one keeps the input waiting for 50 us.
     """
 
-    def __init__(self, serve: Callable[[float], bool]) -> None:
+    def __init__(self, serve: Callable[[float], bool], events: int) -> None:
         self._serve = serve
+        self._events = events
         self._left = 0
 
     def run_due(self) -> float:
@@ -33,5 +34,5 @@ class Turns:
             self._left -= 1
         else:
             # Where nothing comes nothing is in a hurry, and each look at the executor costs.
-            self._left = _EVENTS_AFTER_SLICE - 1 if self._serve(LONGEST_SLICE) else 0
+            self._left = self._events - 1 if self._serve(LONGEST_SLICE) else 0
         return 0.0
