@@ -37,7 +37,7 @@ class RealtimeLoop:
     """Steps the plant at absolute deadlines of wall time, without drift.
 
     Late by a period or more, the plant is stepped through the periods it missed and only the newest state is
-    published; each missed period counts as an overrun. Its runner calls :meth:`run_due`: a timer of rclpy's would
+    published: one overrun, however many periods were missed. Its runner calls :meth:`run_due`: a timer of rclpy's would
     cost two more threads' attention a period, and drop the periods it missed.
 
     Args:
