@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from pendulum_bags.experiments.conductor_node import Conductor
+from pendulum_bags.experiments.graph_plant import join
+from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag
 from pendulum_sim.model_files import mjcf
@@ -84,3 +87,22 @@ def test_a_plant_that_is_armed_or_commanded_or_not_there_is_left_alone(
     # Whoever armed it has it still: a refusal disarms nobody's plant.
     assert peer.diagnostics["mode"].startswith("armed")
     assert not (out / "hw").exists()
+
+
+def test_a_commander_who_is_met_later_than_the_plant_is_noticed(
+    processes: ProcessGroup, domain_id: int, peer: PlantPeer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/lab", "-p", "armed_at_start:=false")
+    peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the plant")
+    asked: list[str] = []
+    with Conductor(domain_id) as conductor:
+        conductor.wait_for("the peer", lambda: conductor.node.count_publishers("/lab/effort_command"), 30.0)
+        count = conductor.node.count_publishers
+
+        def late(topic: str) -> int:
+            asked.append(topic)
+            return count(topic) if asked.count(topic) > 1 else 0
+
+        monkeypatch.setattr(conductor.node, "count_publishers", late)
+        with pytest.raises(FaultError, match="/lab/effort_command has 1 publisher: somebody else commands this plant"):
+            join(conductor, "/lab")

@@ -72,19 +72,13 @@ def join(conductor: Conductor, space: str) -> PlantClient:
     from pendulum_bags.experiments.conductor_node import PlantClient
 
     node = find_plant(conductor, space)
-    for name, namespace in conductor.node.get_node_names_and_namespaces():
-        if namespace == space and name in _OURS:
-            raise FaultError(f"{space}/{name} runs already, and this experiment starts its own; end that one first")
-    for topic in _COMMANDS:
-        if count := conductor.node.count_publishers(f"{space}/{topic}"):
-            raise FaultError(
-                f"{space}/{topic} has {count} publisher{'s' * (count > 1)}: somebody else commands this plant; "
-                "expected no other commander"
-            )
+    _refuse_others(conductor, space)
     client = PlantClient(conductor, space, node)
     client.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
     # What is on the graph by then has been met: what it says of itself is no older than its services.
     conductor.spin(0.5)
+    # Who commands it may be met later than the plant.
+    _refuse_others(conductor, space)
     if client.is_armed():
         raise FaultError(
             f"{space} is armed already; expected it at rest and disarmed (if no other program uses it: "
@@ -96,3 +90,16 @@ def join(conductor: Conductor, space: str) -> PlantClient:
             f"{space} is at {angle:.2f} rad; expected it within half a turn of hanging at 0: reset its zero"
         )
     return client
+
+
+def _refuse_others(conductor: Conductor, space: str) -> None:
+    for name, namespace in conductor.node.get_node_names_and_namespaces():
+        if namespace == space and name in _OURS:
+            raise FaultError(f"{space}/{name} runs already, and this experiment starts its own; end that one first")
+    ours = [publisher.topic_name for publisher in conductor.node.publishers]
+    for topic in _COMMANDS:
+        if count := conductor.node.count_publishers(f"{space}/{topic}") - ours.count(f"{space}/{topic}"):
+            raise FaultError(
+                f"{space}/{topic} has {count} publisher{'s' * (count > 1)}: somebody else commands this plant; "
+                "expected no other commander"
+            )
