@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pendulum_bags.experiments.session import RECORDER_PRIORITY, permitted
 from pendulum_rosbag.reader import read_bag
 from tests.benchmarks.console_cost import start_console
-from tests.benchmarks.two_plants import PLANTS, two_plants
+from tests.benchmarks.plant_listener import missed_share
+from tests.benchmarks.two_plants import PLANTS, RATE, two_plants
 
 __all__ = ["LoadedPlants", "loaded_plants"]
 
@@ -59,7 +60,7 @@ def loaded_plants(duration: float, *, real_time: bool = True) -> LoadedPlants:
         loops.clear()
         loops.spin(duration)
         rows = {plant: loops.rows[plant] for plant in PLANTS}
-        missed = {plant: _missed(found[0], found[-1]) for plant, found in rows.items()}
+        missed = {plant: missed_share(found[0], found[-1], RATE) for plant, found in rows.items()}
         faults = [found[-1]["reason"] for found in rows.values() if found[-1]["mode"] == "fault"]
         recorder.interrupt()
         recorder.wait(_START)
@@ -72,8 +73,3 @@ def loaded_plants(duration: float, *, real_time: bool = True) -> LoadedPlants:
             lost=sum(count["lost"] for count in counts),
             real_time=priority > 0,
         )
-
-
-def _missed(first: dict[str, str], last: dict[str, str]) -> float:
-    cycles, overruns = (int(last[key]) - int(first[key]) for key in ("cycles", "overruns"))
-    return 100.0 * overruns / max(1, cycles)

@@ -12,10 +12,12 @@ from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import SetBool
 
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.ros.convert import stamp_from_message
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 from tests.graph_peer import GraphPeer
 
-__all__ = ["PlantListener", "cpu_time", "domain_environment"]
+__all__ = ["PlantListener", "cpu_time", "domain_environment", "missed_share"]
 
 
 class PlantListener(GraphPeer):
@@ -26,7 +28,7 @@ class PlantListener(GraphPeer):
         *plants: Full names of their nodes.
 
     Attributes:
-        rows: What each plant said, oldest first.
+        rows: What each plant said, oldest first, with its ``stamp_ns``.
     """
 
     patience = 60.0
@@ -41,7 +43,8 @@ class PlantListener(GraphPeer):
         for status in message.status:
             rows = self.rows.get(status.name.partition(":")[0])
             if rows is not None:
-                rows.append({pair.key: pair.value for pair in status.values})
+                stamp = {"stamp_ns": str(stamp_from_message(message.header.stamp))}
+                rows.append(stamp | {pair.key: pair.value for pair in status.values})
 
     def clear(self) -> None:
         """Forget what was said so far."""
@@ -85,3 +88,21 @@ def cpu_time(processes: Iterable[psutil.Process]) -> float:
         with contextlib.suppress(psutil.NoSuchProcess):
             total += sum(process.cpu_times()[:2])
     return total
+
+
+def missed_share(first: dict[str, str], last: dict[str, str], rate: float) -> float:
+    """Return the share of a plant's periods that it missed between two rows, by its own stamps [%].
+
+    A pause is one overrun, however long, and what a late plant steps through at once are no cycles of their own; so the
+    larger of both counts.
+
+    Args:
+        first: What it said first.
+        last: What it said last.
+        rate: Periods per second [Hz].
+    """
+    past = {key: int(last[key]) - int(first[key]) for key in ("stamp_ns", "cycles", "overruns")}
+    periods = past["stamp_ns"] / NANOSECONDS * rate
+    # The row is written within a period of its stamp.
+    missed = max(past["overruns"], periods - past["cycles"] - 1.0)
+    return 100.0 * missed / periods

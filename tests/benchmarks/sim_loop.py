@@ -20,7 +20,7 @@ from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from tests.benchmarks.limit_loop import build_limit
-from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment
+from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment, missed_share
 from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = [
@@ -35,7 +35,6 @@ __all__ = [
 
 _ROOT = Path(__file__).parents[2]
 _WARM_UP = 6.0
-_DIAGNOSTICS_PERIOD = 0.5
 _SIMULATOR = "/sim/simulator"
 _WINDOW = 4096
 """Round trips that the simulator's percentiles are of; the limit's are of as many."""
@@ -187,15 +186,10 @@ def realtime_figures(duration: float, *, rate: float = 1000.0, cores: Sequence[i
             listener.spin(duration)
             elapsed = time.monotonic() - wall
             cpu = 100.0 * (cpu_time(processes) - busy) / elapsed
-            after = said[-1]
-            expected = (len(said) - 1) * _DIAGNOSTICS_PERIOD * rate
-            cycles = int(after["cycles"]) - int(said[0]["cycles"])
-            # Periods that a late timer stepped through in one go are no cycles of their own.
-            missed = max(expected - cycles, int(after["overruns"]) - int(said[0]["overruns"]))
             return LoopFigures(
                 p50=statistics.median(float(row["command_latency_p50_us"]) for row in said),
                 p99=statistics.median(float(row["command_latency_p99_us"]) for row in said),
-                missed=100.0 * max(0.0, missed) / expected,
+                missed=missed_share(said[0], said[-1], rate),
                 cpu=cpu,
                 memory=processes[0].memory_info().rss / 1e6,
                 growth=(processes[0].memory_info().rss - memory) / 1e6,

@@ -29,6 +29,8 @@ __all__ = ["CAMPAIGN"]
 
 _STALL = 0.15
 """Pause of plant or module that must be a fault [s]: a cycle is 10 ms, the watchdog 30 ms, the command lifetime 50."""
+_BACK_AT_RATE = 10.0
+"""Time in which a loop must have been at its rate for a second [s]."""
 
 
 def _lose_controller(number: int) -> Callable[[LiveSystem, random.Random], Outcome]:
@@ -43,11 +45,15 @@ def _lose_controller(number: int) -> Callable[[LiveSystem, random.Random], Outco
 
 
 def _demand_rate(outcome: Outcome, system: LiveSystem) -> None:
-    """Take note of a loop that has not come back to its rate."""
-    rate, expected = system.rate(), system.plant.rate
-    outcome.demand(
-        abs(rate - expected) < 0.05 * expected, f"rate {rate:.0f} Hz afterwards; expected {expected:.0f} Hz within 5 %"
-    )
+    """Take note of a loop that does not come back to its rate.
+
+    A busy machine takes some periods from any one second; what a fault has left behind takes them from all.
+    """
+    expected, deadline = system.plant.rate, time.monotonic() + _BACK_AT_RATE
+    while abs((rate := system.rate()) - expected) >= 0.05 * expected:
+        if time.monotonic() > deadline:
+            outcome.demand(False, f"rate {rate:.0f} Hz afterwards; expected {expected:.0f} Hz within 5 %")
+            return
 
 
 def _freeze_controller(system: LiveSystem, generator: random.Random) -> Outcome:
