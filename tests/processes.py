@@ -167,7 +167,9 @@ class ProcessGroup:
                 start_new_session=True,
             )
         # What runs behind others (the suite's computing part) stays there: among sessions it is theirs that counts.
-        if nice := os.getpriority(os.PRIO_PROCESS, 0) + niceness:
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        if own or niceness:
+            nice = own + niceness
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, popen.pid, nice)
                 Path(f"/proc/{popen.pid}/autogroup").write_text(str(nice), encoding="ascii")

@@ -114,7 +114,7 @@ def _open(browser: Any, address: str, width: int = 1280, height: int = 860, **op
     page = browser.new_page(viewport={"width": width, "height": height}, **options)
     page.set_default_timeout(60_000)
     page.goto(address)
-    page.wait_for_selector("[data-plant='/sim'] .armed_effort", timeout=60_000)
+    page.wait_for_selector("[data-plant='/sim'] .armed_effort")
     return page
 
 
@@ -242,7 +242,7 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address:
     place = of_sim.evaluate(PLACE_AMONG_PLANTS)
     other = processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot")
     joints = page.get_by_label("Lines of /robot: joint")
-    joints.wait_for(timeout=60_000)
+    joints.wait_for()
     assert joints.locator("option").all_inner_texts() == ["shoulder", "elbow"]
     shown = "[pendulumConsole.plants['/robot'].goal, pendulumConsole.plants['/sim'].goal]"
     assert page.evaluate(shown) == [math.pi, math.pi]
@@ -251,13 +251,13 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address:
 
     # A plant that comes moves no button: it would be pressed in the place of another.
     robot = page.locator("[data-card='/robot']")
-    robot.wait_for(timeout=60_000)
+    robot.wait_for()
     assert of_sim.evaluate(PLACE_AMONG_PLANTS) == place
 
     # What runs already is not doubled.
     of_sim.click()
     already = re.compile(r"/sim/controller \(.+\) is there already")
-    page.locator(".notices .bad", has_text=already).wait_for(timeout=60_000)
+    page.locator(".notices .bad", has_text=already).wait_for()
 
     # A plant of several joints is offered what can hold it; what is started waits until it is activated.
     robot.get_by_role("combobox").click()
@@ -265,26 +265,26 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address:
     wait_for(lambda: page.locator(".q-menu [role=option]").all_inner_texts() == fitting, 60, "the controllers")
     page.locator(".q-menu [role=option]").first.click()
     page.get_by_role("button", name="Start controller /robot").click()
-    robot.get_by_text("lqr: inactive").wait_for(timeout=60_000)
+    robot.get_by_text("lqr: inactive").wait_for()
     weights = page.locator("input[aria-label='q of /robot']")
     wait_for(lambda: weights.input_value() == "10, 10, 1, 1", 60, "its own parameters")
     page.get_by_role("button", name="Activate controller /robot", exact=True).click()
-    robot.get_by_text("lqr: answering").wait_for(timeout=60_000)
+    robot.get_by_text("lqr: answering").wait_for()
     page.get_by_role("button", name="Deactivate controller /robot", exact=True).click()
-    robot.get_by_text("lqr: inactive").wait_for(timeout=60_000)
+    robot.get_by_text("lqr: inactive").wait_for()
     page.get_by_role("button", name="End controller /robot", exact=True).click()
-    robot.get_by_text("no controller").wait_for(timeout=60_000)
-    weights.wait_for(state="detached", timeout=60_000)
+    robot.get_by_text("no controller").wait_for()
+    weights.wait_for(state="detached")
 
     # One that has gone keeps its place, and can be stopped should it come back.
     other.interrupt()
     assert other.wait(20) == 0
-    page.get_by_role("button", name="Arm /robot", exact=True).wait_for(state="hidden", timeout=60_000)
+    page.get_by_role("button", name="Arm /robot", exact=True).wait_for(state="hidden")
     assert page.get_by_role("button", name="Stop /robot", exact=True).is_visible()
     assert robot.get_by_role("heading").is_visible()
     assert of_sim.evaluate(PLACE_AMONG_PLANTS) == place
     processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot")
-    page.get_by_role("button", name="Arm /robot", exact=True).wait_for(timeout=60_000)
+    page.get_by_role("button", name="Arm /robot", exact=True).wait_for()
 
 
 def test_the_page_doubts_a_silent_server_and_gives_its_orders_to_the_next() -> None:

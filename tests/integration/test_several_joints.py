@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import signal
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +26,8 @@ JOINTS = ["shoulder", "elbow"]
 
 @pytest.fixture
 def peer(domain_id: int) -> Iterator[JointsPeer]:
-    peer = JointsPeer()
-    yield peer
-    peer.close()
+    with closing(JointsPeer()) as peer:
+        yield peer
 
 
 def _start(processes, package: str, program: str, *parameters: str):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
 import pytest
@@ -18,9 +19,8 @@ JOINTS = ["shoulder", "elbow"]
 
 @pytest.fixture
 def peer(domain_id: int) -> Iterator[JointsPeer]:
-    peer = JointsPeer()
-    yield peer
-    peer.close()
+    with closing(JointsPeer()) as peer:
+        yield peer
 
 
 def _until_counted(peer: JointsPeer, key: str, before: int) -> None:
