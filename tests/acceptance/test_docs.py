@@ -123,7 +123,7 @@ def test_the_site_is_built_and_needs_no_other_server() -> None:
 
 def test_layouts_show_signals_that_exist() -> None:
     folder = PROJECT / "bags" / "pendulum_bags" / "config"
-    known = {names.JOINT_STATES, names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT}
+    known = set(names.SIGNALS)
     curves = ElementTree.parse(folder / "plotjuggler_layout.xml").getroot().iter("curve")
     plotjuggler = {str(curve.get("name")) for curve in curves}
     assert {name.split("/")[2] for name in plotjuggler} == known

@@ -18,6 +18,7 @@ __all__ = [
     "JOINT_TRAJECTORY",
     "LINK",
     "PUSH",
+    "SIGNALS",
     "Event",
     "full_name",
 ]
@@ -32,6 +33,8 @@ DISTURBANCE = "disturbance"
 JOINT_TRAJECTORY = "joint_trajectory"
 PUSH = "push"
 APPLIED_EFFORT = "applied_effort"
+SIGNALS = (JOINT_STATES, EFFORT_COMMAND, DISTURBANCE, APPLIED_EFFORT)
+"""What goes round the loop, in order: without one of them a recording of a run is of no use."""
 EVENTS = "events"
 E_STOP_INPUT = "e_stop_input"
 """``std_msgs/Bool``: true is pressed, false says "not pressed" and has to come all the time."""

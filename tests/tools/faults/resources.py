@@ -154,7 +154,7 @@ def _record_some(conductor: Conductor, bag: Path) -> tuple[Publisher, int]:
     """Publish states until some are in the bag; return the publisher, and how many are sealed."""
     publisher = conductor.node.create_publisher(JointState, _TOPIC, qos.STATE)
     recorder = RecorderClient(conductor, "/sim")
-    conductor.wait_for("the recorder to hear", lambda: _TOPIC in recorder.heard(), _TIMEOUT)
+    recorder.wait_until_heard([_TOPIC], _TIMEOUT)
     deadline = time.monotonic() + _TIMEOUT
     while (sealed := _states_in(bag)) < _ENOUGH and time.monotonic() < deadline:
         for _ in range(50):

@@ -191,14 +191,8 @@ def _start(processes: ProcessSet, conductor: Conductor, folder: Path) -> list[Ch
     plant = PlantClient(conductor, "/sim", "simulator", watch=False)
     bridge = PlantClient(conductor, "/hw", "bridge")
     for namespace in ("/sim", "/hw"):
-        recorder = RecorderClient(conductor, namespace)
-        inputs = (names.JOINT_STATES, names.APPLIED_EFFORT, names.EFFORT_COMMAND, names.DISTURBANCE)
-        wanted = {f"{namespace}/{name}" for name in inputs} | {names.DIAGNOSTICS}
-        conductor.wait_for(
-            "the recorder to hear all topics",
-            lambda wanted=wanted, recorder=recorder: wanted <= recorder.heard(),  # type: ignore[misc]
-            _START_TIMEOUT,
-        )
+        wanted = [*(f"{namespace}/{name}" for name in names.SIGNALS), names.DIAGNOSTICS]
+        RecorderClient(conductor, namespace).wait_until_heard(wanted, _START_TIMEOUT)
     conductor.wait_for(
         "the plant to be heard",
         lambda: conductor.node.count_subscribers(f"/sim/{names.JOINT_STATES}") >= _SIM_LISTENERS,

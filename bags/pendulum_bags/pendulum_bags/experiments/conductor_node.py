@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
@@ -394,6 +394,14 @@ class RecorderClient:
     def heard(self) -> set[str]:
         """Return the topics whose publishers the recorder is connected with."""
         return set(self._ask().get("matched", []))
+
+    def wait_until_heard(self, topics: Collection[str], timeout: float) -> None:
+        """Wait until it is connected with a publisher of each topic: what is said before is in no bag.
+
+        Raises:
+            FaultError: It does not hear one of them in time [s].
+        """
+        self._conductor.wait_for("the recorder to hear all topics", lambda: self.heard().issuperset(topics), timeout)
 
     def received(self, topic: str) -> int:
         """Return how many messages of a topic it has."""

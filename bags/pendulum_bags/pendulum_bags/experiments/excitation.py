@@ -189,8 +189,7 @@ def play_on_running_plant(
             start_loop(session.processes, replace(program, name=name), ANSWER_PRIORITY)
         plant.wait_until_ready(START_TIMEOUT)
         wanted = {f"{namespace}/{topic}" for topic in (names.JOINT_STATES, names.APPLIED_EFFORT, names.DISTURBANCE)}
-        ears = RecorderClient(conductor, namespace)
-        conductor.wait_for("the recorder to hear the plant", lambda: wanted <= ears.heard(), START_TIMEOUT)
+        RecorderClient(conductor, namespace).wait_until_heard(wanted, START_TIMEOUT)
         # Beyond its limits, or interrupted: the drive lets go now, not when the programs have ended.
         session.drives(plant)
         if not armed:

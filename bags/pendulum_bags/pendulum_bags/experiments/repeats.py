@@ -94,10 +94,7 @@ def record_simulation(bag: Path, spec: RunSpec) -> Path:
 def _write(bag: Path, spec: RunSpec, run: RunArrays) -> None:
     metadata = spec.metadata()
     metadata[RUN_RECORD]["engine"] = "in_process"
-    topics = {
-        name: f"{spec.namespace}/{name}"
-        for name in (names.JOINT_STATES, names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT)
-    }
+    topics = {name: f"{spec.namespace}/{name}" for name in names.SIGNALS}
     events = f"{spec.namespace}/{names.EVENTS}"
     with open_writer(bag, storage=spec.storage, metadata=metadata) as writer:
         for topic in topics.values():

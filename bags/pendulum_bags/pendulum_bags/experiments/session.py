@@ -141,10 +141,9 @@ class Session:
             )
 
         conductor.wait_for("all nodes to hear each other", complete, START_TIMEOUT)
-        recorder = RecorderClient(conductor, namespace)
         recorded = {f"{namespace}/{topic}" for topic, count in listeners.items() if count}
         recorded |= {names.CLOCK} if clock else set()
-        conductor.wait_for("the recorder to hear all topics", lambda: recorded <= recorder.heard(), START_TIMEOUT)
+        RecorderClient(conductor, namespace).wait_until_heard(recorded, START_TIMEOUT)
         # What one side of a match knows, the other side knows a moment later.
         conductor.spin(0.5)
 

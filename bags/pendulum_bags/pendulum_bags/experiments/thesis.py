@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.graph_plant import join
 from pendulum_bags.experiments.lockstep import longest_run
@@ -26,6 +26,7 @@ from pendulum_bags.experiments.session import (
     start_loop,
 )
 from pendulum_bags.experiments.settings import SETTLE_TIME, RegulationSettings
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
@@ -112,6 +113,8 @@ def _regulate(
     conductor, processes, noise = session.conductor, session.processes, settings.noise
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
+        recorded = [f"{plant.namespace}/{topic}" for topic in names.SIGNALS]
+        RecorderClient(conductor, plant.namespace).wait_until_heard(recorded, START_TIMEOUT)
     for plant in plants:
         plant.configure_controller()
         plant.arm()
