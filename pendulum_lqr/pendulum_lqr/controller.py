@@ -193,7 +193,7 @@ class LawController(BaseController):
         effort_limit: Largest torque [N m].
         set_point: Angle to hold, from upright [rad].
         numbers: The law's own numbers, at most ``MOST_NUMBERS - OWN``.
-        memory: What it remembers, at first, at most ``MOST_MEMORY``.
+        memory: What it remembers before its first state, at most ``MOST_MEMORY``.
 
     Attributes:
         law: The function.
@@ -213,7 +213,12 @@ class LawController(BaseController):
         self.law = law
         # Plain floats: indexing an array of two on every state costs more than the law itself.
         self.numbers = tuple(float(number) for number in (effort_limit, set_point, *numbers))
-        self.memory = [float(value) for value in memory]
+        self._at_first = [float(value) for value in memory]
+        self.memory = list(self._at_first)
+
+    def reset(self) -> None:
+        """Remember what it did before its first state."""
+        self.memory[:] = self._at_first
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m] that the law has for the state."""

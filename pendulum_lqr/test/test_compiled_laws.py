@@ -20,7 +20,7 @@ from pendulum_msgs_py.contract.timing import RingOfTimes
 from pendulum_msgs_py.loops.trees import compile_tree
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
-LAWS = ("lqr", "lqr_friction")
+LAWS = ("lqr", "lqr_friction", "lqi", "discrete_lqr", "pid", "pd_gravity")
 finite = st.floats(allow_nan=False, allow_infinity=False)
 stamps = st.integers(0, 2**31 * 10**9 - 1)
 

@@ -2,26 +2,56 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any
 
-from pendulum_lqr.controller import BaseController
+import numpy as np
+
+from pendulum_lqr.controller import LawController
 from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, Q, R
 from pendulum_lqr.design import DesignError, Gain
 from pendulum_lqr.interface import Controller
+from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.model import linearise
 from pendulum_lqr.sampled_design import DiscreteModel, discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["DiscreteLqr"]
+__all__ = ["DiscreteLqr", "discrete_lqr_law"]
 
 _MOST_PENDING = 100
+_HOLD, _EQUILIBRIUM, _K0, _K1, _LAG_GAIN, _LAG_SHARE, _SENT_SHARE, _ON_THEIR_WAY, _PENDING_GAIN = range(OWN, OWN + 9)
+_PENDING_SHARE = _PENDING_GAIN + _MOST_PENDING
+_LAGGED, _PENDING = range(2)
 
 
-class DiscreteLqr(BaseController):
+def discrete_lqr_law(
+    _t: float, angle: float, velocity: float, memory: MutableSequence[float], numbers: Sequence[float]
+) -> float:
+    """Return u* - K [x - x*; lagged; on their way] within the limit [N m]; see :data:`pendulum_lqr.law.Law`.
+
+    It remembers the lagged torque and those on their way, oldest first, as deviations from the one that holds [N m].
+    """
+    error = deviation(angle, numbers[SET_POINT])
+    wanted = numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity - numbers[_LAG_GAIN] * memory[_LAGGED]
+    lagged = numbers[_LAG_SHARE] * memory[_LAGGED]
+    pending = int(numbers[_ON_THEIR_WAY])
+    for k in range(pending):
+        wanted -= numbers[_PENDING_GAIN + k] * memory[_PENDING + k]
+        lagged += numbers[_PENDING_SHARE + k] * memory[_PENDING + k]
+    effort = clamped(wanted, numbers[EFFORT_LIMIT])
+    # What is on its way is what was sent, limits included, as a deviation from the torque that holds.
+    sent = effort - numbers[_EQUILIBRIUM]
+    memory[_LAGGED] = lagged + numbers[_SENT_SHARE] * sent
+    for k in range(1, pending):
+        memory[_PENDING + k - 1] = memory[_PENDING + k]
+    if pending > 0:
+        memory[_PENDING + pending - 1] = sent
+    return effort
+
+
+class DiscreteLqr(LawController):
     """Discrete LQR with delay compensation: u = u* - K [x - x*; lagged torque; torques on their way, oldest first].
 
     Args:
@@ -59,17 +89,20 @@ class DiscreteLqr(BaseController):
         *,
         feedforward: bool = True,
     ) -> None:
-        super().__init__(effort_limit, set_point)
+        hold = equilibrium if feedforward else 0.0
+        pending = model.pending
+        lags = model.A.shape[0] - pending > 2
+        # A torque that does not lag is one that weighs nothing.
+        lag_gain, lag_share, sent_share = (gain.K[2], model.A[2, 2], model.B[2, 0]) if lags else (0.0, 0.0, 0.0)
+        unused = [0.0] * (_MOST_PENDING - pending)
+        shares = model.A[2, 3:] if lags else np.zeros(pending)
+        numbers = (hold, equilibrium, gain.K[0], gain.K[1], lag_gain, lag_share, sent_share, pending)
+        weights = (*gain.K[len(gain.K) - pending :], *unused, *shares, *unused)
+        # No torque in the lag and none on its way.
+        at_first = [-equilibrium] * (1 + pending)
+        super().__init__(discrete_lqr_law, effort_limit, set_point, (*numbers, *weights), at_first)
         self.gain = gain
-        self.hold = equilibrium if feedforward else 0.0
-        self._equilibrium = equilibrium
-        values = [float(value) for value in gain.K]
-        known = model.A.shape[0] - model.pending
-        self._k0, self._k1, self._lag_gain = values[0], values[1], values[2:known]
-        self._pending_gain = values[known:]
-        self._lag_row = [float(value) for value in (*model.A[2, 2:], model.B[2, 0])] if known > 2 else []
-        self._pending: deque[float] = deque(maxlen=len(self._pending_gain))
-        self.reset()
+        self.hold = hold
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> DiscreteLqr:
@@ -90,34 +123,17 @@ class DiscreteLqr(BaseController):
             gain = discrete_lqr(sampled, *sampled_cost(model, p["q"], p["r"], period, p["delay"]))
         return cls(sampled, gain, model.effort, p["effort_limit"], p["set_point"], feedforward=p["feedforward"])
 
-    def reset(self) -> None:
-        """Start with no torque in the lag and none on its way."""
-        self._lagged = -self._equilibrium
-        self._pending.extend([-self._equilibrium] * len(self._pending_gain))
-
-    def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque [N m]."""
-        wanted = self.hold - self._k0 * self.error(x[0]) - self._k1 * x[1]
-        for gain in self._lag_gain:
-            wanted -= gain * self._lagged
-        for gain, effort in zip(self._pending_gain, self._pending, strict=True):
-            wanted -= gain * effort
-        effort = self.clamp(wanted)
-        # What is on its way is what was sent, limits included, as a deviation from the torque that holds.
-        sent = effort - self._equilibrium
-        if self._lag_row:
-            moved = zip(self._lag_row, (self._lagged, *self._pending, sent), strict=True)
-            self._lagged = sum(share * value for share, value in moved)
-        self._pending.append(sent)
-        return effort
-
     def describe(self) -> str:
         """Return the gain."""
-        return f"K = [{', '.join(f'{value:.6f}' for value in self.gain.K)}], {len(self._pending)} torques on their way"
+        gains = ", ".join(f"{value:.6f}" for value in self.gain.K)
+        return f"K = [{gains}], {len(self.memory) - _PENDING} torques on their way"
 
     def take_over(self, previous: Controller) -> None:
         """Take over the torques on their way."""
         if isinstance(previous, DiscreteLqr):
-            shift = previous._equilibrium - self._equilibrium
-            self._lagged = previous._lagged + shift
-            self._pending.extend(effort + shift for effort in previous._pending)
+            shift = previous.numbers[_EQUILIBRIUM] - self.numbers[_EQUILIBRIUM]
+            lagged, *pending = (effort + shift for effort in previous.memory)
+            self.memory[_LAGGED] = lagged
+            kept = min(len(pending), len(self.memory) - _PENDING)
+            if kept:
+                self.memory[-kept:] = pending[-kept:]

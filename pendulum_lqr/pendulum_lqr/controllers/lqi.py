@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any
 
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controller import LawController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import Gain, integral_lqr
 from pendulum_lqr.interface import Controller
+from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["Lqi"]
+__all__ = ["Lqi", "lqi_law"]
+
+_HOLD, _K0, _K1, _KI, _PERIOD = range(OWN, OWN + 5)
+_INTEGRAL = 0
 
 
-class Lqi(BaseController):
+def lqi_law(
+    _t: float, angle: float, velocity: float, memory: MutableSequence[float], numbers: Sequence[float]
+) -> float:
+    """Return u* - K [x - x*; integral] within the limit [N m]; see :data:`pendulum_lqr.law.Law`.
+
+    It remembers the integral [rad s].
+    """
+    error = deviation(angle, numbers[SET_POINT])
+    integral = memory[_INTEGRAL] + numbers[_PERIOD] * error
+    wanted = numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity - numbers[_KI] * integral
+    effort = clamped(wanted, numbers[EFFORT_LIMIT])
+    # wanted beyond the limit with the error's sign opposed means that integrating on would push further out.
+    if wanted == effort or (wanted - effort) * error > 0.0:
+        memory[_INTEGRAL] = integral
+    return effort
+
+
+class Lqi(LawController):
     """LQI: u = u* - K [theta - theta*, theta_dot, integral of (theta - theta*)].
 
     The integral stands still while the torque is at its limit and integrating would drive it further (conditional
@@ -49,12 +70,10 @@ class Lqi(BaseController):
     def __init__(
         self, gain: Gain, period: float, effort_limit: float, set_point: float = 0.0, hold: float = 0.0
     ) -> None:
-        super().__init__(effort_limit, set_point)
+        super().__init__(lqi_law, effort_limit, set_point, (hold, *gain.K, period), (0.0,))
         self.gain = gain
         self.period = period
         self.hold = hold
-        self._k0, self._k1, self._ki = (float(value) for value in gain.K)
-        self.integral = 0.0
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Lqi:
@@ -64,26 +83,11 @@ class Lqi(BaseController):
         weights = [*p["q"], p["q_integral"]]
         return cls(integral_lqr(model, weights, p["r"]), period, p["effort_limit"], p["set_point"], hold)
 
-    def reset(self) -> None:
-        """Empty the integral."""
-        self.integral = 0.0
-
-    def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque [N m]."""
-        error = self.error(x[0])
-        integral = self.integral + self.period * error
-        wanted = self.hold - self._k0 * error - self._k1 * x[1] - self._ki * integral
-        effort = self.clamp(wanted)
-        # wanted beyond the limit with the error's sign opposed means that integrating on would push further out.
-        if wanted == effort or (wanted - effort) * error > 0.0:
-            self.integral = integral
-        return effort
-
     def describe(self) -> str:
         """Return the gain."""
-        return f"K = [{self._k0:.6f}, {self._k1:.6f}, {self._ki:.6f}]"
+        return f"K = [{', '.join(f'{value:.6f}' for value in self.gain.K)}]"
 
     def take_over(self, previous: Controller) -> None:
         """Keep the torque that the integral stands for, though the gain on it has changed."""
         if isinstance(previous, Lqi):
-            self.integral = previous.integral * previous._ki / self._ki
+            self.memory[_INTEGRAL] = previous.memory[_INTEGRAL] * previous.numbers[_KI] / self.numbers[_KI]

@@ -3,18 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any
 
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controller import LawController
+from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.model import linearise, low_frequency, torque_gain
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["PdGravity"]
+__all__ = ["PdGravity", "pd_gravity_law"]
+
+_KP, _KD, _GRAVITY, _ANGLE_OFFSET, _OFFSET = range(OWN, OWN + 5)
 
 
-class PdGravity(BaseController):
+def pd_gravity_law(
+    _t: float, angle: float, velocity: float, _memory: MutableSequence[float], numbers: Sequence[float]
+) -> float:
+    """Return the weight's torque and that of the two gains within the limit [N m]; see :data:`pendulum_lqr.law.Law`."""
+    # sin(theta) = -sin(theta - pi)
+    weight = -numbers[_GRAVITY] * math.sin(angle - numbers[_ANGLE_OFFSET]) - numbers[_OFFSET]
+    error = deviation(angle, numbers[SET_POINT])
+    return clamped(weight - numbers[_KP] * error - numbers[_KD] * velocity, numbers[EFFORT_LIMIT])
+
+
+class PdGravity(LawController):
     """u = (G_c sin(theta - angle_offset) - torque_offset) / gain - k_p (theta - theta*) - k_d theta_dot.
 
     Holds any angle, upright or not; gain is what the actuator gives per torque asked for, 1 for a rigid plant.
@@ -44,13 +57,11 @@ class PdGravity(BaseController):
     def __init__(
         self, plant: PlantParameters, kp: float, kd: float, effort_limit: float, set_point: float = 0.0
     ) -> None:
-        super().__init__(effort_limit, set_point)
+        gain = torque_gain(plant)
+        numbers = (kp, kd, plant.gravity / gain, plant.angle_offset, plant.torque_offset / gain)
+        super().__init__(pd_gravity_law, effort_limit, set_point, numbers)
         self.kp = kp
         self.kd = kd
-        gain = torque_gain(plant)
-        self._gravity = plant.gravity / gain
-        self._angle_offset = plant.angle_offset
-        self._offset = plant.torque_offset / gain
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> PdGravity:
@@ -64,12 +75,6 @@ class PdGravity(BaseController):
         # M w^2 - (b + k_d) w + k_p = 0; where damping is ample the other pole is faster.
         kp = p["kp"] if p["kp"] > 0.0 else w * (damping + kd) - inertia * w * w
         return cls(plant, kp, kd, p["effort_limit"], p["set_point"])
-
-    def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque [N m]."""
-        # sin(theta) = -sin(theta - pi)
-        weight = -self._gravity * math.sin(x[0] - self._angle_offset) - self._offset
-        return self.clamp(weight - self.kp * self.error(x[0]) - self.kd * x[1])
 
     def describe(self) -> str:
         """Return the gains."""

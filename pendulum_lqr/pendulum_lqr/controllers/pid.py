@@ -3,26 +3,50 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableSequence, Sequence
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controller import LawController
 from pendulum_lqr.controllers.specs import Q, R
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.interface import Controller
+from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.model import linearise
 from pendulum_lqr.tuning import PidGains, pid_loop, tune_numerically, ziegler_nichols
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["Pid"]
+__all__ = ["Pid", "pid_law"]
+
+_KP, _KI, _KD, _PERIOD, _POLE, _SLOPE, _TRACKING = range(OWN, OWN + 7)
+_INTEGRAL, _DERIVATIVE, _LAST = range(3)
+_NOTHING_YET = (0.0, 0.0, math.nan)
 
 
-class Pid(BaseController):
+def pid_law(
+    _t: float, angle: float, _velocity: float, memory: MutableSequence[float], numbers: Sequence[float]
+) -> float:
+    """Return the torque of the three terms within the limit [N m]; see :data:`pendulum_lqr.law.Law`.
+
+    It remembers the integral's torque [N m], the filtered derivative [rad/s] and the last angle [rad].
+    """
+    error = deviation(angle, numbers[SET_POINT])
+    if not math.isnan(memory[_LAST]):
+        step = deviation(angle, memory[_LAST])
+        memory[_DERIVATIVE] = numbers[_POLE] * memory[_DERIVATIVE] + numbers[_SLOPE] * step
+    memory[_LAST] = angle
+    integral = memory[_INTEGRAL] + numbers[_KI] * numbers[_PERIOD] * error
+    wanted = -(numbers[_KP] * error + integral + numbers[_KD] * memory[_DERIVATIVE])
+    effort = clamped(wanted, numbers[EFFORT_LIMIT])
+    memory[_INTEGRAL] = integral + numbers[_TRACKING] * (wanted - effort)
+    return effort
+
+
+class Pid(LawController):
     """u = -(k_p e + k_i integral of e + k_d filtered derivative of theta).
 
     The derivative is that of the angle, not of the error, so that a step of the set-point does not kick. Beyond the
@@ -58,16 +82,14 @@ class Pid(BaseController):
     def __init__(
         self, gains: PidGains, period: float, filter_time: float, effort_limit: float, set_point: float = 0.0
     ) -> None:
-        super().__init__(effort_limit, set_point)
-        self.gains = gains
-        self.period = period
-        self._pole = math.exp(-period / filter_time)
-        self._slope = (1.0 - self._pole) / period
+        pole = math.exp(-period / filter_time)
         integral_time = gains.kp / gains.ki if gains.ki > 0.0 else math.inf
         derivative_time = gains.kd / gains.kp if gains.kp > 0.0 else 0.0
         tracking_time = max(math.sqrt(integral_time * derivative_time), period) if gains.ki > 0.0 else math.inf
-        self._tracking = period / tracking_time
-        self.reset()
+        numbers = (gains.kp, gains.ki, gains.kd, period, pole, (1.0 - pole) / period, period / tracking_time)
+        super().__init__(pid_law, effort_limit, set_point, numbers, _NOTHING_YET)
+        self.gains = gains
+        self.period = period
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Pid:
@@ -78,28 +100,6 @@ class Pid(BaseController):
             gains = _tune(plant, period, p["set_point"], p["tuning"], p["derivative_filter"], tuple(p["q"]), p["r"])
         return cls(gains, period, p["derivative_filter"], p["effort_limit"], p["set_point"])
 
-    def reset(self) -> None:
-        """Empty integral and filter."""
-        self._integral_torque = 0.0
-        self._derivative = 0.0
-        self._last: float | None = None
-
-    def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque; the measured velocity is not used [N m]."""
-        error = self.error(x[0])
-        if self._last is not None:
-            step = x[0] - self._last
-            if not -math.pi <= step < math.pi:
-                step = math.remainder(step, 2.0 * math.pi)
-            self._derivative = self._pole * self._derivative + self._slope * step
-        self._last = x[0]
-        gains = self.gains
-        integral = self._integral_torque + gains.ki * self.period * error
-        wanted = -(gains.kp * error + integral + gains.kd * self._derivative)
-        effort = self.clamp(wanted)
-        self._integral_torque = integral + self._tracking * (wanted - effort)
-        return effort
-
     def describe(self) -> str:
         """Return the gains."""
         gains = self.gains
@@ -108,9 +108,7 @@ class Pid(BaseController):
     def take_over(self, previous: Controller) -> None:
         """Take over integral torque and derivative."""
         if isinstance(previous, Pid):
-            self._integral_torque = previous._integral_torque
-            self._derivative = previous._derivative
-            self._last = previous._last
+            self.memory[:] = previous.memory
 
 
 @lru_cache(maxsize=64)
