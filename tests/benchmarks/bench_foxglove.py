@@ -60,7 +60,7 @@ def _loops(
     before = {plant: int(rows[-1]["overruns"]) for plant, rows in loops.rows.items()}
     taken = client.ask("taken") if client else {}
     cpu, wall = cpu_time([server]) if server else 0.0, time.monotonic()
-    loops.spin(SECONDS)
+    loops.let_run(SECONDS)
     elapsed = time.monotonic() - wall
     found: dict[str, Any] = {
         "way": way,

@@ -82,7 +82,7 @@ def loop_figures(rate: float, duration: float) -> BridgeLoopFigures:
             listener.spin(1.0)
             first, wall, busy = said[-1], time.monotonic(), cpu_time(processes)
             said.clear()
-            listener.spin(duration)
+            listener.let_run(duration)
             cpu = 100.0 * (cpu_time(processes) - busy) / (time.monotonic() - wall)
             last = said[-1]
             cycles = int(last["cycles"]) - int(first["cycles"])

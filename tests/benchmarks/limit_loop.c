@@ -33,11 +33,13 @@ typedef struct {
   rcl_serialized_message_t message;
 } Loop;
 
-static long now_ns(void) {
+static long time_ns(clockid_t clock) {
   struct timespec t;
-  clock_gettime(CLOCK_MONOTONIC, &t);
+  clock_gettime(clock, &t);
   return t.tv_sec * NANOSECONDS + t.tv_nsec;
 }
+
+static long now_ns(void) { return time_ns(CLOCK_MONOTONIC); }
 
 static void sleep_until(long deadline_ns) {
   struct timespec t = {deadline_ns / NANOSECONDS, deadline_ns % NANOSECONDS};
@@ -84,8 +86,8 @@ static int wait_for_input(Loop *loop, long timeout_ns) {
   return 1;
 }
 
-static int take(Loop *loop, int input) {
-  if (rcl_take_serialized_message(&loop->inputs[input], &loop->message, NULL, NULL) == RCL_RET_OK) return 1;
+static int take(Loop *loop, int input, rmw_message_info_t *info) {
+  if (rcl_take_serialized_message(&loop->inputs[input], &loop->message, info, NULL) == RCL_RET_OK) return 1;
   rcl_reset_error();
   return 0;
 }
@@ -98,13 +100,17 @@ static int publish(Loop *loop, const unsigned char *state, size_t size, unsigned
   return 0;
 }
 
-// Take what has come and mark who has answered the state with this number.
-static void note_answers(Loop *loop, unsigned sequence, int *answered) {
+// Take what has come, mark who has answered the state with this number, and note when the last answer came, by the
+// system's clock.
+static void note_answers(Loop *loop, unsigned sequence, int *answered, long *arrived_ns) {
+  rmw_message_info_t info = rmw_get_zero_initialized_message_info();
   for (int i = 0; i < loop->count; i++) {
-    while (take(loop, i)) {
+    while (take(loop, i, &info)) {
       unsigned found;
       memcpy(&found, loop->message.buffer + SEQUENCE_AT, sizeof found);
-      if (found == sequence) answered[i] = 1;
+      if (found != sequence) continue;
+      answered[i] = 1;
+      if (info.received_timestamp > *arrived_ns) *arrived_ns = info.received_timestamp;
     }
   }
 }
@@ -117,8 +123,9 @@ static int all(const int *answered, int count) {
 }
 
 // Publish states, at deadlines or, with a rate of zero, as soon as all have answered.
-// round_trips_ns gets one entry a state, 0 where no answer came in time; returns how many deadlines were missed by a
-// period or more, or -1.
+// round_trips_ns gets one entry a state, 0 where no answer came in time. At deadlines it ends when the middleware has the
+// answer, as our plants count it, without deadlines when the next state can go out. Returns how many deadlines were missed
+// by a period or more, or -1.
 long run_plant(double rate_hz, long states, int answerers, const unsigned char *state, long size, long *round_trips_ns) {
   static Loop loop;
   char topics[MOST_ANSWERERS][32];
@@ -142,6 +149,7 @@ long run_plant(double rate_hz, long states, int answerers, const unsigned char *
       sleep_until(deadline);
       if (now_ns() - deadline >= period) missed++;
     }
+    long begun_system = time_ns(CLOCK_REALTIME), arrived = 0;
     long begun = now_ns(), patience = period ? deadline + period * 9 / 10 : begun + NANOSECONDS / 10;
     if (publish(&loop, state, size, (unsigned)k) != 0) return -1;
     while (!all(answered, answerers)) {
@@ -150,9 +158,10 @@ long run_plant(double rate_hz, long states, int answerers, const unsigned char *
       int some = wait_for_input(&loop, left);
       if (some < 0) return -1;
       if (!some) break;
-      note_answers(&loop, (unsigned)k, answered);
+      note_answers(&loop, (unsigned)k, answered, &arrived);
     }
-    round_trips_ns[k] = all(answered, answerers) ? now_ns() - begun : 0;
+    long round_trip = period ? arrived - begun_system : now_ns() - begun;
+    round_trips_ns[k] = all(answered, answerers) ? round_trip : 0;
     deadline += period;
   }
   return missed;
@@ -167,6 +176,6 @@ int run_answerer(int index) {
   if (open_loop(&loop, name, topic, 1, states) != 0) return -1;
   for (;;) {
     if (wait_for_input(&loop, NANOSECONDS) < 0) return -1;
-    while (take(&loop, 0)) TRY(rcl_publish_serialized_message(&loop.publisher, &loop.message, NULL));
+    while (take(&loop, 0, NULL)) TRY(rcl_publish_serialized_message(&loop.publisher, &loop.message, NULL));
   }
 }

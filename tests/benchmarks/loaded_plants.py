@@ -58,7 +58,7 @@ def loaded_plants(duration: float, *, real_time: bool = True) -> LoadedPlants:
             group.start_command(_BUSY, name=f"busy {index}")
         loops.spin(_WARM_UP)
         loops.clear()
-        loops.spin(duration)
+        loops.let_run(duration)
         rows = {plant: loops.rows[plant] for plant in PLANTS}
         missed = {plant: missed_share(found[0], found[-1], RATE) for plant, found in rows.items()}
         faults = [found[-1]["reason"] for found in rows.values() if found[-1]["mode"] == "fault"]

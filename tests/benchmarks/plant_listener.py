@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import time
+from collections import Counter
 from collections.abc import Iterable
 
 import psutil
@@ -18,6 +20,10 @@ from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 from tests.graph_peer import GraphPeer
 
 __all__ = ["PlantListener", "cpu_time", "domain_environment", "missed_share"]
+
+
+_MOST_UNREAD = 2000
+"""Diagnostics that a listener who is not listening keeps: those of a dozen programs for a minute, and more."""
 
 
 class PlantListener(GraphPeer):
@@ -36,7 +42,7 @@ class PlantListener(GraphPeer):
     def __init__(self, domain: int, *plants: str) -> None:
         set_middleware_defaults()
         super().__init__("bench_listener", domain=domain)
-        self.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_message, 10)
+        self.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_message, _MOST_UNREAD)
         self.rows: dict[str, list[dict[str, str]]] = {plant: [] for plant in plants}
 
     def _on_message(self, message: DiagnosticArray) -> None:
@@ -45,6 +51,16 @@ class PlantListener(GraphPeer):
             if rows is not None:
                 stamp = {"stamp_ns": str(stamp_from_message(message.header.stamp))}
                 rows.append(stamp | {pair.key: pair.value for pair in status.values})
+
+    def let_run(self, duration: float) -> None:
+        """Let the plants run for a time [s], and hear afterwards what they said meanwhile.
+
+        Who listens takes a core from those whom it measures, for milliseconds at each message.
+        """
+        time.sleep(duration)
+        unread = Counter(dict.fromkeys(self.rows, -1))
+        while unread != (unread := Counter({plant: len(rows) for plant, rows in self.rows.items()})):
+            self.spin(0.05)
 
     def clear(self) -> None:
         """Forget what was said so far."""

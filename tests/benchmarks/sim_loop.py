@@ -183,9 +183,8 @@ def realtime_figures(duration: float, *, rate: float = 1000.0, cores: Sequence[i
             memory = processes[0].memory_info().rss
             said.clear()
             busy, wall = cpu_time(processes), time.monotonic()
-            listener.spin(duration)
-            elapsed = time.monotonic() - wall
-            cpu = 100.0 * (cpu_time(processes) - busy) / elapsed
+            listener.let_run(duration)
+            cpu = 100.0 * (cpu_time(processes) - busy) / (time.monotonic() - wall)
             return LoopFigures(
                 p50=statistics.median(float(row["command_latency_p50_us"]) for row in said),
                 p99=statistics.median(float(row["command_latency_p99_us"]) for row in said),

@@ -18,6 +18,7 @@ from pendulum_msgs_py.loops.primitives import (
     take_one,
     wait_for_any,
 )
+from pendulum_msgs_py.loops.records import HAND_OVER_NS
 
 __all__ = ["answer_loop", "count_answer"]
 
@@ -43,6 +44,7 @@ def answer_loop(own: np.dtype[Any], answer: Any) -> Any:
                 if not answer(s, now_ns):
                     return LEFT
                 if s.answers >= MOST_ANSWERS or now_ns >= s.end_ns:
+                    wait_for_any(s.time, s.counter, s.calls, HAND_OVER_NS)
                     return ENDED
             elif found != NOTHING:
                 return FAILED

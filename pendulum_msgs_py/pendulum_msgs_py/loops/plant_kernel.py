@@ -35,6 +35,7 @@ from pendulum_msgs_py.loops.primitives import (
     wait_for_any,
     wall_ns,
 )
+from pendulum_msgs_py.loops.records import HAND_OVER_NS
 from pendulum_msgs_py.loops.trees import compile_tree
 
 __all__ = ["plant_loop"]
@@ -145,6 +146,7 @@ def plant_loop(layout: Any, step: Any) -> Any:
             s.late_ns[s.periods] = late_ns
             if not advance(s):
                 return UNUSUAL
+        sleep_until(s.time, s.now_ns - s.wall_ahead_ns + min(HAND_OVER_NS, s.period_ns // 4))
         return ENDED
 
     @compiled

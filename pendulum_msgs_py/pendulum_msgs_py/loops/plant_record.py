@@ -21,7 +21,7 @@ __all__ = [
     "plant_record",
 ]  # fmt: skip
 
-MOST_PERIODS = 128
+MOST_PERIODS = 256
 """Periods of one slice in real time, whose figures are kept one by one."""
 OWN_STAMPS = 128
 """Stamps of own states that an answer is looked up among."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pendulum_msgs_py.contract.cdr import MessageTemplate
 
 __all__ = [
+    "HAND_OVER_NS",
     "INPUT",
     "MESSAGE",
     "MOST_BYTES",
@@ -31,6 +32,12 @@ MOST_BYTES = 512
 """Longest message that a loop reads or writes itself [bytes]; longer ones are Python's."""
 MOST_VALUES = 3
 """Numbers in a message: position, velocity and effort of one joint."""
+HAND_OVER_NS = 250_000
+"""Time that the receiver of the newest message has before Python is next [ns].
+
+Linux wakes a receiver on the core of the sender, and does not interrupt a sender who goes on computing there: what
+Python does between two slices, done at once, kept the receiver from answering for half a millisecond.
+"""
 
 TIME = np.dtype([("now", "i8", (2,)), ("until", "i8", (2,)), ("poll", "i4", (6,))], align=True)
 """Where the C library puts the time, and is told one, in seconds and nanoseconds; three times ``struct pollfd``."""
