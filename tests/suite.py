@@ -33,6 +33,7 @@ _EXPERIMENTS = (
     "tests/faults/test_live_faults.py",
     "tests/acceptance/test_experiment.py",
     "tests/integration/test_plants_on_the_graph.py",
+    "tests/integration/test_runs_in_real_time.py",
 )
 """Whole systems in real time, longest first; each asks for most of a core and judges to milliseconds: of its priority
 nothing runs beside it."""
