@@ -6,6 +6,7 @@ import itertools
 import random
 import signal
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 from std_srvs.srv import SetBool
 
 from pendulum_bags.experiments.processes import Child, start_recorder
+from pendulum_bags.experiments.session import PLANT_PRIORITY, start_loop
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_rosbag.reader import read_bag
@@ -37,7 +39,7 @@ _PERIOD_NS = 2_000_000
 def _twin_plant(name: str) -> Fault:
     def act(system: LiveSystem, _: random.Random) -> Outcome:
         program = system.program("simulator")
-        twin = system.processes.start_node(type(program)(**{**vars(program), "name": name}))
+        twin = start_loop(system.processes, replace(program, name=name), PLANT_PRIORITY)
         outcome = Outcome()
         # Each plant's stamps lie on a grid of its own, which tells the torques of the two apart.
         first = system.applied[-1].stamp_ns % _PERIOD_NS

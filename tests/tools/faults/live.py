@@ -17,7 +17,14 @@ from std_srvs.srv import SetBool
 
 from pendulum_bags.experiments.conductor_node import Conductor
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
-from pendulum_bags.experiments.session import LOOP_NICENESS
+from pendulum_bags.experiments.session import (
+    ANSWER_PRIORITY,
+    LOOP_NICENESS,
+    PLANT_PRIORITY,
+    RECORDER_PRIORITY,
+    permitted,
+    start_loop,
+)
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
@@ -157,12 +164,18 @@ class LiveSystem:
             self._bags += 1
             metadata = self.folder / "metadata.json"
             write_json(metadata, {"pendulum.run": {"experiment": "faults"}})
-            child = start_recorder(self.processes, self.bag, self.plant.namespace, metadata, "mcap")
+            priority = permitted(RECORDER_PRIORITY)
+            child = start_recorder(self.processes, self.bag, self.plant.namespace, metadata, "mcap", priority=priority)
         elif name == MODULE:
             child = self._start_module()
         else:
             program = self.program(name, **{**self._parameters.get(name, {}), **changes})
-            child = self.processes.start_node(program, niceness=LOOP_NICENESS)
+            # As in an experiment: who keeps deadlines goes first, who only shows goes last.
+            if name == "viewer":
+                child = self.processes.start_node(program)
+            else:
+                priority = PLANT_PRIORITY if name == self.plant.name else ANSWER_PRIORITY
+                child = start_loop(self.processes, program, priority)
         self.children[name] = child
         return child
 
