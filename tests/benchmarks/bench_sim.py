@@ -258,6 +258,8 @@ def _node() -> Iterator[Row]:
             ("CPU, simulator + controller", "cpu", "% of a core"),
             ("round trip p50", "p50", "us"),
             ("round trip p99", "p99", "us"),
+            # An answer that never came is in no percentile, of neither.
+            ("states without an answer", "unanswered", "%"),
         ):
             in_c = Peer("the same loop in C", None if limit is None else getattr(limit, field), why)
             yield measured(

@@ -48,6 +48,7 @@ class LoopFigures:
         p50: Median of the round trip from state to command [us].
         p99: 99th percentile [us].
         missed: Share of deadlines missed by a period or more [%].
+        unanswered: Share of periods without an answer [%].
         cpu: CPU of simulator and controller together [% of a core].
         memory: Largest resident memory of the simulator [MB].
         growth: Growth of it during the run [MB].
@@ -56,6 +57,7 @@ class LoopFigures:
     p50: float
     p99: float
     missed: float
+    unanswered: float
     cpu: float
     memory: float
     growth: float
@@ -90,6 +92,7 @@ def limit_figures(duration: float, *, rate: float = 1000.0, cores: Sequence[int]
 
     Raises:
         FileNotFoundError: They cannot be compiled here.
+        RuntimeError: None of the states of some seconds was answered.
     """
     states = round((duration + _WARM_UP) * rate)
     with tempfile.TemporaryDirectory() as folder, reserve_domain(None) as domain:
@@ -108,6 +111,8 @@ def limit_figures(duration: float, *, rate: float = 1000.0, cores: Sequence[int]
             told = _told_by_limit(programs[0])
             trips = np.array(told["round_trips_ns"][round(_WARM_UP * rate) :]) / 1e3
             windows = [window[window > 0.0] for window in np.array_split(trips, max(1, len(trips) // _WINDOW))]
+            if not all(window.size for window in windows):
+                raise RuntimeError("the machine was so busy that no state was answered for seconds")
             return LimitFigures(
                 p50=statistics.median(float(np.percentile(window, 50)) for window in windows),
                 p99=statistics.median(float(np.percentile(window, 99)) for window in windows),
@@ -189,6 +194,7 @@ def realtime_figures(duration: float, *, rate: float = 1000.0, cores: Sequence[i
                 p50=statistics.median(float(row["command_latency_p50_us"]) for row in said),
                 p99=statistics.median(float(row["command_latency_p99_us"]) for row in said),
                 missed=missed_share(said[0], said[-1], rate),
+                unanswered=_unanswered(said[0], said[-1]),
                 cpu=cpu,
                 memory=processes[0].memory_info().rss / 1e6,
                 growth=(processes[0].memory_info().rss - memory) / 1e6,
@@ -196,6 +202,11 @@ def realtime_figures(duration: float, *, rate: float = 1000.0, cores: Sequence[i
         finally:
             listener.close()
             group.close()
+
+
+def _unanswered(first: dict[str, str], last: dict[str, str]) -> float:
+    answered, cycles = (int(last[key]) - int(first[key]) for key in ("effort_command.accepted", "cycles"))
+    return 100.0 * max(0.0, 1.0 - answered / cycles)
 
 
 def peer_cpu(module: str, duration: float, *, rate: float = 1000.0) -> float:

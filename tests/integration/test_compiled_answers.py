@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import random
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
@@ -169,3 +172,32 @@ def test_in_simulated_time_both_begin_anew_and_repeat_alike(twins: Twins, proces
         twins.send(encode_joint_state(2 * SECOND, **STATE))
         twins.send(encode_joint_state(2 * SECOND, **(STATE | {"velocity": 1.0 + run})))
     check(twins)
+
+
+_REDESIGNS: dict[str, tuple[dict[str, Any], ...]] = {
+    # More torques on their way than before, fewer, none.
+    "discrete_lqr": ({"delay": 0.02}, {"delay": 0.2}, {"delay": 0.004}, {"delay": 0.0, "effort_limit": 2.0}),
+    "pid": ({"set_point": 0.1}, {"effort_limit": 2.0}),
+}
+
+
+@pytest.mark.parametrize("name", _REDESIGNS)
+def test_a_law_that_remembers_answers_alike_also_when_it_is_designed_anew(
+    twins: Twins, processes: ProcessGroup, name: str
+) -> None:
+    start(twins, processes, "use_sim_time:=true", f"controller:={name}", "period:=0.002")
+    generator, stamp_ns = random.Random(3), SECOND
+    for values in ({}, *_REDESIGNS[name]):
+        change = SetParametersAtomically.Request(
+            parameters=[Parameter(key, value=value).to_parameter_msg() for key, value in values.items()]
+        )
+        for space in ("/a", "/b") if values else ():
+            done = twins.call(SetParametersAtomically, f"{space}/controller/set_parameters_atomically", change)
+            assert done.result.successful, done.result.reason
+        for number in range(15):
+            spread = 1.0 if number % 5 else 20.0
+            position, velocity = math.pi + spread * generator.gauss(0.0, 0.05), spread * generator.gauss(0.0, 0.3)
+            twins.send(encode_joint_state(stamp_ns, position=position, velocity=velocity, effort=0.0))
+            stamp_ns += SECOND // 500
+    check(twins)
+    assert [each["loop"] for each in twins.said] == ["compiled", "interpreted: compiled is false"]

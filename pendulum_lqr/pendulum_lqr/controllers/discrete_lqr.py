@@ -21,7 +21,9 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["DiscreteLqr", "discrete_lqr_law"]
 
 _MOST_PENDING = 100
-_HOLD, _EQUILIBRIUM, _K0, _K1, _LAG_GAIN, _LAG_SHARE, _SENT_SHARE, _ON_THEIR_WAY, _PENDING_GAIN = range(OWN, OWN + 9)
+_HOLD, _EQUILIBRIUM, _K0, _K1, _LAGS, _LAG_GAIN, _LAG_SHARE, _SENT_SHARE, _ON_THEIR_WAY, _PENDING_GAIN = range(
+    OWN, OWN + 10
+)
 _PENDING_SHARE = _PENDING_GAIN + _MOST_PENDING
 _LAGGED, _PENDING = range(2)
 
@@ -34,7 +36,10 @@ def discrete_lqr_law(
     It remembers the lagged torque and those on their way, oldest first, as deviations from the one that holds [N m].
     """
     error = deviation(angle, numbers[SET_POINT])
-    wanted = numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity - numbers[_LAG_GAIN] * memory[_LAGGED]
+    lags = numbers[_LAGS] != 0.0
+    wanted = numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity
+    if lags:
+        wanted -= numbers[_LAG_GAIN] * memory[_LAGGED]
     lagged = numbers[_LAG_SHARE] * memory[_LAGGED]
     pending = int(numbers[_ON_THEIR_WAY])
     for k in range(pending):
@@ -43,7 +48,8 @@ def discrete_lqr_law(
     effort = clamped(wanted, numbers[EFFORT_LIMIT])
     # What is on its way is what was sent, limits included, as a deviation from the torque that holds.
     sent = effort - numbers[_EQUILIBRIUM]
-    memory[_LAGGED] = lagged + numbers[_SENT_SHARE] * sent
+    if lags:
+        memory[_LAGGED] = lagged + numbers[_SENT_SHARE] * sent
     for k in range(1, pending):
         memory[_PENDING + k - 1] = memory[_PENDING + k]
     if pending > 0:
@@ -92,11 +98,10 @@ class DiscreteLqr(LawController):
         hold = equilibrium if feedforward else 0.0
         pending = model.pending
         lags = model.A.shape[0] - pending > 2
-        # A torque that does not lag is one that weighs nothing.
         lag_gain, lag_share, sent_share = (gain.K[2], model.A[2, 2], model.B[2, 0]) if lags else (0.0, 0.0, 0.0)
         unused = [0.0] * (_MOST_PENDING - pending)
         shares = model.A[2, 3:] if lags else np.zeros(pending)
-        numbers = (hold, equilibrium, gain.K[0], gain.K[1], lag_gain, lag_share, sent_share, pending)
+        numbers = (hold, equilibrium, gain.K[0], gain.K[1], lags, lag_gain, lag_share, sent_share, pending)
         weights = (*gain.K[len(gain.K) - pending :], *unused, *shares, *unused)
         # No torque in the lag and none on its way.
         at_first = [-equilibrium] * (1 + pending)

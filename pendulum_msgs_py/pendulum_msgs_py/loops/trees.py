@@ -55,7 +55,9 @@ def compile_tree(
         # Of fastmath nothing but contraction is allowed. C code calls none of these: a wrapper for it would only cost
         # time to compile.
         allowed = False if exact else {"contract"}
-        _cache[key] = numba.njit(copy, fastmath=allowed, error_model="numpy", forceinline=inline, no_cfunc_wrapper=True)
+        # Arrays are lent to what loops run: nobody there counts who holds them, as numba would in a law with a loop.
+        options = {"fastmath": allowed, "error_model": "numpy", "forceinline": inline, "_nrt": not exact}
+        _cache[key] = numba.njit(copy, no_cfunc_wrapper=True, **options)
     return _cache[key]
 
 

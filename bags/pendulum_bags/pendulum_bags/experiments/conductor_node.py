@@ -401,7 +401,14 @@ class RecorderClient:
         Raises:
             FaultError: It does not hear one of them in time [s].
         """
-        self._conductor.wait_for("the recorder to hear all topics", lambda: self.heard().issuperset(topics), timeout)
+        deadline = time.monotonic() + timeout
+        while missing := set(topics) - self.heard():
+            if time.monotonic() > deadline:
+                raise FaultError(
+                    f"the recorder has met no publisher of {', '.join(sorted(missing))} in {timeout:g} s; expected one of "
+                    "each topic"
+                )
+            self._conductor.spin(_SLICE)
 
     def received(self, topic: str) -> int:
         """Return how many messages of a topic it has."""

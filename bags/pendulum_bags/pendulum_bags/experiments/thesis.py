@@ -64,24 +64,33 @@ def run_thesis(
     ):
         progress.phase("starting", 6.0)
         _refuse_occupied_domain(session.conductor, settings)
-        plants = _start(session, folder, settings)
+        plants, recorders = _start(session, folder, settings)
         session.drives(*plants)
         beside = _regulate(session, plants, settings, progress, folder, repeat=repeat)
         progress.phase("closing the bags", 2.0)
+        # Before anything is waited for: what is said from here on is no part of the experiment.
+        for recorder in recorders:
+            session.close(recorder)
         for child in beside:
             # It has limits of its own and ends by itself; on a busy machine it takes minutes.
             longest = longest_run(max(SHORTEST, settings.noise.duration))
             session.processes.wait(child, longest, on_wait=progress.refresh)
 
 
-def _start(session: Session, folder: Path, settings: RegulationSettings) -> tuple[PlantClient, PlantClient]:
-    """Start all programs; return both plants. Those that run already are looked at first, and only looked at."""
+def _start(
+    session: Session, folder: Path, settings: RegulationSettings
+) -> tuple[tuple[PlantClient, PlantClient], list[Child]]:
+    """Start all programs; return both plants, and their recorders.
+
+    Plants that run already are looked at first, and only looked at.
+    """
     conductor = session.conductor
     joined = {side: join(conductor, running) for side in SIDES if (running := settings.running(side)) is not None}
+    recorders = []
     for side in SIDES:
         namespace, plant = settings.namespace(side), settings.plant_name(side)
         metadata = settings.metadata("thesis", side=side, plant=plant, namespace=namespace)
-        session.record(folder / side, namespace, metadata, settings.storage)
+        recorders.append(session.record(folder / side, namespace, metadata, settings.storage))
     programs = {side: settings.plant_program(side, folder / "hw") for side in SIDES}
     others = [
         make(settings.namespace(side), autostart=False)
@@ -97,7 +106,7 @@ def _start(session: Session, folder: Path, settings: RegulationSettings) -> tupl
         joined[side] if program is None else PlantClient(conductor, settings.namespace(side), program.node_name)
         for side, program in programs.items()
     )
-    return sim, hw
+    return (sim, hw), recorders
 
 
 def _regulate(
