@@ -404,9 +404,9 @@ class RecorderClient:
         deadline = time.monotonic() + timeout
         while missing := set(topics) - self.heard():
             if time.monotonic() > deadline:
+                unheard = ", ".join(sorted(missing))
                 raise FaultError(
-                    f"the recorder has met no publisher of {', '.join(sorted(missing))} in {timeout:g} s; expected one of "
-                    "each topic"
+                    f"the recorder has met no publisher of {unheard} in {timeout:g} s; expected one of each topic"
                 )
             self._conductor.spin(_SLICE)
 
