@@ -33,13 +33,13 @@ _EXPERIMENTS = (
     "tests/faults/test_live_faults.py",
     "tests/acceptance/test_experiment.py",
     "tests/integration/test_plants_on_the_graph.py",
+    "tests/integration/test_stopped_plants.py",
     "tests/integration/test_runs_in_real_time.py",
     "bags/pendulum_bags/test/test_loop_priority.py",
     "pendulum_msgs_py/test/test_realtime.py",
 )
 """Whole systems in real time, longest first; each asks for most of a core and judges to milliseconds: of its priority
-nothing runs beside it. And whoever else takes real-time priority: their programs start with it, and keep all others
-waiting for seconds."""
+nothing runs beside it: a dozen programs that start before ordinary ones keep those waiting for seconds."""
 _WAITS = (
     "tests/acceptance/test_console.py",
     "tests/integration/test_plant_interface.py",
