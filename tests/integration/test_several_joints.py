@@ -45,7 +45,7 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
     peer: JointsPeer, processes, tmp_path: Path
 ) -> None:
     recorder = processes.start("pendulum_rosbag", "record", "-o", str(tmp_path / "bag"), "--regex", "^/sim/")
-    recorder.wait_for_output("ready", 30)
+    recorder.wait_for_output("ready", 60)
     controller = _start(processes, "pendulum_lqr", "controller", "plant:=acrobot_frictionless", "use_sim_time:=true")
     noise = _start(
         processes,
@@ -81,8 +81,11 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
     assert states.names == ("shoulder", "elbow")
     assert commands.names == pushes.names == applied.names == ("elbow",)
     # A plant that waits for an answer repeats its state each second: where nodes start slowly, the first comes twice.
-    assert len(np.unique(states.stamp_ns)) == 1501
-    assert states.position[0] == pytest.approx([3.19, -0.05])
+    # And a recorder that met it a moment after it knew of the recorder counts what it did not hear.
+    unheard = counts.get("/sim/joint_states", {}).get("before", 0)
+    assert 1501 - unheard <= len(np.unique(states.stamp_ns)) <= 1501
+    if not unheard:
+        assert states.position[0] == pytest.approx([3.19, -0.05])
     late = states.stamp_ns > 2_500_000_000
     assert np.abs(states.position[late] - [math.pi, 0.0]).max() < 0.05
     assert np.abs(pushes.effort).max() == pytest.approx(0.2, rel=0.2)
