@@ -6,7 +6,6 @@ import contextlib
 import math
 import os
 import time
-from collections import Counter
 from collections.abc import Iterable
 
 import psutil
@@ -58,8 +57,8 @@ class PlantListener(GraphPeer):
         Who listens takes a core from those whom it measures, for milliseconds at each message.
         """
         time.sleep(duration)
-        unread = Counter(dict.fromkeys(self.rows, -1))
-        while unread != (unread := Counter({plant: len(rows) for plant, rows in self.rows.items()})):
+        heard = -1
+        while heard != (heard := sum(map(len, self.rows.values()))):
             self.spin(0.05)
 
     def clear(self) -> None:

@@ -14,12 +14,11 @@ import numpy as np
 from std_srvs.srv import SetBool
 
 from pendulum_bags.experiments.processes import Child, start_recorder
-from pendulum_bags.experiments.session import PLANT_PRIORITY, start_loop
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_rosbag.reader import read_bag
 from tests.tools.faults.bag_property import check_bag
-from tests.tools.faults.live import EFFORT_LIMIT, NODES, START_TIMEOUT, LiveSystem
+from tests.tools.faults.live import EFFORT_LIMIT, NODES, START_TIMEOUT, LiveSystem, start_with_priority
 from tests.tools.faults.outcome import MACHINE_PATIENCE, Fault, Outcome
 from tests.tools.faults.plants import BRIDGE, SIMULATOR
 
@@ -39,7 +38,7 @@ _PERIOD_NS = 2_000_000
 def _twin_plant(name: str) -> Fault:
     def act(system: LiveSystem, _: random.Random) -> Outcome:
         program = system.program("simulator")
-        twin = start_loop(system.processes, replace(program, name=name), PLANT_PRIORITY)
+        twin = start_with_priority(system.processes, replace(program, name=name))
         outcome = Outcome()
         # Each plant's stamps lie on a grid of its own, which tells the torques of the two apart.
         first = system.applied[-1].stamp_ns % _PERIOD_NS

@@ -38,7 +38,16 @@ from tests.tools.faults.motor import NO_TORQUE, Asked, Drive, ModuleTruth, Witne
 from tests.tools.faults.plants import EFFORT_LIMIT, SIMULATOR, Plant
 from tests.udp_address import free_udp_address
 
-__all__ = ["EFFORT_LIMIT", "MODULE", "NAMESPACE", "NODES", "START_TIMEOUT", "Applied", "LiveSystem"]
+__all__ = [
+    "EFFORT_LIMIT",
+    "MODULE",
+    "NAMESPACE",
+    "NODES",
+    "START_TIMEOUT",
+    "Applied",
+    "LiveSystem",
+    "start_with_priority",
+]
 
 START_TIMEOUT = 60.0
 NAMESPACE = SIMULATOR.namespace
@@ -68,6 +77,14 @@ class Applied(NamedTuple):
     when: float
     effort: float
     stamp_ns: int
+
+
+def start_with_priority(processes: ProcessSet, program: NodeProgram) -> Child:
+    """Start a node as an experiment does: who keeps deadlines goes first, who only shows goes last."""
+    if program.executable in {"viewer", "markers"}:
+        return processes.start_node(program)
+    keeps_time = program.executable in {"simulator", "bridge"}
+    return start_loop(processes, program, PLANT_PRIORITY if keeps_time else ANSWER_PRIORITY)
 
 
 class LiveSystem:
@@ -170,12 +187,7 @@ class LiveSystem:
             child = self._start_module()
         else:
             program = self.program(name, **{**self._parameters.get(name, {}), **changes})
-            # As in an experiment: who keeps deadlines goes first, who only shows goes last.
-            if name == "viewer":
-                child = self.processes.start_node(program)
-            else:
-                priority = PLANT_PRIORITY if name == self.plant.name else ANSWER_PRIORITY
-                child = start_loop(self.processes, program, priority)
+            child = start_with_priority(self.processes, program)
         self.children[name] = child
         return child
 

@@ -25,11 +25,8 @@ from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, Rec
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.session import (
-    ANSWER_PRIORITY,
-    PLANT_PRIORITY,
     RECORDER_PRIORITY,
     permitted,
-    start_loop,
 )
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
@@ -39,6 +36,7 @@ from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from pendulum_rosbag.reader import Bag, read_bag
 from tests.tools.faults.bag_property import check_bag
+from tests.tools.faults.live import start_with_priority
 
 __all__ = ["MAX_GROWTH", "SoakReport", "TopicTally", "soak"]
 
@@ -181,13 +179,7 @@ def _start(processes: ProcessSet, conductor: Conductor, folder: Path) -> list[Ch
         bag, priority = folder / f"bag_{namespace[1:]}", permitted(RECORDER_PRIORITY)
         recorders.append(start_recorder(processes, bag, namespace, metadata, "mcap", priority=priority))
     for program in _programs():
-        # As in an experiment: who keeps deadlines goes first, who only shows goes last.
-        shows = program.executable in {"viewer", "markers"}
-        if shows:
-            processes.start_node(program)
-        else:
-            keeps_time = program.executable in {"simulator", "bridge"}
-            start_loop(processes, program, PLANT_PRIORITY if keeps_time else ANSWER_PRIORITY)
+        start_with_priority(processes, program)
     plant = PlantClient(conductor, "/sim", "simulator", watch=False)
     bridge = PlantClient(conductor, "/hw", "bridge")
     for namespace in ("/sim", "/hw"):
