@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import struct
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.storage import (
     QosProfile,
     message_type,
+    metadata_file,
     open_writer,
 )
 from tests.bag_readers import JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
@@ -154,6 +157,73 @@ def test_large_messages_continue_on_overflow_pages(tmp_path: Path) -> None:
             writer.write("/s", number, text_message("z" * size))
     assert set(count_everywhere(bag)) == {len(sizes)}
     assert [len(stored.message.data) for stored in read_bag(bag)["/s"]] == sizes
+
+
+def test_new_counts_are_written_over_the_old_ones_and_any_mixture_of_both_is_metadata(tmp_path: Path) -> None:
+    """To replace the file at each seal would cost more than all else; in the middle of one, it must be readable too."""
+    bag, texts = tmp_path / "bag", []
+    with open_writer(bag) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        places = set()
+        for index in range(3):
+            writer.write("/a", 10**18 * index + 10**15, state(index))
+            writer.seal()
+            texts.append((bag / "metadata.yaml").read_bytes())
+            places.add((bag / "metadata.yaml").stat().st_ino)
+        assert len(places) == 1
+    assert len({len(text) for text in texts}) == 1
+    for old, new in pairwise(texts):
+        # A write is done byte by byte at worst.
+        for cut in range(len(old)):
+            if new[cut : cut + 1] != old[cut : cut + 1]:
+                told = yaml.safe_load(new[:cut] + old[cut:])["rosbag2_bagfile_information"]
+                assert told["topics_with_message_count"][0]["message_count"] in (0, 1, 2, 3)
+                assert told["storage_identifier"] == "mcap"
+    assert b" \n" in texts[0]
+    assert b" \n" not in (bag / "metadata.yaml").read_bytes()
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_that_is_taken_away_while_it_is_written_is_noticed_at_the_next_seal(tmp_path: Path, storage: str) -> None:
+    writer = open_writer(tmp_path / "bag", storage)
+    writer.add_topic("/a", JOINT_STATE)
+    writer.write("/a", 0, state(0))
+    writer.seal()
+    (tmp_path / "bag").rename(tmp_path / "elsewhere")
+    writer.write("/a", 1, state(1))
+    with pytest.raises(FileNotFoundError, match="metadata"):
+        writer.seal()
+    writer.abandon()
+    assert set(count_everywhere(tmp_path / "elsewhere")) == {2}
+
+
+def test_metadata_that_somebody_replaced_is_replaced_again(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    with open_writer(bag) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        (bag / "own").write_text("mine")
+        (bag / "own").replace(bag / "metadata.yaml")
+        writer.write("/a", 0, state(0))
+        writer.seal()
+        assert set(count_everywhere(bag)) == {1}
+
+
+def test_counts_that_a_full_disk_cuts_short_are_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = tmp_path / "bag"
+    with open_writer(bag) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        writer.write("/a", 0, state(0))
+        writer.seal()
+        write = os.pwrite
+        monkeypatch.setattr(
+            metadata_file.os,
+            "pwrite",
+            lambda fd, data, at: write(fd, data[:9], at) if data[:4] == b"rosb" else write(fd, data, at),
+        )
+        writer.write("/a", 1, state(1))
+        writer.seal()
+        told = yaml.safe_load((bag / "metadata.yaml").read_bytes())["rosbag2_bagfile_information"]
+        assert told["message_count"] == 2
 
 
 def test_a_bag_is_never_overwritten(tmp_path: Path) -> None:

@@ -81,7 +81,8 @@ class BagWriter:
         try:
             self._folder.mkdir(parents=True)
             self._file = self._open_file()
-            self._replace_metadata()
+            self._update_metadata()
+            self._metadata.abandon()
             os.rename(self._folder, path)
         except OSError as error:
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -155,7 +156,7 @@ class BagWriter:
             # they pass over messages of topics that are not listed.
             self._file.seal()
             self._note_sealed()
-            self._replace_metadata()
+            self._update_metadata()
 
     def write(self, topic: str, log_time_ns: int, data: bytes) -> None:
         """Add one serialised message.
@@ -204,7 +205,7 @@ class BagWriter:
         work()
         if self._file.count != before:
             self._note_sealed()
-            self._replace_metadata()
+            self._update_metadata()
         if self._is_due():
             self._split()
 
@@ -239,7 +240,7 @@ class BagWriter:
         with self._lock:
             self._custom.update(encode_custom_data(metadata))
             if self._open:
-                self._replace_metadata()
+                self._update_metadata()
 
     def close(self) -> None:
         """Seal, give back unused room and close; once more does nothing.
@@ -255,13 +256,14 @@ class BagWriter:
                 self._close_file()
             finally:
                 # After the file gave back its unused room there may be space for this again.
-                self._replace_metadata()
+                self._metadata.finish(list(self._topics.values()), self._files, self._custom)
 
     def abandon(self) -> None:
         """Close without writing anything more, as if the process had died."""
         with self._lock:
             self._open = False
             self._file.abandon()
+            self._metadata.abandon()
 
     def __enter__(self) -> BagWriter:
         return self
@@ -300,8 +302,8 @@ class BagWriter:
         for name, topic in self._topics.items():
             topic.count = self._written[name]
 
-    def _replace_metadata(self) -> None:
-        self._metadata.replace(list(self._topics.values()), self._files, self._custom)
+    def _update_metadata(self) -> None:
+        self._metadata.update(list(self._topics.values()), self._files, self._custom)
 
     def _is_due(self) -> bool:
         if not self._file.count:
@@ -315,7 +317,7 @@ class BagWriter:
         for name in self._topics:
             self._add_channel(name)
         self._file.seal()
-        self._replace_metadata()
+        self._update_metadata()
 
     def _close_file(self) -> None:
         text = ""
