@@ -115,10 +115,19 @@ class Conductor:
         Raises:
             FaultError: The service is not there or does not answer in time.
         """
-        self.wait_for(f"service {client.srv_name}", client.service_is_ready, timeout)
+        self.wait_for_service(client, timeout)
         future = client.call_async(request)
         self.wait_for(what, future.done, timeout, until=future)
         return future.result()
+
+    def wait_for_service(self, client: Client, timeout: float) -> None:
+        """Wait until the program that offers a service is there.
+
+        Raises:
+            FaultError: It does not come in time [s].
+        """
+        what = f"service {client.srv_name} (of a program that does not run, or stands still)"
+        self.wait_for(what, client.service_is_ready, timeout)
 
     def listen(self, duration: float, until: Future | None = None) -> None:
         """Handle what arrives within a duration [s], or until a future is done, without asking whether all is well."""
@@ -207,7 +216,7 @@ class PlantClient:
         clients += [self._change_state] if controller else []
         clients += [self._start] if disturbance else []
         for client in clients:
-            wait(f"service {client.srv_name}", client.service_is_ready, timeout)
+            self.conductor.wait_for_service(client, timeout)
         wait(
             f"a plant on {self.namespace}/{names.JOINT_TRAJECTORY}",
             lambda: self._trajectory.get_subscription_count() > 0,
