@@ -85,11 +85,6 @@ class SealedMcapFile:
         """Bytes of data so far, sealed or not (the file itself may end later)."""
         return self._layout.settled_end + self._group_size + self._pending_size
 
-    @property
-    def pending_size(self) -> int:
-        """Bytes of messages that are not sealed yet."""
-        return self._pending_size
-
     def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None:
         """Describe a topic before its first message (ids from 1; QoS profiles as YAML text)."""
         key = (type.name, type.definition)  # neither: messages that describe themselves, such as JSON

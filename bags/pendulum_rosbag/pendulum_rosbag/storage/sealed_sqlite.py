@@ -89,11 +89,6 @@ class SealedSqliteFile:
         """Bytes of data so far, sealed or not."""
         return self._pages.count * PAGE
 
-    @property
-    def pending_size(self) -> int:
-        """Bytes of messages that are not sealed yet."""
-        return self._pending_size
-
     def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None:
         """Describe a topic before its first message (ids ascending from 1; QoS profiles as YAML text)."""
         self._tables["topics"].append(channel_id, record((None, topic, type.name, type.serialization, qos, type.hash)))
