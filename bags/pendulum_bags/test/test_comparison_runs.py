@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,16 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from pendulum_bags.comparison import Outcome, compare_folders, compare_runs, read_run
+from pendulum_bags.comparison.compare import _pool
 from pendulum_bags.comparison.compare_cli import main
+from pendulum_bags.experiments.experiment_cli import _print_summary
+from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.tables import make_tables
 from pendulum_bags.runs.run_data import missed_periods, timing_warning
+from pendulum_bags.verdict.same_run import seen_note
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import BagError, DataError
+from pendulum_msgs_py.programs.terminal import make_console
 from pendulum_rosbag.storage import open_writer
 from tests.synthetic_runs import regulate, run_metadata, write_bag, write_run_folder
 
@@ -137,6 +144,71 @@ def test_pooled_runs_narrow_the_intervals(folder: Path, tmp_path: Path) -> None:
     assert content["runs"] == 4
     assert len(content["paired"]["runs"]) == 4
     assert content["plants"]["hw"]["samples"] == 2000
+
+
+def test_figures_of_several_runs_are_those_of_all_their_samples(tmp_path: Path) -> None:
+    """A run of 1 s beside one of 4 s, with means of their own: numpy on the samples themselves is the reference."""
+    folders, columns = [], []
+    for seed, duration, offset in ((1, 1.0, 0.0), (2, 4.0, 0.004)):
+        place = tmp_path / str(seed)
+        sim = regulate(rate=500.0, seed=seed, duration=duration)
+        hw = regulate(rate=100.0, seed=seed, duration=duration, hardware=True)
+        hw["position"] = hw["position"] + offset
+        for name, motion in (("sim", sim), ("hw", hw)):
+            write_bag(place / name, motion, f"/{name}", metadata=run_metadata(seed), ramps=False)
+        folders.append(place)
+        columns.append(hw)
+    comparison = compare_folders(folders)
+    plant = comparison.plants["hw"]
+    position, velocity, command = (
+        np.concatenate([one[name] for one in columns]) for name in ("position", "velocity", "command")
+    )
+    assert plant["std_theta"] == pytest.approx(position.std(ddof=1), rel=1e-9)
+    assert plant["std_theta_dot"] == pytest.approx(velocity.std(ddof=1), rel=1e-9)
+    assert plant["mean_theta"] == pytest.approx(position.mean(), rel=1e-12)
+    assert plant["rms_u"] == pytest.approx(np.sqrt(np.mean(command**2)), rel=1e-9)
+    assert plant["max_abs_u"] == np.abs(command).max()
+    assert plant["samples"] == position.size == 500
+    assert plant["duration_s"] == pytest.approx(0.99 + 3.99)
+    assert plant["effective_samples"] == pytest.approx(
+        sum(compare_folders([one]).plants["hw"]["effective_samples"] for one in folders)
+    )
+    assert plant["rate_hz"] == pytest.approx(100.0)
+    (row,) = [row for row in make_tables(ReportData(comparison, {}))[0].rows if row[0] == "noise recorded [s]"]
+    assert row[1:] == ("5", "4.98")
+    assert make_tables(ReportData(comparison, {}))[0].sentence.startswith("All samples of 2 runs, so that a run counts")
+
+
+def test_the_terminal_says_of_which_samples_its_figures_are(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    second = write_run_folder(tmp_path / "second", 2, ramps=False)
+    comparison = compare_folders([folder, second])
+    summary = {**comparison.to_json(), "hardware": "hebi"}
+    _print_summary(make_console(), summary)
+    assert main([str(folder), str(second)]) == 0
+    for told in capsys.readouterr().out.split("Plants during the noise"):
+        words = " ".join(told.split())
+        assert ", all samples of 2 runs" in words
+        assert re.search(r"noise recorded \[s\]\W+10\.0\W+10\.0", words)
+    assert seen_note(comparison) in words
+    assert main([str(folder)]) == 0
+    assert "all samples of" not in capsys.readouterr().out
+
+
+def test_the_rate_of_several_runs_is_that_over_their_time() -> None:
+    rows = [
+        {"samples": 100, "duration_s": 1.0, "rate_hz": 100.0},
+        {"samples": 600, "duration_s": 3.0, "rate_hz": 200.0},
+    ]
+    assert _pool(rows)["rate_hz"] == pytest.approx(175.0)
+    rows = [
+        {**row, "noise_hold_time": hold, "rms_tracking_error": hold}
+        for row, hold in zip(rows, (0.1, None), strict=True)
+    ]
+    assert _pool(rows)["noise_hold_time"] is None
+    rows = [{**row, "rms_tracking_error": error} for row, error in zip(rows, (1.0, 2.0), strict=True)]
+    assert _pool(rows)["rms_tracking_error"] == pytest.approx(np.sqrt((100 * 1.0 + 600 * 4.0) / 700))
 
 
 def test_states_that_are_missing_count_as_missed_deadlines() -> None:

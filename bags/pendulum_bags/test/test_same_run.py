@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pendulum_bags.comparison import Comparison, Looks, Margins, Outcome, RunData, Series, Signal, compare
+from pendulum_bags.comparison import (
+    Comparison,
+    EquivalenceTest,
+    Looks,
+    Margins,
+    Outcome,
+    RunData,
+    Series,
+    Signal,
+    compare,
+)
 from pendulum_bags.comparison.same_run import paired_tests
 from pendulum_bags.comparison.spectra import spectra_of
+from pendulum_bags.comparison.statistics import Interval
 from pendulum_bags.report.figures import comparison_figures
+from pendulum_bags.report.tables import tests_table as table_of_tests
 from pendulum_bags.verdict import Mark
-from pendulum_bags.verdict.same_run import same_run_layer
+from pendulum_bags.verdict.same_run import in_words, same_run_layer, seen_note
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from tests.benchmarks.bench_verdict import DEFAULT_LOOKS, DIFFERENCES, ON_THE_MARGIN, margins_at, run_trial
@@ -242,11 +255,87 @@ def test_the_layer_says_what_differs_and_what_to_do() -> None:
     early = same_run_layer(compare([(hardware, replace(simulation, metadata={}))]))
     assert "ms less delay than now" in early.next_steps[0]
     slack = same_run_layer(compare([pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))]))
-    assert "the standard deviation of the hardware's velocity is 47 % smaller" in slack.reason
+    assert "the hardware's spread of velocity is 47 % smaller (ratio 0.5" in slack.reason
     assert "identify" in slack.next_steps[0]
     fine = same_run_layer(compare([pair(5, plant=MACHINE)]))
     assert fine.mark is Mark.YES
     assert not fine.next_steps
+
+
+def test_every_figure_of_the_headline_stands_in_the_table_of_tests_under_its_name() -> None:
+    def told(comparison: Comparison) -> tuple[list[str], str]:
+        layer = same_run_layer(comparison)
+        assert layer.mark is Mark.NO
+        rows = table_of_tests(comparison).rows
+        said = [row for row in rows if row[4] == "not equivalent" and row[1].lstrip("−") in layer.sentence]
+        return [row[0] for row in said], layer.sentence
+
+    slack = compare([pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))])
+    names, sentence = told(slack)
+    assert {"spread of angle (ratio)", "spread of velocity (ratio)", "spread of torque (ratio)"} <= set(names)
+    assert sentence.count("at the slower plant's sampling times and below 20 Hz)") == 3
+    assert all(f"spread of {what} is" in sentence for what in ("angle", "velocity", "torque"))
+    # Twice and more is told as a factor, which is the ratio.
+    simulation, hardware = pair(5, plant=SIMULATED.with_values(damping=3 * 11.77))
+    names, sentence = told(compare([(hardware, replace(simulation, metadata={}))]))
+    assert "spread of velocity (ratio)" in names
+    assert re.search(r"spread of velocity is \d\.\d\d times as large \(at the slower", sentence)
+    # In a unit, in a narrower band.
+    names, sentence = told(
+        compare(
+            [pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))],
+            margin=["spread_angle=0.01deg", "spread_velocity=9rad/s", "spread_torque=9 N m", "band=5Hz"],
+        )
+    )
+    assert "spread of angle difference [deg]" in names
+    assert re.search(
+        r"spread of angle is 0\.\d+ deg smaller \(at the slower plant's sampling times and below 5 Hz\)", sentence
+    )
+
+
+@pytest.mark.parametrize(
+    ("quantity", "unit", "value", "words"),
+    [
+        (
+            "distance of velocities less the delay",
+            "%",
+            33.54,
+            "the distance of velocities less the delay is 33.5 % of ",
+        ),
+        ("distance of angles", "deg", 0.1234, "the distance of angles is 0.123 deg (below 5 Hz)"),
+        ("mean angle difference", "deg", -0.3456, "the hardware's mean angle is 0.346 deg lower"),
+        (
+            "spread of angle (ratio)",
+            "-",
+            1.234,
+            "the hardware's spread of angle is 23 % larger (ratio 1.23 below 5 Hz)",
+        ),
+    ],
+)
+def test_the_headline_tells_as_many_digits_as_the_table(quantity: str, unit: str, value: float, words: str) -> None:
+    interval = Interval(value, value, value, 0.9, 0.0, 9)
+    test = EquivalenceTest(quantity, unit, interval, -1.0, 1.0, Outcome.DIFFERENT, 0, 1.0)
+    assert in_words(test, "below 5 Hz").startswith(words)
+
+
+def test_a_headline_of_unpaired_runs_does_not_speak_of_common_times() -> None:
+    simulation, hardware = pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))
+    apart = compare([(replace(simulation, disturbance=None), hardware)])
+    assert not apart.is_paired
+    assert apart.seen == "below 20 Hz"
+    slow = replace(hardware, window=hardware.window.between(0.0, 1e9))
+    assert compare([(simulation, slow)]).seen == "at the slower plant's sampling times and below 20 Hz"
+    assert "sampling times" not in seen_note(apart)
+
+
+def test_the_note_below_the_tests_tells_the_ratios_over_all_samples() -> None:
+    comparison = compare([pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))])
+    simulation, hardware = comparison.pairs[0].simulation.window, comparison.pairs[0].hardware.window
+    angle, velocity = (
+        getattr(hardware, name).std(ddof=1) / getattr(simulation, name).std(ddof=1) for name in ("position", "velocity")
+    )
+    assert f"hardware per simulation, are {angle:.3g} (angle) and {velocity:.3g} (velocity)." in seen_note(comparison)
+    assert "sampling times and below 20 Hz: of its velocity it shows those phases" in seen_note(comparison)
 
 
 @pytest.mark.parametrize("plant", [MACHINE, SIMULATED.with_values(damping=2 * 11.77)])

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from pendulum_bags.comparison.band import common_band
 from pendulum_bags.comparison.equivalence import Outcome, Verdict, conclude
 from pendulum_bags.comparison.independence import check_pairs
 from pendulum_bags.comparison.margins import MarginArgument, Margins
@@ -77,13 +78,33 @@ class Comparison:
         return all(pair.is_paired for pair in self.pairs)
 
     @property
+    def is_tested_in_pairs(self) -> bool:
+        """Whether the verdict's tests look at both motions at the same times, under one disturbance."""
+        return self.is_paired and not self.unlike_references
+
+    @property
+    def band(self) -> float:
+        """Frequency up to which the tests compare spreads and distances [Hz]."""
+        if self.is_tested_in_pairs:
+            series = [one for pair in self.pairs for one in pair.motions]
+        else:
+            series = [run.window for run in (*self.own, *(pair.hardware for pair in self.pairs))]
+        return common_band(self.verdict.margins.band.si, *series)
+
+    @property
+    def seen(self) -> str:
+        """Of what the spreads and distances of the tests are, in words: not of all samples, as those of a plant."""
+        times = "at the slower plant's sampling times and " if self.is_tested_in_pairs else ""
+        return f"{times}below {self.band:.3g} Hz"
+
+    @property
     def unlike_references(self) -> str:
         """Why the moving references of a pair are not one, see :attr:`Pair.unlike_references`; empty where they are."""
         return next((pair.unlike_references for pair in self.pairs if pair.unlike_references), "")
 
     @property
     def plants(self) -> dict[str, dict[str, Any]]:
-        """Figures of each plant: means over runs, sums of missed deadlines, the largest torque."""
+        """Figures of each plant over all samples of its runs, so that a run counts by its length, as in the tests."""
         groups = {
             "sim": [pair.simulation for pair in self.pairs],
             "hw": [pair.hardware for pair in self.pairs],
@@ -301,21 +322,48 @@ def _read_pair(folder: Path, joint: str | None, open_bag: OpenBag) -> tuple[RunD
     )
 
 
+_SUMS = ("missed_deadlines", "samples", "effective_samples", "duration_s", "damage")
+_ROOTS_OF_SQUARES = ("rms_u", "rms_tracking_error")
+
+
 def _pool(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures that all runs would have as one: each sample counts once, whichever run it is of."""
     if len(rows) == 1:
         return dict(rows[0])
+    counts = [row["samples"] for row in rows]
     pooled: dict[str, Any] = {}
     for key, value in rows[0].items():
-        values = [row[key] for row in rows]
-        if key in {"missed_deadlines", "samples", "damage"}:
+        values: list[Any] = [row.get(key) for row in rows]
+        if None in values:
+            pooled[key] = None
+        elif key in _SUMS:
             pooled[key] = sum(values, type(value)())
         elif key == "max_abs_u":
             pooled[key] = max(values)
-        elif None in values:
-            pooled[key] = None
+        elif key in _ROOTS_OF_SQUARES:
+            pooled[key] = math.sqrt(_mean([one**2 for one in values], counts))
+        elif key.startswith("std_"):
+            pooled[key] = _pooled_std(values, [row[key.replace("std_", "mean_")] for row in rows], counts)
+        elif key == "rate_hz":
+            # Samples per time, so it is the time by which a run counts.
+            pooled[key] = _mean(values, [row["duration_s"] for row in rows])
         else:
-            pooled[key] = sum(values) / len(values)
+            pooled[key] = _mean(values, counts)
     return pooled
+
+
+def _mean(values: Sequence[float], weights: Sequence[float]) -> float:
+    return math.fsum(value * weight for value, weight in zip(values, weights, strict=True)) / math.fsum(weights)
+
+
+def _pooled_std(spreads: Sequence[float], means: Sequence[float], counts: Sequence[int]) -> float:
+    """Return the standard deviation of all samples about their common mean, from those of the runs."""
+    middle = _mean(means, counts)
+    squares = math.fsum(
+        (count - 1) * spread**2 + count * (mean - middle) ** 2
+        for spread, mean, count in zip(spreads, means, counts, strict=True)
+    )
+    return math.sqrt(squares / (sum(counts) - 1))
 
 
 def _finite(value: Any) -> Any:

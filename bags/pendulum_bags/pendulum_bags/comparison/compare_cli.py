@@ -200,16 +200,18 @@ def _tell_joints(results: Mapping[str, Comparison], kept: Sequence[Path]) -> _To
 
 def _print(console: Console, result: Comparison, content: dict[str, Any]) -> None:
     from pendulum_bags.runs.run_data import timing_warning
-    from pendulum_bags.verdict.terminal import tests_table
+    from pendulum_bags.verdict.terminal import print_tests
     from pendulum_msgs_py.programs.terminal import WholeTable
 
     motion = result.pairs[0].simulation.window
     unit, what = motion.unit, "x" if motion.slides else "theta"
     plants = content["plants"]
-    table = WholeTable(title="Plants during the noise", title_justify="left")
+    pooled = f", all samples of {len(result.pairs)} runs" if len(result.pairs) > 1 else ""
+    table = WholeTable(title=f"Plants during the noise{pooled}", title_justify="left")
     for heading in ("", *plants):
         table.add_column(heading, justify="left" if not heading else "right")
     for label, key, form in (
+        ("noise recorded \\[s]", "duration_s", ".1f"),
         ("rate \\[Hz]", "rate_hz", ".1f"),
         ("missed deadlines", "missed_deadlines", ".0f"),
         ("noise held for \\[s]", "noise_hold_time", ".4f"),
@@ -248,7 +250,7 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
         console.print(f"Not paired: {content['paired']['reason']}.")
     for note in result.left_out:
         console.print(note, style="yellow", highlight=False, markup=False)
-    console.print(tests_table(result.verdict, emulated=result.is_emulated))
+    print_tests(console, result)
 
 
 def _number(value: float | None, form: str) -> str:

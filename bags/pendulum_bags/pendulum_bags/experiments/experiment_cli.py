@@ -154,7 +154,7 @@ def thesis(
     from pendulum_bags.comparison import Margins
     from pendulum_bags.experiments.stalls import run_undisturbed
     from pendulum_bags.experiments.thesis import run_thesis
-    from pendulum_bags.verdict.terminal import print_answer, tests_table
+    from pendulum_bags.verdict.terminal import print_answer, print_tests
 
     if plant is not None and is_mechanism(plant):
         if typed := typed_options(context, _OF_ONE_JOINT):
@@ -226,7 +226,7 @@ def thesis(
         print(json.dumps(summary, indent=2))
     else:
         _print_summary(console, summary)
-        console.print(tests_table(comparison.verdict, emulated=comparison.is_emulated))
+        print_tests(console, comparison)
         print_answer(console, answer)
     elapsed = time.monotonic() - started
     console.print(
@@ -377,7 +377,7 @@ def _print_summary(console: Console, summary: dict[str, Any]) -> None:
     emulated = summary["emulated"]
     title = f"Simulation and {'emulated hardware' if emulated else 'hardware'} under the same noise"
     if summary["runs"] > 1:
-        title += f", means of {summary['runs']} runs"
+        title += f", all samples of {summary['runs']} runs"
     table = WholeTable(title=title, title_justify="left")
     table.add_column("")
     plants = summary["plants"]
@@ -385,6 +385,7 @@ def _print_summary(console: Console, summary: dict[str, Any]) -> None:
         stands_in = "emulator" if summary["hardware"] in HARDWARE else "a simulation"
         table.add_column(f"hw ({stands_in})" if name == "hw" and emulated else name, justify="right")
     rows = (
+        ("noise recorded", "duration_s", "s", ".1f"),
         ("rate", "rate_hz", "Hz", ".1f"),
         ("missed deadlines", "missed_deadlines", "", "d"),
         ("std of theta", "std_theta", "rad", ".5f"),

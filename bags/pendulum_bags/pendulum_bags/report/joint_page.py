@@ -105,11 +105,9 @@ def _motions(comparisons: Mapping[str, Comparison]) -> Table:
         if any(np.ptp(one.effort) > 0.0 for one in both):
             largest = (quantity(float(np.abs(one.effort).max())) for one in both)
             rows.append((f"largest |u| at {joint} [{both[0].effort_unit}]", *largest))
-    first = next(iter(comparisons.values())).plants
+    first = next(iter(comparisons.values()))
     for label, key, digits in (("sampling rate [Hz]", "rate_hz", 4), ("missed deadlines", "missed_deadlines", 6)):
-        rows.append((label, *(quantity(float(first[side][key]), "", digits) for side in ("sim", "hw"))))
-    sentence = (
-        "These are all samples; the tests take both motions at one phase of the noise and in one band, so their ratios "
-        "may differ."
-    )
+        rows.append((label, *(quantity(float(first.plants[side][key]), "", digits) for side in ("sim", "hw"))))
+    of = "" if len(first.pairs) == 1 else f" of the first of {len(first.pairs)} runs"
+    sentence = f"Spreads are of all samples{of}; the tests take both motions {first.seen}, so their ratios may differ."
     return Table("Joints under noise", sentence, ("", "simulation", "hardware"), rows, "Verdict")

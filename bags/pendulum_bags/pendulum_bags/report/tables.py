@@ -16,6 +16,7 @@ from pendulum_bags.report.trial_figures import GRAVITY, INERTIA, UNITS
 from pendulum_bags.report.trials import TrialSet
 from pendulum_bags.verdict import Layer, LayerResult, Mark
 from pendulum_bags.verdict.evidence import evidence_table
+from pendulum_bags.verdict.same_run import seen_note
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
@@ -41,6 +42,7 @@ def _is_further(result: LayerResult) -> bool:
 
 _PLANT_NAMES = {"sim": "simulation", "hw": "hardware", "sim_500hz": "simulation, own noise"}
 _PLANT_ROWS = (
+    ("noise recorded [s]", "duration_s", 3),
     ("sampling rate [Hz]", "rate_hz", 4),
     ("missed deadlines", "missed_deadlines", 6),
     ("noise sample held for [s]", "noise_hold_time", 3),
@@ -59,11 +61,12 @@ def _plants(data: ReportData) -> Table:
         (label, *(_cell(plant.get(key), digits) for plant in plants.values())) for label, key, digits in _PLANT_ROWS
     ]
     sim, hw = plants["sim"], plants["hw"]
+    runs = len(data.comparison.pairs)
+    pooled = f"All samples of {runs} runs, so that a run counts by its length. " if runs > 1 else ""
     sentence = (
-        f"The controllers ask for at most {quantity(max(sim['max_abs_u'], hw['max_abs_u']), 'N m')}; "
+        f"{pooled}The controllers ask for at most {quantity(max(sim['max_abs_u'], hw['max_abs_u']), 'N m')}; "
         f"{int(sim['missed_deadlines'])} deadlines were missed in simulation and {int(hw['missed_deadlines'])} on "
-        "hardware. These are all samples; the tests take both motions at one phase of the noise and in one band, so "
-        "their ratios may differ."
+        f"hardware. {seen_note(data.comparison)}"
     )
     return Table("Plants under noise", sentence, ("", *(_PLANT_NAMES[name] for name in plants)), rows, "Verdict")
 

@@ -9,7 +9,7 @@ from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 
-__all__ = ["design_plant", "in_words", "same_run_layer"]
+__all__ = ["design_plant", "in_words", "same_run_layer", "seen_note"]
 
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
@@ -37,7 +37,7 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
         failed = sorted((test for test in tests if test.outcome is Outcome.DIFFERENT), key=_beyond, reverse=True)
         told = _each_once(failed)
         beside = ", ".join(test.quantity for test in told[_MOST_REASONS:])
-        reason = "; ".join(in_words(test) for test in told[:_MOST_REASONS])
+        reason = "; ".join(in_words(test, comparison.seen) for test in told[:_MOST_REASONS])
         reason += f"; also beyond its margin: {beside}" if beside else ""
         steps = _remedies(comparison, failed)
     else:
@@ -50,27 +50,50 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
     return LayerResult(Layer.SAME_RUN, mark, sentence, evidence, steps, reason=reason)
 
 
-def in_words(test: EquivalenceTest) -> str:
-    """Return what a test found as half a sentence."""
+def in_words(test: EquivalenceTest, seen: str) -> str:
+    """Return what a test found as half a sentence, with the name and the figure that its table has.
+
+    Args:
+        test: The test.
+        seen: Of what its spreads and distances are, as :attr:`Comparison.seen` says: a spread over all samples, which
+            stands in other tables, may be another.
+    """
     value = test.interval.estimate
     if test.quantity == "delay":
         when = "later" if value >= 0.0 else "earlier"
         return f"the hardware answers {abs(value):.3g} {test.unit} {when} than the simulation"
     if test.quantity.startswith("mean "):
         what = test.quantity.removeprefix("mean ").split(" ", maxsplit=1)[0]
-        return f"the hardware's mean {what} is {abs(value):.2g} {test.unit} {'higher' if value >= 0.0 else 'lower'}"
+        return f"the hardware's mean {what} is {abs(value):.3g} {test.unit} {'higher' if value >= 0.0 else 'lower'}"
     if test.quantity.startswith("spread of "):
         what = test.quantity.removeprefix("spread of ").split(" ", maxsplit=1)[0]
-        if test.unit == "-":
-            size = f"{value:.2g} times as large" if value >= 2.0 else f"{100.0 * abs(value - 1.0):.2g} % "
-            size = size if value >= 2.0 else size + ("larger" if value >= 1.0 else "smaller")
+        if test.unit != "-":
+            size, ratio = f"{abs(value):.3g} {test.unit} {'larger' if value >= 0.0 else 'smaller'}", ""
+        elif value >= 2.0:
+            size, ratio = f"{value:.3g} times as large", ""
         else:
-            size = f"{abs(value):.2g} {test.unit} {'larger' if value >= 0.0 else 'smaller'}"
-        return f"the standard deviation of the hardware's {what} is {size}"
-    apart = "% of their spread" if test.unit == "%" else test.unit
-    what = test.quantity.removeprefix("distance of ").split(" ", maxsplit=1)[0]
-    less = ", the delay taken out" if "less the delay" in test.quantity else ""
-    return f"the {what} are {value:.2g} {apart} apart{less}"
+            size = f"{100.0 * abs(value - 1.0):.2g} % {'larger' if value >= 1.0 else 'smaller'}"
+            ratio = f"ratio {value:.3g} "
+        return f"the hardware's spread of {what} is {size} ({ratio}{seen})"
+    apart = "% of the hardware's spread" if test.unit == "%" else test.unit
+    return f"the {test.quantity} is {value:.3g} {apart} ({seen})"
+
+
+def seen_note(comparison: Comparison) -> str:
+    """Return why the tests' ratios of spreads are not those over all samples, and what those are."""
+    plants = comparison.plants
+    simulation = plants["sim"] if comparison.is_tested_in_pairs else plants.get("sim_500hz", plants["sim"])
+    what = "position" if comparison.pairs[0].simulation.window.slides else "angle"
+    ratios = " and ".join(
+        f"{plants['hw'][key] / simulation[key]:.3g} ({name})"
+        for key, name in (("std_theta", what), ("std_theta_dot", "velocity"))
+        if simulation[key] > 0.0
+    )
+    why = ": of its velocity it shows those phases of the noise only" if comparison.is_tested_in_pairs else ""
+    return (
+        f"The tests take spreads and distances {comparison.seen}{why}. Over all samples the ratios of std, hardware "
+        f"per simulation, are {ratios}."
+    )
 
 
 def _evidence(test: EquivalenceTest) -> Evidence:

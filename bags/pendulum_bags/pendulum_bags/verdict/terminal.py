@@ -9,11 +9,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from pendulum_bags.comparison import Verdict
+from pendulum_bags.comparison import Comparison, Verdict
 from pendulum_bags.verdict.layers import Answer, Mark, name_hardware
+from pendulum_bags.verdict.same_run import seen_note
 from pendulum_msgs_py.programs.terminal import WholeTable
 
-__all__ = ["layers_table", "print_answer", "tests_table"]
+__all__ = ["layers_table", "print_answer", "print_tests", "tests_table"]
 
 SIGNS = {
     Mark.YES: "✓ yes",
@@ -63,6 +64,12 @@ def tests_table(verdict: Verdict, *, emulated: bool) -> WholeTable:
             test.outcome.value,
         )
     return table
+
+
+def print_tests(console: Console, comparison: Comparison) -> None:
+    """Print the tests of the first layer, and of which samples their figures are."""
+    console.print(tests_table(comparison.verdict, emulated=comparison.is_emulated))
+    console.print(name_hardware(seen_note(comparison), emulated=comparison.is_emulated), highlight=False, markup=False)
 
 
 def print_answer(console: Console, answer: Answer) -> None:
