@@ -23,6 +23,7 @@ from pendulum_bags.report import FIGURES, write_report
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.emulator_table import emulator_table
 from pendulum_bags.report.figures import comparison_figures, make_figures
+from pendulum_bags.report.page import page_of
 from pendulum_bags.report.provenance import provenance_table, settings_table
 from pendulum_bags.report.report_cli import main
 from pendulum_bags.report.tables import make_tables
@@ -327,6 +328,66 @@ def test_several_runs_are_pooled_and_identification_experiments_join_the_report(
         assert (tmp_path / "out" / "figures" / f"{name}.png").exists()
     for title in ("Regression of experiment 1", "Coefficients of experiment 2"):
         assert title in text
+
+
+def test_every_pooled_run_is_listed_with_seed_bags_and_versions(tmp_path: Path) -> None:
+    """As an experiment leaves them: the repeat in a folder of the run, with a seed and a command of its own."""
+    run = write_run_folder(tmp_path / "private" / "exp", seed=1, ramps=False)
+    repeat = write_run_folder(run / "repeats" / "1", seed=10_000_001, ramps=False)
+    shutil.rmtree(repeat / "sim_500hz")
+    comparison = compare_folders([run])
+    assert len(comparison.pairs) == 2
+    page = write_report(run, comparison=comparison, recordings=[], formats=[]).read_text(encoding="utf-8")
+    # One joint or several: nothing else of the page is in the table.
+    rows = provenance_table(ReportData(comparison, comparison.to_json())).rows
+    told = dict(rows)
+    assert (told["run 1, seed"], told["run 2, seed"]) == ("1", "10000001")
+    assert "seed" not in told
+    assert told["run 1, bag of the simulation"] == "exp/sim (plant thesis)"
+    assert told["run 2, bag of the simulation"] == "exp/repeats/1/sim (plant thesis)"
+    assert told["run 2, bag of the hardware"] == "exp/repeats/1/hw (plant thesis)"
+    assert told["bag of the simulation, own noise"] == "exp/sim_500hz (seed 1000001)"
+    assert told["run 1, revision and versions"] == "git 0123456789ab, pendulum_bags 0.1.0, python 3.11.0"
+    assert told["run 2, revision and versions"] == "as run 1"
+    assert "run 2, command" not in told
+    assert not any("private" in value for value in told.values())
+    head = page.split("<nav")[0]
+    assert "<dt>seeds</dt><dd>1, 10000001</dd>" in head
+    body = page.split("<main>")[1]
+    assert body.count("This section shows run 1 of 2;") == 4
+    for section in ("paired-comparison", "plants-under-noise", "the-thesis-s-analysis", "timing"):
+        assert "This section shows run 1 of 2;" in body.split(f'<section id="{section}"')[1].split("</section>")[0]
+
+
+def test_a_pooled_run_of_other_software_tells_its_own(comparison: Comparison) -> None:
+    (pair,) = comparison.pairs
+    record = {**pair.hardware.metadata["pendulum.run"], "seed": 2, "versions": {"numpy": "2.0"}, "command": "again"}
+    other = replace(
+        pair,
+        simulation=replace(pair.simulation, damage=("no index",)),
+        hardware=replace(pair.hardware, metadata={"pendulum.run": record}),
+    )
+    rows = provenance_table(ReportData(replace(comparison, pairs=[pair, other]), {})).rows
+    told = dict(rows)
+    assert told["run 2, seed"] == "1 and 2"
+    assert told["run 2, command"] == "again"
+    assert told["run 2, damage of the simulation's bag"] == "no index"
+    assert told["run 2, revision and versions"] == (
+        "simulation: git 0123456789ab, pendulum_bags 0.1.0, python 3.11.0; hardware: git 0123456789ab, numpy 2.0"
+    )
+    bare = replace(pair, simulation=replace(pair.simulation, metadata={}), hardware=replace(pair.hardware, metadata={}))
+    rows = provenance_table(ReportData(replace(comparison, pairs=[other, bare]), {})).rows
+    assert dict(rows)["run 2, revision and versions"] == "git unknown"
+    assert dict(rows)["run 1, command"] == "again"
+    assert "run 2, command" not in dict(rows)
+
+
+def test_the_head_of_a_page_names_some_seeds_of_many(comparison: Comparison) -> None:
+    many = replace(comparison, pairs=[*comparison.pairs] * 4)
+    data = ReportData(many, {"seed": 7})
+    page = page_of(data, [], [], [], title="", made_at="")
+    assert dict(page.facts)["seeds"] == "1, 1, 1, …"
+    assert dict(page_of(ReportData(comparison, {"seed": 7}), [], [], [], title="", made_at="").facts)["seed"] == "7"
 
 
 def test_trials_alone_point_to_the_command_that_shows_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -64,6 +64,7 @@ def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: 
         provenance=[table for table in (provenance_table(data), settings_table(data)) if table is not None],
         animation=joint_animation(comparisons, str(data.run.get("design_plant", ""))),
         notes=[*([warning] if warning else []), *dict.fromkeys(n for c in comparisons.values() for n in c.left_out)],
+        runs=len(first.pairs),
         stand_in=stand_in_of(first.pairs[0].hardware),
         missing=[("Difference under the same noise", differences)] if isinstance(differences, str) else [],
     )

@@ -17,7 +17,7 @@ from pendulum_bags.figures.table import Table
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.emulator_table import emulator_table
-from pendulum_bags.report.provenance import provenance_table, settings_table
+from pendulum_bags.report.provenance import provenance_table, seed_of, settings_table
 from pendulum_bags.report.terms import Terms
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.runs.run_data import stand_in_of, timing_warning
@@ -43,6 +43,12 @@ SECTIONS = (
 """Order of the sections; one that only a figure or table names comes after these."""
 
 
+OF_ONE_RUN = ("Paired comparison", "Plants under noise", "The thesis's analysis", "Dynamic phase", "Timing")
+"""Sections that show the first run only, where there are several, and say so."""
+_MOST_SEEDS = 3
+"""Seeds at the head of a page; the table of provenance has them all."""
+
+
 @dataclass(frozen=True)
 class Page:
     """What stands on a report.
@@ -62,6 +68,7 @@ class Page:
         stand_in: What stood in for the hardware where none was measured.
         animation: What moves, as :func:`pendulum_bags.report.animation.animation_of` says; None for nothing.
         missing: Figures that the data do not allow, each with the reason.
+        runs: How many runs there are; sections that show the first of several say so.
         unpaired: The answer without pairs, told with the thesis's analysis.
         noise_note: A sentence about noise that was held differently, told there too.
         pictures: The figures as PNG by name, for paper and for readers without scripts.
@@ -81,6 +88,7 @@ class Page:
     animation: Mapping[str, Any] | None = None
     notes: Sequence[str] = ()
     missing: Sequence[tuple[str, str]] = ()
+    runs: int = 1
     unpaired: str = ""
     noise_note: str = ""
     pictures: Mapping[str, bytes] = field(default_factory=dict)
@@ -123,6 +131,7 @@ def page_of(
         animation=animation_of(data),
         notes=[*([warning] if warning else []), *comparison.left_out],
         missing=missing,
+        runs=len(comparison.pairs),
         unpaired=comparison.unpaired_verdict.sentence,
         noise_note=_noise_note(data),
         stand_in=stand_in_of(comparison.pairs[0].hardware),
@@ -167,6 +176,7 @@ def render_page(page: Page) -> str:
         sentence=_without_mark(page.answer),
         signs=SIGNS,
         noise_note=noise_note,
+        of_one_run=OF_ONE_RUN,
         facts=facts,
         sections=sections,
         provenance=provenance,
@@ -193,7 +203,11 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     delay = 1e3 * comparison.delay
     when = f"{abs(delay):.1f} ms {'later' if delay >= 0.0 else 'earlier'} than the simulation"
     facts.append(("hardware answers", when if math.isfinite(delay) else "with no delay that could be told"))
-    facts.append(("seed", str(data.summary.get("seed", "unknown"))))
+    seeds = [seed_of(pair.hardware) for pair in comparison.pairs]
+    if len(seeds) == 1:
+        facts.append(("seed", str(data.summary.get("seed", "unknown"))))
+    else:
+        facts.append(("seeds", ", ".join(seeds[:_MOST_SEEDS]) + (", …" if len(seeds) > _MOST_SEEDS else "")))
     return facts
 
 

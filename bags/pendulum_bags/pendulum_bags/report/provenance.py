@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.comparison.pairs import Pair
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.tables import typeset
+from pendulum_bags.runs.run_data import RunData
+from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import record_named, run_record
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, PlantParameters
 
-__all__ = ["citation", "provenance_table", "settings_table"]
+__all__ = ["citation", "provenance_table", "seed_of", "settings_table"]
 
 _AUTHORS = "Pendulum maintainers"
 _TITLE = "Pendulum: is your simulation good enough to design a controller on?"
@@ -26,19 +29,16 @@ def provenance_table(data: ReportData) -> Table:
     summary, run = data.summary, data.run
     revision = str(run.get("git_revision") or summary.get("git_revision") or "unknown")
     rows: list[tuple[str, str]] = [
-        ("seed", str(summary.get("seed", "unknown"))),
+        # Of several runs each tells its own below.
+        *([("seed", str(summary.get("seed", "unknown")))] if len(data.comparison.pairs) == 1 else []),
         ("effort strategy", str(summary.get("strategy", "unknown"))),
         ("revision", revision),
         *_occasion(data),
     ]
-    for pair in data.comparison.pairs:
-        for one in (pair.simulation, pair.hardware):
-            name = run_record(one.metadata).get("plant", "unknown")
-            rows.append((f"bag of the {one.label}", f"{_short_path(one.source)} (plant {name})"))
-            rows += [(f"damage of the {one.label}'s bag", text) for text in one.damage]
+    rows += _runs(data.comparison.pairs)
     for run_data in data.comparison.own:
         if all(run_data is not pair.simulation for pair in data.comparison.pairs):
-            rows.append((f"bag of the {run_data.label}", _short_path(run_data.source)))
+            rows.append((f"bag of the {run_data.label}", f"{_short_path(run_data.source)} (seed {seed_of(run_data)})"))
     for key in ("controller", "disturbance"):
         if key in run:
             rows.append((key, json.dumps(run[key])))
@@ -51,12 +51,54 @@ def provenance_table(data: ReportData) -> Table:
     rows += [(f"version of {name}", str(version)) for name, version in versions.items()]
     return Table(
         "Provenance",
-        "Everything that is needed to make these figures again: seeds, parameters, versions and the git revision of "
-        "the run (+changes: edits were not committed).",
+        "Everything that is needed to make these figures again: bags, seeds, parameters, versions and the git revision "
+        "of every run (+changes: edits were not committed).",
         ("what", "value"),
         rows,
         "Provenance",
     )
+
+
+def _runs(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
+    """Return the bags of every run; of several runs each run's seed, command, revision and versions too."""
+    rows = []
+    # That of the first run is told already.
+    commands = {"", str(run_record(pairs[0].simulation.metadata).get("command", ""))}
+    for number, pair in enumerate(pairs, start=1):
+        of = f"run {number}, " if len(pairs) > 1 else ""
+        sides = (pair.simulation, pair.hardware)
+        if of:
+            rows.append((f"{of}seed", " and ".join(dict.fromkeys(seed_of(one) for one in sides))))
+        for one in sides:
+            name = run_record(one.metadata).get("plant", "unknown")
+            rows.append((f"{of}bag of the {one.label}", f"{_short_path(one.source)} (plant {name})"))
+            rows += [(f"{of}damage of the {one.label}'s bag", text) for text in one.damage]
+        if of:
+            told = [str(run_record(one.metadata).get("command", "")) for one in sides]
+            rows += [(f"{of}command", command) for command in dict.fromkeys(told) if command not in commands]
+            commands.update(told)
+            made = _made_with(pair)
+            first = number > 1 and made == _made_with(pairs[0])
+            rows.append((f"{of}revision and versions", "as run 1" if first else made))
+    return rows
+
+
+def _made_with(pair: Pair) -> str:
+    """Return with which software a run was recorded, for each side where they differ."""
+    told = {}
+    for one in (pair.simulation, pair.hardware):
+        record = run_record(one.metadata)
+        versions = record.get("versions")
+        names = versions.items() if isinstance(versions, Mapping) else ()
+        parts = (f"git {record.get('git_revision', 'unknown')}", *(f"{name} {version}" for name, version in names))
+        told[one.label] = ", ".join(parts)
+    texts = set(told.values())
+    return texts.pop() if len(texts) == 1 else "; ".join(f"{label}: {text}" for label, text in told.items())
+
+
+def seed_of(run: RunData) -> str:
+    """Return the seed that a run's bag tells."""
+    return str(run_record(run.metadata).get("seed", "unknown"))
 
 
 def _occasion(data: ReportData) -> list[tuple[str, str]]:
@@ -130,5 +172,6 @@ def _plant_in_words(plant: PlantParameters) -> str:
 
 
 def _short_path(path: str) -> str:
-    """Return folder and bag: the rest of the path is nobody else's business."""
-    return "/".join(Path(path).parts[-2:])
+    """Return run folder and bag, of a repeat what lies between: the rest of the path is nobody else's business."""
+    parts = Path(path).parts
+    return "/".join(parts[-4:] if parts[-3:-2] == (REPEATS,) else parts[-2:])

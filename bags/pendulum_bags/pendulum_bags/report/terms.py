@@ -47,8 +47,8 @@ TERMS: Mapping[str, Term] = {
         r"\(ratio\)|[Rr]atios?",
         "The hardware's spread over the simulation's; 1 is equal. Intervals and margins of ratios are symmetric in the "
         "logarithm: 0.87 is as far from 1 as 1.15. Both motions are first taken at the slower plant's "
-        "sampling times, which are the same phases of the noise, and in one band, so the ratio of velocities may differ "
-        "from that of the spreads over all samples.",
+        "sampling times, which are the same phases of the noise, and in one band, so the ratio of velocities may "
+        "differ from that of the spreads over all samples.",
     ),
     "interval": Term(
         "90 % interval, 95 % interval",
