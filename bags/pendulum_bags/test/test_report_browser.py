@@ -70,6 +70,29 @@ def test_page_is_whole_and_usable(page: Any) -> None:
     share = "n => n._fullLayout._size.w / n._fullLayout.width"
     assert page.locator('[data-graph="equivalence-0"]').evaluate(share) > 0.45
 
+    # The result of a test stands beside its name, inside the screen; on a phone every other cell is labelled.
+    tests = page.locator("figure.table", has=page.locator("h3:text-is('Tests against the margins')"))
+    for row in tests.locator("tbody tr").all():
+        name, result = row.locator("th").bounding_box(), row.locator("td.result").bounding_box()
+        assert result["x"] + result["width"] <= page.viewport_size["width"]
+        assert abs(result["y"] - name["y"]) < 2.0
+    cut = "nodes => nodes.filter(n => n.scrollWidth > n.clientWidth + 1).map(n => n.ariaLabel)"
+    assert page.locator(".scroll").evaluate_all(cut) == []
+    label = "n => getComputedStyle(n, '::before').content"
+    narrow = page.viewport_size["width"] == WIDTHS["phone"]
+    first = tests.locator("tbody tr").first.locator("td")
+    assert first.first.evaluate(label) == ('"estimate"' if narrow else "none")
+    assert tests.locator("td.result").first.evaluate(label) == "none"
+    assert tests.locator("td.result").first.inner_text() in {"equivalent", "not equivalent", "undecided"}
+
+    # Long tables open at a click, and not before.
+    metrics = page.locator("figure.table", has=page.locator("h3:text-is('Metrics of the regulation')"))
+    assert metrics.locator("table").is_hidden()
+    assert tests.locator("table").is_visible()
+    metrics.locator("summary").click()
+    assert metrics.locator("table").is_visible()
+    assert page.locator(".scroll").evaluate_all(cut) == []
+
     # By keyboard: a plot takes the focus, zooms, moves and comes back.
     plot = page.locator('[data-graph="both_together-0"]')
     plot.focus()
@@ -108,4 +131,9 @@ def test_paper_shows_every_figure_as_a_picture(browser: Any, report: Path, scrip
         assert box["width"] > 300
         assert box["height"] > 100
         assert figures.nth(index).locator(".graphs").is_hidden()
+    # What is folded on a screen is all there.
+    tables = page.locator("figure.table table")
+    assert page.locator("details table").count() >= 2
+    assert all(one.bounding_box()["height"] > 40 for one in tables.all())
+    assert page.locator("summary").first.is_hidden()
     context.close()

@@ -19,6 +19,7 @@ from pendulum_bags.comparison import Comparison, compare_folders
 from pendulum_bags.figures.figure import ROLES, Figure, Panel, thinned
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.figures.render_plotly import graphs_of
+from pendulum_bags.figures.table import Table
 from pendulum_bags.report import FIGURES, write_report
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.emulator_table import emulator_table
@@ -115,6 +116,7 @@ def test_provenance_tells_when_where_and_by_which_command_and_what_every_node_wa
     assert [value for what, value in rows if what == "computer"] == ["bench · Linux-6 · dds", "robot"]
     settings = settings_table(data)
     assert settings is not None
+    assert settings.folded
     assert dict(settings.rows) == {
         "/sim/simulator": "plant 'thesis'; rate_hz 500.0",
         "/hw/bridge": "velocity_limit 1.5",
@@ -210,6 +212,25 @@ def test_tables_have_a_cell_for_every_heading(comparison: Comparison) -> None:
     for table in tables:
         assert table.rows
         assert all(len(row) == len(table.head) for row in table.rows), table.title
+
+
+def test_a_table_is_wide_where_a_phone_cannot_hold_a_row() -> None:
+    numbers, words = ("a", "1", "2", "3"), ("a", "1", "m", "a long meaning")
+    assert not Table("", "", numbers, [numbers], "").is_wide
+    assert Table("", "", words, [words], "").is_wide
+    assert Table("", "", (*numbers, "4"), [(*numbers, "4")], "").is_wide
+    assert not Table("", "", words[1:], [words[1:]], "").is_wide
+
+
+def test_what_few_read_is_folded_and_the_answers_tables_are_not(comparison: Comparison) -> None:
+    data = ReportData(comparison, comparison.to_json())
+    folded = {table.title: table.folded for table in [*make_tables(data), provenance_table(data)]}
+    assert [title for title, is_folded in folded.items() if is_folded] == [
+        "Metrics of the regulation",
+        "Parameters of the model",
+    ]
+    assert not folded["Tests against the margins"]
+    assert dict(provenance_table(data).rows)["versions"] == "pendulum_bags 0.1.0, python 3.11.0"
 
 
 def test_thinning_keeps_ends_and_extremes() -> None:
@@ -462,6 +483,7 @@ def test_a_report_on_emulated_hardware_lists_the_constants_of_the_emulator(
     table = emulator_table(data)
     assert table is not None
     assert "x5_9" in table.sentence
+    assert table.folded
     assert ("gear_ratio", "1742.22", "–") in [row[:3] for row in table.rows]
     assert "Ω" in {row[0]: row[2] for row in table.rows}["winding_resistance"]
     assert "unit" in table.head

@@ -335,7 +335,7 @@ def test_the_note_below_the_tests_tells_the_ratios_over_all_samples() -> None:
         getattr(hardware, name).std(ddof=1) / getattr(simulation, name).std(ddof=1) for name in ("position", "velocity")
     )
     assert f"hardware per simulation, are {angle:.3g} (angle) and {velocity:.3g} (velocity)." in seen_note(comparison)
-    assert "sampling times and below 20 Hz: of its velocity it shows those phases" in seen_note(comparison)
+    assert "sampling times and below 20 Hz, since its velocity is seen at those phases" in seen_note(comparison)
 
 
 @pytest.mark.parametrize("plant", [MACHINE, SIMULATED.with_values(damping=2 * 11.77)])

@@ -21,6 +21,7 @@ class Table:
         head: Column headings; the first column holds row names.
         rows: Cells as text.
         section: Heading of the section it belongs to.
+        folded: Whether a page shows it only to who asks, for its length; paper shows it always.
     """
 
     title: str
@@ -28,8 +29,14 @@ class Table:
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     section: str
+    folded: bool = False
 
     @property
     def numeric(self) -> list[bool]:
         """Return for each column whether it holds numbers only, which then align to the right."""
         return [all(_NUMERIC.match(row[i]) for row in self.rows) for i in range(len(self.head))]
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether a phone is too narrow for a row, so that its cells stand one below the other there."""
+        return len(self.head) > 4 or (len(self.head) == 4 and not all(self.numeric[1:]))

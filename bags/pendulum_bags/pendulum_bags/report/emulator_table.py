@@ -35,6 +35,7 @@ def emulator_table(data: ReportData) -> Table | None:
         ("constant", "value", "unit", "meaning"),
         rows,
         "Provenance",
+        folded=True,
     )
 
 

@@ -48,7 +48,8 @@ def provenance_table(data: ReportData) -> Table:
     began = _began(data)
     year = f"{began:%Y}" if began else "n.d."
     rows.append(("cite as", citation(str(versions.get("pendulum_bags", "")), revision, year)))
-    rows += [(f"version of {name}", str(version)) for name, version in versions.items()]
+    if versions:
+        rows.append(("versions", ", ".join(f"{name} {version}" for name, version in versions.items())))
     return Table(
         "Provenance",
         "Everything that is needed to make these figures again: bags, seeds, parameters, versions and the git revision "
@@ -142,6 +143,7 @@ def settings_table(data: ReportData) -> Table | None:
         ("node", "parameters"),
         rows,
         "Provenance",
+        folded=True,
     )
 
 

@@ -180,6 +180,7 @@ def _metrics(data: ReportData) -> Table:
         ("metric", "simulation", "hardware", "meaning"),
         rows,
         "Paired comparison",
+        folded=True,
     )
 
 
@@ -230,7 +231,8 @@ def _model(data: ReportData) -> Table | None:
         for spec in PLANT_SPECS
     ]
     sentence = f"Simulation and design of the controller use the plant {plant.name!r}: M θ″ + b θ′ + G sin θ = u + d."
-    return Table("Parameters of the model", sentence, ("parameter", "value", "unit", "meaning"), rows, "Model")
+    head = ("parameter", "value", "unit", "meaning")
+    return Table("Parameters of the model", sentence, head, rows, "Model", folded=True)
 
 
 def _regression(trials: TrialSet) -> list[Table]:

@@ -89,7 +89,7 @@ def seen_note(comparison: Comparison) -> str:
         for key, name in (("std_theta", what), ("std_theta_dot", "velocity"))
         if simulation[key] > 0.0
     )
-    why = ": of its velocity it shows those phases of the noise only" if comparison.is_tested_in_pairs else ""
+    why = ", since its velocity is seen at those phases of the noise only" if comparison.is_tested_in_pairs else ""
     return (
         f"The tests take spreads and distances {comparison.seen}{why}. Over all samples the ratios of std, hardware "
         f"per simulation, are {ratios}."

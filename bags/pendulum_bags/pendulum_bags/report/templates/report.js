@@ -108,6 +108,16 @@
     document.documentElement.dataset.ready = "true";
   }
 
+  // Paper has nothing to click on.
+  let folded = [];
+  window.addEventListener("beforeprint", () => {
+    folded = [...document.querySelectorAll("details:not([open])")];
+    for (const one of folded) one.open = true;
+  });
+  window.addEventListener("afterprint", () => {
+    for (const one of folded) one.open = false;
+  });
+
   loadPlotly().then(drawAll).catch((error) => {
     const notice = element("failure");
     notice.hidden = false;
