@@ -282,6 +282,9 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
         console.print(f"- {sentence}", style=style, markup=False, highlight=False)
     if out is not None:
         console.print(f"wrote {out}", highlight=False)
+        told, command = result.next_step(str(out))
+        # The command is on a line of its own, to be copied.
+        console.print(f"{told}\n  {command}", markup=False, highlight=False, soft_wrap=True)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,11 +112,7 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     left_out = _left_out(fit)
     if left_out is not None:
         said.insert(0, left_out)
-    for name, start, end, value in outliers:
-        said.append(
-            f"{name}, {start:.2f} to {end:.2f} s after its start, fits {value / middle:.0f} times worse than the "
-            "median window: an outside force (a hand?), or a fault of the recording; the robust loss limits its weight."
-        )
+    said += [_told(stretch, middle) for stretch in _stretches(outliers)]
     bound = 2.576 / float(np.sqrt(samples))
     return ResidualTests(
         auto,
@@ -129,6 +126,36 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
         outliers,
         tuple(said),
         incomplete=not independent or bool(missing) or left_out is not None,
+    )
+
+
+Outlier: TypeAlias = tuple[str, float, float, float]
+
+
+def _stretches(outliers: Sequence[Outlier]) -> list[list[Outlier]]:
+    """Return the windows that stand out, those that follow one another together."""
+    stretches: list[list[Outlier]] = []
+    for one in outliers:
+        last = stretches[-1][-1] if stretches else None
+        if last is not None and last[0] == one[0] and one[1] - last[2] < 0.5 * (one[2] - one[1]):
+            stretches[-1].append(one)
+        else:
+            stretches.append([one])
+    return stretches
+
+
+def _told(stretch: Sequence[Outlier], middle: float) -> str:
+    name, start = stretch[0][:2]
+    fewest, most = (f"{find(one[3] for one in stretch) / middle:.0f}" for find in (min, max))
+    times = most if fewest == most else f"{fewest} to {most}"
+    if len(stretch) == 1:
+        why = "an outside force (a hand?), or a fault of the recording"
+    else:
+        times = f"in {len(stretch)} windows {times}"
+        why = "an outside force, a fault of the recording, or a motion that shows more of what the model lacks"
+    return (
+        f"{name}, {start:.2f} to {stretch[-1][2]:.2f} s after its start, fits {times} times worse than the median "
+        f"window: {why}; the robust loss limits the weight."
     )
 
 

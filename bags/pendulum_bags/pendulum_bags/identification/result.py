@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +29,8 @@ from pendulum_bags.identification.selection import Candidate
 from pendulum_bags.identification.uncertainty import Interval, Uncertainty
 from pendulum_bags.identification.window_score import WindowScore
 from pendulum_bags.runs.datasets import INPUT_KINDS, Recording, data_notes, distinct_names
+from pendulum_bags.runs.next_test import next_test_of
+from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
 
@@ -91,6 +94,11 @@ class IdentificationResult:
         """Whether the fit is no model of the recorded motion: it is written to no plant file."""
         return self.explained.refusal is not None
 
+    @property
+    def incomplete(self) -> bool:
+        """Whether the pendulum does something that no candidate model has, or that the fit does not explain."""
+        return self.tests.incomplete or self.explained.doubt is not None
+
     def sentences(self) -> list[str]:
         """Return what there is to say about the fit, most important first."""
         if self.explained.refusal is not None:
@@ -110,6 +118,27 @@ class IdentificationResult:
         if self.score is None:
             said.append("There is one window only: no held-out score; give a longer recording or a shorter --window.")
         return [*said, *self._calibration(), *tests, *self.uncertainty.sentences]
+
+    def next_step(self, plant: str) -> tuple[str, str]:
+        """Return what a plant file is to be tested by, in words and as a command: a fit does not tell what it is for.
+
+        Args:
+            plant: The file, written.
+        """
+        records = [run_record(piece.recording.meta) for piece in self.fit.pieces]
+        command = next(filter(None, (next_test_of(record, plant) for record in records)), "")
+        if not command and any(record.get("plant") == "emulator" for record in records):
+            command = f"python -m pendulum_bags experiment thesis --plant {shlex.quote(plant)}"
+        unseen = "under noise" if command else "on a recording"
+        command = command or f"python -m pendulum_bags replay RECORDING --params {shlex.quote(plant)}"
+        incomplete = "The model is incomplete. " if self.incomplete else ""
+        apart = "Apart from the windows named above, it" if self.tests.outliers else "It"
+        told = (
+            f"{incomplete}{apart} misses {100.0 * self.explained.share:.2g} % of what straight lines through the "
+            "windows miss; whether that is good enough to design a controller on, no fit can say. Test it "
+            f"{unseen} that it was not fitted to:"
+        )
+        return told, command
 
     def _of_the_data(self) -> list[str]:
         said = [f"{name}: {note}" for name, piece in self._named() for note in data_notes(piece.recording)]
@@ -226,7 +255,7 @@ class IdentificationResult:
                 "share": self.explained.share,
                 "refused": self.refused,
             },
-            "incomplete": self.tests.incomplete or self.explained.doubt is not None,
+            "incomplete": self.incomplete,
             "sentences": self.sentences(),
             "data": [fingerprint(recording) for recording in self.fit.recordings],
         }

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
+from pendulum_bags.runs.next_test import next_test_of
+from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 
@@ -14,6 +18,8 @@ __all__ = ["design_plant", "in_words", "same_run_layer", "seen_note"]
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
 """Reasons that a sentence tells with their size; it names the rest, and the table has them all."""
+_MOST_RECORDINGS = 4
+"""Recordings that the command names from which the plant is identified."""
 
 
 def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
@@ -136,7 +142,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     steps = []
     names = {test.quantity for test in failed}
     shapes = {name for name in names if name != "delay" and not name.startswith("mean")}
-    source = comparison.pairs[0].hardware.source or "RUN/hw"
+    source = " ".join(map(shlex.quote, _recordings(comparison))) or "RUN/hw"
     late = next((test for test in failed if test.quantity == "delay"), None)
     foreign = _foreign_simulation(comparison)
     if any(name.startswith("spread") or "less the delay" in name for name in shapes):
@@ -145,7 +151,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
             identify = f"{identify} --plant {design_plant(comparison)}"
         steps.append(
             f"Identify the plant from what the hardware did ({identify}), then "
-            + (f"carry its values over to {foreign}." if foreign else "simulate and design with --plant plant.yaml.")
+            + (f"carry its values over to {foreign}." if foreign else _test_of_the_plant(comparison))
         )
     elif late is not None and foreign:
         # No plant file of ours reaches into it.
@@ -158,6 +164,30 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     if any(name.startswith("mean") for name in names):
         steps.append("Look for an offset: angle_offset or torque_offset in the plant file, or dry friction.")
     return tuple(steps)
+
+
+def _recordings(comparison: Comparison) -> list[str]:
+    """Return the recordings of the hardware to identify it from: those that were compared, as many as a line holds.
+
+    A repeat in lockstep stays upright, where gravity shows little of itself: the run that it repeats comes first, also
+    where it does not count in the comparison, since states that are missing do not harm a fit.
+    """
+    sources = [pair.hardware.source for pair in comparison.pairs if pair.hardware.source]
+    repeated = [path.parents[2] / path.name for path in map(Path, sources) if path.parts[-3:-2] == (REPEATS,)]
+    runs = [str(path) for path in repeated if path.is_dir()]
+    return list(dict.fromkeys([*runs, *sources]))[:_MOST_RECORDINGS]
+
+
+def _test_of_the_plant(comparison: Comparison) -> str:
+    pair = comparison.pairs[0]
+    records = [run_record(run.metadata) for run in (pair.hardware, pair.simulation)]
+    command = next(filter(None, (next_test_of(record, "plant.yaml") for record in records)), "")
+    if not command:
+        return "simulate and design with --plant plant.yaml, and compare again under noise of another seed."
+    return (
+        f"test that file under other noise ({command}). MODEL INCOMPLETE, if identify says so, is no reason to stop: "
+        "the parameters stand in for what the model lacks, and the test tells whether they suffice for this controller."
+    )
 
 
 def _late(test: EquivalenceTest) -> str:

@@ -1,0 +1,188 @@
+"""What a program tells its user to do next leads on: commands that exist, with the recordings and options they need."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer.main
+from typer.testing import CliRunner
+
+from pendulum_bags.comparison import compare
+from pendulum_bags.experiments.experiment_cli import app as experiment_app
+from pendulum_bags.identification.identify import identify
+from pendulum_bags.identification.identify_cli import main
+from pendulum_bags.identification.options import Options
+from pendulum_bags.identification.residual_tests import _stretches, _told
+from pendulum_bags.report.terms import Terms
+from pendulum_bags.runs.datasets import Recording
+from pendulum_bags.runs.next_test import next_test_of
+from pendulum_bags.verdict.same_run import same_run_layer
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from tests.plant_pairs import SIMULATED, pair
+from tests.synthetic_recordings import multisine, synthetic_recording
+
+THESIS = "python -m pendulum_bags experiment thesis"
+QUICK = Options(friction="viscous", folds=2, multi_start=False)
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (THESIS, f"{THESIS} --plant my.yaml --seed 2"),
+        (f"{THESIS} --out /tmp/a --seed 7", f"{THESIS} --plant my.yaml --seed 8"),
+        (f"{THESIS} -o /tmp/a --plant=x.yaml --seed=7", f"{THESIS} --plant my.yaml --seed 8"),
+        (
+            f"{THESIS} --hardware hebi --lab 'my lab.yaml' --yes --q 100 0.01 --plant x --margin delay=8ms",
+            f"{THESIS} --hardware hebi --lab 'my lab.yaml' --q 100 0.01 --margin delay=8ms --plant my.yaml --seed 2",
+        ),
+        (
+            "python -m pendulum_bags experiment joints --plant acrobot --seed x",
+            "python -m pendulum_bags experiment joints --plant my.yaml --seed 2",
+        ),
+        (f"{THESIS} --seed", f"{THESIS} --plant my.yaml --seed 2"),
+        ("python -m pendulum_bags experiment lockstep --side hw --seed 7", ""),
+        ("python -m pendulum_bags experiment", ""),
+        ("python -m pendulum_sim experiment thesis", ""),
+        (f"{THESIS} --lab 'no end", ""),
+        ("", ""),
+    ],
+)
+def test_a_plant_file_is_tested_by_the_recorded_experiment_under_other_noise(command: str, expected: str) -> None:
+    assert next_test_of({"command": command}, "my.yaml") == expected
+
+
+def test_a_record_without_a_command_tells_no_experiment() -> None:
+    assert next_test_of({}, "my.yaml") == ""
+
+
+def test_the_experiment_takes_the_options_of_the_command_that_is_told() -> None:
+    told = shlex.split(next_test_of({"command": f"{THESIS} --hardware hebi"}, "my file.yaml"))
+    assert told[-4:] == ["--plant", "my file.yaml", "--seed", "2"]
+    command = typer.main.get_command(experiment_app).commands["thesis"]  # type: ignore[attr-defined]
+    known = {name for parameter in command.params for name in parameter.opts}
+    assert {word for word in told if word.startswith("--")} <= known
+    assert CliRunner().invoke(experiment_app, ["thesis", "--help"]).exit_code == 0
+
+
+# -- after a comparison that says no ------------------------------------------------------------------------------
+
+
+def slack(sources: list[str], command: str) -> str:
+    """Return the first step that is told after runs whose hardware has twice the damping."""
+    runs = []
+    for number, source in enumerate(sources):
+        simulation, hardware = pair(5 + number, plant=SIMULATED.with_values(damping=2 * 11.77))
+        record = {"pendulum.run": {"command": command, "seed": 5 + number}}
+        runs.append((simulation, replace(hardware, source=source, metadata=record)))
+    return same_run_layer(compare(runs)).next_steps[0]
+
+
+def test_after_a_no_the_plant_is_identified_from_all_runs_and_tested_under_other_noise(tmp_path: Path) -> None:
+    run = tmp_path / "my run"
+    (run / "hw").mkdir(parents=True)
+    first, repeat = run / "hw", run / "repeats" / "1" / "hw"
+    both = f"python -m pendulum_bags identify '{first}' '{repeat}' --out plant.yaml"
+    test = f"{THESIS} --plant plant.yaml --seed 2"
+    step = slack([str(first), str(repeat)], f"{THESIS} --out x")
+    assert f"({both})" in step
+    assert f"({test})" in step
+    assert "MODEL INCOMPLETE" in step
+    marked = Terms().mark(step)
+    assert marked.count("<code>") == 2
+    assert f"<code>{test}</code>" in marked
+    # A repeat stands upright all the while, where gravity hardly shows: the fit has the run, which the test has not.
+    assert f"({both})" in slack([str(repeat)], THESIS)
+    (run / "hw").rmdir()
+    assert f"identify '{repeat}' --out" in slack([str(repeat)], THESIS)
+
+
+def test_after_a_no_of_other_recordings_the_step_names_no_experiment_and_few_recordings() -> None:
+    step = slack([f"/lab/{number}/hw" for number in range(6)], "by hand")
+    assert "identify /lab/0/hw /lab/1/hw /lab/2/hw /lab/3/hw --out plant.yaml" in step
+    assert step.endswith("simulate and design with --plant plant.yaml, and compare again under noise of another seed.")
+    assert "identify RUN/hw --out" in slack([""], "")
+
+
+# -- after an identification ---------------------------------------------------------------------------------------
+
+
+def swing() -> Recording:
+    rng = np.random.default_rng(1)
+    effort = multisine(np.arange(0.0, 6.0, 0.01), 1.2, rng)
+    return synthetic_recording(PlantParameters(inertia=0.05, damping=0.03, gravity=1.5), effort, 0.01, rng)
+
+
+def test_identify_ends_with_the_test_of_the_file_that_it_wrote(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = swing()
+    content = np.column_stack([recording.time, recording.position, recording.input])
+    np.savetxt(tmp_path / "run.csv", content, delimiter=",", header="time,position,torque", comments="")
+    out = tmp_path / "a plant.yaml"
+    arguments = [str(tmp_path / "run.csv"), "--hold", "zero", "--friction", "viscous", "--no-page"]
+    assert main([*arguments, "--out", str(out)]) == 0
+    last = capsys.readouterr().out.strip().splitlines()[-1]
+    assert last == f"  python -m pendulum_bags replay RECORDING --params '{out}'"
+    assert main(arguments) == 0
+    assert "replay" not in capsys.readouterr().out
+
+
+def test_identify_tells_the_experiment_that_recorded_its_data() -> None:
+    recording = swing()
+    result = identify([recording], QUICK, profiles=0)
+
+    def next_step(*records: dict[str, str]) -> tuple[str, str]:
+        pieces = [
+            replace(result.fit.pieces[0], recording=replace(recording, meta={"pendulum.run": one})) for one in records
+        ]
+        return replace(result, fit=replace(result.fit, pieces=pieces)).next_step("my.yaml")
+
+    repeat = {"command": "python -m pendulum_bags experiment lockstep --side hw", "plant": "emulator"}
+    told, command = next_step(repeat, {"command": f"{THESIS} --seed 7", "plant": "hebi"})
+    assert command == f"{THESIS} --plant my.yaml --seed 8"
+    assert told.endswith("Test it under noise that it was not fitted to:")
+    assert next_step(repeat)[1] == f"{THESIS} --plant my.yaml"
+    told, command = next_step({"plant": "hebi"})
+    assert command == "python -m pendulum_bags replay RECORDING --params my.yaml"
+    assert told.endswith("Test it on a recording that it was not fitted to:")
+
+
+def test_the_next_step_says_what_is_missing_and_how_much() -> None:
+    recording = swing()
+    result = identify([recording], QUICK, profiles=0)
+    explained = replace(result.explained, share=0.0432, doubt=None)
+    whole = replace(result, explained=explained, tests=replace(result.tests, incomplete=False, outliers=()))
+    assert whole.next_step("my.yaml")[0].startswith("It misses 4.3 % of what straight lines through the windows miss; ")
+    assert not whole.incomplete
+    outlier = ("run", 1.0, 2.0, 0.1)
+    lacking = replace(whole, tests=replace(whole.tests, incomplete=True, outliers=(outlier,)))
+    assert lacking.next_step("my.yaml")[0].startswith(
+        "The model is incomplete. Apart from the windows named above, it misses 4.3 % of what"
+    )
+    assert replace(whole, explained=replace(explained, doubt="A part is not explained.")).incomplete
+
+
+def test_windows_that_stand_out_one_after_the_other_are_told_as_one_stretch() -> None:
+    outliers = [
+        ("hw", 5.0, 5.99, 0.6),
+        ("hw", 21.0, 21.99, 0.9),
+        ("hw", 22.0, 22.99, 1.2),
+        ("hw", 23.0, 23.99, 1.1),
+        ("hw", 26.0, 26.99, 0.7),
+        ("other", 27.0, 27.99, 0.7),
+    ]
+    stretches = _stretches(outliers)
+    assert [len(one) for one in stretches] == [1, 3, 1, 1]
+    assert _stretches([]) == []
+    alone, together = (_told(one, 0.1) for one in stretches[:2])
+    assert alone.startswith(
+        "hw, 5.00 to 5.99 s after its start, fits 6 times worse than the median window: an outside "
+    )
+    assert "(a hand?)" in alone
+    assert together.startswith("hw, 21.00 to 23.99 s after its start, fits in 3 windows 9 to 12 times worse than the ")
+    assert "what the model lacks" in together
+    assert "fits in 2 windows 6 times worse" in _told([outliers[0], outliers[0]], 0.1)
