@@ -94,12 +94,15 @@ def test_references_that_began_apart_are_no_difference_of_the_plants(tmp_path: P
     simulation = record("sim", "sim", 1.0)
     together = compare_runs(simulation, record("hw", "hw", 1.0))
     assert together.unlike_references == ""
+    assert together.seen == "at the slower plant's sampling times and below 20 Hz"
     assert together.plants["hw"]["rms_tracking_error"] == pytest.approx(
         regulate(rate=100.0, seed=1, hardware=True)["position"].std(), rel=0.1
     )
     apart = compare_runs(simulation, record("hw", "late", 0.0))
     assert apart.verdict.outcome is Outcome.UNDECIDED
     assert "the moving references of both sides were" in apart.verdict.sentence
+    assert apart.is_paired
+    assert apart.seen == "below 20 Hz", "the tests are those without pairs"
     # Five seconds are a whole period: what is said is no matter of where in it the noise began.
     assert float(apart.unlike_references.split(" were ")[1].split()[0]) == pytest.approx(
         0.3 * np.sqrt(2.0) * np.sin(np.pi * 0.2), rel=0.05
@@ -177,6 +180,8 @@ def test_figures_of_several_runs_are_those_of_all_their_samples(tmp_path: Path) 
     (row,) = [row for row in make_tables(ReportData(comparison, {}))[0].rows if row[0] == "noise recorded [s]"]
     assert row[1:] == ("5", "4.98")
     assert make_tables(ReportData(comparison, {}))[0].sentence.startswith("All samples of 2 runs, so that a run counts")
+    alone = compare_folders(folders[:1])
+    assert make_tables(ReportData(alone, {}))[0].sentence.startswith("The controllers ask for at most")
 
 
 def test_the_terminal_says_of_which_samples_its_figures_are(

@@ -7,6 +7,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ import pytest
 from pendulum_bags.comparison import Outcome, compare_runs
 from pendulum_bags.comparison.compare_cli import main
 from pendulum_bags.comparison.pairs import Pair
+from pendulum_bags.report.joint_page import joint_page
 from pendulum_bags.report.report_cli import main as report_main
 from pendulum_bags.runs.run_data import joints_of, read_run
 from pendulum_bags.runs.run_record import RUN_RECORD
+from pendulum_bags.verdict.answer import answer_of_joints
 from pendulum_bags.verdict.joints import join_joints
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 from pendulum_lqr.joint_controller import make_joint_controller
@@ -263,6 +266,16 @@ def test_a_report_shows_each_joint_in_its_own_unit_below_one_answer(report: Path
     drawn = sorted(path.stem for path in (report / "figures").iterdir())
     joined = ["joint_differences", "joint_spectra", "joints_together", "timing"]
     assert drawn == [*(f"equivalence_{joint}" for joint in JOINTS), *joined]
+
+
+def test_a_page_of_several_runs_says_where_it_shows_the_first(bags: dict[str, Path]) -> None:
+    one = {joint: compare_runs(bags["sim"], bags["alike"], joint=joint) for joint in JOINTS}
+    three = {joint: replace(found, pairs=[*found.pairs] * 3) for joint, found in one.items()}
+    for comparisons, runs, words in ((one, 1, "all samples; "), (three, 3, "all samples of the first of 3 runs; ")):
+        page = joint_page(comparisons, answer_of_joints(comparisons), title="", made_at="")
+        assert page.runs == runs
+        sentence = page.tables[0].sentence
+        assert sentence.startswith(f"Spreads are of {words}the tests take both motions at the slower plant's sampling")
 
 
 def test_a_report_moves_the_links_of_both_plants(report: Path, recordings: dict[str, dict[str, np.ndarray]]) -> None:

@@ -34,6 +34,7 @@ QUICK = Options(friction="viscous", folds=2, multi_start=False)
     [
         (THESIS, f"{THESIS} --plant my.yaml --seed 2"),
         (f"{THESIS} --out /tmp/a --seed 7", f"{THESIS} --plant my.yaml --seed 8"),
+        (f"{THESIS} --seed 7 --out 12 --plant 3", f"{THESIS} --plant my.yaml --seed 8"),
         (f"{THESIS} -o /tmp/a --plant=x.yaml --seed=7", f"{THESIS} --plant my.yaml --seed 8"),
         (
             f"{THESIS} --hardware hebi --lab 'my lab.yaml' --yes --q 100 0.01 --plant x --margin delay=8ms",
@@ -96,6 +97,11 @@ def test_after_a_no_the_plant_is_identified_from_all_runs_and_tested_under_other
     assert f"<code>{test}</code>" in marked
     # A repeat stands upright all the while, where gravity hardly shows: the fit has the run, which the test has not.
     assert f"({both})" in slack([str(repeat)], THESIS)
+    # Of a repeat the simulation's side tells the experiment: the hardware's was recorded by a command of its own.
+    simulation, hardware = pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))
+    told = [{"pendulum.run": {"command": command}} for command in (f"{THESIS} --seed 4", "experiment lockstep")]
+    sides = replace(simulation, metadata=told[0]), replace(hardware, metadata=told[1])
+    assert f"({THESIS} --plant plant.yaml --seed 5)" in same_run_layer(compare([sides])).next_steps[0]
     (run / "hw").rmdir()
     assert f"identify '{repeat}' --out" in slack([str(repeat)], THESIS)
 

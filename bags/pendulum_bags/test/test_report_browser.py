@@ -85,6 +85,10 @@ def test_page_is_whole_and_usable(page: Any) -> None:
     assert tests.locator("td.result").first.evaluate(label) == "none"
     assert tests.locator("td.result").first.inner_text() in {"equivalent", "not equivalent", "undecided"}
 
+    # Headings that are labels already take no room on a phone.
+    heading = "n => n.querySelector('tbody').getBoundingClientRect().y - n.getBoundingClientRect().y"
+    assert (tests.locator("table").evaluate(heading) < 5.0) == narrow
+
     # Long tables open at a click, and not before.
     metrics = page.locator("figure.table", has=page.locator("h3:text-is('Metrics of the regulation')"))
     assert metrics.locator("table").is_hidden()
@@ -92,6 +96,15 @@ def test_page_is_whole_and_usable(page: Any) -> None:
     metrics.locator("summary").click()
     assert metrics.locator("table").is_visible()
     assert page.locator(".scroll").evaluate_all(cut) == []
+    # Before the page is printed all are open; then those again that the reader opened.
+    shut = page.locator("details:not([open])")
+    before = shut.count()
+    assert before >= 1
+    page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+    assert shut.count() == 0
+    page.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    assert shut.count() == before
+    assert metrics.locator("table").is_visible()
 
     # By keyboard: a plot takes the focus, zooms, moves and comes back.
     plot = page.locator('[data-graph="both_together-0"]')

@@ -148,6 +148,7 @@ def test_page_is_complete_in_itself_and_small(page: Path) -> None:
     ):
         assert heading in text
     assert "2.687959" in text
+    assert "This section shows run 1" not in text
 
 
 def test_every_term_that_the_page_links_has_its_sentence_and_every_command_is_set_as_code(page: Path) -> None:
@@ -401,6 +402,10 @@ def test_a_pooled_run_of_other_software_tells_its_own(comparison: Comparison) ->
     assert dict(rows)["run 2, revision and versions"] == "git unknown"
     assert dict(rows)["run 1, command"] == "again"
     assert "run 2, command" not in dict(rows)
+    rows = provenance_table(ReportData(replace(comparison, pairs=[bare, bare]), {})).rows
+    assert not [what for what, _ in rows if what.endswith("command")]
+    rows = provenance_table(ReportData(replace(comparison, pairs=[pair, other, other]), {})).rows
+    assert [what for what, _ in rows if what.endswith("command")] == ["run 2, command"]
 
 
 def test_the_head_of_a_page_names_some_seeds_of_many(comparison: Comparison) -> None:

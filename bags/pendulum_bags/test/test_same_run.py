@@ -29,8 +29,10 @@ from pendulum_bags.report.figures import comparison_figures
 from pendulum_bags.report.tables import tests_table as table_of_tests
 from pendulum_bags.verdict import Mark
 from pendulum_bags.verdict.same_run import in_words, same_run_layer, seen_note
+from pendulum_bags.verdict.terminal import print_tests
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.programs.terminal import make_console
 from tests.benchmarks.bench_verdict import DEFAULT_LOOKS, DIFFERENCES, ON_THE_MARGIN, margins_at, run_trial
 from tests.plant_pairs import MACHINE, SIMULATED, pair, record
 
@@ -326,6 +328,38 @@ def test_a_headline_of_unpaired_runs_does_not_speak_of_common_times() -> None:
     slow = replace(hardware, window=hardware.window.between(0.0, 1e9))
     assert compare([(simulation, slow)]).seen == "at the slower plant's sampling times and below 20 Hz"
     assert "sampling times" not in seen_note(apart)
+
+
+def test_the_band_of_the_tests_is_that_of_the_slowest_plant_of_all_runs() -> None:
+    simulation, _ = pair(6)
+    slow = record(MACHINE, rate=40.0, seed=6, duration=5.0, label="hardware")
+    assert compare([pair(5), (simulation, slow)]).band == pytest.approx(16.0)
+    assert compare([(slow, record(MACHINE, rate=100.0, seed=6, duration=5.0))]).band == pytest.approx(16.0)
+    apart = compare([pair(5), (replace(simulation, disturbance=None), slow)])
+    assert apart.seen == "below 16 Hz"
+
+
+def test_without_pairs_the_note_tells_the_ratio_to_the_simulation_that_was_tested() -> None:
+    simulation, hardware = pair(5)
+    own = record(SIMULATED.with_values(damping=2 * 11.77), rate=500.0, seed=8, duration=5.0)
+    apart = compare([(replace(simulation, disturbance=None), hardware)], own=[own])
+    ratio = hardware.window.velocity.std(ddof=1) / own.window.velocity.std(ddof=1)
+    assert f"and {ratio:.3g} (velocity)" in seen_note(apart)
+
+
+def test_the_note_leaves_out_the_ratio_to_a_simulation_that_tells_no_velocity() -> None:
+    comparison = compare([pair(5)])
+    (one,) = comparison.pairs
+    window = replace(one.simulation.window, velocity=np.zeros_like(one.simulation.window.velocity))
+    still = replace(comparison, pairs=[replace(one, simulation=replace(one.simulation, window=window))])
+    assert seen_note(still).endswith("(angle).")
+
+
+def test_the_note_speaks_of_emulated_hardware_where_no_machine_was_measured(capsys: pytest.CaptureFixture[str]) -> None:
+    simulation, hardware = pair(5)
+    emulated = compare([(simulation, replace(hardware, metadata={"pendulum.run": {"plant": "emulator"}}))])
+    print_tests(make_console(), emulated)
+    assert "emulated hardware per simulation" in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_note_below_the_tests_tells_the_ratios_over_all_samples() -> None:
