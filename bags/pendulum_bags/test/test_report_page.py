@@ -402,6 +402,9 @@ def test_a_pooled_run_of_other_software_tells_its_own(comparison: Comparison) ->
     assert dict(rows)["run 2, revision and versions"] == "git unknown"
     assert dict(rows)["run 1, command"] == "again"
     assert "run 2, command" not in dict(rows)
+    told_first = replace(pair, simulation=other.hardware)
+    rows = provenance_table(ReportData(replace(comparison, pairs=[told_first, bare]), {})).rows
+    assert [what for what, _ in rows if what.endswith("command")] == ["command"]
     rows = provenance_table(ReportData(replace(comparison, pairs=[bare, bare]), {})).rows
     assert not [what for what, _ in rows if what.endswith("command")]
     rows = provenance_table(ReportData(replace(comparison, pairs=[pair, other, other]), {})).rows

@@ -332,6 +332,10 @@ def test_a_headline_of_unpaired_runs_does_not_speak_of_common_times() -> None:
 
 def test_the_band_of_the_tests_is_that_of_the_slowest_plant_of_all_runs() -> None:
     simulation, _ = pair(6)
+    fast = record(MACHINE, rate=200.0, seed=6, duration=5.0, label="hardware")
+    both = compare([(simulation, fast), pair(5)], margin="band=60Hz")
+    assert both.is_tested_in_pairs
+    assert both.seen == "at the slower plant's sampling times and below 40 Hz"
     slow = record(MACHINE, rate=40.0, seed=6, duration=5.0, label="hardware")
     assert compare([pair(5), (simulation, slow)]).band == pytest.approx(16.0)
     assert compare([(slow, record(MACHINE, rate=100.0, seed=6, duration=5.0))]).band == pytest.approx(16.0)
