@@ -416,7 +416,10 @@ def test_the_head_of_a_page_names_some_seeds_of_many(comparison: Comparison) -> 
     data = ReportData(many, {"seed": 7})
     page = page_of(data, [], [], [], title="", made_at="")
     assert dict(page.facts)["seeds"] == "1, 1, 1, …"
-    assert dict(page_of(ReportData(comparison, {"seed": 7}), [], [], [], title="", made_at="").facts)["seed"] == "7"
+    assert "paths apart (rms), run 1" in dict(page.facts)
+    alone = dict(page_of(ReportData(comparison, {"seed": 7}), [], [], [], title="", made_at="").facts)
+    assert alone["seed"] == "7"
+    assert "paths apart (rms)" in alone
 
 
 def test_trials_alone_point_to_the_command_that_shows_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

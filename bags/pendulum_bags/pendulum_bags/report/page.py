@@ -199,7 +199,8 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
         ("std of θ, hardware", quantity(plants["hw"]["std_theta"], "rad")),
     ]
     if comparison.is_paired:
-        facts.append(("paths apart (rms)", quantity(float(pair.as_dict()["rms_position"]), "rad")))
+        of = ", run 1" if len(comparison.pairs) > 1 else ""
+        facts.append((f"paths apart (rms){of}", quantity(float(pair.as_dict()["rms_position"]), "rad")))
     delay = 1e3 * comparison.delay
     when = f"{abs(delay):.1f} ms {'later' if delay >= 0.0 else 'earlier'} than the simulation"
     facts.append(("hardware answers", when if math.isfinite(delay) else "with no delay that could be told"))
