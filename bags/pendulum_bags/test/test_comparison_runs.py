@@ -179,7 +179,9 @@ def test_figures_of_several_runs_are_those_of_all_their_samples(tmp_path: Path) 
     assert plant["rate_hz"] == pytest.approx(100.0)
     (row,) = [row for row in make_tables(ReportData(comparison, {}))[0].rows if row[0] == "noise recorded [s]"]
     assert row[1:] == ("5", "4.98")
-    assert make_tables(ReportData(comparison, {}))[0].sentence.startswith("All samples of 2 runs, so that a run counts")
+    assert make_tables(ReportData(comparison, {}))[0].sentence.startswith(
+        "All samples of 2 runs, so that a run counts by their number"
+    )
     alone = compare_folders(folders[:1])
     assert make_tables(ReportData(alone, {}))[0].sentence.startswith("The controllers ask for at most")
 

@@ -19,7 +19,7 @@ from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.residual_tests import _stretches, _told
 from pendulum_bags.report.terms import Terms
 from pendulum_bags.runs.datasets import Recording
-from pendulum_bags.runs.next_test import next_test_of
+from pendulum_bags.runs.next_test import next_test_of, question_of
 from pendulum_bags.verdict.same_run import same_run_layer
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from tests.plant_pairs import SIMULATED, pair
@@ -45,6 +45,11 @@ QUICK = Options(friction="viscous", folds=2, multi_start=False)
             "python -m pendulum_bags experiment joints --plant my.yaml --seed 2",
         ),
         (f"{THESIS} --seed", f"{THESIS} --plant my.yaml --seed 2"),
+        (f"{THESIS} --seed 3 -o/tmp/a --seed 5", f"{THESIS} --plant my.yaml --seed 6"),
+        (
+            f"{THESIS} --simulation my.xml --mapping my.map --design-plant x",
+            f"{THESIS} --design-plant x --plant my.yaml --seed 2",
+        ),
         ("python -m pendulum_bags experiment lockstep --side hw --seed 7", ""),
         ("python -m pendulum_bags experiment", ""),
         ("python -m pendulum_sim experiment thesis", ""),
@@ -53,20 +58,37 @@ QUICK = Options(friction="viscous", folds=2, multi_start=False)
     ],
 )
 def test_a_plant_file_is_tested_by_the_recorded_experiment_under_other_noise(command: str, expected: str) -> None:
-    assert next_test_of({"command": command}, "my.yaml") == expected
+    assert next_test_of([{"command": command}], "my.yaml") == expected
 
 
 def test_a_record_without_a_command_tells_no_experiment() -> None:
-    assert next_test_of({}, "my.yaml") == ""
+    assert next_test_of([{}], "my.yaml") == ""
+    assert next_test_of([], "my.yaml") == ""
 
 
 def test_the_experiment_takes_the_options_of_the_command_that_is_told() -> None:
-    told = shlex.split(next_test_of({"command": f"{THESIS} --hardware hebi"}, "my file.yaml"))
+    told = shlex.split(next_test_of([{"command": f"{THESIS} --hardware hebi"}], "my file.yaml"))
     assert told[-4:] == ["--plant", "my file.yaml", "--seed", "2"]
     command = typer.main.get_command(experiment_app).commands["thesis"]  # type: ignore[attr-defined]
     known = {name for parameter in command.params for name in parameter.opts}
     assert {word for word in told if word.startswith("--")} <= known
     assert CliRunner().invoke(experiment_app, ["thesis", "--help"]).exit_code == 0
+
+
+def test_noise_of_no_recording_that_is_fitted_to_is_the_test() -> None:
+    records = [{"command": f"{THESIS} --seed {seed}", "seed": seed} for seed in (2, 1, 3)]
+    assert next_test_of(records, "my.yaml") == f"{THESIS} --plant my.yaml --seed 4"
+    assert next_test_of([{}, {"seed": 2}, *records[1:2]], "my.yaml") == f"{THESIS} --plant my.yaml --seed 3"
+
+
+@pytest.mark.parametrize("told", ["", "--hardware emulator", "--hardware=emulator", "--q 1 1"])
+def test_an_emulator_is_moved_without_a_question(told: str) -> None:
+    assert question_of(f"{THESIS} {told}") == ""
+
+
+@pytest.mark.parametrize("told", ["--hardware hebi", "--hardware=hebi", "--hardware ros:/lab"])
+def test_of_a_command_that_may_move_a_machine_it_is_said_that_it_asks(told: str) -> None:
+    assert "it asks first" in question_of(f"{THESIS} {told}")
 
 
 # -- after a comparison that says no ------------------------------------------------------------------------------
@@ -151,7 +173,12 @@ def test_identify_tells_the_experiment_that_recorded_its_data() -> None:
     told, command = next_step(repeat, {"command": f"{THESIS} --seed 7", "plant": "hebi"})
     assert command == f"{THESIS} --plant my.yaml --seed 8"
     assert told.endswith("Test it under noise that it was not fitted to:")
-    assert next_step(repeat)[1] == f"{THESIS} --plant my.yaml"
+    assert "it asks first" not in told
+    assert next_step(repeat)[1] == f"{THESIS} --plant my.yaml --seed 2"
+    assert next_step({**repeat, "seed": 2})[1] == f"{THESIS} --plant my.yaml --seed 3"
+    told, command = next_step({"command": f"{THESIS} --hardware hebi --lab my.yaml", "plant": "hebi"})
+    assert "--hardware hebi" in command
+    assert told.endswith("not fitted to. Where that moves a machine, it asks first:")
     told, command = next_step({"plant": "hebi"})
     assert command == "python -m pendulum_bags replay RECORDING --params my.yaml"
     assert told.endswith("Test it on a recording that it was not fitted to:")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import os
 import sqlite3
 import struct
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.storage import (
     QosProfile,
+    exchange,
     message_type,
     metadata_file,
     open_writer,
@@ -159,28 +161,111 @@ def test_large_messages_continue_on_overflow_pages(tmp_path: Path) -> None:
     assert [len(stored.message.data) for stored in read_bag(bag)["/s"]] == sizes
 
 
-def test_new_counts_are_written_over_the_old_ones_and_any_mixture_of_both_is_metadata(tmp_path: Path) -> None:
-    """To replace the file at each seal would cost more than all else; in the middle of one, it must be readable too."""
-    bag, texts = tmp_path / "bag", []
+def _descriptors() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def _told(bag: Path) -> dict[str, Any]:
+    told: dict[str, Any] = yaml.safe_load((bag / "metadata.yaml").read_bytes())["rosbag2_bagfile_information"]
+    return told
+
+
+def test_two_files_of_metadata_take_turns_and_leave_nothing_behind(tmp_path: Path) -> None:
+    """To make a new one at each seal would cost more than all else."""
+    bag, places, before = tmp_path / "bag", [], _descriptors()
     with open_writer(bag) as writer:
         writer.add_topic("/a", JOINT_STATE)
-        places = set()
-        for index in range(3):
-            writer.write("/a", 10**18 * index + 10**15, state(index))
+        for index in range(12):
+            writer.write("/a", 10**index, state(index))
+            note = "x" * (index % 8 < 4) * 600
+            if index % 4 == 0:
+                writer.update_metadata({"pendulum.note": note})
             writer.seal()
-            texts.append((bag / "metadata.yaml").read_bytes())
-            places.add((bag / "metadata.yaml").stat().st_ino)
-        assert len(places) == 1
-    assert len({len(text) for text in texts}) == 1
-    for old, new in pairwise(texts):
-        # A write is done byte by byte at worst.
-        for cut in range(len(old)):
-            if new[cut : cut + 1] != old[cut : cut + 1]:
-                told = yaml.safe_load(new[:cut] + old[cut:])["rosbag2_bagfile_information"]
-                assert told["topics_with_message_count"][0]["message_count"] in (0, 1, 2, 3)
-                assert told["storage_identifier"] == "mcap"
-    assert b" \n" in texts[0]
-    assert b" \n" not in (bag / "metadata.yaml").read_bytes()
+            told = _told(bag)
+            assert told["message_count"] == told["topics_with_message_count"][0]["message_count"] == index + 1
+            assert told["custom_data"]["pendulum.note"] == note
+            places.append((bag / "metadata.yaml").stat().st_ino)
+        assert len(set(places)) == 2
+    assert sorted(path.name for path in bag.iterdir()) == ["bag_0.mcap", "metadata.yaml"]
+    assert _descriptors() == before
+
+
+@pytest.mark.parametrize("how", ["close", "abandon", "replaced", "renamed"])
+def test_no_file_of_metadata_stays_open(tmp_path: Path, how: str) -> None:
+    before = _descriptors()
+    for number in range(3):
+        bag = tmp_path / str(number)
+        writer = open_writer(bag)
+        writer.add_topic("/a", JOINT_STATE)
+        for index in range(4):
+            writer.write("/a", index, state(index))
+            writer.seal()
+            if how == "replaced":
+                (bag / "own").write_text("mine")
+                (bag / "own").replace(bag / "metadata.yaml")
+        if how == "renamed":
+            bag.rename(tmp_path / f"{number}_elsewhere")
+            with pytest.raises(FileNotFoundError):
+                writer.close()
+        elif how == "abandon":
+            writer.abandon()
+            assert sorted(path.name for path in bag.iterdir()) == [f"{number}_0.mcap", "metadata.yaml"]
+        else:
+            writer.close()
+    assert _descriptors() == before
+
+
+@pytest.mark.parametrize("written", [0, 900])
+def test_a_kill_in_the_middle_of_new_metadata_leaves_the_old(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    bag = tmp_path / "bag"
+    with open_writer(bag) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        for index in range(4):
+            writer.write("/a", index, state(index))
+            writer.seal()
+        old, write = (bag / "metadata.yaml").read_bytes(), os.pwrite
+
+        def killed(descriptor: int, data: bytes, at: int) -> int:
+            if data[:7] != b"rosbag2":
+                return write(descriptor, data, at)
+            write(descriptor, data[:written], at)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(metadata_file.os, "pwrite", killed)
+        writer.write("/a", 4, state(4))
+        with pytest.raises(KeyboardInterrupt):
+            writer.seal()
+        assert (bag / "metadata.yaml").read_bytes() == old
+
+
+@pytest.mark.parametrize("code", [errno.EINVAL, errno.ENOSYS, None])
+def test_where_files_cannot_exchange_their_names_metadata_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None
+) -> None:
+    def refuse(*_: object) -> int:
+        ctypes.set_errno(code or 0)
+        return -1
+
+    monkeypatch.setattr(exchange, "_renameat2", lambda: refuse if code else None)
+    bag = tmp_path / "bag"
+    with open_writer(bag) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        for index in range(4):
+            writer.write("/a", index, state(index))
+            writer.seal()
+            assert _told(bag)["message_count"] == index + 1
+            assert sorted(path.name for path in bag.iterdir()) == ["bag_0.mcap", "metadata.yaml"]
+
+
+def test_an_exchange_that_is_refused_says_of_what(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("a")
+    with pytest.raises(FileNotFoundError, match=r"a.*->.*b"):
+        exchange.exchange(tmp_path / "a", tmp_path / "b")
+    (tmp_path / "b").write_text("b")
+    assert exchange.exchange(tmp_path / "a", tmp_path / "b")
+    assert (tmp_path / "a").read_text() == "b"
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -197,15 +282,17 @@ def test_a_bag_that_is_taken_away_while_it_is_written_is_noticed_at_the_next_sea
     assert set(count_everywhere(tmp_path / "elsewhere")) == {2}
 
 
-def test_metadata_that_somebody_replaced_is_replaced_again(tmp_path: Path) -> None:
+def test_metadata_that_somebody_replaced_is_replaced_again_and_does_not_come_back(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     with open_writer(bag) as writer:
         writer.add_topic("/a", JOINT_STATE)
-        (bag / "own").write_text("mine")
-        (bag / "own").replace(bag / "metadata.yaml")
-        writer.write("/a", 0, state(0))
-        writer.seal()
-        assert set(count_everywhere(bag)) == {1}
+        for index in range(6):
+            if index % 3 == 0:
+                (bag / "own").write_text("mine")
+                (bag / "own").replace(bag / ("metadata.yaml" if index else ".metadata.yaml.tmp"))
+            writer.write("/a", index, state(index))
+            writer.seal()
+            assert set(count_everywhere(bag)) == {index + 1}
 
 
 def test_counts_that_a_full_disk_cuts_short_are_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,14 +303,11 @@ def test_counts_that_a_full_disk_cuts_short_are_written_anew(tmp_path: Path, mon
         writer.seal()
         write = os.pwrite
         monkeypatch.setattr(
-            metadata_file.os,
-            "pwrite",
-            lambda fd, data, at: write(fd, data[:9], at) if data[:4] == b"rosb" else write(fd, data, at),
+            metadata_file.os, "pwrite", lambda fd, data, at: write(fd, data[: 9 if data[:4] == b"rosb" else None], at)
         )
         writer.write("/a", 1, state(1))
         writer.seal()
-        told = yaml.safe_load((bag / "metadata.yaml").read_bytes())["rosbag2_bagfile_information"]
-        assert told["message_count"] == 2
+        assert _told(bag)["message_count"] == 2
 
 
 def test_a_bag_is_never_overwritten(tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ class Comparison:
 
     @property
     def plants(self) -> dict[str, dict[str, Any]]:
-        """Figures of each plant over all samples of its runs, so that a run counts by its length, as in the tests."""
+        """Figures of each plant over all samples of its runs, so that a run counts by their number, as in the tests."""
         groups = {
             "sim": [pair.simulation for pair in self.pairs],
             "hw": [pair.hardware for pair in self.pairs],
@@ -332,12 +332,12 @@ def _pool(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         return dict(rows[0])
     counts = [row["samples"] for row in rows]
     pooled: dict[str, Any] = {}
-    for key, value in rows[0].items():
+    for key in dict.fromkeys(key for row in rows for key in row):
         values: list[Any] = [row.get(key) for row in rows]
         if None in values:
             pooled[key] = None
         elif key in _SUMS:
-            pooled[key] = sum(values, type(value)())
+            pooled[key] = sum(values, type(values[0])())
         elif key == "max_abs_u":
             pooled[key] = max(values)
         elif key in _ROOTS_OF_SQUARES:

@@ -29,7 +29,7 @@ from pendulum_bags.identification.selection import Candidate
 from pendulum_bags.identification.uncertainty import Interval, Uncertainty
 from pendulum_bags.identification.window_score import WindowScore
 from pendulum_bags.runs.datasets import INPUT_KINDS, Recording, data_notes, distinct_names
-from pendulum_bags.runs.next_test import next_test_of
+from pendulum_bags.runs.next_test import next_test_of, question_of
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
@@ -126,9 +126,9 @@ class IdentificationResult:
             plant: The file, written.
         """
         records = [run_record(piece.recording.meta) for piece in self.fit.pieces]
-        command = next(filter(None, (next_test_of(record, plant) for record in records)), "")
-        if not command and any(record.get("plant") == "emulator" for record in records):
-            command = f"python -m pendulum_bags experiment thesis --plant {shlex.quote(plant)}"
+        if any(record.get("plant") == "emulator" for record in records):
+            records.append({"command": "python -m pendulum_bags experiment thesis"})
+        command = next_test_of(records, plant)
         unseen = "under noise" if command else "on a recording"
         command = command or f"python -m pendulum_bags replay RECORDING --params {shlex.quote(plant)}"
         incomplete = "The model is incomplete. " if self.incomplete else ""
@@ -136,9 +136,9 @@ class IdentificationResult:
         told = (
             f"{incomplete}{apart} misses {100.0 * self.explained.share:.2g} % of what straight lines through the "
             "windows miss; whether that is good enough to design a controller on, no fit can say. Test it "
-            f"{unseen} that it was not fitted to:"
+            f"{unseen} that it was not fitted to.{question_of(command)}"
         )
-        return told, command
+        return f"{told.removesuffix('.')}:", command
 
     def _of_the_data(self) -> list[str]:
         said = [f"{name}: {note}" for name, piece in self._named() for note in data_notes(piece.recording)]

@@ -62,7 +62,7 @@ def _plants(data: ReportData) -> Table:
     ]
     sim, hw = plants["sim"], plants["hw"]
     runs = len(data.comparison.pairs)
-    pooled = f"All samples of {runs} runs, so that a run counts by its length. " if runs > 1 else ""
+    pooled = f"All samples of {runs} runs, so that a run counts by their number. " if runs > 1 else ""
     sentence = (
         f"{pooled}The controllers ask for at most {quantity(max(sim['max_abs_u'], hw['max_abs_u']), 'N m')}; "
         f"{int(sim['missed_deadlines'])} deadlines were missed in simulation and {int(hw['missed_deadlines'])} on "

@@ -3,28 +3,43 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
+from itertools import count, pairwise
 from typing import Any
 
-__all__ = ["next_test_of"]
+__all__ = ["next_test_of", "question_of"]
 
 _EXPERIMENTS = ("thesis", "joints")
-_REPLACED = ("--plant", "--seed", "--out", "-o")
-"""Options, each with a value, that the test has of its own: noise that a fit has seen is no test of it."""
+_REPLACED = ("--plant", "--seed", "--out", "-o", "--simulation", "--mapping")
+"""Options, each with a value, that the test has of its own: noise that a fit has seen is no test of it, and somebody
+else's simulation would stand where the plant is to."""
 _LEFT_OUT = ("--yes",)
 """Nobody is to be spared the question whether a machine may move."""
 
 
-def next_test_of(record: Mapping[str, Any], plant: str) -> str:
+def next_test_of(records: Sequence[Mapping[str, Any]], plant: str) -> str:
     """Return the command that runs a recorded experiment again with another plant and other noise.
 
     Args:
-        record: What a bag says of its run.
+        records: What bags say of their runs; the first that was an experiment is run again, under noise of none.
         plant: The plant file.
 
     Returns:
-        The command; empty where the record tells of no experiment that compares two plants.
+        The command; empty where no record tells of an experiment that compares two plants.
     """
+    seen = {str(record.get("seed", "")) for record in records}
+    return next(filter(None, (_again(record, plant, seen) for record in records)), "")
+
+
+def question_of(command: str) -> str:
+    """Return the sentence to set behind a command that may move a machine; empty behind one that moves an emulator."""
+    words = shlex.split(command)
+    hardware = [value for name, value in pairwise(words) if name == "--hardware"]
+    hardware += [word.partition("=")[2] for word in words if word.startswith("--hardware=")]
+    return " Where that moves a machine, it asks first." if set(hardware) - {"emulator"} else ""
+
+
+def _again(record: Mapping[str, Any], plant: str, seen: Set[str]) -> str:
     try:
         words = shlex.split(str(record.get("command", "")))
     except ValueError:  # a quote without its end: by hand
@@ -38,6 +53,8 @@ def next_test_of(record: Mapping[str, Any], plant: str) -> str:
         if name in _REPLACED:
             value = value if has_value else next(rest, "")
             seed = value if name == "--seed" else seed
-        elif name not in _LEFT_OUT:
+        elif name not in _LEFT_OUT and not (word.startswith("-o") and word[1:2] != "-"):
             kept.append(word)
-    return shlex.join([*kept, "--plant", plant, "--seed", str(int(seed) + 1 if seed.isdecimal() else 2)])
+    first = int(seed) + 1 if seed.isdecimal() else 2
+    unseen = next(number for number in count(first) if str(number) not in seen)
+    return shlex.join([*kept, "--plant", plant, "--seed", str(unseen)])

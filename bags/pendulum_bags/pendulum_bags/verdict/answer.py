@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -57,7 +58,8 @@ def answer_of_joints(comparisons: Mapping[str, Comparison], folders: Sequence[Pa
     joined = join_joints({joint: same_run_layer(one) for joint, one in comparisons.items()})
     kept = [one for folder in folders for one in read_layers(folder) if one.layer is not Layer.SAME_RUN]
     asked = {one.layer for one in (joined, *kept)}
-    command = f"python -m pendulum_bags experiment joints --plant {design_plant(next(iter(comparisons.values())))}"
+    plant = shlex.quote(design_plant(next(iter(comparisons.values()))))
+    command = f"python -m pendulum_bags experiment joints --plant {plant}"
     others = [
         LayerResult(layer, Mark.NOT_MEASURED, f"Not asked: {_HOW[layer].format(command)}")
         for layer in Layer

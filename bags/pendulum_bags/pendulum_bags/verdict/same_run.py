@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
-from pendulum_bags.runs.next_test import next_test_of
+from pendulum_bags.runs.next_test import next_test_of, question_of
 from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
@@ -148,7 +148,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     if any(name.startswith("spread") or "less the delay" in name for name in shapes):
         identify = f"python -m pendulum_bags identify {source} --out plant.yaml"
         if comparison.pairs[0].hardware.joint:
-            identify = f"{identify} --plant {design_plant(comparison)}"
+            identify = f"{identify} --plant {shlex.quote(design_plant(comparison))}"
         steps.append(
             f"Identify the plant from what the hardware did ({identify}), then "
             + (f"carry its values over to {foreign}." if foreign else _test_of_the_plant(comparison))
@@ -179,14 +179,14 @@ def _recordings(comparison: Comparison) -> list[str]:
 
 
 def _test_of_the_plant(comparison: Comparison) -> str:
-    pair = comparison.pairs[0]
-    records = [run_record(run.metadata) for run in (pair.hardware, pair.simulation)]
-    command = next(filter(None, (next_test_of(record, "plant.yaml") for record in records)), "")
+    sides = [run for pair in comparison.pairs for run in (pair.hardware, pair.simulation)]
+    command = next_test_of([run_record(run.metadata) for run in sides], "plant.yaml")
     if not command:
         return "simulate and design with --plant plant.yaml, and compare again under noise of another seed."
     return (
         f"test that file under other noise ({command}). MODEL INCOMPLETE, if identify says so, is no reason to stop: "
-        "the parameters stand in for what the model lacks, and the test tells whether they suffice for this controller."
+        "the parameters stand in for what the model lacks, and the test tells whether they suffice for this "
+        f"controller.{question_of(command)}"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pendulum_rosbag.storage.exchange import exchange
 from pendulum_rosbag.storage.message_types import MessageType
 from pendulum_rosbag.storage.qos import QosProfile
 
@@ -26,8 +28,6 @@ __all__ = [
 
 METADATA_NAME = "metadata.yaml"
 METADATA_VERSION = 9
-_WIDTH = 19
-"""Digits of the largest 64-bit integer."""
 
 # YAML allows these only escaped, JSON leaves them as they are.
 _PLAIN = re.compile("cdr|[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)+")
@@ -80,8 +80,9 @@ class MetadataFile:
     """Renders and replaces ``metadata.yaml`` of one bag.
 
     A recorder rewrites the file many times a second, so the text of topics and run metadata is kept and only the
-    numbers are rendered anew. They keep their places while the file is written, so that new ones are written over the
-    old ones: to replace a file costs ext4 300 times as much, since it allocates the new one's place at once.
+    numbers are rendered anew. And two files take turns: the next text is written over the one before the last, and they
+    exchange their names. To make a new file each time, and to give it the name of another, costs ext4 thirty times as
+    much.
 
     Args:
         folder: Folder of the bag.
@@ -99,20 +100,11 @@ class MetadataFile:
         self._key: tuple[Any, ...] | None = None
         self._topic_texts: list[str] = []
         self._custom_text = ""
-        self._fd = -1
-        self._size = 0
+        # Descriptors of the file that is seen, and of the one that was before.
+        self._seen = self._spare = -1
 
-    def render(
-        self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str], width: int = 0
-    ) -> str:
-        """Return the text for these topics, storage files (in order of time) and run metadata.
-
-        Args:
-            topics: With the numbers of their messages.
-            files: Storage files, in order of time.
-            custom_data: Run metadata.
-            width: Characters that each number takes at least, with blanks behind it.
-        """
+    def render(self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]) -> str:
+        """Return the text for these topics, storage files (in order of time) and run metadata."""
         filled = [file for file in files if file.count]
         start = min((file.start_ns for file in filled), default=0)
         stop = max((file.stop_ns for file in filled), default=0)
@@ -125,21 +117,20 @@ class MetadataFile:
             "rosbag2_bagfile_information:\n"
             f"  version: {METADATA_VERSION}\n"
             f"  storage_identifier: {self._storage}\n"
-            f"  duration:\n    nanoseconds: {stop - start:<{width}}\n"
-            f"  starting_time:\n    nanoseconds_since_epoch: {start:<{width}}\n"
-            f"  message_count: {sum(topic.count for topic in topics):<{width}}\n"
+            f"  duration:\n    nanoseconds: {stop - start}\n"
+            f"  starting_time:\n    nanoseconds_since_epoch: {start}\n"
+            f"  message_count: {sum(topic.count for topic in topics)}\n"
             f"  topics_with_message_count:{'' if topics else ' []'}\n"
         )
         body = "".join(
-            f"{text}      message_count: {topic.count:<{width}}\n"
-            for text, topic in zip(self._topic_texts, topics, strict=True)
+            f"{text}      message_count: {topic.count}\n" for text, topic in zip(self._topic_texts, topics, strict=True)
         )
         paths = "".join(f"    - {yaml_string(file.name)}\n" for file in files)
         entries = "".join(
             f"    - path: {yaml_string(file.name)}\n"
-            f"      starting_time:\n        nanoseconds_since_epoch: {file.start_ns:<{width}}\n"
-            f"      duration:\n        nanoseconds: {file.stop_ns - file.start_ns:<{width}}\n"
-            f"      message_count: {file.count:<{width}}\n"
+            f"      starting_time:\n        nanoseconds_since_epoch: {file.start_ns}\n"
+            f"      duration:\n        nanoseconds: {file.stop_ns - file.start_ns}\n"
+            f"      message_count: {file.count}\n"
             for file in files
         )
         return (
@@ -150,40 +141,52 @@ class MetadataFile:
         )
 
     def update(self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]) -> None:
-        """Write the file while the bag is written; after a kill it holds the old numbers or the new ones.
+        """Write the file while the bag is written; a reader, and a kill at any moment, sees the old text or the new.
 
-        Who reads it in the very microsecond in which numbers are written may see digits of both.
+        (A reader that takes longer than until the update after the next may see parts of both.)
 
         Raises:
-            OSError: The disk is full or fails; the file is as it was.
+            OSError: The disk is full or fails, or somebody has taken the folder away; the file is as it was.
         """
-        data = self.render(topics, files, custom_data, _WIDTH).encode()
-        if not (self._is_in_place() and len(data) == self._size and os.pwrite(self._fd, data, 0) == len(data)):
+        data = self.render(topics, files, custom_data).encode()
+        if not self._take_turns(data):
             self._replace(data)
-            self._fd, self._size = os.open(self.path, os.O_WRONLY), len(data)
+            self._seen = os.open(self.path, os.O_WRONLY)
 
     def finish(self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]) -> None:
-        """Write the file for the last time, without the blanks; raises as :meth:`update`."""
-        try:
-            self._replace(self.render(topics, files, custom_data).encode())
-        finally:
-            self.abandon()
+        """Write the file for the last time; raises as :meth:`update`."""
+        self._replace(self.render(topics, files, custom_data).encode())
 
     def abandon(self) -> None:
         """Leave the file as it is."""
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
+        if self._spare >= 0 and _is_at(self._spare, self._temporary):
+            with contextlib.suppress(OSError):
+                self._temporary.unlink()
+        for descriptor in (self._seen, self._spare):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._seen = self._spare = -1
 
-    def _is_in_place(self) -> bool:
-        """Tell whether the open file is the bag's; somebody may have moved or removed it."""
-        try:
-            return self._fd >= 0 and os.path.samestat(os.fstat(self._fd), self.path.stat())
-        except FileNotFoundError:
+    def _take_turns(self, data: bytes) -> bool:
+        """Write the file that is not seen, and let it be seen; return whether that was possible."""
+        # Somebody may have moved or replaced what is seen, and who exchanges it would bring theirs back the next time.
+        if not _is_at(self._seen, self.path):
             return False
+        if not _is_at(self._spare, self._temporary):
+            if self._spare >= 0:
+                return False
+            self._spare = os.open(self._temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        if os.pwrite(self._spare, data, 0) < len(data):
+            return False
+        if os.fstat(self._spare).st_size != len(data):
+            os.ftruncate(self._spare, len(data))
+        if not exchange(self._temporary, self.path):
+            return False
+        self._seen, self._spare = self._spare, self._seen
+        return True
 
     def _replace(self, data: bytes) -> None:
-        """Put a new file in the old one's place: a reader, and a kill at any moment, sees one of them."""
+        """Put a new file in the old one's place."""
         self.abandon()
         try:
             self._temporary.write_bytes(data)
@@ -191,6 +194,14 @@ class MetadataFile:
         except OSError:
             self._temporary.unlink(missing_ok=True)
             raise
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Tell whether an open file is the one of this name."""
+    try:
+        return descriptor >= 0 and os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def _topic_head(topic: TopicEntry) -> str:
