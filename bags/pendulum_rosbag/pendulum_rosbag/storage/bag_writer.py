@@ -256,7 +256,7 @@ class BagWriter:
                 self._close_file()
             finally:
                 # After the file gave back its unused room there may be space for this again.
-                self._metadata.finish(list(self._topics.values()), self._files, self._custom)
+                self._metadata.finish(*self._described)
 
     def abandon(self) -> None:
         """Close without writing anything more, as if the process had died."""
@@ -302,8 +302,13 @@ class BagWriter:
         for name, topic in self._topics.items():
             topic.count = self._written[name]
 
+    @property
+    def _described(self) -> tuple[list[TopicEntry], list[FileEntry], dict[str, str]]:
+        """What the metadata are rendered from."""
+        return list(self._topics.values()), self._files, self._custom
+
     def _update_metadata(self) -> None:
-        self._metadata.update(list(self._topics.values()), self._files, self._custom)
+        self._metadata.update(*self._described)
 
     def _is_due(self) -> bool:
         if not self._file.count:
@@ -324,7 +329,7 @@ class BagWriter:
         try:
             self._file.seal()
             self._note_sealed()
-            text = self._metadata.render(list(self._topics.values()), self._files, self._custom)
+            text = self._metadata.render(*self._described)
         finally:
             # rosbag2 stores the content of "rosbag2_bagfile_information" without that key.
             self._file.close(_without_root(text))
