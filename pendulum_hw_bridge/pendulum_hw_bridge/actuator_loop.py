@@ -35,9 +35,11 @@ class ActuatorLoop:
     Args:
         bridge: Bridge and actuator; only this thread touches the actuator.
         statistics: Gets the figures of the loop.
-        on_state: Called with each new sample and the feedback record of each module.
+        on_state: Called with each new sample.
         decide: Returns the decision for now.
         on_outcome: Called with the stamp of the state answered [ns] and what was done.
+        on_records: Called at the end of the cycle, however it ended, with the feedback record of each module: whoever
+            reads these has time, and who answers the state has not.
         take_inputs: Takes the torques that have come, each into :meth:`answered`; where none has, it waits for one, for
             as long as it is told at most [s]. By default none ever comes.
         answer_window: Share of the period in which to wait for answers to a state before acting [-].
@@ -49,9 +51,10 @@ class ActuatorLoop:
         bridge: Bridge,
         statistics: LoopStatistics,
         *,
-        on_state: Callable[[JointSample, tuple[Feedback, ...]], None],
+        on_state: Callable[[JointSample], None],
         decide: Callable[[], Drive],
         on_outcome: Callable[[int, Outcome], None],
+        on_records: Callable[[tuple[Feedback, ...]], None] = lambda records: None,
         take_inputs: Callable[[float], None] = time.sleep,
         answer_window: float = 0.3,
         report: Callable[[str], None] = lambda text: None,
@@ -62,6 +65,7 @@ class ActuatorLoop:
         self._on_state = on_state
         self._decide = decide
         self._on_outcome = on_outcome
+        self._on_records = on_records
         self._period = statistics.period_ns / NANOSECONDS
         self._take_inputs = take_inputs
         self._window = answer_window * self._period
@@ -171,9 +175,13 @@ class ActuatorLoop:
         self._last_state_ns = now
         self._state_ns = sample.stamp_ns
         self._answered.clear()
-        self._on_state(sample, bridge.records)
-        self._wait_for_answers(sample.stamp_ns)
-        self._on_outcome(sample.stamp_ns, self._decide_and_act())
+        records, awaited = bridge.records, self._awaited(now)
+        try:
+            self._on_state(sample)
+            self._wait_for_answers(awaited)
+            self._on_outcome(sample.stamp_ns, self._decide_and_act())
+        finally:
+            self._on_records(records)
 
     def _act_between(self) -> None:
         """Between two records only what ends torque is carried out: a command that went stale need not wait."""
@@ -186,19 +194,21 @@ class ActuatorLoop:
         was_armed = self.bridge.supervisor.mode.armed
         return self.bridge.carry_out(self._decide(), was_armed=was_armed)
 
-    def _wait_for_answers(self, stamp_ns: int) -> None:
-        """Wait for those who answered lately; whoever is late or has never answered is not waited for again."""
-        self._take_inputs(0.0)
+    def _awaited(self, now_ns: int) -> set[Input]:
+        """Return who answered lately: whoever is late or has never answered is not waited for."""
         supervisor = self.bridge.supervisor
         if not supervisor.mode.armed:
-            return
-        now = self.bridge.now_ns()
-        expected = {
-            kind for kind in (Input.EFFORT_COMMAND, Input.DISTURBANCE) if supervisor.gates[kind].fresh(now) is not None
-        }
-        deadline = time.monotonic() + self._window
-        while not (expected <= self._answered or self._closing.is_set()):
-            left = deadline - time.monotonic()
-            if left <= 0.0:
-                break
+            return set()
+        answering = (Input.EFFORT_COMMAND, Input.DISTURBANCE)
+        return {kind for kind in answering if supervisor.gates[kind].fresh(now_ns) is not None}
+
+    def _wait_for_answers(self, awaited: set[Input]) -> None:
+        """Take what has come, and wait in the window for answers to the newest state."""
+        left = self._window if awaited else 0.0
+        deadline = time.monotonic() + left
+        while True:
+            # Asleep at once: on a busy machine, who answers may wait for this processor.
             self._take_inputs(left)
+            left = deadline - time.monotonic()
+            if awaited <= self._answered or left <= 0.0 or self._closing.is_set():
+                return

@@ -199,9 +199,10 @@ class BridgeNode(LifecycleNode, PollingNode):
             self._loop = self.loop_type(
                 bridge,
                 self._statistics,
-                on_state=self._on_state,
+                on_state=self._interface.publish_state,
                 decide=lambda: self._derated(self._interface.decide()),
                 on_outcome=self._on_outcome,
+                on_records=self._on_records,
                 take_inputs=self._interface.wait_for_inputs,
                 answer_window=values["answer_window"],
                 report=self.get_logger().error,
@@ -330,12 +331,11 @@ class BridgeNode(LifecycleNode, PollingNode):
 
     # --- cycle ---------------------------------------------------------------------------------------------
 
-    def _on_state(self, sample: JointSample, records: tuple[Feedback, ...]) -> None:
-        self._interface.publish_state(sample)
-        self._feedback.publish(encode_feedback(records, self._several))
-
     def _on_outcome(self, stamp_ns: int, outcome: Outcome) -> None:
         self._interface.publish_applied(stamp_ns, outcome.effort)
+
+    def _on_records(self, records: tuple[Feedback, ...]) -> None:
+        self._feedback.publish(encode_feedback(records, self._several))
 
     def _on_command(self, kind: Input, command: JointCommand) -> None:
         if self._lockstep_loop is not None:

@@ -72,9 +72,9 @@ class SteppedLoop(ActuatorLoop):
         clock = self.bridge.modules[0].port.clock  # type: ignore[attr-defined]  # the emulator's port has one
         clock.wait_until(clock.now_ns() + duration_ns)
 
-    def _wait_for_answers(self, stamp_ns: int) -> None:
+    def _wait_for_answers(self, awaited: set[Input]) -> None:
         self.answer()
-        super()._wait_for_answers(stamp_ns)
+        super()._wait_for_answers(awaited)
 
     def _decide_and_act(self) -> Outcome:
         outcome = super()._decide_and_act()
@@ -169,7 +169,7 @@ class Rig:
         self.loop = SteppedLoop(
             self.bridge,
             LoopStatistics(round(self.period * SECOND)),
-            on_state=lambda sample, feedback: None,
+            on_state=lambda sample: None,
             decide=lambda: self.supervisor.decide(self.port.now_ns(), self.bridge.sample),
             on_outcome=lambda stamp_ns, outcome: self.supervisor.report_applied(outcome.effort),
         )
