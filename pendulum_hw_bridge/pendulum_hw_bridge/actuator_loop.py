@@ -38,8 +38,8 @@ class ActuatorLoop:
         on_state: Called with each new sample.
         decide: Returns the decision for now.
         on_outcome: Called with the stamp of the state answered [ns] and what was done.
-        on_records: Called at the end of the cycle, however it ended, with the feedback record of each module: whoever
-            reads these has time, and who answers the state has not.
+        on_records: Called with the feedback record of each module when its cycle has ended, in an error too, when the
+            drive is off already: whoever reads these has time, and who answers the state has not.
         take_inputs: Takes the torques that have come, each into :meth:`answered`; where none has, it waits for one, for
             as long as it is told at most [s]. By default none ever comes.
         answer_window: Share of the period in which to wait for answers to a state before acting [-].
@@ -73,6 +73,7 @@ class ActuatorLoop:
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
         self._answered: set[Input] = set()
         self._state_ns = 0
+        self._unpublished: tuple[Feedback, ...] = ()
         self._closing = threading.Event()
         self._job_waiting = threading.Event()
         self._last_state_ns: int | None = None
@@ -150,8 +151,14 @@ class ActuatorLoop:
                 future.set_exception(error)
 
     def _guarded_cycle(self) -> None:
+        self._guarded(self._cycle)
+        records, self._unpublished = self._unpublished, ()
+        if records:
+            self._guarded(lambda: self._on_records(records))
+
+    def _guarded(self, step: Callable[[], None]) -> None:
         try:
-            self._cycle()
+            step()
         except Exception as error:  # noqa: BLE001
             # Whatever broke, the drive goes off first; a second break in the next cycle finds it off already.
             self.bridge.fail("exception", f"{type(error).__name__}: {error}")
@@ -175,13 +182,11 @@ class ActuatorLoop:
         self._last_state_ns = now
         self._state_ns = sample.stamp_ns
         self._answered.clear()
-        records, awaited = bridge.records, self._awaited(now)
-        try:
-            self._on_state(sample)
-            self._wait_for_answers(awaited)
-            self._on_outcome(sample.stamp_ns, self._decide_and_act())
-        finally:
-            self._on_records(records)
+        self._unpublished = bridge.records
+        awaited = self._awaited(now)
+        self._on_state(sample)
+        self._wait_for_answers(awaited)
+        self._on_outcome(sample.stamp_ns, self._decide_and_act())
 
     def _act_between(self) -> None:
         """Between two records only what ends torque is carried out: a command that went stale need not wait."""

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Strategy
+from pendulum_hw_bridge.actuator import ActuatorError, Feedback, Strategy
 from pendulum_hw_bridge.actuator_loop import ActuatorLoop
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.bridge import Bridge, Outcome
@@ -51,15 +51,20 @@ class Running:
         """Stamp of each cycle's feedback record, and how many outcomes there were when it came."""
         self.errors: list[str] = []
         self.threads: set[int] = set()
+        self.strategies: list[Strategy] = []
+        """Strategy of the actuator when each feedback record came."""
         self.on_state: Callable[[JointSample], None] = lambda sample: None
+        self.decide: Callable[[], object] = lambda: None
+        self.on_outcome: Callable[[Outcome], object] = lambda outcome: None
+        self.on_records: Callable[[tuple[Feedback, ...]], object] = lambda records: None
         self.take_inputs: Callable[[float], object] = time.sleep
         self.loop = ActuatorLoop(
             self.bridge,
             LoopStatistics(10_000_000),
             on_state=self._on_state,
             decide=self._decide,
-            on_outcome=lambda stamp, outcome: self.outcomes.append((stamp, outcome)),
-            on_records=lambda records: self.recorded.append((records[0].stamp_ns, len(self.outcomes))),
+            on_outcome=self._on_outcome,
+            on_records=self._on_records,
             take_inputs=self._take_inputs,
             report=self.errors.append,
         )
@@ -76,7 +81,17 @@ class Running:
         self.states.append(sample)
         self.on_state(sample)
 
+    def _on_outcome(self, stamp_ns: int, outcome: Outcome) -> None:
+        self.outcomes.append((stamp_ns, outcome))
+        self.on_outcome(outcome)
+
+    def _on_records(self, records: tuple[Feedback, ...]) -> None:
+        self.strategies.append(self.actuator.strategy)
+        self.recorded.append((records[0].stamp_ns, len(self.outcomes)))
+        self.on_records(records)
+
     def _decide(self) -> Drive:
+        self.decide()
         return self.supervisor.decide(self.port.now_ns(), self.bridge.sample)
 
     def until(self, predicate: Callable[[], object], what: str) -> None:
@@ -203,10 +218,34 @@ def test_an_error_in_a_cycle_releases_the_drive_and_is_told(running: Running) ->
     running.until(lambda: running.errors, "the report")
     # Of a cycle that broke, what was measured is what explains it.
     broken = running.states[len(running.outcomes)].stamp_ns
-    assert (broken, len(running.outcomes)) in running.recorded
+    running.until(lambda: (broken, len(running.outcomes)) in running.recorded, "its record")
     running.on_state = lambda sample: None
     count = len(running.outcomes)
     running.until(lambda: len(running.outcomes) > count, "states again")
+
+
+@pytest.mark.parametrize("step", ["on_state", "take_inputs", "decide", "on_outcome", "on_records"])
+def test_whichever_step_breaks_the_drive_is_off_before_the_record_of_that_cycle_leaves(
+    running: Running, step: str
+) -> None:
+    running.arm()
+    broken: list[int] = []
+
+    def fail(*_: object) -> None:
+        newest = running.states[-1].stamp_ns
+        # Between two cycles inputs are taken and decisions made as well.
+        if step == "on_records" or newest not in [stamp for stamp, _ in running.recorded]:
+            broken.append(newest)
+            raise ValueError(step)
+
+    setattr(running, step, fail)
+    running.until(lambda: running.errors, "the report")
+    assert running.errors[0] == f"cycle of the actuator failed: ValueError: {step}"
+    assert running.supervisor.mode is Mode.FAULT
+    assert running.actuator.strategy is Strategy.OFF
+    running.until(lambda: broken[0] in [stamp for stamp, _ in running.recorded], "the record of the broken cycle")
+    leaving = running.strategies[[stamp for stamp, _ in running.recorded].index(broken[0])]
+    assert leaving is (Strategy.DIRECT_PWM if step == "on_records" else Strategy.OFF)
 
 
 def test_an_error_of_a_job_goes_to_its_caller(running: Running) -> None:
