@@ -23,6 +23,7 @@ from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.ros.leaving import leaving_graph
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
 from pendulum_msgs_py.ros.parameters import NodeParameters
 
@@ -76,7 +77,8 @@ def bridge_values(ros_arguments: Sequence[str], given: Mapping[str, graph.Parame
         try:
             return NodeParameters(node, with_lab_file(node, for_plant(SPECS, given_plant(node)))).values
         finally:
-            node.destroy_node()
+            with leaving_graph():
+                node.destroy_node()
     finally:
         rclpy.try_shutdown(context=context)
 

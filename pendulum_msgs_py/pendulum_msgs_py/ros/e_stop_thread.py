@@ -8,17 +8,24 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Callable
+from typing import Any
 
 import rclpy
+from rclpy._rclpy_pybind11 import InvalidHandle, NodeNameNonExistentError, RCLError
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from pendulum_msgs_py.ros.answers import answer_who_listens
+from pendulum_msgs_py.ros.leaving import leaving_graph
 
 __all__ = ["EStopThread"]
 
 _JOIN = 2.0
+_DISCOVERY = 0.5
+"""Longest wait until all of the owner is known here, which takes 0.1 s from its beginning [s]."""
+_LOOK = 0.002
 _SWITCH = 0.001
 """Time after which a thread that computes hands Python's lock to one that waits [s]; by default it is 5 ms."""
 _PAUSE = 0.01
@@ -39,6 +46,7 @@ class EStopThread:
 
     def __init__(self, owner: Node, suffix: str, press: Callable[[str], None]) -> None:
         self._press = press
+        self._owner = owner
         self._context = rclpy.Context()
         # With the process's arguments, which may name a security enclave.
         rclpy.init(args=sys.argv, context=self._context, domain_id=owner.context.get_domain_id())
@@ -72,8 +80,26 @@ class EStopThread:
         self._executor.shutdown()
         if self._thread.is_alive():
             self._thread.join(_JOIN)
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        # Where a node is ended as soon as it is made, its participant is told of the owner's entities just then.
+        entities, deadline = self._entities_of_owner(self._owner), time.monotonic() + _DISCOVERY
+        while entities and self._entities_of_owner(self.node) != entities and time.monotonic() < deadline:
+            time.sleep(_LOOK)
+        with leaving_graph():
+            self.node.destroy_node()
+            rclpy.try_shutdown(context=self._context)
+
+    def _entities_of_owner(self, seen_by: Node) -> list[Any]:
+        """Return what a node knows of the owner: its publishers, subscriptions and services; nothing if it cannot."""
+        try:
+            owner = (self._owner.get_name(), self._owner.get_namespace())
+            return [
+                seen_by.get_publisher_names_and_types_by_node(*owner),
+                seen_by.get_subscriber_names_and_types_by_node(*owner),
+                seen_by.get_service_names_and_types_by_node(*owner),
+            ]
+        # Not discovered yet, or destroyed or shut down already.
+        except (NodeNameNonExistentError, InvalidHandle, RCLError):
+            return []
 
     def _run(self) -> None:
         while not self._closing.is_set():

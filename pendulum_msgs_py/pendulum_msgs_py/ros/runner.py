@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import faulthandler
 import gc
 import os
 import re
@@ -43,6 +42,7 @@ from pendulum_msgs_py.programs.executables import (
 )
 from pendulum_msgs_py.programs.realtime import run_in_real_time
 from pendulum_msgs_py.ros.answers import answer_who_listens
+from pendulum_msgs_py.ros.leaving import leaving_graph
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 from pendulum_msgs_py.ros.polled import PollingNode
 
@@ -50,8 +50,6 @@ __all__ = ["Closeable", "Paced", "run_node"]
 
 _SPIN_SLICE = 0.5
 """EventsExecutor.spin() hangs in the Jazzy wheels; spinning in finite slices works [s]."""
-_LEAVE_TIMEOUT = 5.0
-"""Time that the middleware may take to leave the graph [s]; once in thousands of times it did not come back."""
 _M_MMAP_THRESHOLD = -3
 _LARGEST_HEAP_BLOCK = 128 * 1024
 """[bytes]"""
@@ -231,15 +229,12 @@ def _close(node: Node | None, executor: rclpy.executors.Executor) -> int:
                 traceback.print_exc()
             exit_code = 1
         exit_code = exit_code or int(getattr(node, "exit_code", 0))
-    # The node is safe and what it holds is written: from here on a process that hangs is only in the way. The watchdog
-    # needs no interpreter, which the middleware may hold.
-    faulthandler.dump_traceback_later(_LEAVE_TIMEOUT, exit=True)
-    if node is not None:
-        executor.remove_node(node)
-        node.destroy_node()
-    executor.shutdown()
-    rclpy.try_shutdown()
-    faulthandler.cancel_dump_traceback_later()
+    with leaving_graph():
+        if node is not None:
+            executor.remove_node(node)
+            node.destroy_node()
+        executor.shutdown()
+        rclpy.try_shutdown()
     return exit_code
 
 

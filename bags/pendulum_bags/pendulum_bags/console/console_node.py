@@ -42,6 +42,7 @@ from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import fields_from_bytes, stamp_from_message
+from pendulum_msgs_py.ros.leaving import leaving_graph
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
 from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
@@ -123,9 +124,10 @@ class Hub:
         self._done.set_result(None)
         self._executor.wake()
         self._thread.join(2.0)
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        with leaving_graph():
+            self._executor.shutdown()
+            self._node.destroy_node()
+            rclpy.try_shutdown(context=self._context)
 
     @property
     def parameters(self) -> dict[str, dict[str, Any]]:

@@ -32,6 +32,7 @@ from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, stamp_of_state, trajectory_to_message
+from pendulum_msgs_py.ros.leaving import leaving_graph
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 
 __all__ = ["Conductor", "PlantClient", "RecorderClient"]
@@ -79,9 +80,10 @@ class Conductor:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Leave the graph."""
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
+        with leaving_graph():
+            self._executor.shutdown()
+            self.node.destroy_node()
+            rclpy.try_shutdown(context=self.context)
         signal.signal(signal.SIGTERM, self._previous)
 
     def spin(self, duration: float) -> None:

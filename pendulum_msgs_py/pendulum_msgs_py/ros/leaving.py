@@ -1,0 +1,37 @@
+"""Leaving the ROS graph, in which the middleware can hang for good."""
+
+from __future__ import annotations
+
+import faulthandler
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+__all__ = ["leaving_graph"]
+
+_LONGEST = 5.0
+"""Time that the middleware may take to leave the graph [s]."""
+_lock = threading.Lock()
+_under_way = 0
+
+
+@contextmanager
+def leaving_graph() -> Iterator[None]:
+    """Destroy nodes and contexts in this context: where the middleware hangs, it ends the process, with exit code 1.
+
+    Fast DDS waits for those whom it just tells of somebody else, while it keeps from them the lock that they need to
+    end, wherever it was built with an older standard library, as in the wheels (eProsima/Fast-DDS issue 6513): once in
+    thousands of times it does not come back, and holds Python's lock meanwhile, so that no signal ends the process. The
+    watchdog needs no interpreter. Whatever is to be made safe, or written, comes before.
+    """
+    global _under_way  # noqa: PLW0603  # the watchdog is one for the process
+    with _lock:
+        _under_way += 1
+        faulthandler.dump_traceback_later(_LONGEST, exit=True)
+    try:
+        yield
+    finally:
+        with _lock:
+            _under_way -= 1
+            if not _under_way:
+                faulthandler.cancel_dump_traceback_later()

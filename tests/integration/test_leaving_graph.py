@@ -1,0 +1,100 @@
+"""The end of a node where the middleware does not come back from it, and what keeps that rare."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+
+from pendulum_msgs_py.ros.e_stop import EStopServer
+from tests.processes import ProcessGroup, RunningProgram
+
+DEADLINE = 60.0
+_HANGING = """
+import ctypes, sys
+from rclpy.node import Node
+destroy = Node.destroy_node
+def destroy_node(node):
+    if node.get_name() == {name!r}:
+        print("hangs", flush=True)
+        ctypes.PyDLL(None).sleep(600)  # with Python's lock held, as the middleware does
+    destroy(node)
+Node.destroy_node = destroy_node
+"""
+_SIMULATOR = """
+from pendulum_sim.simulator_node import main
+sys.exit(main([]))
+"""
+_CONDUCTOR = """
+from pendulum_bags.experiments.conductor_node import Conductor
+with Conductor({domain}):
+    pass
+"""
+
+
+@pytest.mark.parametrize("name", ["simulator", "simulator_e_stop"])
+def test_a_plant_that_cannot_leave_the_graph_ends_all_the_same(
+    name: str, domain_id: int, processes: ProcessGroup
+) -> None:
+    simulator = _start(_HANGING.format(name=name) + _SIMULATOR, processes)
+    simulator.wait_for_output("ready", DEADLINE)
+    simulator.interrupt()
+    assert simulator.wait(DEADLINE) == 1
+    # With the plant made safe before, and where it stood.
+    assert simulator.output.index("hangs") < simulator.output.index("Timeout")
+    assert "in close" in simulator.output or "in _close" in simulator.output
+
+
+def test_an_experiment_that_cannot_leave_the_graph_ends_all_the_same(domain_id: int, processes: ProcessGroup) -> None:
+    conductor = _start(_HANGING.format(name="conductor") + _CONDUCTOR.format(domain=domain_id), processes)
+    assert conductor.wait(DEADLINE) == 1
+    assert "hangs" in conductor.output
+
+
+def test_an_e_stop_leaves_when_it_knows_all_of_its_owner(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    context = Context()
+    rclpy.init(context=context, domain_id=domain_id)
+    owner = Node("plant", context=context)
+    known: list[list[object]] = []
+    destroy = Node.destroy_node
+
+    def views(node: Node) -> list[object]:
+        of_owner = (owner.get_name(), owner.get_namespace())
+        return [
+            node.get_publisher_names_and_types_by_node(*of_owner),
+            node.get_subscriber_names_and_types_by_node(*of_owner),
+            node.get_service_names_and_types_by_node(*of_owner),
+        ]
+
+    def destroy_node(node: Node) -> None:
+        if node is not owner:
+            known.append(views(node))
+        destroy(node)
+
+    monkeypatch.setattr(Node, "destroy_node", destroy_node)
+    try:
+        for _ in range(3):
+            # Ended as soon as it is made: it has been told of nothing yet.
+            EStopServer(owner, lambda reason: None).close()
+        assert known == [views(owner)] * 3
+    finally:
+        owner.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_an_e_stop_whose_owner_has_gone_leaves_at_once(domain_id: int) -> None:
+    context = Context()
+    rclpy.init(context=context, domain_id=domain_id)
+    owner = Node("plant", context=context)
+    server = EStopServer(owner, lambda reason: None)
+    owner.destroy_node()
+    rclpy.shutdown(context=context)  # closes it
+    assert not server._thread._thread.is_alive()
+    server.close()
+
+
+def _start(code: str, processes: ProcessGroup) -> RunningProgram:
+    return processes.start_command([sys.executable, "-c", code], name="hanging")
