@@ -68,12 +68,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     interrupted = False
     for area in chosen:
         start = time.monotonic()
+        of_area = []
         with console.status(f"measuring {area}"):
             try:
-                rows += list(measure(area))
+                for row in measure(area):
+                    of_area.append(row)
+                    # Some take minutes: who waits, or has to break off, sees what is there.
+                    console.print(f"{row.what}: {_figure(row.ours, row.unit)}", style="dim", markup=False)
             except KeyboardInterrupt:
                 interrupted = True
                 break
+        rows += of_area
         console.print(f"{area}: measured in {time.monotonic() - start:.1f} s", style="dim")
     if arguments.json:
         print(json.dumps([asdict(row) for row in rows], indent=2))
