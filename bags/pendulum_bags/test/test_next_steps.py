@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -96,12 +97,16 @@ def test_of_a_command_that_may_move_a_machine_it_is_said_that_it_asks(told: str)
 
 def slack(sources: list[str], command: str) -> str:
     """Return the first step that is told after runs whose hardware has twice the damping."""
+    return slack_steps(sources, command)[0]
+
+
+def slack_steps(sources: list[str], command: str) -> Sequence[str]:
     runs = []
     for number, source in enumerate(sources):
         simulation, hardware = pair(5 + number, plant=SIMULATED.with_values(damping=2 * 11.77))
         record = {"pendulum.run": {"command": command, "seed": 5 + number}}
         runs.append((simulation, replace(hardware, source=source, metadata=record)))
-    return same_run_layer(compare(runs)).next_steps[0]
+    return same_run_layer(compare(runs)).next_steps
 
 
 def test_after_a_no_the_plant_is_identified_from_all_runs_and_tested_under_other_noise(tmp_path: Path) -> None:
@@ -133,6 +138,27 @@ def test_after_a_no_of_other_recordings_the_step_names_no_experiment_and_few_rec
     assert "identify /lab/0/hw /lab/1/hw /lab/2/hw /lab/3/hw --out plant.yaml" in step
     assert step.endswith("simulate and design with --plant plant.yaml, and compare again under noise of another seed.")
     assert "identify RUN/hw --out" in slack([""], "")
+
+
+@pytest.mark.parametrize(
+    ("simulated", "following"),
+    [("plant.yaml", "plant_2.yaml"), ("a b/plant_2.yml", "'a b/plant_3.yml'"), ("_7.yaml", "_7_2.yaml")],
+)
+def test_a_file_that_was_fitted_is_left_alone_by_the_next_fit_and_no_third_is_promised_to_do(
+    simulated: str, following: str
+) -> None:
+    again, otherwise = slack_steps(["/lab/run/hw"], f"{THESIS} --plant {shlex.quote(simulated)} --seed 2")
+    assert again.startswith(f"The simulation had {simulated} already. Identify once more")
+    assert f"identify /lab/run/hw --out {following})" in again
+    assert f"({THESIS} --plant {following} --seed 3)" in again
+    assert "experiment frequency_response)" in otherwise
+    assert slack_steps(["/lab/run/hw"], f"{THESIS} --plant={shlex.quote(simulated)}")[0] == again.replace(
+        "seed 3", "seed 2"
+    )
+    # Of a preset nobody has fitted anything.
+    (step,) = slack_steps(["/lab/run/hw"], f"{THESIS} --plant thesis --seed 2")
+    assert step.startswith("Identify the plant from what the hardware did")
+    assert "--out plant.yaml)" in step
 
 
 # -- after an identification ---------------------------------------------------------------------------------------

@@ -5,14 +5,16 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence, Set
 from itertools import count, pairwise
+from pathlib import Path
 from typing import Any
 
-__all__ = ["next_test_of", "question_of"]
+__all__ = ["next_test_of", "plant_file_of", "question_of"]
 
 _EXPERIMENTS = ("thesis", "joints")
 _REPLACED = ("--plant", "--seed", "--out", "-o", "--simulation", "--mapping")
 """Options, each with a value, that the test has of its own: noise that a fit has seen is no test of it, and somebody
 else's simulation would stand where the plant is to."""
+_PLANT_FILES = (".yaml", ".yml")
 _LEFT_OUT = ("--yes",)
 """Nobody is to be spared the question whether a machine may move."""
 
@@ -31,6 +33,14 @@ def next_test_of(records: Sequence[Mapping[str, Any]], plant: str) -> str:
     return next(filter(None, (_again(record, plant, seen) for record in records)), "")
 
 
+def plant_file_of(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return the plant file that the recorded experiment simulated, as its command names it; empty for a preset."""
+    commands = [_words(record) for record in records]
+    named = [value for words in commands for name, value in pairwise(words) if name == "--plant"]
+    named += [word.partition("=")[2] for words in commands for word in words if word.startswith("--plant=")]
+    return next((name for name in named if Path(name).suffix in _PLANT_FILES), "")
+
+
 def question_of(command: str) -> str:
     """Return the sentence to set behind a command that may move a machine; empty behind one that moves an emulator."""
     words = shlex.split(command)
@@ -40,10 +50,7 @@ def question_of(command: str) -> str:
 
 
 def _again(record: Mapping[str, Any], plant: str, seen: Set[str]) -> str:
-    try:
-        words = shlex.split(str(record.get("command", "")))
-    except ValueError:  # a quote without its end: by hand
-        return ""
+    words = _words(record)
     if words[:4] != ["python", "-m", "pendulum_bags", "experiment"] or " ".join(words[4:5]) not in _EXPERIMENTS:
         return ""
     kept, seed = words[:5], "1"
@@ -58,3 +65,10 @@ def _again(record: Mapping[str, Any], plant: str, seen: Set[str]) -> str:
     first = int(seed) + 1 if seed.isdecimal() else 2
     unseen = next(number for number in count(first) if str(number) not in seen)
     return shlex.join([*kept, "--plant", plant, "--seed", str(unseen)])
+
+
+def _words(record: Mapping[str, Any]) -> list[str]:
+    try:
+        return shlex.split(str(record.get("command", "")))
+    except ValueError:  # a quote without its end: by hand
+        return []

@@ -6,12 +6,13 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
-from pendulum_bags.runs.next_test import next_test_of, question_of
+from pendulum_bags.runs.next_test import next_test_of, plant_file_of, question_of
 from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import run_record
-from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
+from pendulum_bags.verdict.layers import HOW, Evidence, Layer, LayerResult, Mark
 
 __all__ = ["design_plant", "in_words", "same_run_layer", "seen_note"]
 
@@ -146,13 +147,25 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     late = next((test for test in failed if test.quantity == "delay"), None)
     foreign = _foreign_simulation(comparison)
     if any(name.startswith("spread") or "less the delay" in name for name in shapes):
-        identify = f"python -m pendulum_bags identify {source} --out plant.yaml"
+        fitted = "" if foreign else plant_file_of(_records(comparison))
+        out = _next_file(fitted)
+        identify = f"python -m pendulum_bags identify {source} --out {shlex.quote(out)}"
         if comparison.pairs[0].hardware.joint:
             identify = f"{identify} --plant {shlex.quote(design_plant(comparison))}"
+        begin = "Identify the plant from what the hardware did"
+        if fitted:
+            begin = (
+                f"The simulation had {fitted} already. Identify once more, with the recordings behind that file added"
+            )
         steps.append(
-            f"Identify the plant from what the hardware did ({identify}), then "
-            + (f"carry its values over to {foreign}." if foreign else _test_of_the_plant(comparison))
+            f"{begin} ({identify}), then "
+            + (f"carry its values over to {foreign}." if foreign else _test_of_the_plant(comparison, out))
         )
+        if fitted:
+            steps.append(
+                "If that says no too, no parameters will do: the model lacks what the hardware does. Measure which "
+                f"designs are safe all the same ({HOW[Layer.WHICH_CONTROLLERS]})."
+            )
     elif late is not None and foreign:
         # No plant file of ours reaches into it.
         steps.append(f"Give {foreign} {_late(late)}; measure again.")
@@ -178,11 +191,24 @@ def _recordings(comparison: Comparison) -> list[str]:
     return list(dict.fromkeys([*runs, *sources]))[:_MOST_RECORDINGS]
 
 
-def _test_of_the_plant(comparison: Comparison) -> str:
-    sides = [run for pair in comparison.pairs for run in (pair.hardware, pair.simulation)]
-    command = next_test_of([run_record(run.metadata) for run in sides], "plant.yaml")
+def _records(comparison: Comparison) -> list[Mapping[str, Any]]:
+    return [run_record(run.metadata) for pair in comparison.pairs for run in (pair.hardware, pair.simulation)]
+
+
+def _next_file(fitted: str) -> str:
+    """Return the file for the next fit, which leaves the one that was simulated as it is."""
+    if not fitted:
+        return "plant.yaml"
+    path = Path(fitted)
+    stem, _, number = path.stem.rpartition("_")
+    following = f"{stem}_{int(number) + 1}" if stem and number.isdecimal() else f"{path.stem}_2"
+    return str(path.with_name(f"{following}{path.suffix}"))
+
+
+def _test_of_the_plant(comparison: Comparison, plant: str) -> str:
+    command = next_test_of(_records(comparison), plant)
     if not command:
-        return "simulate and design with --plant plant.yaml, and compare again under noise of another seed."
+        return f"simulate and design with --plant {shlex.quote(plant)}, and compare again under noise of another seed."
     return (
         f"test that file under other noise ({command}). MODEL INCOMPLETE, if identify says so, is no reason to stop: "
         "the parameters stand in for what the model lacks, and the test tells whether they suffice for this "
