@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -23,6 +24,7 @@ from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.trajectory import from_points
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message, stamp_to_message, trajectory_to_message
+from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from tests.fixtures import PROJECT, own_domain
 from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup, RunningProgram
@@ -492,3 +494,20 @@ def test_help_shows_every_parameter_and_survives_a_reader_that_goes() -> None:
     process.stdout.close()
     assert process.wait(30) == 0
     assert process.stderr.read() == ""
+
+
+def test_last_words_wait_to_be_heard_without_pythons_lock_and_a_torque_under_way_waits_for_nobody() -> None:
+    asked: list[int] = []
+    publisher = SimpleNamespace(
+        get_subscription_count=lambda: 0, wait_for_all_acked=lambda longest: asked.append(longest.nanoseconds)
+    )
+    stopping = SimpleNamespace(
+        supervisor=SimpleNamespace(report_applied=lambda effort: None), applied_publisher=publisher, _stopping=True
+    )
+    # Decided before the stop: its thread has the drive still to release.
+    PlantInterface.publish_applied(stopping, 0, (1.0,))  # type: ignore[arg-type]
+    assert asked == []
+    PlantInterface.publish_applied(stopping, 0, (0.0,))  # type: ignore[arg-type]
+    assert len(asked) > 1
+    # For whatever longer rclpy waits itself, no other thread of the process runs.
+    assert set(asked) == {0}

@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -46,6 +48,8 @@ _LEAST_BETWEEN_LINES = 1.0
 """Time between two lines of the log about one mode [s]."""
 _WAITED_NS = 10 * NANOSECONDS
 """Longest time for which a message may wait while a plant arms [ns]; more is a system clock that was set back."""
+_LOOK_FOR_WORD = 0.001
+"""Time between two looks whether all have heard [s]."""
 _LOOK = 0.02
 """Time between two looks for a press or a trajectory [s]; of trajectories without pause the newest is read then."""
 TRAJECTORY_AGE_LIMIT = 1.0
@@ -203,8 +207,9 @@ class PlantInterface:
         # Building and publishing what nobody hears would be a tenth of the loop.
         if self.applied_publisher.get_subscription_count():
             self.applied_publisher.publish(encode_joints(stamp_ns, "", self._driven, (), (), effort))
-        if self._stopping:
-            self.applied_publisher.wait_for_all_acked(qos.LAST_WORDS)
+        # Only the last words are waited for: a torque that was under way meanwhile is still to be ended.
+        if self._stopping and not any(effort):
+            _wait_until_heard(self.applied_publisher)
 
     def publish_event(self, name: str, **details: object) -> None:
         """Publish an event at the plant's time."""
@@ -232,7 +237,7 @@ class PlantInterface:
         """Disarm, say so in diagnostics; the plant then applies zero torque and publishes that, to be heard too."""
         self.supervisor.disarm(self.clock(), reason)
         self.publish_diagnostics()
-        self._diagnostics.publisher.wait_for_all_acked(qos.LAST_WORDS)
+        _wait_until_heard(self._diagnostics.publisher)
         self._stopping = True
 
     def close(self) -> None:
@@ -424,3 +429,14 @@ class PlantInterface:
         conflict = bool(self.supervisor.commander_conflict)
         warn = starved or conflict or self._second_commander
         return DiagnosticStatus.WARN if warn else DiagnosticStatus.OK
+
+
+def _wait_until_heard(publisher: Publisher) -> None:
+    """Wait until all reliable subscribers have heard the last message, for a time at most.
+
+    Looked at again and again, since rclpy keeps Python's lock while it waits itself, 0.15 s with any subscriber: for as
+    long neither an actuator's thread could end its torque nor the e-stop be served.
+    """
+    ends = time.monotonic() + qos.LAST_WORDS.nanoseconds / NANOSECONDS
+    while not publisher.wait_for_all_acked(Duration()) and time.monotonic() < ends:
+        time.sleep(_LOOK_FOR_WORD)
