@@ -5,9 +5,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from pendulum_hw_bridge import actuator_loop
 from pendulum_hw_bridge.actuator import ActuatorError, Feedback, Strategy
 from pendulum_hw_bridge.actuator_loop import ActuatorLoop
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
@@ -169,6 +171,157 @@ def test_a_cycle_waits_for_an_answer_only_in_its_window_and_no_longer_once_it_ha
     assert max(asked) <= 0.3 * 0.01
 
 
+_BOTH = frozenset({Input.EFFORT_COMMAND, Input.DISTURBANCE})
+
+
+class _Waiting:
+    """A loop of which only the wait for answers is there, in a time of its own: each look ends with a message."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, window: float, looks: list[set[Input]]) -> None:
+        self.now = 0.0
+        self.waits: list[float] = []
+        self._looks = looks
+        self.loop: Any = SimpleNamespace(
+            _window=window, _answered=set(), _closing=threading.Event(), _take_inputs=self._take
+        )
+        monkeypatch.setattr(actuator_loop, "time", SimpleNamespace(monotonic=lambda: self.now))
+
+    def _take(self, wait: float) -> None:
+        assert len(self.waits) < 20, "it waits without end"
+        self.waits.append(wait)
+        self.now += min(wait, 1.0)
+        self.loop._answered |= self._looks.pop(0) if self._looks else set()
+
+    def wait(self, awaited: frozenset[Input]) -> list[float]:
+        ActuatorLoop._wait_for_answers(self.loop, set(awaited))
+        return self.waits
+
+
+@pytest.mark.parametrize(
+    ("looks", "waits"),
+    [
+        ([set(_BOTH)], [3.0]),
+        ([{Input.EFFORT_COMMAND}, {Input.DISTURBANCE}], [3.0, 2.0]),
+        ([{Input.DISTURBANCE}, set(), {Input.EFFORT_COMMAND}], [3.0, 2.0, 1.0]),
+        ([], [3.0, 2.0, 1.0]),
+    ],
+    ids=["both_at_once", "one_after_the_other", "one_between_strangers", "a_flood_of_strangers"],
+)
+def test_a_wait_is_for_all_who_are_awaited_and_no_message_makes_it_longer(
+    monkeypatch: pytest.MonkeyPatch, looks: list[set[Input]], waits: list[float]
+) -> None:
+    assert _Waiting(monkeypatch, window=3.0, looks=looks).wait(_BOTH) == waits
+
+
+def test_where_nobody_is_awaited_what_has_come_is_taken_and_nothing_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert _Waiting(monkeypatch, window=3.0, looks=[]).wait(frozenset()) == [0.0]
+
+
+def test_without_a_window_what_has_come_is_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert _Waiting(monkeypatch, window=0.0, looks=[]).wait(_BOTH) == [0.0]
+
+
+def test_a_loop_that_closes_waits_for_no_further_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    waiting = _Waiting(monkeypatch, window=3.0, looks=[])
+    waiting.loop._closing.set()
+    assert waiting.wait(_BOTH) == [3.0]
+
+
+def test_awaited_are_those_who_answered_an_armed_plant_lately() -> None:
+    supervisor = SharedSupervisor(PlantLimits(effort=(13.0,), command_timeout=0.5, feedback_timeout=0.5))
+    loop: Any = SimpleNamespace(bridge=SimpleNamespace(supervisor=supervisor))
+
+    def awaited(now_ns: int) -> set[Input]:
+        return ActuatorLoop._awaited(loop, now_ns)
+
+    def offer(kind: Input, now_ns: int) -> None:
+        assert supervisor.offer(kind, JointCommand.of_one(now_ns, 0.1, kind.value), now_ns) is None
+
+    offer(Input.EFFORT_COMMAND, 1)
+    assert awaited(1) == set()
+    assert supervisor.arm(2, JointSample.of_one(2, 0.0, 0.0, 0.0)) == ""
+    # What came before counts for nothing; a first answer is not waited for.
+    assert awaited(2) == set()
+    offer(Input.DISTURBANCE, 3)
+    assert awaited(3) == {Input.DISTURBANCE}
+    offer(Input.EFFORT_COMMAND, 400_000_000)
+    assert awaited(400_000_000) == _BOTH
+    assert awaited(600_000_000) == {Input.EFFORT_COMMAND}
+    supervisor.e_stop(600_000_001)
+    assert awaited(600_000_001) == set()
+
+
+def test_only_an_answer_to_the_newest_state_counts_and_only_a_torque_has_an_age() -> None:
+    ages: list[int] = []
+    loop: Any = SimpleNamespace(
+        _state_ns=5,
+        _answered=set(),
+        statistics=SimpleNamespace(act_on_age=ages.append),
+        bridge=SimpleNamespace(now_ns=lambda: 9),
+    )
+    ActuatorLoop.answered(loop, Input.EFFORT_COMMAND, JointCommand.of_one(4, 0.1, "c"))
+    assert (loop._answered, ages) == (set(), [5])
+    ActuatorLoop.answered(loop, Input.DISTURBANCE, JointCommand.of_one(5, 0.1, "d"))
+    assert (loop._answered, ages) == ({Input.DISTURBANCE}, [5])
+
+
+def test_whoever_answered_a_state_has_not_answered_the_next(running: Running) -> None:
+    def answer(wait: float) -> None:
+        command = JointCommand.of_one(running.states[-1].stamp_ns, 0.1, "c")
+        if running.supervisor.offer(Input.EFFORT_COMMAND, command, running.port.now_ns()) is None:
+            running.loop.answered(Input.EFFORT_COMMAND, command)
+
+    at_state: list[set[Input]] = []
+    at_outcome: list[set[Input]] = []
+    running.arm()
+    running.on_state = lambda sample: at_state.append(set(running.loop._answered))
+    running.on_outcome = lambda outcome: at_outcome.append(set(running.loop._answered))
+    running.take_inputs = answer
+    running.until(lambda: len(at_outcome) > 5, "outcomes")
+    assert {Input.EFFORT_COMMAND} in at_outcome
+    assert not any(at_state)
+    assert running.loop.statistics.cycles >= len(at_outcome)
+
+
+def test_an_e_stop_pressed_while_the_cycle_waits_for_an_answer_ends_torque_in_that_cycle(running: Running) -> None:
+    running.arm()
+    command = JointCommand.of_one(running.port.now_ns(), 0.1, "c")
+    assert running.supervisor.offer(Input.EFFORT_COMMAND, command, running.port.now_ns()) is None
+    pressed: list[int] = []
+
+    def press(wait: float) -> None:
+        if wait > 0.0 and not pressed:
+            pressed.append(running.states[-1].stamp_ns)
+            running.supervisor.e_stop(running.port.now_ns())
+
+    running.take_inputs = press
+    running.until(lambda: pressed and pressed[0] in [stamp for stamp, _ in running.recorded], "the record")
+    outcome = dict(running.outcomes)[pressed[0]]
+    assert (outcome.drive.kind, outcome.effort, outcome.fault) == (DriveKind.OFF, (0.0,), "")
+    leaving = running.strategies[[stamp for stamp, _ in running.recorded].index(pressed[0])]
+    assert leaving is Strategy.OFF
+
+
+def test_while_no_record_comes_commands_are_taken_and_silence_is_acted_upon() -> None:
+    done: list[object] = []
+    loop: Any = SimpleNamespace(
+        bridge=SimpleNamespace(observe=done.append),
+        _take_inputs=done.append,
+        _act_between=lambda: done.append("act"),
+    )
+    ActuatorLoop._cycle(loop)
+    # A wait for nothing: the next record may be there already.
+    assert done == [0.005, 0.0, "act"]
+
+
+def test_the_record_of_a_cycle_in_which_the_loop_is_told_to_rest_still_leaves(running: Running) -> None:
+    running.on_outcome = lambda outcome: setattr(running.loop, "active", False)
+    running.loop.active = True
+    running.until(lambda: running.outcomes and not running.loop.active, "an outcome")
+    running.loop.call(lambda: None)
+    assert [stamp for stamp, _ in running.recorded] == [stamp for stamp, _ in running.outcomes]
+
+
 class _PassingTime(WallClock):
     """Wall time that passes when somebody waits; keeps what each wait was for."""
 
@@ -246,6 +399,37 @@ def test_whichever_step_breaks_the_drive_is_off_before_the_record_of_that_cycle_
     running.until(lambda: broken[0] in [stamp for stamp, _ in running.recorded], "the record of the broken cycle")
     leaving = running.strategies[[stamp for stamp, _ in running.recorded].index(broken[0])]
     assert leaving is (Strategy.DIRECT_PWM if step == "on_records" else Strategy.OFF)
+
+
+def test_when_something_breaks_the_drive_is_off_before_anything_is_told_and_the_loop_rests_a_period() -> None:
+    done: list[str] = []
+    loop: Any = SimpleNamespace(
+        bridge=SimpleNamespace(
+            fail=lambda name, message: done.append(f"{name}: {message}"), release=lambda: done.append("release")
+        ),
+        _report=lambda text: done.append("report"),
+        _pause=lambda: done.append("pause"),
+    )
+
+    def step() -> None:
+        raise ValueError("a bug")
+
+    ActuatorLoop._guarded(loop, step)
+    assert done == ["exception: ValueError: a bug", "release", "report", "pause"]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_thread_that_ends_in_whatever_way_releases_the_drive(running: Running) -> None:
+    def leave(sample: JointSample) -> None:
+        raise SystemExit
+
+    running.arm()
+    running.on_state = leave
+    running.until(lambda: not running.loop._thread.is_alive(), "the end of the thread")
+    assert running.actuator.strategy is Strategy.OFF
+    assert not running.supervisor.mode.armed
+    with pytest.raises(ActuatorError, match="actuator thread has ended"):
+        running.loop.call(lambda: None)
 
 
 def test_an_error_of_a_job_goes_to_its_caller(running: Running) -> None:
