@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pendulum_msgs_py.errors import BagError
-from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
-from pendulum_rosbag.storage.mcap_records import MESSAGE
+from pendulum_rosbag.storage.mcap_records import MESSAGE, Attachment, Metadata
 
 __all__ = ["MCAP_HEAD", "Batch", "Bytes", "Int64", "Source", "Stream"]
 

@@ -19,6 +19,7 @@ __all__ = [
     "DamagedError",
     "keep_staged",
     "raw_content",
+    "read_metadata",
     "read_text",
     "read_text_map",
     "records_in",
@@ -127,3 +128,9 @@ def read_text_map(content: bytes, at: int) -> dict[str, str]:
         key, at = read_text(content, at)
         items[key], at = read_text(content, at)
     return items
+
+
+def read_metadata(content: bytes) -> rec.Metadata:
+    """Return the named map of texts that a record holds."""
+    name, at = read_text(content, 0)
+    return rec.Metadata(name, read_text_map(content, at))

@@ -1,9 +1,13 @@
-"""Walking through an MCAP file record by record: for one that is damaged, was not closed, or has no index."""
+"""Walking through an MCAP file record by record: for one that is damaged, was not closed, or has no index.
+
+Also for what no message index tells, attachments and metadata: they are found in a file that was cut off, too.
+"""
 
 from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +16,25 @@ import numpy as np
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import Bytes
 from pendulum_rosbag.reader.decompression import decompress_torn
-from pendulum_rosbag.reader.mcap_chunks import CHUNK_FIELDS, Chunk, DamagedError, raw_content, read_text, records_in
+from pendulum_rosbag.reader.mcap_chunks import (
+    CHUNK_FIELDS,
+    Chunk,
+    DamagedError,
+    raw_content,
+    read_metadata,
+    read_text,
+    records_in,
+)
 from pendulum_rosbag.reader.mcap_topics import McapTopics
 from pendulum_rosbag.storage import mcap_records as rec
 
-__all__ = ["McapScan", "MessageTable"]
+__all__ = ["McapScan", "MessageTable", "find_extras"]
 
 _HEAD = rec.RECORD_HEAD_SIZE
 MessageTable = dict[int, list[tuple[int, int]]]
 """(Log time [ns], offset) of the messages of each channel."""
+_OURS = "rosbag2"
+"""Name of the metadata that every writer of rosbag2 files makes anew."""
 
 
 class McapScan:
@@ -148,3 +162,36 @@ class McapScan:
         self.counts[channel] = self.counts.get(channel, 0) + 1
         self.start_ns = min(self.start_ns, time)
         self.stop_ns = max(self.stop_ns, time)
+
+
+def find_extras(buffer: Bytes) -> Iterator[rec.Attachment | rec.Metadata]:
+    """Yield what a file holds besides messages, the copy of its ``metadata.yaml`` left out; broken records too.
+
+    Args:
+        buffer: The whole file, shape (n,).
+    """
+    view, size, at = buffer.data, len(buffer), len(rec.MAGIC)
+    while at + _HEAD <= size:
+        opcode, length = rec.RECORD_HEAD.unpack_from(view, at)
+        body = at + _HEAD
+        at = body + length
+        if opcode in (0, rec.DATA_END, rec.FOOTER) or at > size:
+            return
+        if opcode not in (rec.ATTACHMENT, rec.METADATA):
+            continue
+        content = bytes(view[body:at])
+        try:
+            extra = _attachment(content) if opcode == rec.ATTACHMENT else read_metadata(content)
+        except (struct.error, UnicodeDecodeError):
+            continue
+        if not isinstance(extra, rec.Metadata) or extra.name != _OURS:
+            yield extra
+
+
+def _attachment(content: bytes) -> rec.Attachment:
+    name, at = read_text(content, 16)
+    media_type, at = read_text(content, at)
+    (size,) = struct.unpack_from("<Q", content, at)
+    if at + 8 + size + 4 != len(content):
+        raise struct.error("attachment does not fill its record")
+    return rec.Attachment(content, name, media_type, size)

@@ -17,12 +17,11 @@ from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Bytes, Int64
 from pendulum_rosbag.reader.checksums import Checksums, Comparison
 from pendulum_rosbag.reader.mcap_chunks import CHUNK_FIELDS, Chunk, DamagedError, keep_staged, raw_content, read_text
-from pendulum_rosbag.reader.mcap_extras import find_extras
 from pendulum_rosbag.reader.mcap_index import indexed_counts, indexed_messages
-from pendulum_rosbag.reader.mcap_scan import McapScan, MessageTable
+from pendulum_rosbag.reader.mcap_scan import McapScan, MessageTable, find_extras
 from pendulum_rosbag.reader.mcap_topics import McapTopics
 from pendulum_rosbag.storage import mcap_records as rec
-from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
+from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 
 __all__ = ["McapSource"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 from pendulum_rosbag.reader.batches import Stream
-from pendulum_rosbag.reader.mcap_chunks import read_text, read_text_map
+from pendulum_rosbag.reader.mcap_chunks import read_metadata, read_text, read_text_map
 from pendulum_rosbag.storage import mcap_records as rec
 
 __all__ = ["McapTopics"]
@@ -48,8 +48,8 @@ class McapTopics:
             encoding, at = read_text(content, at)
             self.channels[key] = (schema, topic, encoding, read_text_map(content, at))
         elif opcode == rec.METADATA:
-            name, at = read_text(content, 0)
-            self.metadata[name] = read_text_map(content, at)
+            found = read_metadata(content)
+            self.metadata[found.name] = dict(found.items)
 
     def describe_all(self, named: set[int]) -> bool:
         """Tell whether every channel of a set is described, and every schema that the channels name."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from pendulum_rosbag.reader.batches import Batch, Source
 from pendulum_rosbag.reader.decompression import decompress_bounded
-from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
+from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 
 __all__ = ["UnpackedSource", "holds_packed_messages"]
 

@@ -14,7 +14,7 @@ import numpy as np
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import Batch, Bytes, Stream
 from pendulum_rosbag.reader.sqlite_pages import MessageRows, leaf_pages, message_rows, page_size
-from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
+from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 
 __all__ = ["SqliteSource"]
 

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any
 
 from pendulum_msgs_py.errors import BagError, ParameterError
-from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
+from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 from pendulum_rosbag.storage.message_types import MessageType, message_type
 from pendulum_rosbag.storage.metadata_file import (
     FileEntry,

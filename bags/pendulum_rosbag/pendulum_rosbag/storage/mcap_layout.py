@@ -39,7 +39,7 @@ from pathlib import Path
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.storage import mcap_records as rec
-from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
+from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 from pendulum_rosbag.storage.mcap_summary import Chunk, McapSummary
 
 __all__ = ["McapLayout"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 __all__ = [
     "ATTACHMENT",
@@ -32,13 +33,12 @@ __all__ = [
     "STATISTICS",
     "SUMMARY_CHECKSUM",
     "SUMMARY_OFFSET",
-    "attachment_index_record",
+    "Attachment",
+    "Metadata",
     "channel_record",
     "chunk_index_record",
     "footer_record",
     "header_record",
-    "metadata_index_record",
-    "metadata_record",
     "padding_head",
     "record",
     "schema_record",
@@ -100,22 +100,47 @@ def channel_record(
     return record(CHANNEL, head + _text(topic) + _text(message_encoding) + _text_map(metadata))
 
 
-def attachment_index_record(
-    offset: int, length: int, log_time_ns: int, create_time_ns: int, data_size: int, name: str, media_type: str
-) -> bytes:
-    """Return the summary's pointer to an attachment."""
-    head = struct.pack("<QQQQQ", offset, length, log_time_ns, create_time_ns, data_size)
-    return record(ATTACHMENT_INDEX, head + _text(name) + _text(media_type))
+@dataclass(frozen=True)
+class Attachment:
+    """A file inside the file: its record's content as it stands there, checksum included.
+
+    Args:
+        content: Log time, creation time, name, media type, data and checksum, as the format lays them out.
+        name: As in ``content``.
+        media_type: As in ``content``.
+        data_size: Bytes of data.
+    """
+
+    content: bytes
+    name: str
+    media_type: str
+    data_size: int
+
+    def record(self) -> bytes:
+        """Return the whole record."""
+        return record(ATTACHMENT, self.content)
+
+    def index_record(self, offset: int) -> bytes:
+        """Return the summary's record of it when it begins at byte ``offset`` of the file."""
+        head = struct.pack("<QQ", offset, RECORD_HEAD_SIZE + len(self.content)) + self.content[:16]
+        size = struct.pack("<Q", self.data_size)
+        return record(ATTACHMENT_INDEX, head + size + _text(self.name) + _text(self.media_type))
 
 
-def metadata_record(name: str, items: Mapping[str, str]) -> bytes:
-    """Return a named map of strings."""
-    return record(METADATA, _text(name) + _text_map(items))
+@dataclass(frozen=True)
+class Metadata:
+    """A named map of strings."""
 
+    name: str
+    items: Mapping[str, str]
 
-def metadata_index_record(offset: int, length: int, name: str) -> bytes:
-    """Return the summary's pointer to a metadata record."""
-    return record(METADATA_INDEX, struct.pack("<QQ", offset, length) + _text(name))
+    def record(self) -> bytes:
+        """Return the whole record."""
+        return record(METADATA, _text(self.name) + _text_map(self.items))
+
+    def index_record(self, offset: int) -> bytes:
+        """Return the summary's record of it when it begins at byte ``offset`` of the file."""
+        return record(METADATA_INDEX, struct.pack("<QQ", offset, len(self.record())) + _text(self.name))
 
 
 def statistics_record(

@@ -13,8 +13,8 @@ import numpy as np
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.storage import mcap_records as rec
-from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
 from pendulum_rosbag.storage.mcap_layout import McapLayout
+from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 from pendulum_rosbag.storage.mcap_summary import Chunk, Compressor, McapSummary, build_chunk
 from pendulum_rosbag.storage.message_types import MessageType
 

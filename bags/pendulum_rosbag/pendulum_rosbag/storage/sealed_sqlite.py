@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from pendulum_msgs_py.errors import BagError
-from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
+from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 from pendulum_rosbag.storage.message_types import MessageType
 from pendulum_rosbag.storage.sqlite_pages import PAGE, Pages, Table, record, tree_page, varint
 

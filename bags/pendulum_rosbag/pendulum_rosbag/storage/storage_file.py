@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Protocol
 
-from pendulum_rosbag.storage.mcap_extras import Attachment, Metadata
+from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 from pendulum_rosbag.storage.message_types import MessageType
 
 __all__ = ["StorageFile"]
