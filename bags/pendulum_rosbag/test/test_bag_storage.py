@@ -152,6 +152,13 @@ def test_sqlite_files_have_the_index_that_rosbag2_seeks_by(tmp_path: Path) -> No
     connection.close()
 
 
+def test_a_database_names_the_distribution_that_its_metadata_name(tmp_path: Path) -> None:
+    open_writer(tmp_path / "bag", "sqlite3", ros_distro="humble").close()
+    connection = sqlite3.connect(tmp_path / "bag" / "bag_0.db3")
+    assert connection.execute("SELECT ros_distro FROM schema").fetchall() == [("humble",)]
+    assert "ros_distro: humble" in (tmp_path / "bag" / "metadata.yaml").read_text()
+
+
 def test_large_messages_continue_on_overflow_pages(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     sizes = [0, 1, 4000, 4030, 4031, 4032, 4040, 4044, 4061, 4100, 8000, 8150, 12_345, 70_000, 300_000]

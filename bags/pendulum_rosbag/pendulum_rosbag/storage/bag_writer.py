@@ -68,6 +68,7 @@ class BagWriter:
         self._chunk_size = chunk_size
         self._max_size = max_size
         self._max_duration_ns = max_duration_ns
+        self._ros_distro = ros_distro
         self._custom = encode_custom_data(metadata)
         self._topics: dict[str, TopicEntry] = {}
         self._ids = _Channels(path)
@@ -288,7 +289,7 @@ class BagWriter:
         else:
             from pendulum_rosbag.storage.sealed_sqlite import SealedSqliteFile
 
-            file = SealedSqliteFile(self._folder / f"{name}.db3")
+            file = SealedSqliteFile(self._folder / f"{name}.db3", ros_distro=self._ros_distro)
         self._files.append(FileEntry(file.path.name))
         return file
 
@@ -361,7 +362,7 @@ def open_writer(
         chunk_size: Bytes of messages that are sealed together at the latest.
         max_size: Begin a new storage file at this size [bytes]; 0 for never.
         max_duration: Begin a new storage file after this time of messages [s]; 0 for never.
-        ros_distro: What ``metadata.yaml`` names as distribution.
+        ros_distro: What ``metadata.yaml``, and a database, name as distribution.
         file_stem: Beginning of the names of storage files; by default the name of the folder.
 
     Raises:
