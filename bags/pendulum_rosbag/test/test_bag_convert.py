@@ -138,6 +138,17 @@ def test_merged_bags_are_interleaved_and_tell_what_each_said_of_its_run(tmp_path
     assert set(twins.metadata["pendulum.merged"]) == {str(sim), str(twin)}
 
 
+def test_metadata_of_merged_bags_are_what_each_bag_reads_as(tmp_path: Path) -> None:
+    odd = {"nested": "[" * 100_000, "none": "NaN", "number": "3"}
+    for name in ("one", "two"):
+        with open_writer(tmp_path / name, metadata={**odd, "name": name}) as writer:
+            writer.add_topic("/text", STRING)
+            writer.write("/text", 1, text_message(name))
+    rewrite([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
+    merged = read_bag(tmp_path / "both").metadata["pendulum.merged"]
+    assert merged["one"] == read_bag(tmp_path / "one").metadata == {**odd, "number": 3, "name": "one"}
+
+
 def test_bags_that_disagree_about_a_type_are_not_merged(tmp_path: Path) -> None:
     sim = a_bag(tmp_path / "sim", "mcap")
     with open_writer(tmp_path / "other") as writer:

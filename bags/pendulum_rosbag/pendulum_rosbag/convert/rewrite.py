@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import os
 import re
@@ -197,18 +196,8 @@ def _metadata(inputs: Sequence[_Input], choice: Choice) -> dict[str, Any]:
     names = [one.path.name for one in inputs]
     if len(set(names)) < len(names):
         names = [str(one.path) for one in inputs]
-    merged = {
-        name: {key: _parsed(value) for key, value in one.folder.custom_data.items()}
-        for name, one in zip(names, inputs, strict=True)
-    }
+    merged = {name: one.folder.metadata for name, one in zip(names, inputs, strict=True)}
     return {**agreed, "pendulum.merged": merged, **origin}
-
-
-def _parsed(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
 
 
 def _copy(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +17,7 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader.batches import Batch, Int64, Source, Stream
 from pendulum_rosbag.reader.joint_state import JointStateParser
 from pendulum_rosbag.reader.joint_table import JointTable, joint_table
-from pendulum_rosbag.reader.open_source import BagFolder, open_folder, open_sources
+from pendulum_rosbag.reader.open_source import BagFolder, open_folder, open_sources, parsed
 from pendulum_rosbag.reader.topic_info import StoredMessage, TopicInfo
 
 __all__ = ["Bag", "read_bag", "read_bags"]
@@ -59,7 +58,7 @@ class Bag(Mapping[str, Any]):
     ) -> None:
         self.path = folder.path
         self.storage = folder.storage
-        self.metadata: dict[str, Any] = {key: _parsed(value) for key, value in folder.custom_data.items()}
+        self.metadata: dict[str, Any] = folder.metadata
         self.damage = [
             *folder.damage,
             *(f"{source.path.name}: {source.damage}" for source in sources if source.damage),
@@ -206,8 +205,8 @@ class Bag(Mapping[str, Any]):
             for time, data in self.raw(name):
                 size = int.from_bytes(data[4:8], "little")
                 text = data[8 : 8 + size].split(b"\0")[0].decode("utf-8", "replace")
-                parsed = _parsed(text)
-                event = parsed if isinstance(parsed, dict) else {"name": text}
+                content = parsed(text)
+                event = content if isinstance(content, dict) else {"name": text}
                 events.append({"stamp_ns": time, "name": "", **event, "topic": name, "log_time_ns": time})
         for event in events:
             if not isinstance(event["stamp_ns"], int):
@@ -375,13 +374,3 @@ def _held(kind: str, stored: Sequence[StoredMessage]) -> str:
         if max(sizes) > 1:
             return f"{kind} of the joint {joints[0]} with {max(sizes)} values"
     return f"{kind} in more layouts than can be read (big-endian CDR, or damaged)"
-
-
-def _parsed(text: Any) -> Any:
-    """Return JSON text as the value that it stands for; any other text as it is."""
-    if not isinstance(text, str) or text[:1] not in '{["-0123456789tfn':
-        return text
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        return text

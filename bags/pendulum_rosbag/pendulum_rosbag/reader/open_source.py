@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ from pendulum_rosbag.reader.message_compression import UnpackedSource, holds_pac
 from pendulum_rosbag.reader.sqlite_source import SqliteSource
 from pendulum_rosbag.storage.metadata_file import METADATA_NAME, METADATA_VERSION
 
-__all__ = ["BagFolder", "is_bag_folder", "is_storage_file", "open_folder", "open_source", "open_sources"]
+__all__ = ["BagFolder", "is_bag_folder", "is_storage_file", "open_folder", "open_source", "open_sources", "parsed"]
 
 _ENDINGS = {".mcap": "mcap", ".db3": "sqlite3"}
 _LEAST_ROOM = 1 << 28
@@ -42,6 +43,11 @@ class BagFolder:
     topic_counts: dict[str, int] = field(default_factory=dict)
     """Messages by topic, as its metadata has it; empty where nothing says so."""
     damage: list[str] = field(default_factory=list)
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """Run metadata (``custom_data``), values parsed where they are JSON."""
+        return {key: parsed(value) for key, value in self.custom_data.items()}
 
 
 def is_storage_file(path: Path) -> bool:
@@ -276,3 +282,13 @@ def _metadata_from_storage(folder: BagFolder, source: Source) -> None:
             folder.topic_counts = _counts_by_topic(info)
     except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, RecursionError, OverflowError):
         return
+
+
+def parsed(text: Any) -> Any:
+    """Return JSON text as the value that it stands for; any other text as it is."""
+    if not isinstance(text, str) or text[:1] not in '{["-0123456789tfn':
+        return text
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
