@@ -16,7 +16,7 @@ from typing import Any
 
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_rosbag.reader.batches import Source
-from pendulum_rosbag.reader.open_source import BagFolder, open_folder, open_sources
+from pendulum_rosbag.reader.open_source import BagFolder, damage_of, open_folder, open_sources
 from pendulum_rosbag.repair.repair import message_type_of, profiles_of
 from pendulum_rosbag.storage.bag_writer import BagWriter, open_writer
 from pendulum_rosbag.storage.message_types import MessageType
@@ -138,8 +138,7 @@ def rewrite(
         _require_topics(inputs, choice)
         report = RewriteReport(Path(output))
         for one in inputs:
-            damage = (*one.folder.damage, *(f"{s.path.name}: {s.damage}" for s in one.sources if s.damage))
-            report.damage += [f"{one.path}: {sentence}" for sentence in damage]
+            report.damage += [f"{one.path}: {sentence}" for sentence in damage_of(one.folder, one.sources)]
         metadata = _metadata(inputs, choice)
         writer = open_writer(output, storage, compression, metadata, max_size=max_size, max_duration=max_duration)
         try:

@@ -17,7 +17,7 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader.batches import Batch, Int64, Source, Stream
 from pendulum_rosbag.reader.joint_state import JointStateParser
 from pendulum_rosbag.reader.joint_table import JointTable, joint_table
-from pendulum_rosbag.reader.open_source import BagFolder, open_folder, open_sources, parsed
+from pendulum_rosbag.reader.open_source import BagFolder, damage_of, open_folder, open_sources, parsed
 from pendulum_rosbag.reader.topic_info import StoredMessage, TopicInfo
 
 __all__ = ["Bag", "read_bag", "read_bags"]
@@ -59,10 +59,7 @@ class Bag(Mapping[str, Any]):
         self.path = folder.path
         self.storage = folder.storage
         self.metadata: dict[str, Any] = folder.metadata
-        self.damage = [
-            *folder.damage,
-            *(f"{source.path.name}: {source.damage}" for source in sources if source.damage),
-        ]
+        self.damage = damage_of(folder, sources)
         self.notes = [
             f"{source.path.name}: {source.unchecked}, so bytes that changed in messages cannot be told"
             for source in sources
@@ -73,12 +70,7 @@ class Bag(Mapping[str, Any]):
         self._topics, several = _group(sources, folder.topic_hashes)
         self.damage += several
         if topics is not None:
-            missing = [topic for topic in topics if topic not in self._topics]
-            if missing:
-                raise DataError(
-                    f"bag {self.path} has no topic {missing[0]}; it has {', '.join(sorted(self._topics)) or 'none'}"
-                )
-            self._topics = {topic: self._topics[topic] for topic in topics}
+            self._topics = {topic: self._entry(topic) for topic in topics}
         self._arrays: dict[str, npt.NDArray[Any] | list[StoredMessage]] = {}
         self._tables: dict[str, JointTable] = {}
 
@@ -98,8 +90,7 @@ class Bag(Mapping[str, Any]):
         return max((source.stop_ns for source in self._sources), default=0)
 
     def __getitem__(self, topic: str) -> Any:
-        if topic not in self._topics:
-            raise DataError(f"bag {self.path} has no topic {topic}; it has {', '.join(sorted(self._topics)) or 'none'}")
+        self._entry(topic)
         if topic not in self._arrays:
             self._load([topic])
         return self._arrays[topic]
@@ -146,8 +137,6 @@ class Bag(Mapping[str, Any]):
 
     def joint_names(self, topic: str) -> tuple[str, ...]:
         """Return the joints that the first message of a topic names; none where it has none or is no JointState."""
-        if topic not in self._topics:
-            return self[topic]  # raises
         batches = self._batches({topic})[topic] if self._is_fixed(topic) else []
         first = next((decode_joint_state(data) for batch in batches for _, data in batch.payloads()), None)
         return () if first is None else first.joints
@@ -159,16 +148,12 @@ class Bag(Mapping[str, Any]):
 
     def raw(self, topic: str) -> list[tuple[int, bytes]]:
         """Return all messages of a topic as (log time [ns], CDR bytes), ordered by log time."""
-        if topic not in self._topics:
-            return self[topic]  # raises
         rows = [row for batch in self._batches({topic})[topic] for row in batch.payloads()]
         rows.sort(key=lambda row: row[0])
         return rows
 
     def log_times(self, topic: str) -> Int64:
         """Return the log times of a topic in ascending order [ns], shape (n,), without reading its messages."""
-        if topic not in self._topics:
-            return self[topic]["log_time_ns"]  # raises
         batches = self._batches({topic})[topic]
         for batch in batches:
             batch.check_heads()
@@ -231,6 +216,11 @@ class Bag(Mapping[str, Any]):
 
     # -- parts -------------------------------------------------------------------------------------------------
 
+    def _entry(self, topic: str) -> _Topic:
+        if topic not in self._topics:
+            raise DataError(f"bag {self.path} has no topic {topic}; it has {', '.join(sorted(self._topics)) or 'none'}")
+        return self._topics[topic]
+
     def _batches(self, topics: set[str]) -> dict[str, list[Batch]]:
         """Collect the batches of some topics over all files in order."""
         found: dict[str, list[Batch]] = {topic: [] for topic in topics}
@@ -240,12 +230,10 @@ class Bag(Mapping[str, Any]):
         return found
 
     def _wanted(self, topics: set[str]) -> Iterator[tuple[Source, dict[int, str]]]:
+        streams = {name: self._entry(name).streams for name in topics}
         for source in self._sources:
             wanted = {
-                stream.channel: name
-                for name in topics
-                for owner, stream in self._topics[name].streams
-                if owner is source
+                stream.channel: name for name, found in streams.items() for owner, stream in found if owner is source
             }
             if wanted:
                 yield source, wanted
@@ -261,7 +249,7 @@ class Bag(Mapping[str, Any]):
             self._arrays[topic] = self.messages(topic) if array is None else array
 
     def _is_fixed(self, topic: str) -> bool:
-        entry = self._topics[topic]
+        entry = self._entry(topic)
         plain = all(stream.serialization == "cdr" for _, stream in entry.streams)
         return entry.info.type == _JOINT_STATE and plain
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.storage.mcap_records import MESSAGE, Attachment, Metadata
 
-__all__ = ["MCAP_HEAD", "Batch", "Bytes", "Int64", "Source", "Stream"]
+__all__ = ["MCAP_HEAD", "Batch", "Bytes", "Int64", "Source", "Stream", "items_at", "joined", "within"]
 
 Bytes = npt.NDArray[np.uint8]
 Int64 = npt.NDArray[np.int64]
@@ -28,6 +28,32 @@ _OVERLAP = "the bag names messages that overlap each other; try to repair it"
 
 def _unknown_origin(*_: int) -> str:
     return "the message index"
+
+
+def items_at(buffer: Bytes, item: np.dtype[Any], at: Int64) -> npt.NDArray[Any]:
+    """Return copies of the items that begin at some bytes of a buffer.
+
+    Every byte counts as the possible start of one: taking rows of that copies the items, and nothing else.
+    """
+    places = max(len(buffer) - item.itemsize + 1, 0)
+    anywhere: npt.NDArray[Any] = np.ndarray((places,), f"V{item.itemsize}", buffer.data, strides=(1,))
+    return anywhere[at].view(item)
+
+
+def joined(datas: Sequence[bytes]) -> tuple[Bytes, Int64, Int64]:
+    """Return messages in one buffer, where each begins there, and the size of each."""
+    sizes = np.fromiter(map(len, datas), np.int64, len(datas))
+    return np.frombuffer(b"".join(datas), np.uint8), np.cumsum(sizes) - sizes, sizes
+
+
+def within(times: Int64, start: int | None, stop: int | None) -> npt.NDArray[np.bool_]:
+    """Return which log times lie in a span [ns]: first included, last not, ``None`` for no end."""
+    inside = np.ones(len(times), bool)
+    if start is not None:
+        inside &= times >= start
+    if stop is not None:
+        inside &= times < stop
+    return inside
 
 
 @dataclass(slots=True)
@@ -63,9 +89,7 @@ class Batch:
         """
         if self.sizes is not None:
             return
-        places = max(len(self.buffer) - _HEAD.itemsize + 1, 0)
-        anywhere: np.ndarray[Any, Any] = np.ndarray((places,), f"V{_HEAD.itemsize}", self.buffer.data, strides=(1,))
-        heads = anywhere[self.offsets].view(_HEAD)
+        heads = items_at(self.buffer, _HEAD, self.offsets)
         same = (heads["opcode"] == MESSAGE) & (heads["channel"] == self.channel) & (heads["time"] == self.times)
         if not same.all():
             wrong = int(np.argmin(same))

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Int64
+from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Int64, items_at
 from pendulum_rosbag.storage.mcap_records import MESSAGE
 
 __all__ = ["FIELDS", "JointStateParser", "Layout", "Trimmer", "canonical", "layout_of"]
@@ -332,14 +332,7 @@ def _fit_items(
         ]
         found = [rest for rest in rests if rest is not None]
         return np.concatenate(found) if found else None
-    # Every byte of the buffer as the possible start of a message: taking rows of it copies messages, nothing else.
-    anywhere: npt.NDArray[Any] = np.ndarray(
-        (len(batch.buffer) - size + 1,),
-        f"V{size}",
-        batch.buffer.data,
-        strides=(1,),
-    )
-    items = anywhere[offsets].view(plan.item)
+    items = items_at(batch.buffer, plan.item, offsets)
     fits = items["length"] >= plan.least_length if sizes is None else sizes >= layout.size
     if sizes is None:
         fits &= items["log_time"] == times

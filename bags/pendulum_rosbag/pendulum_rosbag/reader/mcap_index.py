@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pendulum_msgs_py.errors import BagError
-from pendulum_rosbag.reader.batches import Bytes, Int64
+from pendulum_rosbag.reader.batches import Bytes, Int64, items_at
 from pendulum_rosbag.reader.mcap_chunks import Chunk
 from pendulum_rosbag.storage import mcap_records as rec
 
@@ -80,9 +80,6 @@ def indexed_messages(path: Path, channel: int, index: Bytes, places: Sequence[tu
 
 
 def _take(path: Path, buffer: Bytes, item: np.dtype[Any], at: Int64) -> Any:
-    """Return copies of the items that begin at some bytes of a buffer."""
-    places = max(len(buffer) - item.itemsize + 1, 0)
-    if len(at) and not 0 <= int(at.max()) < places:
+    if len(at) and not 0 <= int(at.max()) <= len(buffer) - item.itemsize:
         raise BagError(f"{path}: a message index lies beyond the end of the file; try to repair the bag")
-    anywhere: np.ndarray[Any, Any] = np.ndarray((places,), f"V{item.itemsize}", buffer.data, strides=(1,))
-    return anywhere[at].view(item)
+    return items_at(buffer, item, at)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from pendulum_msgs_py.errors import BagError
-from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Bytes, Int64
+from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Bytes, Int64, within
 from pendulum_rosbag.reader.checksums import Checksums, Comparison
 from pendulum_rosbag.reader.mcap_chunks import CHUNK_FIELDS, Chunk, DamagedError, keep_staged, raw_content, read_text
 from pendulum_rosbag.reader.mcap_index import indexed_counts, indexed_messages
@@ -365,11 +365,7 @@ class McapSource:
     def _cut(self, batch: Batch, start: int | None, stop: int | None) -> Iterator[Batch]:
         """Limit a batch to a time span and check that its records lie inside the buffer."""
         if start is not None or stop is not None:
-            keep = np.ones(len(batch.times), bool)
-            if start is not None:
-                keep &= batch.times >= start
-            if stop is not None:
-                keep &= batch.times < stop
+            keep = within(batch.times, start, stop)
             batch = replace(batch, offsets=batch.offsets[keep], times=batch.times[keep])
         if not len(batch.times):
             return

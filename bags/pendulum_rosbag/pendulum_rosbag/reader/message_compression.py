@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pendulum_rosbag.reader.batches import Batch, Source
+from pendulum_rosbag.reader.batches import Batch, Source, joined
 from pendulum_rosbag.reader.decompression import decompress_bounded
 from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 
@@ -73,9 +73,8 @@ class UnpackedSource:
 
 
 def _batch(channel: int, times: list[int], parts: list[bytes]) -> Batch:
-    sizes = np.fromiter(map(len, parts), np.int64, len(parts))
-    buffer = np.frombuffer(b"".join(parts), np.uint8)
-    return Batch(channel, buffer, np.cumsum(sizes) - sizes, np.array(times, np.int64), sizes)
+    buffer, offsets, sizes = joined(parts)
+    return Batch(channel, buffer, offsets, np.array(times, np.int64), sizes)
 
 
 def holds_packed_messages(source: Source) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
@@ -19,7 +19,16 @@ from pendulum_rosbag.reader.message_compression import UnpackedSource, holds_pac
 from pendulum_rosbag.reader.sqlite_source import SqliteSource
 from pendulum_rosbag.storage.metadata_file import METADATA_NAME, METADATA_VERSION
 
-__all__ = ["BagFolder", "is_bag_folder", "is_storage_file", "open_folder", "open_source", "open_sources", "parsed"]
+__all__ = [
+    "BagFolder",
+    "damage_of",
+    "is_bag_folder",
+    "is_storage_file",
+    "open_folder",
+    "open_source",
+    "open_sources",
+    "parsed",
+]
 
 _ENDINGS = {".mcap": "mcap", ".db3": "sqlite3"}
 _LEAST_ROOM = 1 << 28
@@ -27,6 +36,8 @@ _MAX_RATIO = 100
 """A file compressed as a whole may hold this many times its size: states shrink to a fifth, bombs to nothing."""
 _MAX_METADATA = 16 << 20
 _MAX_DEPTH = 40
+_NO_METADATA = (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, RecursionError, OverflowError)
+"""What reading leads to where YAML is not that of a bag."""
 
 
 @dataclass(slots=True)
@@ -144,15 +155,7 @@ def _take_metadata(folder: BagFolder, text: str) -> None:
             folder.topic_hashes[str(topic["name"])] = str(topic.get("type_description_hash", ""))
         folder.topic_counts = _counts_by_topic(info)
         folder.message_compression = _is_message_compression(info)
-    except (
-        yaml.YAMLError,
-        KeyError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        RecursionError,
-        OverflowError,
-    ) as error:
+    except _NO_METADATA as error:
         sentence = " ".join(str(error).split())
         folder.damage.append(f"{METADATA_NAME} is not what a bag has: {sentence or type(error).__name__}")
 
@@ -232,16 +235,19 @@ def open_sources(folder: BagFolder, *, verify: bool | None = None) -> list[Sourc
     return [UnpackedSource(source) for source in sources] if folder.message_compression else sources
 
 
+def damage_of(folder: BagFolder, sources: Iterable[Source]) -> list[str]:
+    """Return what is wrong with a bag and its storage files, one sentence each; empty for a healthy one."""
+    return [*folder.damage, *(f"{source.path.name}: {source.damage}" for source in sources if source.damage)]
+
+
 def open_source(file: Path, *, verify: bool | None = None) -> Source:
     """Open one storage file by its name; files compressed as a whole (``.zstd``) are decompressed first."""
+    if file.suffix == ".mcap":
+        return McapSource(file, verify=verify)
+    if file.suffix == ".db3":
+        return SqliteSource(file)
     if file.suffix != ".zstd":
-        return (
-            McapSource(file, verify=verify)
-            if file.suffix == ".mcap"
-            else SqliteSource(file)
-            if file.suffix == ".db3"
-            else _unknown(file)
-        )
+        raise BagError(f"{file} is no storage file of a bag; expected .mcap or .db3")
     try:
         with file.open("rb") as packed:
             data = decompress_bounded(packed, str(file), max(_LEAST_ROOM, _MAX_RATIO * file.stat().st_size))
@@ -257,10 +263,6 @@ def open_source(file: Path, *, verify: bool | None = None) -> Source:
     source = SqliteSource(copy)
     source.keep(folder)
     return source
-
-
-def _unknown(file: Path) -> Source:
-    raise BagError(f"{file} is no storage file of a bag; expected .mcap or .db3")
 
 
 def _metadata_from_storage(folder: BagFolder, source: Source) -> None:
@@ -280,7 +282,7 @@ def _metadata_from_storage(folder: BagFolder, source: Source) -> None:
             folder.message_compression = _is_message_compression(info)
         if folder.path.is_file() and len(info.get("relative_file_paths") or []) == 1:
             folder.topic_counts = _counts_by_topic(info)
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, RecursionError, OverflowError):
+    except _NO_METADATA:
         return
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pendulum_msgs_py.errors import BagError
-from pendulum_rosbag.reader.batches import Batch, Bytes, Stream
+from pendulum_rosbag.reader.batches import Batch, Bytes, Stream, joined, within
 from pendulum_rosbag.reader.sqlite_pages import MessageRows, leaf_pages, message_rows, page_size
 from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 
@@ -229,11 +229,7 @@ class SqliteSource:
         """Yield all messages of some topics with start <= log time < stop, in the order of the file."""
         if self._rows is not None:
             for block in self._rows:
-                inside = np.ones(len(block.times), bool)
-                if start is not None:
-                    inside &= block.times >= start
-                if stop is not None:
-                    inside &= block.times < stop
+                inside = within(block.times, start, stop)
                 for channel in channels:
                     wanted = (block.topics == channel) & inside
                     mine = np.flatnonzero(wanted & block.local)
@@ -285,9 +281,7 @@ def _first_of_each(blocks: list[MessageRows]) -> list[MessageRows]:
 
 def _batches(rows: list[tuple[int, int, bytes]]) -> Iterator[Batch]:
     topics, times, datas = zip(*rows, strict=True)
-    sizes = np.fromiter(map(len, datas), np.int64, len(datas))
-    offsets = np.cumsum(sizes) - sizes
-    buffer = np.frombuffer(b"".join(datas), np.uint8)
+    buffer, offsets, sizes = joined(datas)
     topic = np.array(topics)
     time = np.array(times, np.int64)
     for channel in np.unique(topic):

@@ -75,15 +75,12 @@ def repair_bag(
     Raises:
         BagError: There is no bag, nothing of it can be read, or the new one cannot be written.
     """
-    from pendulum_rosbag.reader.open_source import open_folder, open_sources
+    from pendulum_rosbag.reader.open_source import damage_of, open_folder, open_sources
 
     bag = Path(path)
     folder = open_folder(bag)
     sources = open_sources(folder, verify=True)
-    damage = [
-        *folder.damage,
-        *(f"{source.path.name}: {source.damage}" for source in sources if source.damage),
-    ]
+    damage = damage_of(folder, sources)
     damage += [f"{source.path.name}: its recorder did not close it" for source in sources if source.unclosed]
     report = RepairReport(bag, damage)
     if not damage and not force:
