@@ -19,7 +19,7 @@ from pendulum_rosbag.storage import (
     mcap_layout,
     open_writer,
     sealed_mcap,
-    sealed_sqlite,
+    storage_file,
 )
 from tests.bag_readers import ENDLESS_WRITER, JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
 from tests.mcap_js_reader import McapJs
@@ -58,7 +58,7 @@ def test_no_write_of_a_commit_ever_leaves_a_broken_bag(
         return len(view)
 
     writer = open_writer(bag, storage)
-    monkeypatch.setattr(mcap_layout if storage == "mcap" else sealed_sqlite, "os", _WatchedOs(watched))
+    monkeypatch.setattr(storage_file, "os", _WatchedOs(watched))
     writer.add_topic("/a", STRING)
     for round_number in range(14):
         for _ in range(rng.randrange(1, 5)):
@@ -138,7 +138,7 @@ def test_small_chunks_become_large_ones_unseen(
         return done
 
     writer = open_writer(bag, compression=compression)
-    monkeypatch.setattr(mcap_layout, "os", _WatchedOs(watched))
+    monkeypatch.setattr(storage_file, "os", _WatchedOs(watched))
     ends = []
     for round_number in range(25 if compression else 45):
         if round_number % 20 == 0:
@@ -228,7 +228,7 @@ def test_foxgloves_readers_open_a_growing_file_at_every_write(
         return done
 
     writer = open_writer(bag, compression=compression)
-    monkeypatch.setattr(mcap_layout, "os", _WatchedOs(watched))
+    monkeypatch.setattr(storage_file, "os", _WatchedOs(watched))
     assert mcap_js.counts(bag / "bag_0.mcap") == (0, 0)
     sizes = set()
     for round_number in range(24):

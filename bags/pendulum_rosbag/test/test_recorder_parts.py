@@ -11,11 +11,13 @@ import pytest
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_rosbag.reader import read_bag
-from pendulum_rosbag.recorder import GapCounter, RecordingSession, stamp_reader
+from pendulum_rosbag.recorder.gaps import GapCounter
 from pendulum_rosbag.recorder.options import RecorderOptions
 from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
 from pendulum_rosbag.recorder.record_cli import main as record_main
-from pendulum_rosbag.storage import message_type, open_writer
+from pendulum_rosbag.recorder.session import RecordingSession
+from pendulum_rosbag.storage import mcap_layout, message_type, open_writer
+from pendulum_rosbag.storage.stamps import stamp_reader
 from tests.fixtures import wait_for
 from tests.graph_peer import GraphPeer
 
@@ -136,7 +138,7 @@ def test_messages_before_the_subscription_was_complete_are_told_and_are_no_loss(
     session = RecordingSession(open_writer(tmp_path / "bag"))
     session.add_topic("/a", message_type(JOINT_STATE), ())
     session.offer("/a", [(1, encode_joint_state(1, position=1.0))])
-    session.note_early("/a", 905)
+    session.note("/a", early=905)
     report = session.close()
     assert report.lost == 0
     assert "nothing lost; published before the subscription was complete, and not recorded: /a 905" in report.sentence()
@@ -148,9 +150,9 @@ def test_a_bag_that_was_not_closed_tells_what_is_missing_in_it(tmp_path: Path) -
     try:
         session.add_topic("/a", message_type(JOINT_STATE), ())
         session.offer("/a", [(1, encode_joint_state(1, position=1.0))])
-        session.note_missing("/a", 3)
-        session.note_early("/a", 4)
-        session.note_before("/a", 5)
+        session.note("/a", missing=3)
+        session.note("/a", early=4)
+        session.note("/a", before=5)
 
         def told() -> object:
             return read_bag(tmp_path / "bag").metadata.get("pendulum.recorder.counts")
@@ -182,7 +184,7 @@ def test_a_disk_that_fails_ends_the_session_in_a_sentence(tmp_path: Path, monkey
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(writer._file._layout, "_write", full)  # type: ignore[attr-defined]
+    monkeypatch.setattr(mcap_layout, "write_at", full)
     session.offer("/a", [(2, encode_joint_state(2, position=1.0))])
     wait_for(lambda: reasons, 10.0, "the session to say why it stops")
     report = session.close()
@@ -196,8 +198,8 @@ def test_a_topic_that_appears_after_the_disk_failed_is_counted_as_lost(tmp_path:
     session = RecordingSession(open_writer(tmp_path / "bag"))
     session.fail(MemoryError())
     session.add_topic("/late", message_type(JOINT_STATE), ())
-    session.note_early("/late", 3)
-    session.note_missing("/late", 2)
+    session.note("/late", early=3)
+    session.note("/late", missing=2)
     session.offer("/late", [(1, encode_joint_state(1, position=1.0))])
     report = session.close()
     assert "LOST 3 of 3 (/late 3)" in report.sentence()

@@ -17,9 +17,10 @@ from typing import Any
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_rosbag.reader.batches import Source
 from pendulum_rosbag.reader.open_source import BagFolder, damage_of, open_folder, open_sources
-from pendulum_rosbag.repair.repair import message_type_of, profiles_of
+from pendulum_rosbag.repair.repair import message_type_of
 from pendulum_rosbag.storage.bag_writer import BagWriter, open_writer
 from pendulum_rosbag.storage.message_types import MessageType
+from pendulum_rosbag.storage.qos import profiles_of
 
 __all__ = ["Choice", "RewriteReport", "rewrite"]
 

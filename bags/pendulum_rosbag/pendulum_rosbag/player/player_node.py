@@ -13,7 +13,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-import yaml
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -28,7 +27,7 @@ from pendulum_msgs_py.ros.convert import stamp_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_rosbag.reader import Bag, read_bag
-from pendulum_rosbag.storage import QosProfile
+from pendulum_rosbag.storage.qos import profiles_of
 
 __all__ = ["PlayOptions", "Player", "main"]
 
@@ -246,11 +245,7 @@ def _schedule(bag: Bag, options: PlayOptions) -> tuple[Any, Any, list[bytes], li
 
 def _recorded_qos(text: str) -> QoSProfile:
     """Return the reliability and durability that the publishers had, where the bag tells."""
-    try:
-        items = yaml.safe_load(text) if text else None
-    except yaml.YAMLError:
-        items = None
-    recorded = [QosProfile.from_mapping(item) for item in items or [] if isinstance(item, dict)]
+    recorded = profiles_of(text)
     best_effort = any(profile.reliability == "best_effort" for profile in recorded)
     latched = bool(recorded) and all(profile.durability == "transient_local" for profile in recorded)
     return QoSProfile(
@@ -310,7 +305,3 @@ def play(
 def main(argv: list[str] | None = None) -> int:
     """Run the player; arguments from ``--ros-args`` on belong to ROS."""
     return cli_main(app, argv, name="python -m pendulum_rosbag play", takes_ros_arguments=True)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

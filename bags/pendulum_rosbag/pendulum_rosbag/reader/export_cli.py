@@ -54,7 +54,3 @@ def export(
 def main(argv: list[str] | None = None) -> int:
     """Run the command."""
     return cli_main(app, argv, name="python -m pendulum_rosbag export")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

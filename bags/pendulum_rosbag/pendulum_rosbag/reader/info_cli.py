@@ -118,7 +118,3 @@ def _without_nan(value: Any) -> Any:
 def main(argv: list[str] | None = None) -> int:
     """Run the command."""
     return cli_main(app, argv, name="python -m pendulum_rosbag info")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

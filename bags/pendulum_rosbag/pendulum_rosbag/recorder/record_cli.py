@@ -71,7 +71,3 @@ def record(
 def main(argv: list[str] | None = None) -> int:
     """Run the recorder; arguments from ``--ros-args`` on belong to ROS."""
     return cli_main(app, argv, name="python -m pendulum_rosbag record", takes_ros_arguments=True)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

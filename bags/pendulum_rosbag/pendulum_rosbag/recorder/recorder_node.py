@@ -22,10 +22,10 @@ from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.timers import create_wall_timer
 from pendulum_rosbag import __version__
-from pendulum_rosbag.recorder import RecordingSession, SessionReport
 from pendulum_rosbag.recorder.options import RecorderOptions
 from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
 from pendulum_rosbag.recorder.recorder_tap_node import Tap
+from pendulum_rosbag.recorder.session import RecordingSession, SessionReport
 from pendulum_rosbag.storage import QosProfile, open_writer
 from pendulum_rosbag.storage.message_types import message_type
 
@@ -207,10 +207,10 @@ class Recorder(PollingNode):
             self._offer(tap, session, items, missing)
         if repeated:
             tap.announce(session)
-            session.note_repeated(tap.topic, repeated)
+            session.note(tap.topic, repeated=repeated)
         if unheard and tap.is_new:
             tap.announce(session)
-            session.note_before(tap.topic, unheard)
+            session.note(tap.topic, before=unheard)
         elif unheard:
             self._tell_early(tap, session, unheard)
 
@@ -221,7 +221,7 @@ class Recorder(PollingNode):
             missing = 0
         refused = session.offer(tap.topic, items)
         if missing:
-            session.note_missing(tap.topic, missing)
+            session.note(tap.topic, missing=missing)
         if missing or refused:
             why = "the disk failed" if session.failure else "the disk does not keep up"
             self.get_logger().error(
@@ -231,7 +231,7 @@ class Recorder(PollingNode):
 
     def _tell_early(self, tap: Tap, session: RecordingSession, count: int) -> None:
         tap.announce(session)
-        session.note_early(tap.topic, count)
+        session.note(tap.topic, early=count)
         self.get_logger().warning(
             f"{count} messages of {tap.topic} are not recorded: they were published before the subscription was "
             "complete"

@@ -14,9 +14,11 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_rosbag.reader.joint_state import Trimmer
-from pendulum_rosbag.recorder import GapCounter, RecordingSession, stamp_reader
+from pendulum_rosbag.recorder.gaps import GapCounter
+from pendulum_rosbag.recorder.session import RecordingSession
 from pendulum_rosbag.storage import QosProfile
 from pendulum_rosbag.storage.message_types import message_type
+from pendulum_rosbag.storage.stamps import stamp_reader
 
 __all__ = ["Tap", "wanted_qos"]
 

@@ -181,21 +181,11 @@ class RecordingSession:
         except OSError as error:
             self.fail(error)
 
-    def note_missing(self, topic: str, number: int) -> None:
-        """Count messages that the middleware lost before they could be offered."""
-        self._counts[topic].missing += number
-
-    def note_early(self, topic: str, number: int) -> None:
-        """Count messages that were published before the subscription was complete."""
-        self._counts[topic].early += number
-
-    def note_before(self, topic: str, number: int) -> None:
-        """Count messages that were published before the recording of their topic began."""
-        self._counts[topic].before += number
-
-    def note_repeated(self, topic: str, number: int) -> None:
-        """Count messages that came again and are in the bag already."""
-        self._counts[topic].repeated += number
+    def note(self, topic: str, **numbers: int) -> None:
+        """Count messages of a topic that are not in the bag, or are there already: ``missing``, ``early`` and so on."""
+        count = self._counts[topic]
+        for kind, number in numbers.items():
+            setattr(count, kind, getattr(count, kind) + number)
 
     def counts(self) -> dict[str, TopicCount]:
         """Return the counts so far; ``written`` are those that are safe on disk."""

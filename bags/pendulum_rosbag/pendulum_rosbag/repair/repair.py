@@ -8,17 +8,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import yaml
-
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.storage.bag_writer import BagWriter, open_writer
 from pendulum_rosbag.storage.message_types import MessageType, message_type
-from pendulum_rosbag.storage.qos import QosProfile
+from pendulum_rosbag.storage.qos import profiles_of
 
 if TYPE_CHECKING:
     from pendulum_rosbag.reader.batches import Source, Stream
 
-__all__ = ["RepairReport", "message_type_of", "profiles_of", "repair_bag"]
+__all__ = ["RepairReport", "message_type_of", "repair_bag"]
 
 
 @dataclass(slots=True)
@@ -151,15 +149,6 @@ def _known_hash(name: str) -> str:
         return message_type(name).hash
     except BagError:
         return ""
-
-
-def profiles_of(text: str) -> list[QosProfile]:
-    """Return QoS profiles from the YAML text of a bag; none where it cannot be read."""
-    try:
-        items = yaml.safe_load(text) if text else []
-    except yaml.YAMLError:
-        items = []
-    return [QosProfile.from_mapping(item) for item in items or [] if isinstance(item, dict)]
 
 
 def _free_name(path: Path) -> Path:

@@ -49,7 +49,3 @@ def repair(
 def main(argv: list[str] | None = None) -> int:
     """Run the command."""
     return cli_main(app, argv, name="python -m pendulum_rosbag repair")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -93,11 +93,6 @@ class BagWriter:
         self._file.path = path / self._file.path.name
 
     @property
-    def topics(self) -> dict[str, str]:
-        """Topic name -> message type."""
-        return {name: topic.type.name for name, topic in self._topics.items()}
-
-    @property
     def written(self) -> dict[str, int]:
         """Topic name -> messages given to the writer so far."""
         return dict(self._written)
@@ -108,19 +103,9 @@ class BagWriter:
         return {name: topic.count for name, topic in self._topics.items()}
 
     @property
-    def message_count(self) -> int:
-        """Messages given to the writer so far, over all topics."""
-        return sum(self._written.values())
-
-    @property
     def files(self) -> list[Path]:
         """Storage files, in order of time."""
         return [self.path / entry.name for entry in self._files]
-
-    @property
-    def size(self) -> int:
-        """Bytes of data in the current storage file."""
-        return self._file.data_size
 
     def add_topic(
         self, name: str, type: str | MessageType, qos: QosProfile | Sequence[QosProfile] | None = None

@@ -41,6 +41,7 @@ from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.storage import mcap_records as rec
 from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 from pendulum_rosbag.storage.mcap_summary import Chunk, McapSummary
+from pendulum_rosbag.storage.storage_file import write_at
 
 __all__ = ["McapLayout"]
 
@@ -111,9 +112,9 @@ class McapLayout:
                 self._slots[0].start - _FIRST_ROOM // 2, self._slots[0].start - len(_DATA_END)
             )
             self._cursor = self._area.start
-            self._write(header + rec.padding_head(len(header), self._tail), 0)
+            write_at(self._fd, header + rec.padding_head(len(header), self._tail), 0)
             self._fill_slot(self._slots[0])
-            self._write(self._tail_bytes(self._slots[0]), self._tail)
+            write_at(self._fd, self._tail_bytes(self._slots[0]), self._tail)
             os.rename(temporary, self.path)
         except OSError:
             self.abandon()
@@ -151,11 +152,11 @@ class McapLayout:
         start = self._next_stage
         blob, end = self._blob(chunk.parts, start, chunk.size)
         if self._chain_end == self.settled_end:
-            self._write(blob, start)
-            self._write(rec.padding_head(self.settled_end, start), self.settled_end)
+            write_at(self._fd, blob, start)
+            write_at(self._fd, rec.padding_head(self.settled_end, start), self.settled_end)
         else:
-            self._write(blob[_HEAD:], start + _HEAD)
-            self._write(blob[:_HEAD], start)
+            write_at(self._fd, blob[_HEAD:], start + _HEAD)
+            write_at(self._fd, blob[:_HEAD], start)
         self._chain_end = end
         return start
 
@@ -169,8 +170,8 @@ class McapLayout:
             self._grow(chunk.size + _PAGE)
         start = self.settled_end
         blob, end = self._blob(chunk.parts, start, chunk.size)
-        self._write(blob[_HEAD:], start + _HEAD)
-        self._write(blob[:_HEAD], start)
+        write_at(self._fd, blob[_HEAD:], start + _HEAD)
+        write_at(self._fd, blob[:_HEAD], start)
         if self._chain_end != start:
             self._cursor = self._chain_end
         if self._area != self._next_area:
@@ -190,7 +191,7 @@ class McapLayout:
             self._grow(0)
             return
         self._live = 1 - self._live
-        self._write(self._tail_bytes(slot), self._tail)
+        write_at(self._fd, self._tail_bytes(slot), self._tail)
 
     def duplicate(self) -> int:
         """Return a file descriptor of its own, to wait for the disk without keeping the writer waiting."""
@@ -208,8 +209,8 @@ class McapLayout:
             entry = extra.record()
             self._make_room(start + len(entry) + _PAGE)
             blob, end = self._blob([entry], start, len(entry))
-            self._write(blob[_HEAD:], start + _HEAD)
-            self._write(blob[:_HEAD], start)
+            write_at(self._fd, blob[_HEAD:], start + _HEAD)
+            write_at(self._fd, blob[:_HEAD], start)
             indexes.append(extra.index_record(start))
             if self.settled_end == start:
                 self.settled_end = end
@@ -221,8 +222,8 @@ class McapLayout:
         footer = rec.footer_record(summary_start, offsets_start, content)
         whole = _DATA_END + content + footer + rec.MAGIC
         self._make_room(start + len(whole))
-        self._write(whole[_HEAD:], start + _HEAD)
-        self._write(whole[:_HEAD], start)
+        write_at(self._fd, whole[_HEAD:], start + _HEAD)
+        write_at(self._fd, whole[:_HEAD], start)
         os.ftruncate(self._fd, start + len(whole))
 
     def sync(self) -> None:
@@ -256,13 +257,6 @@ class McapLayout:
     def _place_slots(self, capacity: int) -> list[_Slot]:
         top = self._tail // _PAGE * _PAGE
         return [_Slot(top - 2 * capacity, capacity), _Slot(top - capacity, capacity)]
-
-    def _write(self, data: bytes | bytearray, offset: int) -> None:
-        view = memoryview(data)
-        while view:
-            done = os.pwrite(self._fd, view, offset)
-            view = view[done:]
-            offset += done
 
     def _blob(self, parts: Sequence[bytes], start: int, size: int) -> tuple[bytes, int]:
         """Return records for byte ``start`` with the padding up to the tail behind them, and where that begins."""
@@ -312,8 +306,8 @@ class McapLayout:
         if end + _HEAD > slot.start + slot.capacity - len(_DATA_END):
             return False
         if slot.described < 0:
-            self._write(_DATA_END, slot.start - len(_DATA_END))
-        self._write(b"".join([body, tail, rec.padding_head(end, self._summary_stop)]), start)
+            write_at(self._fd, _DATA_END, slot.start - len(_DATA_END))
+        write_at(self._fd, b"".join([body, tail, rec.padding_head(end, self._summary_stop)]), start)
         slot.described, slot.settled = len(description), len(summary.settled)
         slot.group, slot.staged = summary.group, len(summary.staged)
         slot.offsets_start = offsets_start
@@ -334,20 +328,20 @@ class McapLayout:
             checksum = rec.summary_checksum_record(zlib.crc32(content))
             padding = rec.padding_head(keeper.start + len(content) + len(checksum), self._summary_stop)
             keeper.described = -1
-            self._write(_DATA_END + content + checksum + padding, keeper.start - len(_DATA_END))
+            write_at(self._fd, _DATA_END + content + checksum + padding, keeper.start - len(_DATA_END))
             # ... then the end of the file moves there in one write (offsets name absolute places: the copy has none).
-            self._write(_DATA_END + rec.footer_record(keeper.start, 0) + rec.MAGIC, self._tail)
+            write_at(self._fd, _DATA_END + rec.footer_record(keeper.start, 0) + rec.MAGIC, self._tail)
         except OSError:
             self._size = old_size
             raise
         keeper.offsets_start = keeper.start + len(content)
         self._live = 1 - self._live
         # Readers in order learn of the new end, and the summaries move to it.
-        self._write(rec.padding_head(self._chain_end, self._tail), self._chain_end)
+        write_at(self._fd, rec.padding_head(self._chain_end, self._tail), self._chain_end)
         slots = self._place_slots(capacity)
         if not self._fill_slot(slots[0]):
             raise BagError(f"{self.path}: a summary outgrew the {capacity} bytes that were made for it")
-        self._write(self._tail_bytes(slots[0]), self._tail)
+        write_at(self._fd, self._tail_bytes(slots[0]), self._tail)
         self._slots, self._live = slots, 0
         self._next_area = _Area(slots[0].start - staging, slots[0].start - len(_DATA_END))
         if self._chain_end == self.settled_end:

@@ -90,17 +90,14 @@ class McapSummary:
         self.staged = bytearray()
         self.group = 0
         self._settled_chunks = 0
-        self._staged_chunks = 0
+        self.staged_chunks = 0
+        """Chunks that wait to be settled."""
         self._schemas: list[bytes] = []
-        self._description = b""
+        self.description = b""
+        """Records of definitions and topics: how each summary begins."""
         # Checksums of description and settled chunks, and of these and the staged ones: continued, never made anew.
         self._settled_crc = 0
         self._staged_crc = 0
-
-    @property
-    def staged_chunks(self) -> int:
-        """Chunks that wait to be settled."""
-        return self._staged_chunks
 
     @property
     def schemas(self) -> int:
@@ -119,8 +116,8 @@ class McapSummary:
         self._describe()
 
     def _describe(self) -> None:
-        self._description = b"".join([*self._schemas, *self.channels.values()])
-        self._settled_crc = zlib.crc32(self.settled, zlib.crc32(self._description))
+        self.description = b"".join([*self._schemas, *self.channels.values()])
+        self._settled_crc = zlib.crc32(self.settled, zlib.crc32(self.description))
         self._staged_crc = zlib.crc32(self.staged, self._settled_crc)
 
     def add_messages(self, counts: dict[int, int], span: tuple[int, int]) -> None:
@@ -135,7 +132,7 @@ class McapSummary:
         """Add a small chunk to the index."""
         self.staged += record
         self._staged_crc = zlib.crc32(record, self._staged_crc)
-        self._staged_chunks += 1
+        self.staged_chunks += 1
 
     def settle(self, record: bytes) -> None:
         """Add a chunk that holds what the staged ones did, in their place."""
@@ -143,18 +140,13 @@ class McapSummary:
         self._settled_crc = self._staged_crc = zlib.crc32(record, self._settled_crc)
         self._settled_chunks += 1
         self.staged.clear()
-        self._staged_chunks = 0
+        self.staged_chunks = 0
         self.group += 1
-
-    @property
-    def description(self) -> bytes:
-        """Records of definitions and topics: how each summary begins."""
-        return self._description
 
     @property
     def size(self) -> int:
         """Bytes of all records but those that close the summary."""
-        return len(self._description) + len(self.settled) + len(self.staged)
+        return len(self.description) + len(self.settled) + len(self.staged)
 
     def checksum_record(self, tail: bytes) -> bytes:
         """Return the record that ends a summary in a file that grows: the checksum of the whole with this tail."""
@@ -176,7 +168,7 @@ class McapSummary:
             schema_count=len(self._schemas),
             attachment_count=sum(index[0] == rec.ATTACHMENT_INDEX for index in indexes),
             metadata_count=sum(index[0] == rec.METADATA_INDEX for index in indexes),
-            chunk_count=self._settled_chunks + self._staged_chunks,
+            chunk_count=self._settled_chunks + self.staged_chunks,
             start_ns=self.start_ns,
             stop_ns=self.stop_ns,
             channel_counts=self.counts,
@@ -184,7 +176,7 @@ class McapSummary:
         schemas = sum(map(len, self._schemas))
         groups = (
             (rec.SCHEMA, schemas),
-            (rec.CHANNEL, len(self._description) - schemas),
+            (rec.CHANNEL, len(self.description) - schemas),
             (rec.CHUNK_INDEX, len(self.settled) + len(self.staged)),
             (rec.STATISTICS, len(statistics)),
             *((opcode, len(records)) for opcode, records in kinds.items()),

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["INFINITE_NS", "QosProfile"]
+import yaml
+
+__all__ = ["INFINITE_NS", "QosProfile", "profiles_of"]
 
 INFINITE_NS = 2**63 - 1
 """What rmw means by "no limit" for a deadline, a lifespan or a lease [ns]."""
@@ -63,6 +65,15 @@ class QosProfile:
             liveliness=_name(item.get("liveliness"), _LIVELINESS),
             lease_ns=_nanoseconds(item.get("liveliness_lease_duration")),
         )
+
+
+def profiles_of(text: str) -> list[QosProfile]:
+    """Return QoS profiles from the YAML text of a bag; none where it cannot be read."""
+    try:
+        items = yaml.safe_load(text) if text else []
+    except yaml.YAMLError:
+        items = []
+    return [QosProfile.from_mapping(item) for item in items or [] if isinstance(item, dict)]
 
 
 _HISTORY = ("system_default", "keep_last", "keep_all", "unknown")

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag import __version__
 from pendulum_rosbag.storage import mcap_records as rec
 from pendulum_rosbag.storage.mcap_layout import McapLayout
 from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
@@ -35,19 +36,16 @@ class SealedMcapFile:
     Args:
         path: File to create.
         compression: ``None`` or ``"zstd"`` (by chunk).
-        level: Zstd level.
 
     Raises:
         BagError: The file exists, or cannot be written.
     """
 
-    suffix = ".mcap"
-
-    def __init__(self, path: Path, *, compression: str | None = None, level: int = 1) -> None:
+    def __init__(self, path: Path, *, compression: str | None = None) -> None:
         if path.exists():
             raise BagError(f"{path} exists already; expected a new file")
         self.path = path
-        self._compressor = ("zstd", _zstd_compressor(level)) if compression == "zstd" else None
+        self._compressor = ("zstd", _zstd_compressor()) if compression == "zstd" else None
         self._summary = McapSummary()
         self._schema_ids: dict[tuple[str, str], int] = {}
         self._sequences: dict[int, int] = {}
@@ -63,7 +61,7 @@ class SealedMcapFile:
         self._group_span = _NO_SPAN
         self._stale = False
         self._kept: list[Attachment | Metadata] = []
-        self._layout = McapLayout(path, rec.MAGIC + rec.header_record(_library()), self._summary)
+        self._layout = McapLayout(path, rec.MAGIC + rec.header_record(f"pendulum_rosbag {__version__}"), self._summary)
 
     @property
     def count(self) -> int:
@@ -285,16 +283,7 @@ def _union(a: tuple[int, int], b: tuple[int, int]) -> tuple[int, int]:
     return min(a[0], b[0]), max(a[1], b[1])
 
 
-def _zstd_compressor(level: int) -> Compressor:
+def _zstd_compressor() -> Compressor:
     import zstandard
 
-    return zstandard.ZstdCompressor(level=level).compress
-
-
-def _library() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return f"pendulum_rosbag {version('pendulum_rosbag')}"
-    except PackageNotFoundError:
-        return "pendulum_rosbag"
+    return zstandard.ZstdCompressor(level=1).compress

@@ -24,6 +24,7 @@ from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 from pendulum_rosbag.storage.message_types import MessageType
 from pendulum_rosbag.storage.sqlite_pages import PAGE, Pages, Table, record, tree_page, varint
+from pendulum_rosbag.storage.storage_file import write_at
 
 __all__ = ["SealedSqliteFile"]
 
@@ -53,8 +54,6 @@ class SealedSqliteFile:
     Raises:
         BagError: The file exists, or cannot be written.
     """
-
-    suffix = ".db3"
 
     def __init__(self, path: Path, *, ros_distro: str = "jazzy") -> None:
         if path.exists():
@@ -217,7 +216,7 @@ class SealedSqliteFile:
         self._write_runs()
         if os.fstat(self._fd).st_size < pages.count * PAGE:
             os.ftruncate(self._fd, pages.count * PAGE)  # places that were not used yet belong to the file, too
-        self._write(self._first_page(self._trunks[hidden], len(free) + 1), 0)
+        write_at(self._fd, self._first_page(self._trunks[hidden], len(free) + 1), 0)
         self._commits += 1
         for table in tables:
             table.confirm()
@@ -229,13 +228,13 @@ class SealedSqliteFile:
         start = 0
         for number in sorted(waiting):
             if run and number != start + len(run):
-                self._write(b"".join(run), (start - 1) * PAGE)
+                write_at(self._fd, b"".join(run), (start - 1) * PAGE)
                 run = []
             if not run:
                 start = number
             run.append(waiting[number])
         if run:
-            self._write(b"".join(run), (start - 1) * PAGE)
+            write_at(self._fd, b"".join(run), (start - 1) * PAGE)
         waiting.clear()
 
     def _first_page(self, trunk: int, free: int) -> bytes:
@@ -268,13 +267,6 @@ class SealedSqliteFile:
             payload = record(("table", name, name, self._tables[name].root, sql))
             cells.append(varint(len(payload)) + varint(number) + payload)
         return header + tree_page(struct.pack(">BHHHB", 0x0D, 0, len(cells), 0, 0), cells, PAGE - len(header))
-
-    def _write(self, data: bytes, offset: int) -> None:
-        view = memoryview(data)
-        while view:
-            done = os.pwrite(self._fd, view, offset)
-            view = view[done:]
-            offset += done
 
     def _add_index(self) -> None:
         """Build the index in a copy and put that in place of the file, in one step; without room for it, do not."""

@@ -3,6 +3,7 @@
 # ruff: noqa: D102 (what each does is said where it is done)
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Protocol
@@ -10,13 +11,12 @@ from typing import Protocol
 from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 from pendulum_rosbag.storage.message_types import MessageType
 
-__all__ = ["StorageFile"]
+__all__ = ["StorageFile", "write_at"]
 
 
 class StorageFile(Protocol):
     """What a storage format offers; see :class:`~pendulum_rosbag.storage.sealed_mcap.SealedMcapFile`."""
 
-    suffix: str
     path: Path
 
     @property
@@ -37,3 +37,16 @@ class StorageFile(Protocol):
     def keep(self, record: Attachment | Metadata) -> None: ...
     def close(self, metadata: str = "") -> None: ...
     def abandon(self) -> None: ...
+
+
+def write_at(descriptor: int, data: bytes | bytearray, offset: int) -> None:
+    """Write all bytes to a place in an open file.
+
+    Raises:
+        OSError: The disk is full or fails.
+    """
+    view = memoryview(data)
+    while view:
+        done = os.pwrite(descriptor, view, offset)
+        view = view[done:]
+        offset += done
