@@ -73,10 +73,7 @@ class GroupAssembly:
     def modules(self, clock: Clock | None) -> list[Module]:
         """Return the modules on a host clock, not connected yet; without one, modules that nobody connects."""
         values, coordinates = self._values, self._coordinates
-        selections = [
-            ModuleSelection(own["family"], own["name"], own["mac_address"], own["serial"], values["module_type"])
-            for own in self._joints
-        ]
+        selections = map(ModuleSelection.of, self._joints)
         shared = HebiGroup(
             list(zip(coordinates.names, selections, strict=True)),
             coordinates.driven,

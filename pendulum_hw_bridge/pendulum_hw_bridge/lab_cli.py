@@ -286,10 +286,9 @@ def _machine(file: Path) -> Iterator[tuple[ActuatorPort, AsTheBridge]]:
 
 
 def _group(lab: LabFile) -> Any:
-    values = lab.values
-    family, name, mac, serial = (str(values.get(key, "")) for key in ("family", "name", "mac_address", "serial"))
-    wanted = ModuleSelection(family, name, mac, serial, str(values.get("module_type", "X5-9")))
-    return hebi.connect_group(wanted, str(values.get("interface", "")))
+    return hebi.connect_group(
+        ModuleSelection.of({"module_type": "X5-9", **lab.values}), lab.values.get("interface", "")
+    )
 
 
 def _keep(file: Path, procedure: str, result: str, **values: Any) -> None:

@@ -72,12 +72,9 @@ def scan(
     if not as_json:
         console.print(f"looking for {values['backend']} actuators for {look_time:g} s ...", style="dim")
     modules = _modules(values, look_time)
-    wanted = ModuleSelection(
-        values["family"], values["name"], values["mac_address"], values["serial"], values["module_type"]
-    )
     chosen, reason = None, ""
     try:
-        chosen = select_module(modules, wanted, seconds=look_time)
+        chosen = select_module(modules, ModuleSelection.of(values), seconds=look_time)
     except ActuatorError as error:
         reason = str(error)
     if as_json:

@@ -22,8 +22,8 @@ from pendulum_hw_bridge.actuator import (
     Strategy,
     TemperatureState,
 )
-from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.hebi import HebiBackend
+from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES
 from pendulum_hw_bridge.bridge import Bridge
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
@@ -117,7 +117,7 @@ class Module:
         if not self.flows:
             return None
         self.time_us += 10_000
-        quantities = {theirs: np.array([self.values.get(theirs, 0.5)]) for theirs in backend_module._FLOATS.values()}
+        quantities = {theirs: np.array([self.values.get(theirs, 0.5)]) for theirs in ATTRIBUTES.values()}
         times = {"receive_time_us": self.time_us, "hardware_transmit_time_us": self.time_us + 7}
         return SimpleNamespace(
             **quantities, **{name: np.array([value]) for name, value in {**times, **self.states}.items()}

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from pendulum_hw_bridge.actuator import ActuatorError, Command, CommandLock, Strategy
-from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends import hebi_group
 from pendulum_hw_bridge.backends.hebi_discovery import ModuleSelection, discover
 from pendulum_hw_bridge.backends.hebi_emulated import _holds, _Of
 from pendulum_hw_bridge.backends.hebi_group import GroupDrive, GroupEncoder, HebiGroup
+from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES
 from pendulum_hw_bridge.bridge import Bridge
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
@@ -213,7 +213,7 @@ class Rig:
                 continue
             module.count += 1
             now_us = self.clock.now_ns() // 1000
-            module.record = dict.fromkeys(backend_module._FLOATS.values(), 0.0) | {
+            module.record = dict.fromkeys(ATTRIBUTES.values(), 0.0) | {
                 "deflection": 1e-3 * module.count,
                 "voltage": 32.0,
                 "motor_winding_temperature": 30.0,

@@ -17,6 +17,7 @@ from pendulum_hw_bridge.actuator import ActuatorError, Command, HardwareLimits, 
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.hebi import HebiBackend, connect_group
 from pendulum_hw_bridge.backends.hebi_discovery import ModuleSelection
+from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES
 from pendulum_hw_bridge.backends.hebi_settings import fill_limits
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
@@ -68,7 +69,7 @@ class Group:
         self.buffers.append(reuse)
         if not self.flows:
             return None
-        values = dict.fromkeys(backend_module._FLOATS.values(), 0.5) | {
+        values = dict.fromkeys(ATTRIBUTES.values(), 0.5) | {
             "receive_time_us": self.receive_us,
             "hardware_transmit_time_us": 7,
             "mstop_state": self.mstop_state,

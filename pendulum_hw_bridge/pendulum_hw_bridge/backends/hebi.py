@@ -7,8 +7,6 @@ when a module is connected and never before; its licence and its wheels are not 
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
 import threading
 from collections.abc import Callable, Mapping
@@ -30,7 +28,7 @@ from pendulum_hw_bridge.actuator import (
 )
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.backends.hebi_emulated import EmulatedLookup
-from pendulum_hw_bridge.backends.hebi_log import start_log, stop_log
+from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES, import_hebi, start_log, stop_log
 from pendulum_hw_bridge.backends.hebi_settings import fill_gains, fill_limits, gains_of, limits_of
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.command_check import check_command, check_lifetime
@@ -39,7 +37,6 @@ from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
-from pendulum_msgs_py.programs.extras import how_to_install
 
 __all__ = [
     "ACKNOWLEDGE_MS",
@@ -48,7 +45,6 @@ __all__ = [
     "STOP_ATTEMPTS",
     "HebiBackend",
     "connect_group",
-    "import_hebi",
     "new_command",
     "open_lookup",
 ]
@@ -58,43 +54,6 @@ ACKNOWLEDGE_MS = 200
 STOP_ATTEMPTS = 3
 STOP_ACKNOWLEDGE_MS = 15
 """Ten times the round trip; together the attempts take less than the command lifetime [ms]."""
-_FLOATS = {
-    "position": "position",
-    "velocity": "velocity",
-    "effort": "effort",
-    "position_command": "position_command",
-    "velocity_command": "velocity_command",
-    "effort_command": "effort_command",
-    "pwm_command": "pwm_command",
-    "motor_current": "motor_current",
-    "winding_current": "motor_winding_current",
-    "motor_position": "motor_position",
-    "motor_velocity": "motor_velocity",
-    "deflection": "deflection",
-    "deflection_velocity": "deflection_velocity",
-    "voltage": "voltage",
-    "winding_temperature": "motor_winding_temperature",
-    "housing_temperature": "motor_housing_temperature",
-    "motor_sensor_temperature": "motor_sensor_temperature",
-    "board_temperature": "board_temperature",
-    "processor_temperature": "processor_temperature",
-}
-"""Our quantity -> attribute of hebi-py's feedback."""
-
-
-def import_hebi() -> Any:
-    """Return hebi-py, imported now and not before.
-
-    Raises:
-        ActuatorError: It is not installed.
-    """
-    try:
-        # The library greets on standard output when an optional module of its own is missing.
-        with contextlib.redirect_stdout(io.StringIO()):
-            import hebi
-    except ImportError as error:
-        raise ActuatorError("not_installed", how_to_install(error) or f"hebi-py cannot be imported: {error}") from error
-    return hebi
 
 
 def connect_group(wanted: ModuleSelection, interface: str = "", look_time: float = LOOK_TIME) -> Any:
@@ -184,9 +143,7 @@ class HebiBackend:
     def from_parameters(cls, values: Mapping[str, Any], clock: Clock, **_: Any) -> HebiBackend:
         """Return the port of the module that the bridge's parameters name, with the constants of its plant file."""
         return cls(
-            ModuleSelection(
-                values["family"], values["name"], values["mac_address"], values["serial"], values["module_type"]
-            ),
+            ModuleSelection.of(values),
             clock=clock,
             interface=values["interface"],
             log=Path(values["hebi_log"]) if values["hebi_log"] else None,
@@ -399,7 +356,7 @@ class HebiBackend:
         return info
 
     def _copy(self, record: Any, now_ns: int) -> Feedback:
-        values = {ours: float(getattr(record, theirs)[0]) for ours, theirs in _FLOATS.items()}
+        values = {ours: float(getattr(record, theirs)[0]) for ours, theirs in ATTRIBUTES.items()}
         hardware_us = int(record.hardware_transmit_time_us[0])
         return Feedback(
             stamp_ns=now_ns,

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from pendulum_hw_bridge.actuator import ActuatorError
@@ -69,6 +69,11 @@ class ModuleSelection:
     mac_address: str = ""
     serial: str = ""
     module_type: str = ""
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> ModuleSelection:
+        """Return what parameters of the bridge say; those that are not there may be anything."""
+        return cls(**{field.name: values[field.name] for field in fields(cls) if field.name in values})
 
     def __str__(self) -> str:
         """Return what was asked for."""
@@ -159,14 +164,11 @@ def _identify(lookup: Any, entry: Any) -> ModuleRecord:
     info = None if group is None else group.request_info(_ANSWER_MS)
     if info is None:
         return record
-    return ModuleRecord(
-        record.family,
-        record.name,
-        mac,
+    return replace(
+        record,
         serial=str(info.serial[0] or ""),
         type=str(info.mechanical_type[0] or ""),
         firmware=str(info.firmware_revision[0] or ""),
-        address=record.address,
     )
 
 

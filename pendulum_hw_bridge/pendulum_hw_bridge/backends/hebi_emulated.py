@@ -20,6 +20,7 @@ from typing import Any
 
 from pendulum_hw_bridge.actuator import ActuatorError, Command, Feedback, Strategy
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES
 from pendulum_hw_bridge.backends.hebi_settings import LIMIT_DISABLED, LIMIT_MOTOR_OFF, M_STOPS
 from pendulum_hw_bridge.emulation import wire
 from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS
@@ -29,11 +30,6 @@ from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
 __all__ = ["EmulatedEntry", "EmulatedGroup", "EmulatedGroups", "EmulatedLookup"]
 
 _LOOK_ATTEMPTS = 2
-_THEIRS = {
-    "winding_current": "motor_winding_current",
-    "winding_temperature": "motor_winding_temperature",
-    "housing_temperature": "motor_housing_temperature",
-}
 
 
 @dataclass(frozen=True)
@@ -417,7 +413,7 @@ def _entry(where: str, status: dict[str, Any]) -> EmulatedEntry:
 
 
 def _feedback(record: Feedback) -> Any:
-    values = {_THEIRS.get(name, name): value for name, value in record._asdict().items()}
+    values = {ATTRIBUTES.get(name, name): value for name, value in record._asdict().items()}
     values |= {
         "receive_time_us": record.stamp_ns * 1_000_000 // NANOSECONDS,
         "hardware_transmit_time_us": record.hardware_ns * 1_000_000 // NANOSECONDS,

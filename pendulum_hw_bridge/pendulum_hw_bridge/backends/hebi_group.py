@@ -26,7 +26,6 @@ from pendulum_hw_bridge.backends.hebi import (
     STOP_ACKNOWLEDGE_MS,
     STOP_ATTEMPTS,
     HebiBackend,
-    import_hebi,
     open_lookup,
 )
 from pendulum_hw_bridge.backends.hebi_discovery import (
@@ -36,7 +35,7 @@ from pendulum_hw_bridge.backends.hebi_discovery import (
     discover,
     select_module,
 )
-from pendulum_hw_bridge.backends.hebi_log import start_log, stop_log
+from pendulum_hw_bridge.backends.hebi_log import import_hebi, start_log, stop_log
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.command_check import check_command
 

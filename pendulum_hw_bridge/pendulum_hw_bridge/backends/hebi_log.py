@@ -1,4 +1,4 @@
-"""HEBI's own log files: written beside a bag by the library's thread, and read back as quantities by name.
+"""HEBI's library: what it calls our quantities, and its log files, written by its thread and read back by name.
 
 A ``.hebilog`` holds what the module sent, at the full feedback rate and with the module's clock, whatever happened to
 the bridge, to ROS or to the recorder.
@@ -18,7 +18,7 @@ from pendulum_hw_bridge.actuator import FEEDBACK_QUANTITIES, ActuatorError
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.extras import how_to_install
 
-__all__ = ["ATTRIBUTES", "read_hebilog", "start_log", "stop_log", "to_joint"]
+__all__ = ["ATTRIBUTES", "import_hebi", "read_hebilog", "start_log", "stop_log", "to_joint"]
 
 ATTRIBUTES = {
     **{name: name for name in FEEDBACK_QUANTITIES},
@@ -30,6 +30,21 @@ ATTRIBUTES = {
 _POSITIONS = ("position", "position_command")
 _ODD = ("velocity", "effort", "velocity_command", "effort_command")
 """Quantities that change their sign with the joint's, beside the positions."""
+
+
+def import_hebi() -> Any:
+    """Return hebi-py, imported now and not before.
+
+    Raises:
+        ActuatorError: It is not installed.
+    """
+    try:
+        # The library greets on standard output when an optional module of its own is missing.
+        with contextlib.redirect_stdout(io.StringIO()):
+            import hebi
+    except ImportError as error:
+        raise ActuatorError("not_installed", how_to_install(error) or f"hebi-py cannot be imported: {error}") from error
+    return hebi
 
 
 def start_log(group: Any, path: Path) -> None:
@@ -113,13 +128,8 @@ def to_joint(
 def _open(path: Path) -> Any:
     if not path.is_file():
         raise DataError(f"HEBI log {path} does not exist")
+    hebi = import_hebi()
     try:
-        # The library greets on standard output when an optional module of its own is missing.
-        with contextlib.redirect_stdout(io.StringIO()):
-            from hebi.util import load_log
-    except ImportError as error:
-        raise ActuatorError("not_installed", how_to_install(error) or f"hebi-py cannot be imported: {error}") from error
-    try:
-        return load_log(str(path), load=False)
+        return hebi.util.load_log(str(path), load=False)
     except (OSError, RuntimeError) as error:
         raise DataError(f"{path} is no HEBI log: {error}") from error
