@@ -159,7 +159,7 @@ def assemble(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
 def _one(values: Mapping[str, Any], *, lockstep: bool) -> Assembly:
     plant = bridge_parameters.plant_of(values)
     gains = bridge_parameters.trajectory_gains(values)
-    limits = bridge_parameters.bridge_limits(values, plant, lockstep=lockstep)
+    limits = bridge_parameters.supervisor_limits(values, (plant.effort_limit,), lockstep=lockstep)
     check_consistency(values, limits)
     mapping = bridge_parameters.effort_mapping(values, plant, gains, limits)
     settings = bridge_parameters.bridge_settings(

@@ -17,13 +17,13 @@ from sensor_msgs.msg import BatteryState, JointState, Temperature
 
 from pendulum_hw_bridge.actuator import ActuatorError, ActuatorInfo, Feedback
 from pendulum_hw_bridge.actuator_loop import ActuatorLoop
-from pendulum_hw_bridge.assembly import assemble, for_plant
+from pendulum_hw_bridge.assembly import assemble
 from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.clocks import Clock, SteppedClock, WallClock
 from pendulum_hw_bridge.derating import Derating
 from pendulum_hw_bridge.e_stop_input_node import EStopInputServer
 from pendulum_hw_bridge.feedback_message import encode_feedback
-from pendulum_hw_bridge.lab_node import given_backend, given_plant, with_lab_file
+from pendulum_hw_bridge.lab_node import specs_of
 from pendulum_hw_bridge.module import DrivenModule, Module
 from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_msgs_py.contract.plant_specs import LOCKSTEP_EPOCH_NS
@@ -85,7 +85,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         super().__init__("bridge", enable_logger_service=True, **options)
         self._stop_runner = stop
         self.failure: Exception | None = None
-        specs = tuple(with_lab_file(self, for_plant(SPECS, given_plant(self), given_backend(self))))
+        specs = specs_of(self)
         self._values = values = NodeParameters(self, specs).values
         self._lockstep = values["clock"] == "lockstep"
         self._period_ns = round(NANOSECONDS / values["feedback_rate"])

@@ -13,7 +13,6 @@ from pendulum_hw_bridge.clocks import Clock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, load_gains
-from pendulum_hw_bridge.lab import LAB_SPEC
 from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_hw_bridge.safety_limits import SafetyLimits
 from pendulum_hw_bridge.settings import BridgeSettings
@@ -26,16 +25,13 @@ from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import (
     PRESETS,
     PlantParameters,
-    SeriesElasticParameters,
     load_plant,
 )
 
 __all__ = [
     "BRIDGE_SPECS",
     "POSITION_LOOP_STRATEGY",
-    "bridge_limits",
     "bridge_settings",
-    "drivetrain_of",
     "effort_mapping",
     "make_port",
     "plant_of",
@@ -56,7 +52,12 @@ def _fixed(name: str, default: Any, unit: str, description: str, **domain: Any) 
 
 
 BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
-    LAB_SPEC,
+    _fixed(
+        "lab_file",
+        "",
+        "",
+        "Lab file: which actuator, how it is mounted, limited, driven and fed; what is given beside it wins.",
+    ),
     _fixed("backend", "emulator", "", "What stands behind the actuator port.", choices=tuple(BACKENDS)),
     _fixed("autostart", True, "", "Configure and activate at once, without a lifecycle manager."),
     _fixed(
@@ -251,13 +252,6 @@ def told_plants(values: Mapping[str, Any]) -> list[PlantParameters]:
     return [plant.with_values(gravity=0.0) for plant in plants] if emulated and values["flat"] else plants
 
 
-def drivetrain_of(plant: PlantParameters) -> SeriesElasticParameters:
-    """Return the drivetrain of a plant that has one."""
-    if plant.drivetrain is None:
-        raise ParameterError(f"plant {plant.name!r} has no drivetrain; expected one for the effort mapping")
-    return plant.drivetrain
-
-
 def make_port(values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False) -> ActuatorPort:
     """Return the backend that the parameters name, not connected yet.
 
@@ -306,7 +300,9 @@ def effort_mapping(
     values: Mapping[str, Any], plant: PlantParameters, gains: GainSet, limits: PlantLimits, *, joint: int = 0
 ) -> EffortMapping:
     """Return the mapping of torque to setpoints of one of the driven joints, with the limits that it keeps."""
-    drivetrain = drivetrain_of(plant)
+    drivetrain = plant.drivetrain
+    if drivetrain is None:
+        raise ParameterError(f"plant {plant.name!r} has no drivetrain; expected one for the effort mapping")
     return EffortMapping(
         EffortStrategy(values["effort_strategy"]),
         drivetrain,
@@ -316,20 +312,6 @@ def effort_mapping(
         effort_limit=limits.effort[joint],
         velocity_limit=min(limits.velocity, MOTOR_SPEED_LIMIT / drivetrain.gear_ratio),
     )
-
-
-def bridge_limits(values: Mapping[str, Any], plant: PlantParameters, *, lockstep: bool = False) -> PlantLimits:
-    """Return the limits that the supervisor keeps.
-
-    Args:
-        values: Parameters of the bridge.
-        plant: Content of the plant file.
-        lockstep: Whether time is simulated.
-
-    Raises:
-        ParameterError: They contradict each other or the plant.
-    """
-    return supervisor_limits(values, (plant.effort_limit,), lockstep=lockstep)
 
 
 def supervisor_limits(
@@ -405,12 +387,12 @@ def bridge_settings(
     )
 
 
-def safety_limits(values: Mapping[str, Any], effort: float | None = None) -> SafetyLimits:
+def safety_limits(values: Mapping[str, Any], effort: float) -> SafetyLimits:
     """Return the limits of the feedback checks.
 
     Args:
         values: Parameters of :data:`BRIDGE_SPECS`.
-        effort: Effort limit of the plant; None for that of the plant file [N m].
+        effort: Effort limit of the plant [N m].
 
     Raises:
         ParameterError: ``voltage_window`` is not a window.
@@ -418,12 +400,11 @@ def safety_limits(values: Mapping[str, Any], effort: float | None = None) -> Saf
     window = values["voltage_window"]
     if len(window) != 2:
         raise ParameterError(f"voltage_window has {len(window)} values; expected [low, high] in V")
-    limit = plant_of(values).effort_limit if effort is None else effort
     return SafetyLimits(
         winding_temperature=values["winding_temperature_limit"],
         voltage_min=window[0],
         voltage_max=window[1],
-        measured_effort=values["measured_effort_limit"] or limit + _MEASURED_EFFORT_MARGIN,
+        measured_effort=values["measured_effort_limit"] or effort + _MEASURED_EFFORT_MARGIN,
         winding_current=values["winding_current_tolerance"],
         feedback_cycles=values["feedback_watchdog"],
     )

@@ -11,11 +11,13 @@ from typing import Annotated, Any
 import typer
 
 from pendulum_hw_bridge.backends import BACKENDS
+from pendulum_hw_bridge.bridge_parameters import plant_of
 from pendulum_hw_bridge.check_item import Checklist
 from pendulum_hw_bridge.checklist import run_checklist
 from pendulum_hw_bridge.clocks import WallClock
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.machine_checklist import run_machine_checklist
+from pendulum_hw_bridge.module import DrivenModule
 from pendulum_hw_bridge.nudge import hand_of
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism
@@ -94,10 +96,7 @@ def check(
         if not as_json:
             ask(f"{text} ...", style="dim")
 
-    if is_mechanism(values["plant"]):
-        found = _of_several(values, progress)
-    else:
-        found = _of_one(values, progress, (lambda text: ask(text, style="bold")) if nudge else None)
+    found = _go_through(values, progress, (lambda text: ask(text, style="bold")) if nudge else None)
     if as_json:
         items = [asdict(item) for item in found.items]
         document = {"ready": found.ready, "host_busy": found.host_busy, "items": items, "figures": found.figures}
@@ -109,29 +108,28 @@ def check(
     return EXIT_NOT_READY if found.refused else EXIT_BUSY
 
 
-def _of_one(values: Mapping[str, Any], progress: Callable[[str], None], ask: Callable[[str], None] | None) -> Checklist:
-    from pendulum_hw_bridge.check_node import as_the_bridge
-
-    bridge = as_the_bridge(values)
-    return run_checklist(
-        bridge.port,
-        bridge.settings,
-        bridge.limits,
-        bridge.plant,
-        window=bridge.window,
-        hand=None if ask is None else hand_of(bridge.port, ask),
-        hangs=not bridge.values["flat"],
-        progress=progress,
-    )
-
-
-def _of_several(values: Mapping[str, Any], progress: Callable[[str], None]) -> Checklist:
+def _go_through(
+    values: Mapping[str, Any], progress: Callable[[str], None], ask: Callable[[str], None] | None
+) -> Checklist:
     from pendulum_hw_bridge.check_node import machine_of
 
     machine = machine_of(values)
+    modules = machine.modules(WallClock())
     windows = list(zip(machine.limits.position_min, machine.limits.position_max, strict=True))
-    plant = load_mechanism(values["plant"])
-    return run_machine_checklist(machine.modules(WallClock()), plant, windows, progress=progress)
+    if is_mechanism(values["plant"]):
+        return run_machine_checklist(modules, load_mechanism(values["plant"]), windows, progress=progress)
+    (module,) = modules
+    assert isinstance(module, DrivenModule)
+    return run_checklist(
+        module.port,
+        module.settings,
+        module.monitor.limits,
+        plant_of(values),
+        window=windows[0],
+        hand=None if ask is None else hand_of(module.port, ask),
+        hangs=not values["flat"],
+        progress=progress,
+    )
 
 
 def _print(found: Checklist) -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-__all__ = ["HOST_ITEM", "CheckItem", "Checklist"]
+from pendulum_hw_bridge.actuator import ActuatorError
+from pendulum_msgs_py.errors import PendulumError
+
+__all__ = ["HOST_ITEM", "CheckItem", "Checklist", "error_item"]
 
 HOST_ITEM = "this computer keeps time"
 """Name of the line that is not about the actuator."""
@@ -27,6 +30,11 @@ class CheckItem:
     seen: str
     expected: str
     hint: str = ""
+
+
+def error_item(error: PendulumError) -> CheckItem:
+    """Return the line of an error that ended the check of a module."""
+    return CheckItem(error.fault if isinstance(error, ActuatorError) else "parameter", False, str(error), "no error")
 
 
 @dataclass

@@ -23,7 +23,7 @@ from pendulum_hw_bridge.actuator import (
     Strategy,
     TemperatureState,
 )
-from pendulum_hw_bridge.check_item import HOST_ITEM, CheckItem, Checklist
+from pendulum_hw_bridge.check_item import HOST_ITEM, CheckItem, Checklist, error_item
 from pendulum_hw_bridge.check_rest import rest_items, sign_item
 from pendulum_hw_bridge.check_timing import PULSE, HostWatch, Punctuality, TimingFigures, measure
 from pendulum_hw_bridge.nudge import Hand
@@ -102,16 +102,15 @@ def run_checklist(
                 )
             items += rest_items(records, settings, plant, window, hangs)
         progress("trying the strategy at zero torque")
-        items.append(_strategy(port))
+        items.append(strategy_item(port, Strategy.DIRECT_PWM, Command(pwm=0.0), "direct PWM can be set"))
         items.append(sign_item(port, settings, hand, progress))
     except PendulumError as error:
-        fault = error.fault if isinstance(error, ActuatorError) else "parameter"
-        items.append(CheckItem(fault, False, str(error), "no error"))
+        items.append(error_item(error))
     finally:
         try:
             port.close()
         except ActuatorError as error:
-            items.append(CheckItem(error.fault, False, str(error), "no error"))
+            items.append(error_item(error))
     return found
 
 
@@ -337,10 +336,6 @@ def state_items(
             "normal",
         ),
     ]
-
-
-def _strategy(port: ActuatorPort) -> CheckItem:
-    return strategy_item(port, Strategy.DIRECT_PWM, Command(pwm=0.0), "direct PWM can be set")
 
 
 def strategy_item(port: ActuatorPort, strategy: Strategy, idle: Command, name: str) -> CheckItem:

@@ -8,26 +8,26 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from pendulum_hw_bridge import guided, module_files
-from pendulum_hw_bridge.actuator import ActuatorPort, HardwareLimits
+from pendulum_hw_bridge.actuator import HardwareLimits
 from pendulum_hw_bridge.backends import hebi
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
-from pendulum_hw_bridge.bridge_parameters import drivetrain_of
+from pendulum_hw_bridge.bridge_parameters import plant_of
+from pendulum_hw_bridge.clocks import WallClock
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
+from pendulum_hw_bridge.module import DrivenModule
 from pendulum_hw_bridge.nudge import hand_of
 from pendulum_hw_bridge.settings import expect_limits
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.plants.lab_file import LabFile, load_lab, write_lab
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
-
-if TYPE_CHECKING:
-    from pendulum_hw_bridge.check_node import AsTheBridge
 
 __all__ = ["main"]
 
@@ -154,9 +154,9 @@ def zero(file: File, yes: Yes = False) -> None:
     Example: python -m pendulum_hw_bridge lab zero lab.yaml
     """
     terminal = _Terminal(yes=yes)
-    with _machine(file) as (port, _):
-        hand, other = hand_of(port, terminal.say), hand_of(port, terminal.say, clockwise=True)
-        found = guided.find_zero_and_sign(port, terminal, hand, other)
+    with _machine(file) as (module, _):
+        hand, other = hand_of(module.port, terminal.say), hand_of(module.port, terminal.say, clockwise=True)
+        found = guided.find_zero_and_sign(module.port, terminal, hand, other)
     result = f"{found.offset:+.4f} rad, sign {found.sign:+d}, play {found.play:.3f} rad"
     _keep(file, "zero", result, joint_offset=round(found.offset, 5), joint_sign=found.sign)
 
@@ -167,8 +167,8 @@ def tare(file: File, yes: Yes = False) -> None:
 
     Example: python -m pendulum_hw_bridge lab tare lab.yaml
     """
-    with _machine(file) as (port, bridge):
-        found = guided.measure_tare(port, bridge.settings, bridge.plant, _Terminal(yes=yes))
+    with _machine(file) as (module, plant):
+        found = guided.measure_tare(module.port, module.settings, plant, _Terminal(yes=yes))
     _keep(file, "effort_tare", f"{found:+.3f} N m", effort_tare=round(found, 4))
 
 
@@ -178,9 +178,9 @@ def prove_lifetime(file: File, yes: Yes = False) -> None:
 
     Example: python -m pendulum_hw_bridge lab prove_lifetime lab.yaml
     """
-    with _machine(file) as (port, bridge):
+    with _machine(file) as (module, _):
         took = guided.prove_lifetime(
-            port, bridge.settings, _Terminal(yes=yes), bridge.limits, drivetrain_of(bridge.plant)
+            module.port, module.settings, _Terminal(yes=yes), module.monitor.limits, module.mapping.drivetrain
         )
     _keep(file, "command_lifetime", f"torque ended {1e3 * took:.0f} ms after the last command")
 
@@ -191,9 +191,9 @@ def prove_m_stop(file: File, yes: Yes = False) -> None:
 
     Example: python -m pendulum_hw_bridge lab prove_m_stop lab.yaml
     """
-    with _machine(file) as (port, bridge):
+    with _machine(file) as (module, _):
         took = guided.prove_m_stop(
-            port, bridge.settings, _Terminal(yes=yes), bridge.limits, drivetrain_of(bridge.plant)
+            module.port, module.settings, _Terminal(yes=yes), module.monitor.limits, module.mapping.drivetrain
         )
     _keep(file, "m_stop", f"torque ended within {1e3 * took:.0f} ms")
 
@@ -216,9 +216,9 @@ def backup(
         written = module_files.backup_group(group, folder)
         ours = _ours(file, lambda limits: module_files.limits_of_group(group, limits))
     else:
-        with _machine(file) as (port, _):
-            written = module_files.backup_emulator(port, folder)
-            ours = _ours(file, lambda _: port.connect().limits)
+        with _machine(file) as (module, _):
+            written = module_files.backup_emulator(module.port, folder)
+            ours = _ours(file, lambda _: module.port.connect().limits)
     if ours:
         print(
             f"note: the module holds the limits of {file}, which a proof or the bridge has set: this backup holds what "
@@ -251,15 +251,15 @@ def restore(
     if lab.values["backend"] == "hebi":
         module_files.restore_group(_group(lab), folder, hebi.new_command, terminal.say)
     else:
-        with _machine(file) as (port, _):
-            module_files.restore_emulator(port, folder, terminal.say)
+        with _machine(file) as (module, _):
+            module_files.restore_emulator(module.port, folder, terminal.say)
     print("restored, and read back")
 
 
 def _ours(file: Path, limits_of: Callable[[HardwareLimits], HardwareLimits]) -> bool:
     """Whether a module tells the limits that the bridge sets with a lab file."""
     try:
-        wanted = _as_the_bridge(file).settings.limits
+        wanted = _as_the_bridge(file)[0].settings.limits
         expect_limits(limits_of(wanted), wanted)
     except PendulumError:
         # Others, or a lab file that the bridge does not take: nothing was set with it.
@@ -267,22 +267,27 @@ def _ours(file: Path, limits_of: Callable[[HardwareLimits], HardwareLimits]) -> 
     return True
 
 
-def _as_the_bridge(file: Path) -> AsTheBridge:
-    from pendulum_hw_bridge.check_node import as_the_bridge, bridge_values
+def _as_the_bridge(file: Path) -> tuple[DrivenModule, PlantParameters]:
+    """Return the module of a lab file as the bridge makes it, not connected, and what it drives."""
+    from pendulum_hw_bridge.check_node import bridge_values, machine_of
 
-    return as_the_bridge(bridge_values([], {"lab_file": str(file)}))
+    values = bridge_values([], {"lab_file": str(file)})
+    # Before the rest: it refuses a plant of several joints.
+    plant = plant_of(values)
+    (module,) = machine_of(values).modules(WallClock())
+    assert isinstance(module, DrivenModule)
+    return module, plant
 
 
 @contextlib.contextmanager
-def _machine(file: Path) -> Iterator[tuple[ActuatorPort, AsTheBridge]]:
+def _machine(file: Path) -> Iterator[tuple[DrivenModule, PlantParameters]]:
     """Connect the machine of a lab file; on every way out its motor is off."""
-    bridge = _as_the_bridge(file)
-    port = bridge.port
+    module, plant = _as_the_bridge(file)
     try:
-        port.connect()
-        yield port, bridge
+        module.port.connect()
+        yield module, plant
     finally:
-        port.close()
+        module.port.close()
 
 
 def _group(lab: LabFile) -> Any:

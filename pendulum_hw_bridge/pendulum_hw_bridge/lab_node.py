@@ -8,43 +8,49 @@ from typing import Any
 
 from rclpy.node import Node
 
-from pendulum_hw_bridge.lab import LAB_SPEC, check_lab
+from pendulum_hw_bridge.assembly import for_plant
+from pendulum_hw_bridge.node_specs import SPECS
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.lab_file import LAB_ENTRIES, load_lab
 
-__all__ = ["given_backend", "given_plant", "with_lab_file"]
-
-
-def given_plant(node: Node) -> str:
-    """Return the plant that a node was given, whose joints decide the defaults of what is not."""
-    given = node._parameter_overrides.get("plant")
-    return "thesis" if given is None else str(given.value)
+__all__ = ["specs_of"]
 
 
-def given_backend(node: Node) -> str:
-    """Return the backend that a node was given, which decides some of those defaults too."""
-    given = node._parameter_overrides.get("backend")
-    return "emulator" if given is None else str(given.value)
-
-
-def with_lab_file(node: Node, specs: Iterable[ParameterSpec]) -> list[ParameterSpec]:
-    """Return a node's parameters with the values of the lab file that it was given as their defaults.
+def specs_of(node: Node) -> tuple[ParameterSpec, ...]:
+    """Return the bridge's parameters, with the defaults that the plant, the backend and the lab file of a node give.
 
     Args:
-        node: The node; its parameter ``lab_file`` is not declared yet.
-        specs: Its parameters, ``lab_file`` among them.
+        node: The node; none of them is declared yet.
 
     Raises:
-        ParameterError: The lab file is refused.
+        ParameterError: There is no such plant, or the lab file is refused.
     """
-    table = list(specs)
     overrides: Mapping[str, Any] = node._parameter_overrides
-    given = overrides.get(LAB_SPEC.name)
-    if given is None or not given.value:
+    plant, backend = (
+        str(overrides[name].value) if name in overrides else default
+        for name, default in (("plant", "thesis"), ("backend", "emulator"))
+    )
+    table = for_plant(SPECS, plant, backend)
+    lab = overrides.get("lab_file")
+    if lab is None or not lab.value:
         return table
-    values = check_lab(str(given.value), table)
+    values = _read(str(lab.value), table)
     for name in sorted(values.keys() & overrides.keys()):
         if overrides[name].value != values[name]:
             node.get_logger().warning(
                 f"{name} is {overrides[name].value!r} as given, not {values[name]!r} as in the lab file"
             )
-    return [dataclasses.replace(spec, default=values[spec.name]) if spec.name in values else spec for spec in table]
+    return tuple(dataclasses.replace(spec, default=values.get(spec.name, spec.default)) for spec in table)
+
+
+def _read(path: str, specs: Iterable[ParameterSpec]) -> dict[str, Any]:
+    """Return the values of a lab file by parameter, each checked by the table of the bridge's parameters."""
+    table = {spec.name: spec for spec in specs}
+    places = {e.parameter: f"{section}.{name}" for section, es in LAB_ENTRIES.items() for name, e in es.items()}
+    values = {}
+    for name, value in load_lab(path).values.items():
+        if name not in table:
+            raise ParameterError(f"{path}: {places[name]} is not known to this program")
+        values[name] = table[name].check(value, where=f"{path}: {places[name]}")
+    return values

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pendulum_hw_bridge.actuator import ActuatorError, Feedback
-from pendulum_hw_bridge.check_item import HOST_ITEM, CheckItem, Checklist
+from pendulum_hw_bridge.actuator import Feedback
+from pendulum_hw_bridge.check_item import HOST_ITEM, CheckItem, Checklist, error_item
 from pendulum_hw_bridge.check_timing import HostWatch, Punctuality
 from pendulum_hw_bridge.checklist import (
     acknowledgement_item,
@@ -66,14 +66,14 @@ def run_machine_checklist(
             try:
                 _check(module, index, parameters, windows[index], part, host(), progress)
             except PendulumError as error:
-                part.items.append(_of_error(error))
+                part.items.append(error_item(error))
             _add(found, part, module.joint)
     finally:
         for module in modules:
             try:
                 module.port.close()
             except PendulumError as error:
-                found.items.append(_named(_of_error(error), module.joint))
+                found.items.append(_named(error_item(error), module.joint))
     _judge_host_once(found)
     return found
 
@@ -101,7 +101,7 @@ def _connect(modules: Sequence[Module], found: Checklist, progress: Callable[[st
         try:
             info = module.port.connect()
         except PendulumError as error:
-            found.items.append(_named(_of_error(error), module.joint))
+            found.items.append(_named(error_item(error), module.joint))
             continue
         told.append(info.name)
         item = CheckItem("module answers", True, identity(info), "the one that is meant")
@@ -211,11 +211,6 @@ def _largest_weight(parameters: MechanismParameters, index: int, joint: Joint) -
     turns = np.linspace(0.0, math.tau, 73)
     largest = max(abs(energy(turn + step) - energy(turn - step)) / (2.0 * step) for turn in turns.tolist())
     return largest if largest > 1e-6 else 0.0
-
-
-def _of_error(error: PendulumError) -> CheckItem:
-    fault = error.fault if isinstance(error, ActuatorError) else "parameter"
-    return CheckItem(fault, False, str(error), "no error")
 
 
 def _named(item: CheckItem, joint: str) -> CheckItem:

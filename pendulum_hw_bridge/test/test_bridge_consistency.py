@@ -11,10 +11,10 @@ from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge_parameters import (
     BRIDGE_SPECS,
-    bridge_limits,
     bridge_settings,
     effort_mapping,
     safety_limits,
+    supervisor_limits,
     trajectory_gains,
 )
 from pendulum_hw_bridge.emulation.parameters import load_emulator
@@ -175,11 +175,11 @@ def test_a_plant_file_gives_a_real_machine_no_more_torque_than_its_actuator_has(
     plant = load_emulator("thesis").plant.with_values(effort_limit=38.0)
     for backend, wanted in (("emulator", 0.0), ("emulator", 14.0), ("hebi", 13.0)):
         values = validate(SPECS, {"backend": backend, "effort_limit": wanted})
-        check_consistency(values, bridge_limits(values, plant))
+        check_consistency(values, supervisor_limits(values, (plant.effort_limit,)))
     for wanted in (0.0, 14.0):
         values = validate(SPECS, {"backend": "hebi", "effort_limit": wanted})
         with pytest.raises(ParameterError, match=r"^effort_limit is (38|14) N m; expected at most 13 N m with backend"):
-            check_consistency(values, bridge_limits(values, plant))
+            check_consistency(values, supervisor_limits(values, (plant.effort_limit,)))
 
 
 @pytest.mark.parametrize(
@@ -189,14 +189,14 @@ def test_the_rules_of_the_plant_wait_for_feedback_one_period_longer_than_the_che
     rate: float, watchdog: int, patience: float
 ) -> None:
     values = validate(SPECS, {"feedback_rate": rate, "feedback_watchdog": watchdog})
-    limits = bridge_limits(values, load_emulator("thesis").plant)
+    limits = supervisor_limits(values, (load_emulator("thesis").plant.effort_limit,))
     assert limits.feedback_timeout == pytest.approx(patience)
 
 
 @pytest.mark.parametrize("lockstep", [False, True])
 def test_a_disturbance_that_waits_is_judged_as_a_command_is_but_in_lockstep(lockstep: bool) -> None:
     values = validate(SPECS, {"start_effort_limit": 1.5, "handover_effort_limit": 1.2})
-    limits = bridge_limits(values, load_emulator("thesis").plant, lockstep=lockstep)
+    limits = supervisor_limits(values, (load_emulator("thesis").plant.effort_limit,), lockstep=lockstep)
     assert (limits.start_effort, limits.handover_effort) == (1.5, 1.2)
     assert (limits.start_sum, limits.handover_sum) == ((math.inf, math.inf) if lockstep else (1.5, 1.2))
 
@@ -226,7 +226,7 @@ def test_a_joint_that_turns_neither_way_and_a_window_of_one_voltage_are_refused(
 
 def test_measured_torque_is_limited_with_the_effort_limit() -> None:
     assert safety_limits(validate(BRIDGE_SPECS, {}), 1.0).measured_effort == 2.0
-    assert safety_limits(validate(BRIDGE_SPECS, {})).measured_effort == 14.0
+    assert safety_limits(validate(BRIDGE_SPECS, {}), 13.0).measured_effort == 14.0
     assert safety_limits(validate(BRIDGE_SPECS, {"measured_effort_limit": 3.0}), 1.0).measured_effort == 3.0
 
 

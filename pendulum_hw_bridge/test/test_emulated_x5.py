@@ -12,7 +12,7 @@ from pendulum_hw_bridge.emulation import kernel
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.firmware import gain_rows, new_loop_memory
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters, load_emulator
-from pendulum_hw_bridge.emulation.thermal import ThermalParameters, steady_rise
+from pendulum_hw_bridge.emulation.thermal import ThermalParameters
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_msgs_py.errors import ParameterError
@@ -213,6 +213,11 @@ def test_feedback_has_the_measured_rate_jitter_and_steps() -> None:
     assert np.ptp(noise) / 2 <= 2.1e-4
 
 
+def steady_rise(power: float, ladder: ThermalParameters) -> float:
+    """How far the winding ends above ambient under constant heat in it [K]."""
+    return power * (ladder.winding_housing + ladder.housing_body + ladder.body_ambient)
+
+
 def test_motor_warms_to_what_its_thermal_resistances_say() -> None:
     thermal = ThermalParameters(winding_capacity=0.02, housing_capacity=0.02, body_capacity=0.02, ambient=22.0)
     parameters = replace(load_emulator("x5_9"), thermal=thermal, flat=True)
@@ -224,7 +229,7 @@ def test_motor_warms_to_what_its_thermal_resistances_say() -> None:
     current = actuator.link.motor_torque / (parameters.drivetrain.torque_constant * parameters.drivetrain.gear_ratio)
     winding = actuator.link.winding_temperature
     resistance = parameters.drivetrain.winding_resistance * (1.0 + 0.004 * (winding - 20.0))
-    rise, _, _ = steady_rise(current**2 * resistance, thermal)
+    rise = steady_rise(current**2 * resistance, thermal)
     assert winding - 22.0 == pytest.approx(rise, rel=0.03)
 
 
@@ -232,7 +237,7 @@ def test_nine_newton_metres_for_ever_stay_just_below_the_winding_limit() -> None
     drive = load_plant("x5_9").drivetrain
     assert drive is not None
     current = 9.0 / (drive.torque_constant * drive.gear_ratio * drive.efficiency**0.5)
-    rise, _, _ = steady_rise(current**2 * drive.winding_resistance * 1.4, ThermalParameters())
+    rise = steady_rise(current**2 * drive.winding_resistance * 1.4, ThermalParameters())
     assert 100.0 < 22.0 + rise < 260.0
 
 

@@ -76,7 +76,7 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target(
         "pendulum_hw_bridge.bridge_parameters",
-        ("bridge_limits", "bridge_settings", "effort_mapping", "safety_limits"),
+        ("supervisor_limits", "bridge_settings", "effort_mapping", "safety_limits"),
         (f"{_BRIDGE}/test_bridge_consistency.py",),
     ),
     Target(

@@ -170,18 +170,15 @@ class ReplayBackend:
     Args:
         recording: What to play.
         clock: Host clock; the recording starts when it is connected.
-        loop: Start again at the end instead of falling silent.
     """
 
     name = "replay"
 
-    def __init__(self, recording: FeedbackRecording, clock: Clock | None = None, *, loop: bool = False) -> None:
+    def __init__(self, recording: FeedbackRecording, clock: Clock | None = None) -> None:
         self.recording = recording
         self._clock = clock or WallClock()
-        self._loop = loop
         self._start_ns: int | None = None
         self._index = 0
-        self._rounds = 0
         self._strategy = Strategy.OFF
         self._limits = HardwareLimits()
         self._lifetime = 0.25
@@ -232,9 +229,6 @@ class ReplayBackend:
         """Return the newest record that is due, waiting for one at most ``timeout`` [s]."""
         start_ns = self._require_start()
         deadline = self._clock.now_ns() + round(timeout * NANOSECONDS)
-        if self.finished and self._loop:
-            self._restart()
-            start_ns = self._require_start()
         if self.finished:
             self._clock.wait_until(deadline)
             return None
@@ -249,8 +243,7 @@ class ReplayBackend:
         index = max(self._index, newest)
         self._index = index + 1
         stamp_ns = start_ns + int(self.recording.time_ns[index])
-        record = self.recording.record(index, stamp_ns)
-        return record._replace(sequence=record.sequence + self._rounds * self.recording.size)
+        return self.recording.record(index, stamp_ns)
 
     def write(self, command: Command) -> Applied:
         """Check and limit setpoints; the recording does not listen."""
@@ -297,13 +290,6 @@ class ReplayBackend:
         """Stop to play."""
         self.stop()
         self._start_ns = None
-
-    def _restart(self) -> None:
-        assert self._start_ns is not None
-        period = round(NANOSECONDS / self.recording.rate)
-        self._start_ns += int(self.recording.time_ns[-1]) + period
-        self._index = 0
-        self._rounds += 1
 
     def _require_start(self) -> int:
         if self._start_ns is None:

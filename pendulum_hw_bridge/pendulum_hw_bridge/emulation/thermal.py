@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from pendulum_msgs_py.errors import ParameterError
 
-__all__ = ["ThermalParameters", "steady_rise", "torque_constant_at"]
+__all__ = ["ThermalParameters", "torque_constant_at"]
 
 
 @dataclass(frozen=True)
@@ -69,18 +69,6 @@ class ThermalParameters:
                 f"critical_winding is {self.critical_winding} degC; "
                 f"expected below max_winding = {self.max_winding} degC"
             )
-
-
-def steady_rise(power: float, parameters: ThermalParameters) -> tuple[float, float, float]:
-    """Return how far winding, housing and body end above ambient under constant power [K].
-
-    Args:
-        power: Heat in the winding [W].
-        parameters: The ladder.
-    """
-    body = power * parameters.body_ambient
-    housing = body + power * parameters.housing_body
-    return housing + power * parameters.winding_housing, housing, body
 
 
 def torque_constant_at(temperature: float, constant: float, coefficient: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import TracebackType
 
-from pendulum_hw_bridge.emulation.link_state import LinkState
+from pendulum_hw_bridge.emulation.x5 import LinkState
 from pendulum_msgs_py.errors import PendulumError
 
 __all__ = ["COLUMNS", "TruthLog"]

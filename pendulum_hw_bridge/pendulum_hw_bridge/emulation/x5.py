@@ -10,6 +10,7 @@ import heapq
 import math
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from pendulum_hw_bridge.command_check import check_lifetime
 from pendulum_hw_bridge.emulation import kernel
 from pendulum_hw_bridge.emulation.faults import ActuatorFault, distort
 from pendulum_hw_bridge.emulation.firmware import gain_rows, new_loop_memory
-from pendulum_hw_bridge.emulation.link_state import LinkState
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
 from pendulum_hw_bridge.emulation.sensing import measure
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, PidGains
@@ -34,7 +34,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.series_elastic import spring_deflection
 from pendulum_msgs_py.errors import ParameterError
 
-__all__ = ["EmulatedX5", "HandTorque"]
+__all__ = ["EmulatedX5", "HandTorque", "LinkState"]
 
 HandTorque = Callable[[float, float, float], float]
 """Torque of a hand on the link as a function of time [s], position [rad] and velocity [rad/s]; returns [N m]."""
@@ -48,6 +48,33 @@ _SLOW_FEEDBACK = 10
 _LATE_NS = 80_000_000
 _OTHER_SENDER = -1
 _OPEN_CIRCUIT = 1e9
+
+
+@dataclass(frozen=True)
+class LinkState:
+    """What link and motor really do: the truth behind the feedback.
+
+    Attributes:
+        time_ns: Actuator time [ns].
+        position: Link angle [rad].
+        velocity: [rad/s].
+        motor_position: Motor angle at the output side [rad].
+        motor_velocity: [rad/s].
+        spring_torque: Torque on the link [N m].
+        motor_torque: Electromagnetic torque at the output side [N m].
+        pwm: Duty on the motor [-].
+        winding_temperature: [degC].
+    """
+
+    time_ns: int
+    position: float
+    velocity: float
+    motor_position: float
+    motor_velocity: float
+    spring_torque: float
+    motor_torque: float
+    pwm: float
+    winding_temperature: float
 
 
 class EmulatedX5:

@@ -18,9 +18,8 @@ from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.bridge import Bridge, Outcome
 from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.emulation.link_state import LinkState
 from pendulum_hw_bridge.emulation.parameters import load_emulator
-from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5, LinkState
 from pendulum_hw_bridge.module import DrivenModule
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
