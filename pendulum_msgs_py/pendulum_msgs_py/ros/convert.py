@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -20,6 +21,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSam
 from pendulum_msgs_py.joints import ONE_JOINT
 
 __all__ = [
+    "class_of",
     "command_from_bytes",
     "diagnostic_status",
     "event_message",
@@ -39,6 +41,19 @@ __all__ = [
 
 
 _NO_JOINT_STATE = "its bytes are no sensor_msgs/JointState"
+
+
+def class_of(name: str) -> Any:
+    """Return the class of a message or service, such as ``sensor_msgs/msg/JointState``.
+
+    Raises:
+        ImportError: It is not installed.
+    """
+    package, kind, short = name.split("/")
+    module = importlib.import_module(f"{package}.{kind}")
+    if not hasattr(module, short):
+        raise ImportError(f"{module.__name__} has no {short}")
+    return getattr(module, short)
 
 
 def stamp_to_message(stamp_ns: int) -> Time:

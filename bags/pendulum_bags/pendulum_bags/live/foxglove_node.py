@@ -6,7 +6,6 @@ with its own rules: an e-stop latches, and arming is refused where a plant refus
 
 from __future__ import annotations
 
-import importlib
 import queue
 import secrets
 import threading
@@ -27,6 +26,7 @@ from pendulum_bags.live.live_topic_node import LiveTopic
 from pendulum_bags.live.schemas import service_text
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import FaultError, PendulumError
+from pendulum_msgs_py.ros.convert import class_of
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.timers import create_wall_timer
 from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
@@ -188,7 +188,7 @@ class LiveNode(PollingNode):
             self.destroy_client(self._callable.pop(name))
         for name in there.keys() - self._callable.keys() - self._unknown:
             try:
-                kind = _service_class(there[name])
+                kind = class_of(there[name])
                 offered = self._as_service(name, there[name], kind)
             except (PendulumError, ImportError) as error:
                 self._unknown.add(name)
@@ -319,11 +319,6 @@ def _start_server(listener: Any, domain: int, context: Any) -> tuple[Any, str]:
         return start(host), host
     except RuntimeError:
         return start("127.0.0.1"), "127.0.0.1"
-
-
-def _service_class(name: str) -> Any:
-    package, _, short = name.split("/")
-    return getattr(importlib.import_module(f"{package}.srv"), short)
 
 
 def _in_words(answer: Any) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 import foxglove
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from pendulum_msgs_py.ros.convert import class_of
 from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
 from pendulum_rosbag.reader.joint_state import Trimmer
 from pendulum_rosbag.recorder.recorder_tap_node import wanted_qos
@@ -37,11 +37,7 @@ class LiveTopic:
     """
 
     def __init__(self, node: PollingNode, topic: str, type_name: str, context: Any) -> None:
-        package, _, short = type_name.split("/")
-        module = importlib.import_module(f"{package}.msg")
-        if not hasattr(module, short):
-            raise ImportError(f"{package}.msg has no {short}")
-        self._class = getattr(module, short)
+        self._class = class_of(type_name)
         self._node = node
         self._topic = topic
         self._trim = Trimmer() if type_name == "sensor_msgs/msg/JointState" else bytes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import threading
 import time
@@ -23,7 +22,7 @@ from pendulum_msgs_py.contract.names import CLOCK
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.programs.executables import cli_main
-from pendulum_msgs_py.ros.convert import stamp_to_message
+from pendulum_msgs_py.ros.convert import class_of, stamp_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_rosbag.reader import Bag, read_bag
@@ -148,10 +147,9 @@ class Player(Node):
 
     def _publisher(self, bag: Bag, name: str) -> Publisher:
         info = bag.topics[name]
-        package, _, short = info.type.split("/")
         try:
-            message_class = getattr(importlib.import_module(f"{package}.msg"), short)
-        except (ImportError, AttributeError) as error:
+            message_class = class_of(info.type)
+        except ImportError as error:
             raise DataError(f"topic {name} has type {info.type}, which is not installed here") from error
         new_name = dict(self._options.remaps).get(name, name)
         return self.create_publisher(message_class, new_name, _recorded_qos(info.qos))

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from rclpy.event_handler import QoSSubscriptionEventType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from pendulum_msgs_py.ros.convert import class_of
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_rosbag.reader.joint_state import Trimmer
 from pendulum_rosbag.recorder.gaps import GapCounter
@@ -79,7 +78,7 @@ class Tap:
         )
         self._opened = self._first_opened = time.monotonic()
         self._told_unmet = 0
-        self.source = node.create_polled_input(_message_class(name), topic, profile)
+        self.source = node.create_polled_input(class_of(name), topic, profile)
         # Taken when it is asked for, not delivered by the executor: it must be as new as the messages.
         handle = self.source.subscription.handle
         with handle:
@@ -143,14 +142,6 @@ class Tap:
         with self._matched:
             status = self._matched.take_event()
         return (status.total_count, status.current_count) if status else (0, 0)
-
-
-def _message_class(name: str) -> Any:
-    package, _, short = name.split("/")
-    module = importlib.import_module(f"{package}.msg")
-    if not hasattr(module, short):
-        raise ImportError(f"{package}.msg has no {short}")
-    return getattr(module, short)
 
 
 def _offered(publisher: TopicEndpointInfo) -> QosProfile:
