@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.model import LinearModel, sort_poles
 from pendulum_lqr.sampled_design import DiscreteModel, discretise
+from pendulum_msgs_py.contract.values import finite
 
 __all__ = [
     "LoopReport",
@@ -84,7 +85,7 @@ class LoopReport:
         """Return plain values for JSON; complex poles as [re, im], infinities as None."""
         plain = asdict(self)
         plain["poles"] = [[pole.real, pole.imag] for pole in self.poles]
-        return _finite(plain)
+        return finite(plain)
 
 
 def closed_loop_poles(model: LinearModel, K: ArrayLike) -> NDArray[np.complex128]:
@@ -280,13 +281,3 @@ def _delay_margin(phases: NDArray[np.float64], crossovers: NDArray[np.float64]) 
         return math.inf
     positive = np.where(phases > 0.0, phases, phases + 2.0 * math.pi)
     return float(np.min(positive / crossovers))
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

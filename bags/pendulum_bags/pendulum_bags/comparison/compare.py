@@ -19,6 +19,7 @@ from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_test
 from pendulum_bags.runs.run_data import OpenBag, RunData, is_emulated, noise_hold_time, plant_summary, read_run
 from pendulum_bags.runs.run_folder import pair_folders, read_looks, read_stalls
 from pendulum_bags.runs.run_record import run_record
+from pendulum_msgs_py.contract.values import finite
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_rosbag.reader import read_bag
 
@@ -163,7 +164,7 @@ class Comparison:
             "metrics": self.metrics,
             "verdict": self.verdict.as_dict(),
         }
-        result: dict[str, Any] = _finite(content)
+        result: dict[str, Any] = finite(content)
         return result
 
     def _why_not_paired(self) -> str:
@@ -364,14 +365,3 @@ def _pooled_std(spreads: Sequence[float], means: Sequence[float], counts: Sequen
         for spread, mean, count in zip(spreads, means, counts, strict=True)
     )
     return math.sqrt(squares / (sum(counts) - 1))
-
-
-def _finite(value: Any) -> Any:
-    """Return the value with numbers that JSON does not know as None."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    return value

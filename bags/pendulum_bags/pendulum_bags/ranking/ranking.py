@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.ranking.contender import PARTS, Contender, Interval, compared_runs, refuse_no_number
 from pendulum_bags.ranking.regret import regret_share
+from pendulum_msgs_py.contract.values import finite
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Ranking", "WrongPair", "mmrv", "rank"]
@@ -96,17 +97,7 @@ class Ranking:
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON values; infinities and what does not exist as None."""
-        return _finite(asdict(self))
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(entry) for entry in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
+        return finite(asdict(self))
 
 
 def mmrv(sim: Array, hw: Array) -> float:

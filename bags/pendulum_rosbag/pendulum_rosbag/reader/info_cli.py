@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pendulum_msgs_py.contract.values import finite
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
@@ -31,7 +32,7 @@ def info(
     statistics = bag_statistics(opened)
     if as_json:
         document = dataclasses.asdict(statistics) | {"metadata": opened.metadata, "notes": opened.notes}
-        print(json.dumps(_without_nan(document), indent=2))
+        print(json.dumps(finite(document), indent=2))
         return 0
     _print(statistics, opened.metadata, opened.notes)
     return 0
@@ -102,17 +103,6 @@ def _number(value: float) -> str:
 
 def _alarm(count: int) -> str:
     return f"[bold red]{count}[/]" if count else "0"
-
-
-def _without_nan(value: Any) -> Any:
-    """JSON has no NaN: absent numbers become null."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return value
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS, finite
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_rosbag.reader.bag import Bag
@@ -119,15 +119,7 @@ def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
 
 def _json(value: Any) -> str:
     """Return a list as JSON, which knows neither NaN nor infinity: those become null."""
-    return json.dumps(_finite(value), allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    return [_finite(item) for item in value] if isinstance(value, list) else value
+    return json.dumps(finite(value), allow_nan=False)
 
 
 def _write_parquet(path: Path, table: pd.DataFrame, info: TopicInfo) -> None:
