@@ -20,6 +20,7 @@ import yaml
 from pendulum_msgs_py.errors import ParameterError
 
 __all__ = [
+    "TYPE_NAMES",
     "ParameterSpec",
     "ParameterValue",
     "dump_yaml",
@@ -35,7 +36,8 @@ __all__ = [
 
 ParameterValue: TypeAlias = bool | int | float | str | list[float] | list[str]
 
-_TYPE_NAMES = {bool: "true or false", int: "an integer", float: "a number", str: "text", list: "a list"}
+TYPE_NAMES = {bool: "true or false", int: "an integer", float: "a number", str: "text", list: "a list"}
+"""What a parameter of a type must be, in words."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ class ParameterSpec:
             self._check_range(value, where)
             return value
         if not isinstance(value, wanted):
-            raise self._error(value, f"expected {_TYPE_NAMES[wanted]}", where)
+            raise self._error(value, f"expected {TYPE_NAMES[wanted]}", where)
         if self.choices and value not in self.choices:
             raise self._error(value, f"expected {self.domain}", where)
         return value
@@ -325,18 +327,14 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
             loader.dispose()
 
 
-def parameter_sections(content: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def parameter_sections(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Yield the sections of a ROS parameter file: node name or pattern, and parameters; namespaces may be nested."""
-    return _sections(content, "")
-
-
-def _sections(content: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
     for key, value in content.items():
         if key == "ros__parameters":
             if isinstance(value, Mapping):
                 yield prefix, value
         elif isinstance(value, Mapping):
-            yield from _sections(value, f"{prefix}/{key.strip('/')}")
+            yield from parameter_sections(value, f"{prefix}/{key.strip('/')}")
 
 
 def dump_yaml(document: Mapping[str, Any], what: str = "file") -> str:

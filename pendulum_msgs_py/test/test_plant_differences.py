@@ -13,7 +13,6 @@ from pendulum_msgs_py.plants.plant_differences import (
     describe_plants,
     plant_differences,
     plant_mismatch,
-    read_pendulums,
     read_plants,
 )
 from pendulum_msgs_py.plants.plant_parameters import (
@@ -109,8 +108,6 @@ def test_plants_of_several_joints_are_described_and_compared_by_the_names_of_the
     assert "model double_pendulum, runs cart_pole" in plant_mismatch(acrobot, [load_mechanism("cart_pole")])
     assert "model double_pendulum, runs pendulum" in plant_mismatch(acrobot, [THESIS])
     assert "elbow.effort_limit 6, runs none" in plant_mismatch(acrobot, [load_mechanism("pendubot")])
-    with pytest.raises(ParameterError, match="'acrobot' has several joints; expected a plant of one joint"):
-        read_pendulums(describe_plants([acrobot]))
 
 
 def test_a_description_of_a_mechanism_that_nobody_knows_is_refused() -> None:

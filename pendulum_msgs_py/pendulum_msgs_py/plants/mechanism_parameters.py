@@ -325,9 +325,7 @@ def write_mechanism(
         "parameters": write_quantities(values, mechanism.parameters, known),
         "joints": joints,
     }
-    if provenance:
-        document["provenance"] = dict(provenance)
-    return save_document(path, document)
+    return save_document(path, document, provenance)
 
 
 def _read_document(document: Mapping[str, Any], path: Path) -> tuple[MechanismParameters, dict[str, Any]]:

@@ -26,7 +26,6 @@ __all__ = [
     "describe_plants",
     "plant_differences",
     "plant_mismatch",
-    "read_pendulums",
     "read_plants",
 ]
 
@@ -142,19 +141,6 @@ def read_plants(text: str) -> tuple[AnyPlant, ...]:
         return tuple(_from_mapping(entry) for entry in json.loads(text))
     except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
         raise ParameterError(f"{PLANT_PARAMETERS} is no description of plants: {error}") from error
-
-
-def read_pendulums(text: str) -> tuple[PlantParameters, ...]:
-    """Return the plants of a text, all of one joint.
-
-    Raises:
-        ParameterError: As :func:`read_plants`; or one is of several joints.
-    """
-    plants = read_plants(text)
-    several = [plant.name for plant in plants if not isinstance(plant, PlantParameters)]
-    if several:
-        raise ParameterError(f"plant {several[0]!r} has several joints; expected a plant of one joint")
-    return tuple(plant for plant in plants if isinstance(plant, PlantParameters))
 
 
 def _as_mapping(plant: AnyPlant) -> dict[str, Any]:

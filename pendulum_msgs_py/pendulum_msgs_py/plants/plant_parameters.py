@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import ParameterSpec, dump_yaml, load_yaml, reject_unknown
+from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown
 from pendulum_msgs_py.plants.friction_terms import term_fields
 from pendulum_msgs_py.plants.quantities import (
     Quantity,
@@ -250,7 +250,8 @@ def read_plant_document(document: Mapping[str, Any], path: Path) -> tuple[PlantP
         raise ParameterError(f"{where}: format is {document.get('format')!r}; expected {FORMAT!r}")
     reject_unknown(document, ("format", "name", "parameters", "drivetrain", "provenance"), where=where)
     if "parameters" not in document:
-        raise ParameterError(f"{where}: parameters is missing; expected a mapping of {_names(PLANT_SPECS)}")
+        names = ", ".join(spec.name for spec in PLANT_SPECS)
+        raise ParameterError(f"{where}: parameters is missing; expected a mapping of {names}")
     values, intervals = read_quantities(document["parameters"], PLANT_SPECS, f"{where}: parameters")
     for required in ("inertia", "damping", "gravity"):
         if required not in values:
@@ -285,20 +286,18 @@ def write_plant(
     Raises:
         ParameterError: The file cannot be written.
     """
-    document = plant_document(parameters, intervals)
-    if provenance:
-        document["provenance"] = dict(provenance)
-    return save_document(path, document)
+    return save_document(path, plant_document(parameters, intervals), provenance)
 
 
-def save_document(path: str | Path, document: Mapping[str, Any]) -> Path:
-    """Write the content of a plant file; the file appears whole or not at all.
+def save_document(path: str | Path, document: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> Path:
+    """Write the content of a plant file, and where it is from; the file appears whole or not at all.
 
     Raises:
         ParameterError: The file cannot be written.
     """
     path = Path(path)
-    text = dump_yaml(document, f"plant file {path}")
+    whole = {**document, "provenance": dict(provenance)} if provenance else document
+    text = dump_yaml(whole, f"plant file {path}")
     try:
         write_whole(path, text)
     except (OSError, ValueError) as error:
@@ -358,7 +357,3 @@ def require_one_joint(preset_or_path: str | Path, instead: str) -> None:
         raise ParameterError(
             f"plant is {preset_or_path}, which has several joints; expected one of one joint, or {instead}"
         )
-
-
-def _names(specs: Sequence[ParameterSpec]) -> str:
-    return ", ".join(spec.name for spec in specs)

@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import ParameterSpec, reject_unknown
+from pendulum_msgs_py.parameters import TYPE_NAMES, ParameterSpec, reject_unknown
 from pendulum_msgs_py.ros.shared_parameters import given_to_every_node, refuse_near_misses
 
 __all__ = ["NodeParameters"]
@@ -75,7 +75,8 @@ class NodeParameters:
             decimals = _as_decimals(spec, value)
             hint = f"; ROS tells whole numbers and decimals apart: write {decimals}" if decimals else ""
             raise ParameterError(
-                f"{spec.name} is {_plain(value)!r}; expected {_kind(spec)} {spec.domain}".rstrip() + hint
+                f"{spec.name} is {_plain(value)!r}; expected {TYPE_NAMES[type(spec.default)]} {spec.domain}".rstrip()
+                + hint
             ) from error
         except InvalidParameterValueException as error:
             given = node._parameter_overrides.get(spec.name)
@@ -151,11 +152,6 @@ def _as_decimals(spec: ParameterSpec, value: object) -> str:
         if isinstance(numbers, list) and all(type(number) is int for number in numbers):
             return str([float(number) for number in numbers])
     return ""
-
-
-def _kind(spec: ParameterSpec) -> str:
-    kinds = {bool: "true or false", int: "an integer", float: "a number", str: "text", list: "a list"}
-    return kinds[type(spec.default)]
 
 
 def _descriptor(spec: ParameterSpec) -> ParameterDescriptor:

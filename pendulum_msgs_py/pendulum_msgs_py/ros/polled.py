@@ -107,11 +107,6 @@ class WaitedInput(PolledInput):
         """Whether its owner waits for it; otherwise the executor attends to it."""
         return self._arrivals.works
 
-    @property
-    def descriptor(self) -> int:
-        """The event counter that the middleware adds to, where this works."""
-        return self._arrivals.descriptor
-
     def serve(self, longest: float) -> bool:
         """Hand over what has come, and what comes within a time; return whether anything did.
 
