@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 from pendulum_hw_bridge.actuator import (
     ActuatorError,
@@ -126,20 +126,13 @@ class DrivePort(JointPort):
 
     def connect(self) -> ActuatorInfo:
         """Return what the emulated drive says of itself."""
-        info = super().connect()
-        drive = self.machine.drives[self._motor]
-        return ActuatorInfo(
-            info.backend,
-            info.family,
-            info.name,
-            info.serial,
-            info.firmware,
-            self._strategy,
-            info.feedback_rate,
-            drive.lifetime,
-            self._limits,
-            self._gains,
-            asdict(self.machine.hardware),
+        return replace(
+            super().connect(),
+            strategy=self._strategy,
+            command_lifetime=self.machine.drives[self._motor].lifetime,
+            limits=self._limits,
+            gains=self._gains,
+            drivetrain=asdict(self.machine.hardware),
         )
 
     def write(self, command: Command) -> Applied:

@@ -3,20 +3,34 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from typing import BinaryIO
 
-from pendulum_msgs_py.errors import BagError
-from pendulum_rosbag.reader.batches import Bytes
+import numpy as np
 
-__all__ = ["decompress", "decompress_bounded", "decompress_torn"]
+from pendulum_msgs_py.errors import BagError
+from pendulum_rosbag.reader.batches import Batch, Bytes, Source, joined
+from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
+
+__all__ = ["UnpackedSource", "decompress", "decompress_bounded", "holds_packed_messages"]
 
 _MAX_CHUNK = 1 << 28  # decompressed bytes of one chunk: recorders write chunks of about 1 MB, bombs larger ones
+_GROUP_SIZE = 1 << 20  # decompressed bytes that are parsed at once
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+"""How a zstd frame begins; no CDR message does, whose second byte says its byte order and kind (0 to 11)."""
 
 
-def decompress(packed: Bytes, compression: str, size: int, name: str) -> bytes:
+def decompress(packed: Bytes, compression: str, size: int, name: str, *, torn: bool = False) -> bytes:
     """Return the content of a chunk.
 
     Never more is decompressed than the head of the chunk says, and that has a bound.
+
+    Args:
+        packed: The chunk, compressed.
+        compression: ``zstd`` or ``lz4``.
+        size: What its head says that it holds [bytes].
+        name: The file, for messages.
+        torn: Its end was cut off: return its beginning, as far as its compression gives it back.
 
     Raises:
         BagError: Unknown compression, a chunk larger than any recorder's, or the bytes are damaged.
@@ -27,6 +41,8 @@ def decompress(packed: Bytes, compression: str, size: int, name: str) -> bytes:
         import zstandard
 
         try:
+            if torn:
+                return _beginning(io.BytesIO(packed.tobytes()), size)
             claimed = zstandard.frame_content_size(packed.data)  # -1 where the frame does not say
             if claimed not in (-1, size):
                 raise BagError(f"{name}: a chunk claims to hold {claimed} bytes; its head says {size}")
@@ -42,39 +58,11 @@ def decompress(packed: Bytes, compression: str, size: int, name: str) -> bytes:
             raise BagError(f"{name}: a compressed chunk is damaged ({error})") from None
     else:
         raise BagError(f"{name}: chunk compression is {compression!r}; expected zstd, lz4 or none")
+    if torn:
+        return bytes(raw[:size])
     if len(raw) != size:
         raise BagError(f"{name}: a chunk holds {len(raw)} bytes; its head says {size}")
     return raw
-
-
-def decompress_torn(packed: Bytes, compression: str, size: int) -> bytes:
-    """Return the beginning of a chunk whose end was cut off, as far as its compression gives it back.
-
-    Raises:
-        BagError: Unknown compression, a chunk larger than any recorder's, or the bytes are damaged.
-    """
-    if size > _MAX_CHUNK:
-        raise BagError(f"a chunk claims to hold {size} bytes; expected at most {_MAX_CHUNK}")
-    if compression == "zstd":
-        import zstandard
-
-        parts, left = [], size
-        try:
-            with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(packed.tobytes())) as stream:
-                while left > 0 and (part := stream.read(min(left, 1 << 20))):
-                    parts.append(part)
-                    left -= len(part)
-        except zstandard.ZstdError as error:
-            raise BagError(f"a compressed chunk is damaged ({error})") from None
-        return b"".join(parts)
-    if compression == "lz4":
-        import lz4.frame
-
-        try:
-            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed.tobytes(), max_length=size))
-        except (RuntimeError, EOFError) as error:
-            raise BagError(f"a compressed chunk is damaged ({error})") from None
-    raise BagError(f"chunk compression is {compression!r}; expected zstd, lz4 or none")
 
 
 def decompress_bounded(packed: BinaryIO, name: str, limit: int = _MAX_CHUNK) -> bytes:
@@ -85,16 +73,94 @@ def decompress_bounded(packed: BinaryIO, name: str, limit: int = _MAX_CHUNK) -> 
     """
     import zstandard
 
-    parts, size = [], 0
     try:
-        with zstandard.ZstdDecompressor().stream_reader(packed) as stream:
-            while part := stream.read(1 << 20):
-                parts.append(part)
-                size += len(part)
-                if size > limit:
-                    raise BagError(f"{name} holds more than {limit} bytes when decompressed")
+        content = _beginning(packed, limit + 1)
     except (OSError, zstandard.ZstdError) as error:
-        if isinstance(error, BagError):
-            raise
         raise BagError(f"{name} cannot be decompressed: {error}") from None
+    if len(content) > limit:
+        raise BagError(f"{name} holds more than {limit} bytes when decompressed")
+    return content
+
+
+def _beginning(packed: BinaryIO, size: int) -> bytes:
+    """Return the first bytes of a zstd stream, which takes no more memory than they do."""
+    import zstandard
+
+    parts, left = [], size
+    with zstandard.ZstdDecompressor().stream_reader(packed) as stream:
+        while left > 0 and (part := stream.read(min(left, 1 << 20))):
+            parts.append(part)
+            left -= len(part)
     return b"".join(parts)
+
+
+class UnpackedSource:
+    """A storage file whose messages were compressed one by one (``ros2 bag record --compression-mode message``).
+
+    They are decompressed on their way to the parsers.
+
+    Args:
+        packed: The file as it is.
+    """
+
+    compressed = True
+
+    def __init__(self, packed: Source) -> None:
+        self.packed = packed
+        self.path = packed.path
+        self.streams = packed.streams
+        self.start_ns = packed.start_ns
+        self.stop_ns = packed.stop_ns
+        self.damage = packed.damage
+        self.unclosed = packed.unclosed
+        self.unchecked = packed.unchecked
+
+    def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
+        """Yield all messages of some channels with start <= log time < stop, in the order of the file.
+
+        Raises:
+            BagError: A message cannot be decompressed, or claims to be larger than any message.
+        """
+        for batch in self.packed.batches(channels, start, stop):
+            times: list[int] = []
+            parts: list[bytes] = []
+            size = 0
+            for time, data in batch.payloads():
+                parts.append(self._unpacked(data))
+                times.append(time)
+                size += len(parts[-1])
+                if size >= _GROUP_SIZE:
+                    yield _batch(batch.channel, times, parts)
+                    times, parts, size = [], [], 0
+            if times:
+                yield _batch(batch.channel, times, parts)
+
+    def extras(self) -> list[Attachment | Metadata]:
+        """Return attachments and metadata of the file."""
+        return self.packed.extras()
+
+    def close(self) -> None:
+        """Release the file."""
+        self.packed.close()
+
+    def _unpacked(self, data: bytes) -> bytes:
+        # (a recorder that could not compress a message in time may leave it as it was)
+        if not data.startswith(_ZSTD_MAGIC):
+            return data
+        return decompress_bounded(io.BytesIO(data), f"a message of {self.path}")
+
+
+def _batch(channel: int, times: list[int], parts: list[bytes]) -> Batch:
+    buffer, offsets, sizes = joined(parts)
+    return Batch(channel, buffer, offsets, np.array(times, np.int64), sizes)
+
+
+def holds_packed_messages(source: Source) -> bool:
+    """Tell by its first message whether the messages of a file are compressed, where no metadata says so."""
+    for stream in source.streams:
+        if stream.serialization != "cdr" or not stream.count:
+            continue
+        for batch in source.batches({stream.channel}, None, None):
+            for _, data in batch.payloads():
+                return data.startswith(_ZSTD_MAGIC)
+    return False

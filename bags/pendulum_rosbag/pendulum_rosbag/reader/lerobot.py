@@ -74,10 +74,8 @@ def episodes_of(bag: Bag, fps: int) -> list[Episode]:
         DataError: There is no plant with commands, or none was answered for as long as two frames.
     """
     found: list[Episode] = []
-    states = [topic for topic in sorted(bag.topics) if topic.rpartition("/")[2] == names.JOINT_STATES]
-    for topic in states:
-        commanded = f"{topic.removesuffix(names.JOINT_STATES)}{names.EFFORT_COMMAND}"
-        if bag.topics[topic].count and commanded in bag.topics and bag.topics[commanded].count:
+    for topic, commanded in _commanded(bag):
+        if bag.topics[topic].count and bag.topics[commanded].count:
             found += _stretches(bag, topic, bag.joints(topic), bag.joints(commanded), fps)
     if not found:
         raise DataError(
@@ -86,6 +84,14 @@ def episodes_of(bag: Bag, fps: int) -> list[Episode]:
             f"(its topics: {', '.join(sorted(bag.topics)) or 'none'})"
         )
     return found
+
+
+def _commanded(bag: Bag) -> Iterator[tuple[str, str]]:
+    """Yield the topics of states that have a topic of commands beside them, with that."""
+    for topic in sorted(bag.topics):
+        commanded = f"{topic.removesuffix(names.JOINT_STATES)}{names.EFFORT_COMMAND}"
+        if topic.rpartition("/")[2] == names.JOINT_STATES and commanded in bag.topics:
+            yield topic, commanded
 
 
 def _stretches(bag: Bag, topic: str, states: JointTable, commands: JointTable, fps: int) -> Iterator[Episode]:
@@ -133,13 +139,11 @@ def _rate(bags: Sequence[Bag]) -> int:
     """Return the rate of the slowest plant that is commanded, as whole frames per second [Hz]."""
     rates = []
     for bag in bags:
-        for topic in bag.topics:
-            commanded = f"{topic.removesuffix(names.JOINT_STATES)}{names.EFFORT_COMMAND}"
-            if topic.rpartition("/")[2] == names.JOINT_STATES and commanded in bag.topics:
-                stamps = np.sort(bag.joints(topic).stamp_ns) if bag.topics[topic].count > 1 else np.zeros(0)
-                periods = np.diff(stamps)
-                if (periods > 0).any():
-                    rates.append(1e9 / float(np.median(periods[periods > 0])))
+        for topic, _ in _commanded(bag):
+            stamps = np.sort(bag.joints(topic).stamp_ns) if bag.topics[topic].count > 1 else np.zeros(0)
+            periods = np.diff(stamps)
+            if (periods > 0).any():
+                rates.append(1e9 / float(np.median(periods[periods > 0])))
     return max(1, round(min(rates))) if rates else 1
 
 

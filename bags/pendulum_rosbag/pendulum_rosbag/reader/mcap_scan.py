@@ -15,7 +15,7 @@ import numpy as np
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import Bytes
-from pendulum_rosbag.reader.decompression import decompress_torn
+from pendulum_rosbag.reader.decompression import decompress
 from pendulum_rosbag.reader.mcap_chunks import (
     CHUNK_FIELDS,
     Chunk,
@@ -128,7 +128,7 @@ class McapScan:
             packed = self._buffer[chunk.data_start :]
             raw = packed
             if chunk.compression:
-                content = decompress_torn(packed, chunk.compression, chunk.raw_size)
+                content = decompress(packed, chunk.compression, chunk.raw_size, str(self._path), torn=True)
                 raw = np.frombuffer(content, np.uint8)
             records, end = records_in(raw)
         except (BagError, struct.error, UnicodeDecodeError):

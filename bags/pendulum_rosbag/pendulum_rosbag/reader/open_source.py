@@ -13,9 +13,8 @@ import yaml
 
 from pendulum_msgs_py.errors import BagError
 from pendulum_rosbag.reader.batches import Source
-from pendulum_rosbag.reader.decompression import decompress_bounded
+from pendulum_rosbag.reader.decompression import UnpackedSource, decompress_bounded, holds_packed_messages
 from pendulum_rosbag.reader.mcap_source import McapSource
-from pendulum_rosbag.reader.message_compression import UnpackedSource, holds_packed_messages
 from pendulum_rosbag.reader.sqlite_source import SqliteSource
 from pendulum_rosbag.storage.metadata_file import METADATA_NAME, METADATA_VERSION
 
