@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 
 from pendulum_rosbag.reader import Bag, canonical
 from pendulum_rosbag.reader.joint_state import layout_of
-from pendulum_rosbag.storage import open_writer, typestore
+from pendulum_rosbag.storage import BagWriter, typestore
 
 __all__ = [
     "JOINT_STATE",
@@ -122,7 +122,7 @@ def write_bag(
         The folder.
     """
     written = list(messages)
-    writer = open_writer(path, storage, compression, metadata)
+    writer = BagWriter(path, storage, compression, metadata)
     for topic in sorted({topic for topic, _, _ in written}):
         writer.add_topic(topic, JOINT_STATE)
     for number, message in enumerate(written, start=1):

@@ -17,9 +17,9 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
 ENDLESS_WRITER = """
 import os, sys
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from pendulum_msgs_py.contract.cdr import encode_joint_state
-writer = open_writer(sys.argv[1], sys.argv[2])
+writer = BagWriter(sys.argv[1], sys.argv[2])
 for number in range(5):
     writer.add_topic(f"/t{number}", "sensor_msgs/msg/JointState")
 data = encode_joint_state(5, position=1.0, velocity=1.0, effort=2.0)

@@ -18,7 +18,7 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from pendulum_sim.plants import make_plant
 
 K = (33.345265, 0.158993)
@@ -78,7 +78,7 @@ def write_bag(
     period = float(columns["t"][1] - columns["t"][0])
     lead = thesis_ramp(0.0, UPRIGHT)
     jitter = np.random.default_rng(0)
-    with open_writer(path, metadata=metadata or {}) as bag:
+    with BagWriter(path, metadata=metadata or {}) as bag:
         for topic in ("joint_states", "effort_command", "disturbance", "applied_effort"):
             bag.add_topic(f"{prefix}/{topic}", STATE)
         bag.add_topic(f"{prefix}/events", TEXT)
@@ -143,7 +143,7 @@ def write_events_and_torque(
 
     Messages of a topic at a time [s] for which ``leave_out`` holds are missing.
     """
-    with open_writer(path) as bag:
+    with BagWriter(path) as bag:
         for topic in ("joint_states", "applied_effort"):
             bag.add_topic(f"{prefix}/{topic}", STATE)
         bag.add_topic(f"{prefix}/events", TEXT)

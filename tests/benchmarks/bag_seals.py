@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.reader import read_bag
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.benchmarks import Row, measured
 
 __all__ = ["seal_rows"]
@@ -25,7 +25,7 @@ def seal_rows(folder: Path, hours: float) -> Iterator[Row]:
     costs: list[tuple[float, float]] = []
     memory = 0.0
     begin_memory = 0.0
-    with open_writer(folder / "seals") as writer:
+    with BagWriter(folder / "seals") as writer:
         writer.add_topic("/a", "sensor_msgs/msg/JointState")
         file = writer._file
         begin, written = time.perf_counter(), _written_bytes()

@@ -23,7 +23,7 @@ import numpy as np
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.repair.repair import repair_bag
-from pendulum_rosbag.storage import open_writer, typestore
+from pendulum_rosbag.storage import BagWriter, typestore
 from tests.benchmarks import Peer, Row, measured, peer
 from tests.benchmarks.bag_recordings import kill_rows, load_rows
 from tests.benchmarks.bag_seals import seal_rows
@@ -81,7 +81,7 @@ def _reading(folder: Path, messages: list[tuple[str, int, bytes]]) -> Iterator[R
     variants = (("mcap", None, 40.0), ("mcap", "zstd", 25.0), ("sqlite3", None, 5.0))
     for storage, compression, target in variants:
         path = folder / f"read_{storage}_{compression}"
-        with open_writer(path, storage, compression) as writer:
+        with BagWriter(path, storage, compression) as writer:
             for topic in TOPICS:
                 writer.add_topic(topic, JOINT_STATE)
             writer.write_many(messages)
@@ -205,12 +205,12 @@ _OUR_MEMORY = (
 import sys
 from pathlib import Path
 from pendulum_rosbag.reader import read_bag
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 import tempfile
 # A first small bag, so that what is imported late is not counted.
 with tempfile.TemporaryDirectory() as name:
-    with open_writer(name + "/bag", sys.argv[2], metadata={"a": 1}) as writer:
+    with BagWriter(name + "/bag", sys.argv[2], metadata={"a": 1}) as writer:
         writer.add_topic("/a", "sensor_msgs/msg/JointState")
         writer.write("/a", 1, encode_joint_state(1, position=1.0))
     read_bag(name + "/bag").load()
@@ -262,7 +262,7 @@ def _in_process(script: str, path: Path) -> float:
 def _writing(folder: Path, messages: list[tuple[str, int, bytes]]) -> Iterator[Row]:
     def ours(storage: str, seal_every: int) -> Callable[[Path], None]:
         def write(path: Path) -> None:
-            with open_writer(path, storage) as writer:
+            with BagWriter(path, storage) as writer:
                 for topic in TOPICS:
                     writer.add_topic(topic, JOINT_STATE)
                 for begin in range(0, COUNT, seal_every):
@@ -329,7 +329,7 @@ def _truncation(folder: Path) -> Iterator[Row]:
     from mcap.reader import make_reader
 
     def ours(path: Path) -> None:
-        with open_writer(path) as writer:
+        with BagWriter(path) as writer:
             writer.add_topic("/a", JOINT_STATE)
             for index in range(20_000):
                 writer.write("/a", index, encode_joint_state(index, position=float(index)))

@@ -15,7 +15,7 @@ import pytest
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import DataError
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.bag_messages import JOINT_STATE, STORE, write_bag
 from tests.tools.faults.bag_property import POSITION_MARK, TorqueRecord, check_bag
 
@@ -121,7 +121,7 @@ def _judge(
     metadata = dict(marked or {})
     if counts:
         metadata["pendulum.recorder.counts"] = {f"/hw/{names.EFFORT_COMMAND}": dict(counts)}
-    writer = open_writer(path / "bag", "mcap", None, metadata)
+    writer = BagWriter(path / "bag", "mcap", None, metadata)
     for topic, kind in sorted({(topic, kind) for _, topic, kind, _ in rows}):
         writer.add_topic(topic, kind)
     for when, topic, _, data in sorted(rows, key=lambda row: row[0]):
@@ -312,7 +312,7 @@ def test_a_single_torque_too_late_breaks_the_rule(tmp_path: Path) -> None:
 
 
 def test_a_bag_without_torque_is_no_proof(tmp_path: Path) -> None:
-    writer = open_writer(tmp_path / "empty", "mcap", None, {})
+    writer = BagWriter(tmp_path / "empty", "mcap", None, {})
     writer.add_topic(f"/hw/{names.APPLIED_EFFORT}", JOINT_STATE)
     writer.close()
     (record,) = check_bag(tmp_path / "empty", limit=1.0)

@@ -12,7 +12,7 @@ import pytest
 
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.reader import read_bag
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 
 _TOPIC = "/sim/joint_states"
 _START_NS = 1_700_000_000_000_000_000
@@ -34,7 +34,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_full_disk_is_told_and_what_was_sealed_is_kept(small_disk: Path, storage: str) -> None:
     bag = small_disk / "bag"
-    writer = open_writer(bag, storage)
+    writer = BagWriter(bag, storage)
     writer.add_topic(_TOPIC, "sensor_msgs/msg/JointState")
     sealed = 0
 

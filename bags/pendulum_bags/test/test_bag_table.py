@@ -18,7 +18,7 @@ from pendulum_bags.comparison import compare_runs
 from pendulum_bags.runs.run_data import plant_summary, read_run
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_rosbag.reader import read_bag
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -113,7 +113,7 @@ def test_bags_of_one_name_have_rows_of_their_own(runs: Path, tmp_path: Path) -> 
 def test_bags_compressed_as_a_whole_are_asked_too(tmp_path: Path, ending: str) -> None:
     folder = tmp_path / "runs" / "packed"
     bag = read_bag(EXAMPLES / "regulation_sim")
-    with open_writer(folder, "mcap" if ending == ".mcap" else "sqlite3") as writer:
+    with BagWriter(folder, "mcap" if ending == ".mcap" else "sqlite3") as writer:
         for topic, info in bag.topics.items():
             writer.add_topic(topic, info.type)
             writer.write_many((topic, *row) for row in bag.raw(topic))

@@ -22,7 +22,7 @@ from pendulum_bags.verdict.same_run import seen_note
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_msgs_py.programs.terminal import make_console
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.synthetic_runs import regulate, run_metadata, write_bag, write_run_folder
 
 
@@ -232,7 +232,7 @@ def test_a_run_that_lost_many_states_is_told_apart_from_a_sound_one(folder: Path
 
 def test_without_events_the_window_is_that_of_the_disturbance(tmp_path: Path) -> None:
     columns = regulate(rate=100.0, seed=5)
-    with open_writer(tmp_path / "bag") as bag:
+    with BagWriter(tmp_path / "bag") as bag:
         for topic in ("joint_states", "disturbance"):
             bag.add_topic(f"/hw/{topic}", "sensor_msgs/msg/JointState")
         for i in range(600):
@@ -247,7 +247,7 @@ def test_without_events_the_window_is_that_of_the_disturbance(tmp_path: Path) ->
 
 
 def test_a_bag_without_noise_is_refused_in_one_sentence(tmp_path: Path) -> None:
-    with open_writer(tmp_path / "bag") as bag:
+    with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/sim/joint_states", "sensor_msgs/msg/JointState")
         for i in range(10):
             bag.write("/sim/joint_states", i, encode_joint_state(i * 1000, position=0.0, velocity=0.0, effort=0.0))
@@ -256,7 +256,7 @@ def test_a_bag_without_noise_is_refused_in_one_sentence(tmp_path: Path) -> None:
 
 
 def test_a_bag_of_two_plants_asks_which(tmp_path: Path) -> None:
-    with open_writer(tmp_path / "bag") as bag:
+    with BagWriter(tmp_path / "bag") as bag:
         for name in ("/sim/joint_states", "/hw/joint_states"):
             bag.add_topic(name, "sensor_msgs/msg/JointState")
             bag.write(name, 1, encode_joint_state(1, position=0.0, velocity=0.0, effort=0.0))

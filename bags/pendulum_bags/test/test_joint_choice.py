@@ -21,7 +21,7 @@ from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from pendulum_sim.mechanism_plant import MechanismPlant
 
 STATE = "sensor_msgs/msg/JointState"
@@ -37,7 +37,7 @@ def record(bag: Path, run: JointRun, **_: Any) -> Path:
     state = model.reset(plant.coordinates.goal)
     noise = uniform_array(own.seed, 0, round(own.duration / PERIOD), float(own.amplitude or 0.0))
     names, driven = plant.coordinates.names, plant.coordinates.driven_names
-    with open_writer(bag, metadata={}) as writer:
+    with BagWriter(bag, metadata={}) as writer:
         for topic in ("joint_states", "effort_command"):
             writer.add_topic(f"{run.namespace}/{topic}", STATE)
         for k, push in enumerate(map(float, noise)):
@@ -119,7 +119,7 @@ def test_a_design_that_falls_on_the_machine_alone_is_no_choice(
 def test_the_cost_is_that_of_the_plants_own_weights_about_upright(tmp_path: Path, settings: JointSettings) -> None:
     plant = load_mechanism("cart_pole")
     bag = tmp_path / "bag"
-    with open_writer(bag, metadata={}) as writer:
+    with BagWriter(bag, metadata={}) as writer:
         for topic in ("joint_states", "effort_command"):
             writer.add_topic(f"/sim/{topic}", STATE)
         for k in range(4):
@@ -135,7 +135,7 @@ def test_the_cost_is_that_of_the_plants_own_weights_about_upright(tmp_path: Path
 
 def test_a_plant_that_fell_has_no_cost(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    with open_writer(bag, metadata={}) as writer:
+    with BagWriter(bag, metadata={}) as writer:
         for topic in ("joint_states", "effort_command"):
             writer.add_topic(f"/sim/{topic}", STATE)
         for k, angle in enumerate((np.pi, 2.0, 0.0)):

@@ -33,7 +33,7 @@ from pendulum_rosbag.reader import Bag
 from pendulum_rosbag.reader import bag as bag_module
 from pendulum_rosbag.reader.joint_table import JointTable, joint_table
 from pendulum_rosbag.reader.open_source import BagFolder
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from pendulum_sim.mechanism_plant import MechanismPlant
 
 STATE = "sensor_msgs/msg/JointState"
@@ -66,7 +66,7 @@ def write(
     record = {"namespace": "/plant", "plant": "cart_pole", "design_plant": "cart_pole", "seed": 5}
     if stand_in:
         record["stand_in"] = stand_in
-    with open_writer(path, metadata={RUN_RECORD: record}) as bag:
+    with BagWriter(path, metadata={RUN_RECORD: record}) as bag:
         for topic in ("joint_states", "effort_command", "disturbance"):
             bag.add_topic(f"/plant/{topic}", STATE)
         for k in range(len(columns["noise"])):

@@ -14,7 +14,7 @@ from pendulum_bags.identification.mechanism_result import identify_mechanism
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, load_mechanism_file, write_mechanism
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 
 PERIOD = 0.01
 NOISE = 2e-4
@@ -78,7 +78,7 @@ def record(path, recording, plant, *, joints=None, push=0.0):
     """Write a recording as the bag of a plant: an applied effort with each state, or measured efforts alone."""
     names, driven = plant.coordinates.names, plant.coordinates.driven_names
     columns = [list(names).index(name) for name in driven]
-    with open_writer(path) as bag:
+    with BagWriter(path) as bag:
         for topic in ("joint_states", "applied_effort", "push"):
             bag.add_topic(f"/plant/{topic}", "sensor_msgs/msg/JointState")
         for k, t in enumerate(recording.time):

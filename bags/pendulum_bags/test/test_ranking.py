@@ -24,7 +24,7 @@ from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader.mcap_source import McapSource
 from pendulum_rosbag.repair.repair import repair_bag
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.policies import linear_policy
 from tests.synthetic_runs import regulate, run_metadata, write_bag, write_events_and_torque
 
@@ -333,7 +333,7 @@ def test_a_damaged_recording_is_named_and_not_left_out(recorded, capsys):
     # A run of which nothing but its record is left.
     metadata = run_metadata(3)
     metadata["pendulum.run"].update(controller={"kind": "lqr"}, side="hw")
-    with open_writer(recorded / "empty", metadata=metadata) as bag:
+    with BagWriter(recorded / "empty", metadata=metadata) as bag:
         bag.add_topic("/hw/joint_states", "sensor_msgs/msg/JointState")
     # A recorder that was killed: the end is missing, and with it perhaps the fall.
     (file,) = (recorded / "pid_hw_1").glob("*.mcap")

@@ -18,7 +18,7 @@ from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from pendulum_sim.plants import make_plant
 from tests.synthetic_runs import regulate, run_metadata, write_bag
 
@@ -52,7 +52,7 @@ def test_a_plant_follows_its_own_recording() -> None:
 def test_a_bag_whose_torque_was_never_recorded_is_refused_in_a_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], effort: list[None]
 ) -> None:
-    with open_writer(tmp_path / "bag") as writer:
+    with BagWriter(tmp_path / "bag") as writer:
         for topic in ("/sim/joint_states", "/sim/applied_effort", "/sim/effort_command"):
             writer.add_topic(topic, "sensor_msgs/msg/JointState")
         for index in range(100):

@@ -36,7 +36,7 @@ from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.fixtures import PROJECT
 from tests.synthetic_runs import write_run_folder
 
@@ -293,7 +293,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, capsys: pytest.Captu
 
 def write_trial(path: Path, t: np.ndarray, position: np.ndarray, effort: np.ndarray) -> None:
     velocity = np.gradient(position, t)
-    with open_writer(path) as bag:
+    with BagWriter(path) as bag:
         bag.add_topic("/hw/joint_states", "sensor_msgs/msg/JointState")
         bag.add_topic("/hw/events", "std_msgs/msg/String")
         for name, time in (("trial_start", t[0]), ("trial_end", t[-1] + 0.01)):
@@ -482,7 +482,7 @@ def test_a_report_on_emulated_hardware_lists_the_constants_of_the_emulator(
     assert emulator_table(data) is None, "this hardware is no emulator"
     told = {"pendulum.run": {"plant": "emulator", "namespace": "/hw", "strategy": "direct_pwm"}}
     plants = {"/sim/simulator": load_plant("thesis"), "/hw/bridge": load_plant("x5_9")}
-    with open_writer(tmp_path / "hw") as bag:
+    with BagWriter(tmp_path / "hw") as bag:
         bag.add_topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
         for node, plant in plants.items():
             pair = KeyValue(key=PLANT_PARAMETERS, value=describe_plants([plant]))

@@ -18,8 +18,8 @@ from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.info_cli import main as info_main
 from pendulum_rosbag.reader.mcap_source import McapSource
 from pendulum_rosbag.repair.repair import repair_bag
+from pendulum_rosbag.storage import BagWriter
 from pendulum_rosbag.storage import mcap_records as rec
-from pendulum_rosbag.storage import open_writer
 from tests.bag_messages import JOINT_STATE, write_bag
 
 TOPICS = ("/a", "/b", "/c")
@@ -175,7 +175,7 @@ def test_a_changed_summary_of_a_file_that_was_not_closed_is_told(tmp_path: Path)
 def test_a_summary_that_the_recorder_replaces_while_it_is_read_is_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writer = open_writer(tmp_path / "bag")
+    writer = BagWriter(tmp_path / "bag")
     writer.add_topic("/a", JOINT_STATE)
     total = 0
 
@@ -267,7 +267,7 @@ def test_info_notes_what_no_checksum_covers(tmp_path: Path, capsys: pytest.Captu
             writer.finish()
         return tmp_path / name
 
-    with open_writer(tmp_path / "sqlite", "sqlite3") as writer:
+    with BagWriter(tmp_path / "sqlite", "sqlite3") as writer:
         writer.add_topic("/a", JOINT_STATE)
         writer.write("/a", 1, encode_joint_state(1))
     end = ", so bytes that changed in messages cannot be told"

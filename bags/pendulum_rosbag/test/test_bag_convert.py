@@ -23,7 +23,7 @@ from pendulum_rosbag.convert.convert_cli import convert_main, cut_main, filter_m
 from pendulum_rosbag.convert.rewrite import Choice, rewrite
 from pendulum_rosbag.executables import COMMANDS, EXECUTABLES
 from pendulum_rosbag.reader import read_bag, same_messages
-from pendulum_rosbag.storage import QosProfile, open_writer
+from pendulum_rosbag.storage import BagWriter, QosProfile
 from tests.bag_messages import STORE, mixed_messages
 from tests.bag_readers import JOINT_STATE, STRING, count_everywhere, text_message
 
@@ -46,7 +46,7 @@ def a_bag(path: Path, kind: str, prefix: str = "/sim", seed: int = 3) -> Path:
                 library.write(connections[topic], time, data)
         return path
     storage, _, compression = kind.partition(" ")
-    writer = open_writer(
+    writer = BagWriter(
         path,
         storage,
         compression if compression == "zstd" else None,
@@ -141,7 +141,7 @@ def test_merged_bags_are_interleaved_and_tell_what_each_said_of_its_run(tmp_path
 def test_metadata_of_merged_bags_are_what_each_bag_reads_as(tmp_path: Path) -> None:
     odd = {"nested": "[" * 100_000, "none": "NaN", "number": "3"}
     for name in ("one", "two"):
-        with open_writer(tmp_path / name, metadata={**odd, "name": name}) as writer:
+        with BagWriter(tmp_path / name, metadata={**odd, "name": name}) as writer:
             writer.add_topic("/text", STRING)
             writer.write("/text", 1, text_message(name))
     rewrite([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
@@ -151,7 +151,7 @@ def test_metadata_of_merged_bags_are_what_each_bag_reads_as(tmp_path: Path) -> N
 
 def test_bags_that_disagree_about_a_type_are_not_merged(tmp_path: Path) -> None:
     sim = a_bag(tmp_path / "sim", "mcap")
-    with open_writer(tmp_path / "other") as writer:
+    with BagWriter(tmp_path / "other") as writer:
         writer.add_topic("/sim/joint_states", STRING)
         writer.write("/sim/joint_states", 1, text_message("x"))
     with pytest.raises(BagError, match=r"other: topic /sim/joint_states has type std_msgs/msg/String; the bag"):
@@ -161,7 +161,7 @@ def test_bags_that_disagree_about_a_type_are_not_merged(tmp_path: Path) -> None:
 
 def test_a_cut_is_by_time_or_by_events(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = tmp_path / "run"
-    with open_writer(bag, metadata={"seed": 1}) as writer:
+    with BagWriter(bag, metadata={"seed": 1}) as writer:
         writer.add_topic("/a", JOINT_STATE)
         writer.add_topic("/events", STRING)
         for index in range(100):

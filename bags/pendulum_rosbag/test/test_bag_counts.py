@@ -17,7 +17,7 @@ from pendulum_rosbag.convert.rewrite import rewrite
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.mcap_source import McapSource
 from pendulum_rosbag.repair.repair import repair_bag
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.bag_messages import JOINT_STATE, write_bag
 
 TOPICS = ("/a", "/b")
@@ -140,7 +140,7 @@ def test_metadata_that_is_older_than_its_files_raises_no_alarm(tmp_path: Path, s
     assert read_bag(bag).damage == []
     assert {topic: len(found) for topic, found in rows(bag).items()} == dict.fromkeys(TOPICS, COUNT)
     split = tmp_path / "split"
-    with open_writer(split, storage, max_duration=30e-6) as writer:
+    with BagWriter(split, storage, max_duration=30e-6) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(100):
             writer.write("/a", 1000 * index, encode_joint_state(index))

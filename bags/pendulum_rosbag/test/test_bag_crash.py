@@ -16,8 +16,8 @@ from mcap.reader import McapReader, NonSeekingReader, SeekingReader, make_reader
 
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.storage import (
+    BagWriter,
     mcap_layout,
-    open_writer,
     sealed_mcap,
     storage_file,
 )
@@ -57,7 +57,7 @@ def test_no_write_of_a_commit_ever_leaves_a_broken_bag(
                 assert max(counts) <= total
         return len(view)
 
-    writer = open_writer(bag, storage)
+    writer = BagWriter(bag, storage)
     monkeypatch.setattr(storage_file, "os", _WatchedOs(watched))
     writer.add_topic("/a", STRING)
     for round_number in range(14):
@@ -81,7 +81,7 @@ def test_a_reader_keeps_what_it_was_shown_while_the_recorder_goes_on_and_ends(
     tmp_path: Path, compression: str | None
 ) -> None:
     bag = tmp_path / "bag"
-    writer = open_writer(bag, compression=compression)
+    writer = BagWriter(bag, compression=compression)
     writer.add_topic("/a", JOINT_STATE)
 
     def record(first: int, last: int) -> None:
@@ -137,7 +137,7 @@ def test_small_chunks_become_large_ones_unseen(
         check()
         return done
 
-    writer = open_writer(bag, compression=compression)
+    writer = BagWriter(bag, compression=compression)
     monkeypatch.setattr(storage_file, "os", _WatchedOs(watched))
     ends = []
     for round_number in range(25 if compression else 45):
@@ -184,7 +184,7 @@ class _WatchedOs:
 
 def test_a_commit_head_never_straddles_two_pages(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    writer = open_writer(bag)
+    writer = BagWriter(bag)
     writer.add_topic("/a", STRING)
     heads = []
     rng = random.Random(1)
@@ -227,7 +227,7 @@ def test_foxgloves_readers_open_a_growing_file_at_every_write(
                 assert sealed <= answer.get("count", -1) <= total, answer
         return done
 
-    writer = open_writer(bag, compression=compression)
+    writer = BagWriter(bag, compression=compression)
     monkeypatch.setattr(storage_file, "os", _WatchedOs(watched))
     assert mcap_js.counts(bag / "bag_0.mcap") == (0, 0)
     sizes = set()
@@ -269,9 +269,9 @@ def test_kill_9_at_random_moments_costs_nothing_that_was_sealed(tmp_path: Path, 
 
 FULL = """
 import resource, sys
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from pendulum_msgs_py.contract.cdr import encode_joint_state
-writer = open_writer(sys.argv[1], sys.argv[2])
+writer = BagWriter(sys.argv[1], sys.argv[2])
 writer.add_topic("/a", "sensor_msgs/msg/JointState")
 resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
 total = 0

@@ -16,7 +16,7 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.reader import Bag, canonical, read_bag, same_messages
 from pendulum_rosbag.reader.batches import Batch
 from pendulum_rosbag.reader.joint_state import JointStateParser, layout_of
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.bag_messages import (
     JOINT_STATE,
     STORE,
@@ -101,7 +101,7 @@ def test_one_flipped_byte_makes_bags_different(tmp_path: Path) -> None:
     rng = random.Random(8)
 
     def write(path: Path, effort: float, time: int) -> Bag:
-        with open_writer(path) as writer:
+        with BagWriter(path) as writer:
             writer.add_topic("/a", JOINT_STATE)
             for index in range(20):
                 data = encode_joint_state(index, effort=effort if index == 13 else 1.0)
@@ -121,7 +121,7 @@ def test_one_flipped_byte_makes_bags_different(tmp_path: Path) -> None:
 
 def test_messages_of_one_log_time_have_no_order_but_must_all_be_there(tmp_path: Path) -> None:
     def write(name: str, positions: list[float]) -> Bag:
-        with open_writer(tmp_path / name) as writer:
+        with BagWriter(tmp_path / name) as writer:
             writer.add_topic("/a", JOINT_STATE)
             for position in positions:
                 writer.write("/a", 1, encode_joint_state(1, position=position))

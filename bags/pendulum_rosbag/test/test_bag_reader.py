@@ -18,7 +18,7 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from pendulum_msgs_py.contract.cdr import encode_joint_state, encode_joints
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_rosbag.reader import read_bag, read_bags, same_messages
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.bag_messages import (
     JOINT_STATE,
     STORE,
@@ -32,7 +32,7 @@ from tests.bag_messages import (
 def test_our_bags_read_as_rosbags_reads_them(tmp_path: Path, storage: str, compression: str | None) -> None:
     rng = random.Random(2)
     path = tmp_path / "bag"
-    with open_writer(path, storage, compression) as writer:
+    with BagWriter(path, storage, compression) as writer:
         for topic in ("/sim/joint_states", "/sim/effort_command", "/sim/disturbance"):
             writer.add_topic(topic, JOINT_STATE)
         for number, item in enumerate(mixed_messages(rng, 3000)):
@@ -124,7 +124,7 @@ def _no_index() -> Any:
 def test_a_time_span_is_cut_on_both_sides(tmp_path: Path) -> None:
     for storage, compression in (("mcap", None), ("mcap", "zstd"), ("sqlite3", None)):
         path = tmp_path / f"{storage}{compression}"
-        with open_writer(path, storage, compression) as writer:
+        with BagWriter(path, storage, compression) as writer:
             writer.add_topic("/a", JOINT_STATE)
             for index in range(1000):
                 writer.write("/a", index, encode_joint_state(index, position=float(index)))
@@ -139,7 +139,7 @@ def test_a_time_span_is_cut_on_both_sides(tmp_path: Path) -> None:
 
 def test_topics_can_be_chosen_and_missing_ones_are_named(tmp_path: Path) -> None:
     path = tmp_path / "bag"
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         for topic in ("/a", "/b"):
             writer.add_topic(topic, JOINT_STATE)
             writer.write(topic, 1, encode_joint_state(1, effort=1.0))
@@ -157,7 +157,7 @@ def test_topics_can_be_chosen_and_missing_ones_are_named(tmp_path: Path) -> None
 
 def test_states_of_several_joints_come_as_objects(tmp_path: Path) -> None:
     path = tmp_path / "bag"
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         writer.add_topic("/a", JOINT_STATE)
         writer.write("/a", 1, joint_state(1, "", ["pendulum_joint"], [1.0], [2.0], [3.0]))
         writer.write("/a", 2, joint_state(2, "", ["p", "q"], [1.0, 2.0], [], []))
@@ -169,7 +169,7 @@ def test_states_of_several_joints_come_as_objects(tmp_path: Path) -> None:
 
 def test_bytes_behind_the_message_are_passed_over(tmp_path: Path) -> None:
     path = tmp_path / "bag"
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         writer.add_topic("/a", JOINT_STATE)
         writer.add_topic("/clock", "rosgraph_msgs/msg/Clock")
         writer.write("/a", 1, joint_state(1, "", ["pendulum_joint"], [], [], [3.0], trailing=b"\xab" * 12))
@@ -187,7 +187,7 @@ def test_events_come_as_dictionaries_in_order_of_time(tmp_path: Path) -> None:
         '{"stamp_ns": 10, "name": "ramp_up", "target": 3.14}',
         "plain",
     ]
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         writer.add_topic("/sim/events", "std_msgs/msg/String")
         writer.add_topic("/chatter", "std_msgs/msg/String")
         for number, text in enumerate(texts):
@@ -201,7 +201,7 @@ def test_events_come_as_dictionaries_in_order_of_time(tmp_path: Path) -> None:
 
 def test_many_bags_are_read_in_parallel(tmp_path: Path) -> None:
     for number in range(5):
-        with open_writer(tmp_path / str(number)) as writer:
+        with BagWriter(tmp_path / str(number)) as writer:
             writer.add_topic("/a", JOINT_STATE)
             for index in range(100):
                 writer.write("/a", index, encode_joint_state(index, position=float(number)))
@@ -236,7 +236,7 @@ def test_databases_of_the_first_rosbag2_versions_are_read(tmp_path: Path) -> Non
 def test_rows_that_were_deleted_and_moved_are_read_as_sqlite_has_them(tmp_path: Path) -> None:
     """A database that others have worked on: holes, rewritten pages, small integers, an index."""
     path = tmp_path / "bag"
-    with open_writer(path, "sqlite3") as writer:
+    with BagWriter(path, "sqlite3") as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(5000):
             writer.write("/a", index, encode_joint_state(index, position=float(index)))
@@ -251,7 +251,7 @@ def test_rows_that_were_deleted_and_moved_are_read_as_sqlite_has_them(tmp_path: 
 
 def test_a_bag_whose_files_were_renamed_or_lost_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     path = tmp_path / "bag"
-    with open_writer(path, max_duration=1e-7) as writer:
+    with BagWriter(path, max_duration=1e-7) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(300):
             writer.write("/a", index, encode_joint_state(index, position=1.0))
@@ -278,7 +278,7 @@ def test_joints_that_change_from_message_to_message_are_no_arrays(
     tmp_path: Path, names: list[str], problem: str
 ) -> None:
     path = tmp_path / "bag"
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         writer.add_topic("/many", "sensor_msgs/msg/JointState")
         writer.write("/many", 1, encode_joints(2, "", ("p", "q"), (1.0, 2.0)))
         writer.write("/many", 2, encode_joints(3, "", tuple(names), (1.0, 2.0)[: len(names)]))

@@ -31,7 +31,7 @@ from pendulum_rosbag.reader import read_bag, same_messages
 from pendulum_rosbag.recorder import recorder_tap_node
 from pendulum_rosbag.recorder.options import RecorderOptions
 from pendulum_rosbag.recorder.recorder_node import Recorder
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.fixtures import wait_for
 from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup
@@ -372,7 +372,7 @@ def test_kill_9_loses_at_most_a_fifth_of_a_second(tmp_path: Path, node: Node, pr
 
 def test_a_bag_is_played_as_it_was_recorded(tmp_path: Path, node: Node, processes: ProcessGroup) -> None:
     source = tmp_path / "source"
-    with open_writer(source) as writer:
+    with BagWriter(source) as writer:
         writer.add_topic("/sim/joint_states", JOINT_STATE)
         writer.add_topic("/sim/events", STRING)
         for index in range(200):

@@ -28,7 +28,7 @@ from pendulum_rosbag.reader import read_bag, same_messages
 from pendulum_rosbag.reader.statistics import bag_statistics
 from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.repair.repair_cli import main as repair_main
-from pendulum_rosbag.storage import open_writer, typestore
+from pendulum_rosbag.storage import BagWriter, typestore
 from tests.bag_messages import JOINT_STATE, write_bag
 from tests.mcap_js_reader import McapJs
 
@@ -366,7 +366,7 @@ def test_the_command_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_a_bag_can_be_read_while_it_is_being_recorded(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    writer = open_writer(bag)
+    writer = BagWriter(bag)
     writer.add_topic("/a", JOINT_STATE)
     seen = 0
     start = time.monotonic()

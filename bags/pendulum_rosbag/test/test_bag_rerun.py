@@ -11,7 +11,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapLibraryWriter
 
 from pendulum_rosbag.reader import read_bag
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.bag_readers import ENDLESS_WRITER, JOINT_STATE, STRING, state, text_message
 from tests.fixtures import PROJECT
 from tests.rerun_reader import RerunMcap
@@ -34,7 +34,7 @@ def killed_bag(bag: Path) -> None:
 @pytest.mark.parametrize("kind", ["closed", "growing", "compressed", "compressed growing", "split"])
 def test_rerun_finds_all_messages_of_a_bag_in_order(tmp_path: Path, rerun_mcap: RerunMcap, kind: str) -> None:
     bag = tmp_path / "bag"
-    writer = open_writer(
+    writer = BagWriter(
         bag, compression="zstd" if "compressed" in kind else None, max_size=300_000 if kind == "split" else 0
     )
     for topic, type_name in (("/sim/joint_states", JOINT_STATE), ("/sim/events", STRING)):

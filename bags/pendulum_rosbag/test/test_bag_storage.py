@@ -25,7 +25,6 @@ from pendulum_rosbag.storage import (
     exchange,
     message_type,
     metadata_file,
-    open_writer,
 )
 from tests.bag_readers import JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
 
@@ -36,7 +35,7 @@ JOINT_STATE_HASH = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c588
 @pytest.mark.parametrize(("storage", "compression"), [("mcap", None), ("mcap", "zstd"), ("sqlite3", None)])
 def test_what_is_sealed_is_in_the_bag_for_every_reader(tmp_path: Path, storage: str, compression: str | None) -> None:
     bag = tmp_path / "bag"
-    writer = open_writer(bag, storage, compression)
+    writer = BagWriter(bag, storage, compression)
     writer.add_topic("/a", JOINT_STATE)
     writer.add_topic("/b", JOINT_STATE)
     for index in range(300):
@@ -50,7 +49,7 @@ def test_what_is_sealed_is_in_the_bag_for_every_reader(tmp_path: Path, storage: 
 
 def test_a_file_outgrows_its_room_and_its_summaries_many_times(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    writer = open_writer(bag)
+    writer = BagWriter(bag)
     for number in range(10):
         writer.add_topic(f"/t{number}", JOINT_STATE)
     total = 0
@@ -72,7 +71,7 @@ def test_a_file_outgrows_its_room_and_its_summaries_many_times(tmp_path: Path) -
 def test_a_bag_splits_by_size_and_by_time(tmp_path: Path, storage: str) -> None:
     for name, limits in (("size", {"max_size": 60_000}), ("time", {"max_duration": 0.5})):
         bag = tmp_path / name
-        with open_writer(bag, storage, **limits) as writer:
+        with BagWriter(bag, storage, **limits) as writer:
             writer.add_topic("/a", JOINT_STATE)
             for index in range(1000):
                 writer.write("/a", index * 2_000_000, state(index))
@@ -90,7 +89,7 @@ def test_metadata_is_what_rosbag2_writes(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     strange = 'quotes " and \\ and \x7f and \u2028 and : # {"a": [1]}\n'
     qos = QosProfile(reliability="best_effort", durability="transient_local", deadline_ns=1_500_000_000)
-    with open_writer(bag, metadata={"run": {"seed": 3}, "strange": strange}) as writer:
+    with BagWriter(bag, metadata={"run": {"seed": 3}, "strange": strange}) as writer:
         writer.add_topic("/a", JOINT_STATE, qos)
         writer.write("/a", 5_000, state(1))
         writer.write("/a", 9_000, state(2))
@@ -119,7 +118,7 @@ def test_metadata_is_what_rosbag2_writes(tmp_path: Path) -> None:
 
 def test_mcap_files_carry_profile_schema_and_checksums(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    with open_writer(bag, compression="zstd") as writer:
+    with BagWriter(bag, compression="zstd") as writer:
         writer.add_topic("/a", JOINT_STATE)
         writer.write("/a", 1, state(1))
     with (bag / "bag_0.mcap").open("rb") as stream:
@@ -141,7 +140,7 @@ def test_mcap_files_carry_profile_schema_and_checksums(tmp_path: Path) -> None:
 
 def test_sqlite_files_have_the_index_that_rosbag2_seeks_by(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    with open_writer(bag, "sqlite3") as writer:
+    with BagWriter(bag, "sqlite3") as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(100):
             writer.write("/a", index, state(index))
@@ -153,7 +152,7 @@ def test_sqlite_files_have_the_index_that_rosbag2_seeks_by(tmp_path: Path) -> No
 
 
 def test_a_database_names_the_distribution_that_its_metadata_name(tmp_path: Path) -> None:
-    open_writer(tmp_path / "bag", "sqlite3", ros_distro="humble").close()
+    BagWriter(tmp_path / "bag", "sqlite3", ros_distro="humble").close()
     connection = sqlite3.connect(tmp_path / "bag" / "bag_0.db3")
     assert connection.execute("SELECT ros_distro FROM schema").fetchall() == [("humble",)]
     assert "ros_distro: humble" in (tmp_path / "bag" / "metadata.yaml").read_text()
@@ -162,7 +161,7 @@ def test_a_database_names_the_distribution_that_its_metadata_name(tmp_path: Path
 def test_large_messages_continue_on_overflow_pages(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     sizes = [0, 1, 4000, 4030, 4031, 4032, 4040, 4044, 4061, 4100, 8000, 8150, 12_345, 70_000, 300_000]
-    with open_writer(bag, "sqlite3") as writer:
+    with BagWriter(bag, "sqlite3") as writer:
         writer.add_topic("/s", STRING)
         for number, size in enumerate(sizes):
             writer.write("/s", number, text_message("z" * size))
@@ -192,7 +191,7 @@ def _told(bag: Path) -> dict[str, Any]:
 def test_two_files_of_metadata_take_turns_and_leave_nothing_behind(tmp_path: Path) -> None:
     """To make a new one at each seal would cost more than all else."""
     bag, places = tmp_path / "bag", []
-    with open_writer(bag) as writer:
+    with BagWriter(bag) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(12):
             writer.write("/a", 10**index, state(index))
@@ -213,7 +212,7 @@ def test_two_files_of_metadata_take_turns_and_leave_nothing_behind(tmp_path: Pat
 def test_no_file_of_metadata_stays_open(tmp_path: Path, how: str) -> None:
     for number in range(3):
         bag = tmp_path / str(number)
-        writer = open_writer(bag)
+        writer = BagWriter(bag)
         writer.add_topic("/a", JOINT_STATE)
         for index in range(4):
             _write_sealed(writer, index)
@@ -237,7 +236,7 @@ def test_a_kill_in_the_middle_of_new_metadata_leaves_the_old(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
 ) -> None:
     bag = tmp_path / "bag"
-    with open_writer(bag) as writer:
+    with BagWriter(bag) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(4):
             _write_sealed(writer, index)
@@ -266,7 +265,7 @@ def test_where_files_cannot_exchange_their_names_metadata_is_replaced(
 
     monkeypatch.setattr(exchange, "_renameat2", lambda: refuse if code else None)
     bag = tmp_path / "bag"
-    with open_writer(bag) as writer:
+    with BagWriter(bag) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(4):
             _write_sealed(writer, index)
@@ -285,7 +284,7 @@ def test_an_exchange_that_is_refused_says_of_what(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_bag_that_is_taken_away_while_it_is_written_is_noticed_at_the_next_seal(tmp_path: Path, storage: str) -> None:
-    writer = open_writer(tmp_path / "bag", storage)
+    writer = BagWriter(tmp_path / "bag", storage)
     writer.add_topic("/a", JOINT_STATE)
     writer.write("/a", 0, state(0))
     writer.seal()
@@ -299,7 +298,7 @@ def test_a_bag_that_is_taken_away_while_it_is_written_is_noticed_at_the_next_sea
 
 def test_metadata_that_somebody_replaced_is_replaced_again_and_does_not_come_back(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    with open_writer(bag) as writer:
+    with BagWriter(bag) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(6):
             if index % 3 == 0:
@@ -311,7 +310,7 @@ def test_metadata_that_somebody_replaced_is_replaced_again_and_does_not_come_bac
 
 def test_counts_that_a_full_disk_cuts_short_are_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag = tmp_path / "bag"
-    with open_writer(bag) as writer:
+    with BagWriter(bag) as writer:
         writer.add_topic("/a", JOINT_STATE)
         _write_sealed(writer, 0)
         write = os.pwrite
@@ -324,17 +323,17 @@ def test_counts_that_a_full_disk_cuts_short_are_written_anew(tmp_path: Path, mon
 
 def test_a_bag_is_never_overwritten(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    open_writer(bag).close()
+    BagWriter(bag).close()
     with pytest.raises(BagError, match="exists already; expected a new folder"):
-        open_writer(bag)
+        BagWriter(bag)
 
 
 def test_wrong_use_is_refused_in_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="storage is 'rosbag'; expected one of mcap, sqlite3"):
-        open_writer(tmp_path / "a", "rosbag")
+        BagWriter(tmp_path / "a", "rosbag")
     with pytest.raises(ParameterError, match="expected storage mcap"):
-        open_writer(tmp_path / "a", "sqlite3", "zstd")
-    writer = open_writer(tmp_path / "b")
+        BagWriter(tmp_path / "a", "sqlite3", "zstd")
+    writer = BagWriter(tmp_path / "b")
     with pytest.raises(BagError, match="/x was not added"):
         writer.write("/x", 0, b"")
     writer.add_topic("/x", JOINT_STATE)
@@ -354,7 +353,7 @@ def test_many_messages_at_once_are_those_written_one_by_one_across_files_and_chu
     # Times go back and forth, and most chunks and files end in the middle of what is written at once.
     items = [("/ab"[:1] + "ab"[i % 3 == 0], 10**9 + (i * 37) % 500, state(i)) for i in range(500)]
     for name in ("one_by_one", "at_once"):
-        with open_writer(tmp_path / name, storage, chunk_size=3000, max_size=30_000, file_stem="bag") as writer:
+        with BagWriter(tmp_path / name, storage, chunk_size=3000, max_size=30_000, file_stem="bag") as writer:
             writer.add_topic("/a", JOINT_STATE)
             writer.add_topic("/b", JOINT_STATE)
             if name == "at_once":
@@ -392,7 +391,7 @@ def test_what_comes_before_a_message_that_cannot_be_written_is_kept(tmp_path: Pa
             raise KeyError("/a")
         yield bad[problem]
 
-    with open_writer(tmp_path / "bag", storage) as writer:
+    with BagWriter(tmp_path / "bag", storage) as writer:
         writer.add_topic("/a", JOINT_STATE)
         expected = {"unknown topic": BagError, "broken source": KeyError}.get(problem, Exception)
         with pytest.raises(expected):
@@ -405,7 +404,7 @@ def test_what_comes_before_a_message_that_cannot_be_written_is_kept(tmp_path: Pa
 
 def test_a_type_that_nobody_knows_is_kept_as_bytes(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    with open_writer(bag) as writer:
+    with BagWriter(bag) as writer:
         writer.add_topic("/own", "my_msgs/msg/Thing")
         writer.write("/own", 7, b"\0\1\0\0\1\2\3\4")
     opened = read_bag(bag)
@@ -425,7 +424,7 @@ def test_types_of_a_workspace_are_found_and_carried(tmp_path: Path, monkeypatch:
 
 def test_a_message_index_names_every_message(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    with open_writer(bag) as writer:
+    with BagWriter(bag) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(10):
             writer.write("/a", 100 - index, state(index))  # log times may go backwards

@@ -16,7 +16,7 @@ from pendulum_rosbag.reader.export_cli import main as export_main
 from pendulum_rosbag.reader.info_cli import main as info_main
 from pendulum_rosbag.reader.statistics import bag_statistics, clock_jumps, time_statistics
 from pendulum_rosbag.reader.tables import export_bag, to_pandas
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.bag_messages import (
     JOINT_STATE,
     STORE,
@@ -69,7 +69,7 @@ def test_late_messages_are_no_clock_jumps_whether_one_or_a_queue_of_them() -> No
 def test_joint_states_of_any_kind_are_timed_by_their_stamps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "bag"
     kinds: dict[str, tuple[list[str], list[float]]] = {"/unnamed": ([], [1.0]), "/two": (["p", "q"], [1.0, 2.0])}
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         writer.add_topic("/clock", "rosgraph_msgs/msg/Clock")
         for topic in kinds:
             writer.add_topic(topic, JOINT_STATE)
@@ -109,7 +109,7 @@ def test_bursts_of_events_leave_no_gaps_but_a_periodic_topic_without_stamps_does
 @pytest.mark.parametrize("joints", [["pendulum_joint"], ["shoulder", "elbow"]], ids=["one joint", "two joints"])
 def test_latencies_are_matched_by_echoed_stamps(tmp_path: Path, joints: list[str]) -> None:
     path = tmp_path / "bag"
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         writer.add_topic("/joint_states", JOINT_STATE)
         writer.add_topic("/effort_command", JOINT_STATE)
         for index in range(1, 200):
@@ -125,7 +125,7 @@ def test_latencies_are_matched_by_echoed_stamps(tmp_path: Path, joints: list[str
 
 def test_tables_have_the_columns_of_the_arrays(tmp_path: Path) -> None:
     path = tmp_path / "bag"
-    with open_writer(path, metadata={"seed": 1}) as writer:
+    with BagWriter(path, metadata={"seed": 1}) as writer:
         writer.add_topic("/a", JOINT_STATE)
         writer.add_topic("/many", JOINT_STATE)
         writer.write("/a", 1, encode_joint_state(1, position=1.5, frame_id="x"))
@@ -154,7 +154,7 @@ def bag_of_lists(path: Path) -> Path:
     array = STORE.types["diagnostic_msgs/msg/DiagnosticArray"]
     header, time = STORE.types["std_msgs/msg/Header"], STORE.types["builtin_interfaces/msg/Time"]
     empty = array(header(time(1, 2), ""), [])
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         writer.add_topic("/many", JOINT_STATE)
         writer.add_topic("/diagnostics", array.__msgtype__)
         writer.write("/many", 1, joint_state(2, "", [], [1.0, float("nan")], [], []))
@@ -193,7 +193,7 @@ def test_tables_leave_out_the_constants_of_a_type_and_keep_times_whole_without_m
     path = tmp_path / "bag"
     status = STORE.types["diagnostic_msgs/msg/DiagnosticStatus"]
     message = status(level=1, name="n", message="m", hardware_id="h", values=[])
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         writer.add_topic("/status", message.__msgtype__)
         writer.add_topic("/silent", "std_msgs/msg/String")
         writer.write("/status", 1, bytes(STORE.serialize_cdr(message, message.__msgtype__)))
@@ -214,7 +214,7 @@ def test_parquet_reads_back(tmp_path: Path) -> None:
     import pandas as pd
 
     path = tmp_path / "bag"
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(10):
             writer.write("/a", index, encode_joint_state(index, position=0.1 * index))
@@ -229,7 +229,7 @@ def test_an_event_is_printed_with_what_it_says(tmp_path: Path, capsys: pytest.Ca
         {"name": "trial_start", "trial": 2, "reason": ""},
         {"name": "noise_end"},
     )
-    with open_writer(path) as writer:
+    with BagWriter(path) as writer:
         writer.add_topic("/hw/events", "std_msgs/msg/String")
         for index, event in enumerate(events):
             text = json.dumps({"stamp_ns": 1 + index * 10**9, **event})
@@ -246,7 +246,7 @@ def test_an_event_is_printed_with_what_it_says(tmp_path: Path, capsys: pytest.Ca
 
 def test_the_commands_print_tables_json_and_sentences(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "bag"
-    with open_writer(path, metadata={"run": {"seed": 1}}) as writer:
+    with BagWriter(path, metadata={"run": {"seed": 1}}) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(100):
             writer.write("/a", 1000 + index * 2_000_000, encode_joint_state(1 + index * 2_000_000, position=0.0))
@@ -265,7 +265,7 @@ def test_the_commands_print_tables_json_and_sentences(tmp_path: Path, capsys: py
 
 def test_several_joints_are_written_as_a_column_each_unless_messages_differ(tmp_path: Path) -> None:
     for name, second in (("same", ("p", "q")), ("other", ("q", "p")), ("twice", ("p", "p"))):
-        with open_writer(tmp_path / name) as writer:
+        with BagWriter(tmp_path / name) as writer:
             writer.add_topic("/robot/joint_states", JOINT_STATE)
             first = second if name == "twice" else ("p", "q")
             for index, joints in enumerate((first, second)):
@@ -284,7 +284,7 @@ def test_several_joints_are_written_as_a_column_each_unless_messages_differ(tmp_
 
 
 def test_states_with_fewer_values_than_joints_stay_lists(tmp_path: Path) -> None:
-    with open_writer(tmp_path / "bag") as writer:
+    with BagWriter(tmp_path / "bag") as writer:
         writer.add_topic("/many", JOINT_STATE)
         writer.write("/many", 1, joint_state(2, "", ["p", "q"], [1.0], [], []))
     assert to_pandas(read_bag(tmp_path / "bag"), "/many")["position"].tolist() == [[1.0]]

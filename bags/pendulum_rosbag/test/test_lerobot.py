@@ -13,7 +13,7 @@ from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.export_cli import main as export_main
 from pendulum_rosbag.reader.lerobot import episodes_of, export_lerobot
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 from tests.bag_messages import JOINT_STATE, joint_state
 from tests.fixtures import PROJECT
 
@@ -24,7 +24,7 @@ JOINT = ["pendulum_joint"]
 
 def write(path: Path, states: list[int], commands: list[int], joints: list[str] = JOINT) -> Path:
     """Write a bag whose state at k periods is k, k / 10 and k / 100 in each joint, and whose answer to it is -k."""
-    writer = open_writer(path)
+    writer = BagWriter(path)
     for topic in ("/lab/joint_states", "/lab/effort_command"):
         writer.add_topic(topic, JOINT_STATE, [])
     for k in states:

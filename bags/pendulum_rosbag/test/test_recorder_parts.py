@@ -16,7 +16,7 @@ from pendulum_rosbag.recorder.options import RecorderOptions
 from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
 from pendulum_rosbag.recorder.record_cli import main as record_main
 from pendulum_rosbag.recorder.session import RecordingSession
-from pendulum_rosbag.storage import mcap_layout, message_type, open_writer
+from pendulum_rosbag.storage import BagWriter, mcap_layout, message_type
 from pendulum_rosbag.storage.stamps import stamp_reader
 from tests.fixtures import wait_for
 from tests.graph_peer import GraphPeer
@@ -122,7 +122,7 @@ def test_stamps_are_read_from_headers_times_and_events() -> None:
 
 
 def test_a_full_queue_refuses_and_counts(tmp_path: Path) -> None:
-    session = RecordingSession(open_writer(tmp_path / "bag"), max_queue_bytes=1000, seal_interval=0.2)
+    session = RecordingSession(BagWriter(tmp_path / "bag"), max_queue_bytes=1000, seal_interval=0.2)
     session.add_topic("/a", message_type(JOINT_STATE), ())
     data = encode_joint_state(1, position=1.0)
     refused = session.offer("/a", [(number, data) for number in range(100)])
@@ -135,7 +135,7 @@ def test_a_full_queue_refuses_and_counts(tmp_path: Path) -> None:
 
 
 def test_messages_before_the_subscription_was_complete_are_told_and_are_no_loss(tmp_path: Path) -> None:
-    session = RecordingSession(open_writer(tmp_path / "bag"))
+    session = RecordingSession(BagWriter(tmp_path / "bag"))
     session.add_topic("/a", message_type(JOINT_STATE), ())
     session.offer("/a", [(1, encode_joint_state(1, position=1.0))])
     session.note("/a", early=905)
@@ -146,7 +146,7 @@ def test_messages_before_the_subscription_was_complete_are_told_and_are_no_loss(
 
 
 def test_a_bag_that_was_not_closed_tells_what_is_missing_in_it(tmp_path: Path) -> None:
-    session = RecordingSession(open_writer(tmp_path / "bag"), seal_interval=0.02)
+    session = RecordingSession(BagWriter(tmp_path / "bag"), seal_interval=0.02)
     try:
         session.add_topic("/a", message_type(JOINT_STATE), ())
         session.offer("/a", [(1, encode_joint_state(1, position=1.0))])
@@ -174,7 +174,7 @@ def test_a_bag_that_was_not_closed_tells_what_is_missing_in_it(tmp_path: Path) -
 
 
 def test_a_disk_that_fails_ends_the_session_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    writer = open_writer(tmp_path / "bag")
+    writer = BagWriter(tmp_path / "bag")
     reasons: list[str] = []
     session = RecordingSession(writer, seal_interval=0.02, on_failure=reasons.append)
     session.add_topic("/a", message_type(JOINT_STATE), ())
@@ -195,7 +195,7 @@ def test_a_disk_that_fails_ends_the_session_in_a_sentence(tmp_path: Path, monkey
 
 
 def test_a_topic_that_appears_after_the_disk_failed_is_counted_as_lost(tmp_path: Path) -> None:
-    session = RecordingSession(open_writer(tmp_path / "bag"))
+    session = RecordingSession(BagWriter(tmp_path / "bag"))
     session.fail(MemoryError())
     session.add_topic("/late", message_type(JOINT_STATE), ())
     session.note("/late", early=3)
@@ -210,7 +210,7 @@ def test_a_topic_that_appears_while_the_disk_fails_ends_no_recorder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The thread that writes meets the failure, and closes the bag, while another announces a topic."""
-    session = RecordingSession(open_writer(tmp_path / "bag"))
+    session = RecordingSession(BagWriter(tmp_path / "bag"))
     add_topic = session.writer.add_topic
 
     def fail_first(*arguments: Any) -> None:

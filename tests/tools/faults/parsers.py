@@ -28,8 +28,8 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.statistics import bag_statistics
 from pendulum_rosbag.recorder.options import read_metadata
+from pendulum_rosbag.storage import BagWriter
 from pendulum_rosbag.storage import mcap_records as rec
-from pendulum_rosbag.storage import open_writer
 
 __all__ = ["PARSERS", "Parser", "mutate", "read_whole_bag"]
 
@@ -215,7 +215,7 @@ def _feedback_csv(folder: Path) -> Path:
 def make_bag(folder: Path, storage: str = "mcap", compression: str | None = None) -> Path:
     """Write a small bag of states, commands and events, as the recorder does."""
     bag = folder / "bag"
-    with open_writer(bag, storage, compression, metadata={"pendulum.run": {"seed": 1}}) as writer:
+    with BagWriter(bag, storage, compression, metadata={"pendulum.run": {"seed": 1}}) as writer:
         writer.add_topic("/sim/joint_states", "sensor_msgs/msg/JointState")
         writer.add_topic("/sim/effort_command", "sensor_msgs/msg/JointState")
         writer.add_topic("/sim/events", "std_msgs/msg/String")

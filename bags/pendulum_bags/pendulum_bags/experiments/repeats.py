@@ -23,7 +23,7 @@ from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
-from pendulum_rosbag.storage import open_writer
+from pendulum_rosbag.storage import BagWriter
 
 __all__ = ["SHORTEST", "record_repeat", "record_simulation", "repeat_command", "repeat_folder", "repeat_settings"]
 
@@ -96,7 +96,7 @@ def _write(bag: Path, spec: RunSpec, run: RunArrays) -> None:
     metadata[RUN_RECORD]["engine"] = "in_process"
     topics = {name: f"{spec.namespace}/{name}" for name in names.SIGNALS}
     events = f"{spec.namespace}/{names.EVENTS}"
-    with open_writer(bag, storage=spec.storage, metadata=metadata) as writer:
+    with BagWriter(bag, storage=spec.storage, metadata=metadata) as writer:
         for topic in topics.values():
             writer.add_topic(topic, _STATE)
         writer.add_topic(events, _TEXT)

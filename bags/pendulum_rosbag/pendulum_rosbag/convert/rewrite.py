@@ -18,7 +18,7 @@ from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_rosbag.reader.batches import Source
 from pendulum_rosbag.reader.open_source import BagFolder, damage_of, open_folder, open_sources
 from pendulum_rosbag.repair.repair import message_type_of
-from pendulum_rosbag.storage.bag_writer import BagWriter, open_writer
+from pendulum_rosbag.storage.bag_writer import BagWriter
 from pendulum_rosbag.storage.message_types import MessageType
 from pendulum_rosbag.storage.qos import profiles_of
 
@@ -141,7 +141,7 @@ def rewrite(
         for one in inputs:
             report.damage += [f"{one.path}: {sentence}" for sentence in damage_of(one.folder, one.sources)]
         metadata = _metadata(inputs, choice)
-        writer = open_writer(output, storage, compression, metadata, max_size=max_size, max_duration=max_duration)
+        writer = BagWriter(output, storage, compression, metadata, max_size=max_size, max_duration=max_duration)
         try:
             with writer:
                 _copy(inputs, choice, writer, report, on_progress)

@@ -26,7 +26,7 @@ from pendulum_rosbag.recorder.options import RecorderOptions
 from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
 from pendulum_rosbag.recorder.recorder_tap_node import Tap
 from pendulum_rosbag.recorder.session import RecordingSession, SessionReport
-from pendulum_rosbag.storage import QosProfile, open_writer
+from pendulum_rosbag.storage import BagWriter, QosProfile
 from pendulum_rosbag.storage.message_types import message_type
 
 __all__ = ["SPECS", "Recorder"]
@@ -103,7 +103,7 @@ class Recorder(PollingNode):
         base = self._options.output
         path = base if not number else base.with_name(f"{base.name}_{number + 1}")
         options = self._options
-        writer = open_writer(
+        writer = BagWriter(
             path,
             options.storage,
             options.compression,

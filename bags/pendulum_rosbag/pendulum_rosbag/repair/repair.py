@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pendulum_msgs_py.errors import BagError
-from pendulum_rosbag.storage.bag_writer import BagWriter, open_writer
+from pendulum_rosbag.storage.bag_writer import BagWriter
 from pendulum_rosbag.storage.message_types import MessageType, message_type
 from pendulum_rosbag.storage.qos import profiles_of
 
@@ -93,7 +93,7 @@ def repair_bag(
     try:
         compression = "zstd" if any(source.compressed for source in sources) and folder.storage == "mcap" else None
         name = bag.name if in_place else target.name
-        with open_writer(target, folder.storage, compression, folder.custom_data, file_stem=name) as writer:
+        with BagWriter(target, folder.storage, compression, folder.custom_data, file_stem=name) as writer:
             report.left_out = _copy(sources, folder.topic_hashes, writer)
             report.messages = writer.written
             report.kept = [extra.name for source in sources for extra in source.extras()]

@@ -1,7 +1,7 @@
 """Writing bags: rosbag2 folders (MCAP, SQLite) that stay readable whatever happens to the writer."""
 
-from pendulum_rosbag.storage.bag_writer import STORAGES, BagWriter, open_writer
+from pendulum_rosbag.storage.bag_writer import STORAGES, BagWriter
 from pendulum_rosbag.storage.message_types import MessageType, message_type, typestore
 from pendulum_rosbag.storage.qos import QosProfile
 
-__all__ = ["STORAGES", "BagWriter", "MessageType", "QosProfile", "message_type", "open_writer", "typestore"]
+__all__ = ["STORAGES", "BagWriter", "MessageType", "QosProfile", "message_type", "typestore"]

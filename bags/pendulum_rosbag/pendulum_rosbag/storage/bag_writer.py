@@ -23,7 +23,7 @@ from pendulum_rosbag.storage.metadata_file import (
 from pendulum_rosbag.storage.qos import QosProfile
 from pendulum_rosbag.storage.storage_file import StorageFile
 
-__all__ = ["STORAGES", "BagWriter", "open_writer"]
+__all__ = ["STORAGES", "BagWriter"]
 
 STORAGES = ("mcap", "sqlite3")
 _COMPRESSIONS = (None, "zstd")
@@ -41,33 +41,56 @@ class _Channels(dict[str, int]):
 
 
 class BagWriter:
-    """One rosbag2 folder that is being written; made by :func:`open_writer`.
+    """One rosbag2 folder that is being written.
 
     Messages that were written are in memory until ``seal`` (called by itself when ``chunk_size`` bytes have come
     together, and by a recorder every fraction of a second); what is sealed survives the death of the process and is
     readable by any rosbag2 reader without repair. All methods may be called from several threads.
+
+    Args:
+        path: Folder to create; it must not exist.
+        storage: ``"mcap"`` or ``"sqlite3"``.
+        compression: ``None`` or ``"zstd"`` (MCAP only, chunk by chunk).
+        metadata: Run metadata; values that are not strings are stored as JSON text.
+        chunk_size: Bytes of messages that are sealed together at the latest.
+        max_size: Begin a new storage file at this size [bytes]; 0 for never.
+        max_duration: Begin a new storage file after this time of messages [s]; 0 for never.
+        ros_distro: What ``metadata.yaml``, and a database, name as distribution.
+        file_stem: Beginning of the names of storage files; by default the name of the folder.
+
+    Raises:
+        BagError: The folder exists or cannot be created.
+        ParameterError: Unknown storage or compression.
     """
 
     def __init__(
         self,
-        path: Path,
+        path: str | os.PathLike[str],
+        storage: str = "mcap",
+        compression: str | None = None,
+        metadata: Mapping[str, Any] | None = None,
         *,
-        storage: str,
-        compression: str | None,
-        metadata: Mapping[str, Any] | None,
-        chunk_size: int,
-        max_size: int,
-        max_duration_ns: int,
-        ros_distro: str,
-        file_stem: str,
+        chunk_size: int = 1 << 20,
+        max_size: int = 0,
+        max_duration: float = 0.0,
+        ros_distro: str = "jazzy",
+        file_stem: str = "",
     ) -> None:
-        self.path = path
-        self._file_stem = file_stem
+        if storage not in STORAGES:
+            raise ParameterError(f"storage is {storage!r}; expected one of {', '.join(STORAGES)}")
+        if compression not in _COMPRESSIONS:
+            raise ParameterError(f"compression is {compression!r}; expected 'zstd' or none")
+        if compression and storage != "mcap":
+            raise ParameterError(f"compression is {compression!r} with storage {storage}; expected storage mcap")
+        self.path = path = Path(path).absolute()
+        if path.exists():
+            raise BagError(f"bag {path} exists already; expected a new folder (bags are never overwritten)")
+        self._file_stem = file_stem or path.name
         self.storage = storage
         self._compression = compression
         self._chunk_size = chunk_size
         self._max_size = max_size
-        self._max_duration_ns = max_duration_ns
+        self._max_duration_ns = round(max_duration * 1e9)
         self._ros_distro = ros_distro
         self._custom = encode_custom_data(metadata)
         self._topics: dict[str, TopicEntry] = {}
@@ -323,54 +346,3 @@ class BagWriter:
 
 def _without_root(text: str) -> str:
     return "".join(line[2:] + "\n" for line in text.splitlines()[1:])
-
-
-def open_writer(
-    path: str | os.PathLike[str],
-    storage: str = "mcap",
-    compression: str | None = None,
-    metadata: Mapping[str, Any] | None = None,
-    *,
-    chunk_size: int = 1 << 20,
-    max_size: int = 0,
-    max_duration: float = 0.0,
-    ros_distro: str = "jazzy",
-    file_stem: str = "",
-) -> BagWriter:
-    """Create a rosbag2 folder and return its writer.
-
-    Args:
-        path: Folder to create; it must not exist.
-        storage: ``"mcap"`` or ``"sqlite3"``.
-        compression: ``None`` or ``"zstd"`` (MCAP only, chunk by chunk).
-        metadata: Run metadata; values that are not strings are stored as JSON text.
-        chunk_size: Bytes of messages that are sealed together at the latest.
-        max_size: Begin a new storage file at this size [bytes]; 0 for never.
-        max_duration: Begin a new storage file after this time of messages [s]; 0 for never.
-        ros_distro: What ``metadata.yaml``, and a database, name as distribution.
-        file_stem: Beginning of the names of storage files; by default the name of the folder.
-
-    Raises:
-        BagError: The folder exists or cannot be created.
-        ParameterError: Unknown storage or compression.
-    """
-    if storage not in STORAGES:
-        raise ParameterError(f"storage is {storage!r}; expected one of {', '.join(STORAGES)}")
-    if compression not in _COMPRESSIONS:
-        raise ParameterError(f"compression is {compression!r}; expected 'zstd' or none")
-    if compression and storage != "mcap":
-        raise ParameterError(f"compression is {compression!r} with storage {storage}; expected storage mcap")
-    folder = Path(path).absolute()
-    if folder.exists():
-        raise BagError(f"bag {folder} exists already; expected a new folder (bags are never overwritten)")
-    return BagWriter(
-        folder,
-        storage=storage,
-        compression=compression,
-        metadata=metadata,
-        chunk_size=chunk_size,
-        max_size=max_size,
-        max_duration_ns=round(max_duration * 1e9),
-        ros_distro=ros_distro,
-        file_stem=file_stem or folder.name,
-    )
