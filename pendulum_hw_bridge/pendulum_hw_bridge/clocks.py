@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from typing import Protocol
 
 from pendulum_msgs_py.contract.timing import SteadyWallClock
@@ -22,26 +21,21 @@ class Clock(Protocol):
 
 
 class WallClock:
-    """Wall time that never jumps.
+    """Wall time that never jumps."""
 
-    Args:
-        clock: Time since the epoch [ns]; by default one that counts on the monotonic clock.
-        wake: Set to end a wait early, such as on shutdown.
-    """
-
-    def __init__(self, clock: Callable[[], int] | None = None, wake: threading.Event | None = None) -> None:
-        self._clock = clock or SteadyWallClock()
-        self._wake = wake or threading.Event()
+    def __init__(self) -> None:
+        self._clock = SteadyWallClock()
+        self._never = threading.Event()
 
     def now_ns(self) -> int:
         """Return the time since the epoch [ns]."""
         return self._clock()
 
     def wait_until(self, time_ns: int) -> None:
-        """Sleep until a time [ns], or until woken."""
+        """Sleep until a time [ns]."""
         remaining = time_ns - self.now_ns()
         if remaining > 0:
-            self._wake.wait(remaining * 1e-9)
+            self._never.wait(remaining * 1e-9)
 
 
 class SteppedClock:

@@ -52,7 +52,7 @@ def emulator(
     from pendulum_hw_bridge.emulation import wire
     from pendulum_hw_bridge.emulation.parameters import load_emulator
     from pendulum_hw_bridge.emulation.server import EmulatorIdentity, EmulatorServer
-    from pendulum_hw_bridge.emulation.truth_log import TruthLog
+    from pendulum_hw_bridge.emulation.truth_log import truth_log
     from pendulum_hw_bridge.emulation.x5 import EmulatedX5
     from pendulum_msgs_py.contract.timing import SteadyWallClock
 
@@ -68,9 +68,7 @@ def emulator(
     server = EmulatorServer(actuator, wire.parse_address(address), clock, identity)
     host, port = server.address
     print(f"emulated X5-9 ({parameters.plant.name}) listens on {host}:{port}", flush=True)
-    with nullcontext() if truth is None else TruthLog(truth) as log:
-        if log is not None:
-            actuator.trace = log.note
+    with nullcontext() if truth is None else truth_log(truth) as actuator.trace:
         server.serve(lambda: not stopped)
     print("emulated X5-9 ends", flush=True)
 

@@ -162,7 +162,6 @@ def staircase(
     step: float = 10.0,
     top: float = 90.0,
     hold: float = 2.0,
-    start: float = 0.0,
 ) -> Iterator[Phase]:
     """Yield the phases of one trial of experiment 2: a ramp to each angle, then a hold.
 
@@ -171,12 +170,11 @@ def staircase(
         step: [deg].
         top: [deg].
         hold: Time to hold each step [s].
-        start: Angle from which the first ramp starts [rad].
 
     Source:
         Thesis, section "Determination of Gravitational force coefficient of the system".
     """
-    before = start
+    before = 0.0
     for angle in staircase_angles(step, top):
         upwards = abs(angle) > abs(before)
         ramp = thesis_ramp(before, angle)

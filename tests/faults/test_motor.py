@@ -10,7 +10,7 @@ import pytest
 
 from pendulum_hw_bridge.actuator import Command, Strategy
 from pendulum_hw_bridge.emulation.parameters import load_emulator
-from pendulum_hw_bridge.emulation.truth_log import TruthLog
+from pendulum_hw_bridge.emulation.truth_log import truth_log
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_msgs_py.errors import PendulumError
 from tests.tools.faults.live import EFFORT_LIMIT
@@ -123,8 +123,7 @@ def test_the_truth_of_an_emulator_is_on_file_each_millisecond_and_read_as_far_as
     assert truth.read() == []
     actuator = EmulatedX5(load_emulator("thesis"))
     actuator.configure(strategy=Strategy.DIRECT_PWM, command_lifetime=0.05)
-    with TruthLog(path) as log:
-        actuator.trace = log.note
+    with truth_log(path) as actuator.trace:
         actuator.deliver(Command(pwm=0.1), 0)
         actuator.advance_to(20 * MS)
         first = truth.read()
@@ -147,5 +146,6 @@ def test_the_truth_of_an_emulator_is_on_file_each_millisecond_and_read_as_far_as
 
 
 def test_a_truth_that_cannot_be_written_is_a_sentence(tmp_path: Path) -> None:
-    with pytest.raises(PendulumError, match=r"truth of the emulator cannot be written to .*: No such file"):
-        TruthLog(tmp_path / "nowhere" / "truth.csv")
+    expected = r"truth of the emulator cannot be written to .*: No such file"
+    with pytest.raises(PendulumError, match=expected), truth_log(tmp_path / "nowhere" / "truth.csv"):
+        pass

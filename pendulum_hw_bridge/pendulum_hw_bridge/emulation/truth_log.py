@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 from pendulum_hw_bridge.emulation.x5 import LinkState
 from pendulum_msgs_py.errors import PendulumError
 
-__all__ = ["COLUMNS", "TruthLog"]
+__all__ = ["COLUMNS", "truth_log"]
 
 COLUMNS = ("time_ns", "position", "velocity", "motor_torque", "pwm")
 """Fields of :class:`LinkState` that are kept [ns, rad, rad/s, N m, -]."""
 
 
-class TruthLog:
-    """A CSV file with a row for each millisecond of an emulated actuator; give :meth:`note` to its ``trace``.
+@contextmanager
+def truth_log(path: Path) -> Iterator[Callable[[LinkState], None]]:
+    """Open a CSV file with a row for each millisecond of an emulated actuator; what it gives is for its ``trace``.
 
     Each row is on the file system before the next, so that it is kept whatever ends the process.
 
@@ -25,26 +27,14 @@ class TruthLog:
     Raises:
         PendulumError: It cannot be written.
     """
+    try:
+        file = path.open("w", buffering=1, encoding="ascii")
+        file.write(",".join(COLUMNS) + "\n")
+    except OSError as error:
+        raise PendulumError(f"truth of the emulator cannot be written to {path}: {error.strerror}") from error
 
-    def __init__(self, path: Path) -> None:
-        try:
-            self._file = path.open("w", buffering=1, encoding="ascii")
-            self._file.write(",".join(COLUMNS) + "\n")
-        except OSError as error:
-            raise PendulumError(f"truth of the emulator cannot be written to {path}: {error.strerror}") from error
+    def note(link: LinkState) -> None:
+        file.write(f"{link.time_ns},{link.position:.6g},{link.velocity:.5g},{link.motor_torque:.5g},{link.pwm:.5g}\n")
 
-    def __enter__(self) -> TruthLog:
-        """Return itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def note(self, link: LinkState) -> None:
-        """Write a row."""
-        self._file.write(
-            f"{link.time_ns},{link.position:.6g},{link.velocity:.5g},{link.motor_torque:.5g},{link.pwm:.5g}\n"
-        )
+    with file:
+        yield note
