@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
 from pendulum_hw_bridge.e_stop_input import EStopInput
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.ros.e_stop_thread import EStopThread
+from pendulum_msgs_py.ros.e_stop import EStopThread
+from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["EStopInputServer"]
 
@@ -41,9 +41,7 @@ class EStopInputServer:
         qos = QoSProfile(depth=_WAITING, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._topic = owner.resolve_topic_name(names.E_STOP_INPUT)
         node.create_subscription(Bool, self._topic, self._on_message, qos)
-        # Steady time: it must go on where the system clock is set back.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(timeout / _LOOKS, self._look, clock=steady)
+        create_wall_timer(node, timeout / _LOOKS, self._look)
         self._thread.start()
 
     @property

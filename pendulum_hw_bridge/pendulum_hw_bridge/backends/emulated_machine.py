@@ -71,10 +71,7 @@ class JointPort:
             feedback = self.machine.feedback(self._index, now)
             if feedback is not None or now >= deadline:
                 return feedback
-            target = min(deadline, max(now + 1, self.machine.next_arrival_ns(self._index)))
-            self.clock.wait_until(target)
-            if self.now_ns() < target:
-                return None  # woken up early: the program ends
+            self.clock.wait_until(min(deadline, max(now + 1, self.machine.next_arrival_ns(self._index))))
 
     @property
     def stood_still(self) -> float:

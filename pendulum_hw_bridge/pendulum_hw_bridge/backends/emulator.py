@@ -123,10 +123,7 @@ class EmulatorBackend:
                 self.clock.wait_until(deadline)
                 self._catch_up()
                 return self.actuator.feedback(deadline)
-            before = self.clock.now_ns()
             self.clock.wait_until(target)
-            if self.clock.now_ns() < target and self.clock.now_ns() - before < target - before:
-                return None  # woken up early: the program ends
             self._catch_up()
 
     def write(self, command: Command) -> Applied:

@@ -1,20 +1,131 @@
 """The e-stop of a plant on a path of its own: a node, an executor and a thread that do nothing else.
 
 A plant's own thread steps or waits for an actuator, and reads whatever others send. The e-stop must not stand in that
-queue.
+queue. A participant has one socket and one thread that empties it: behind a flood of requests or trajectories to the
+owner a press would wait there, or be lost and come again when DDS asks for it. An error in it is a press, not its end.
 """
 
 from __future__ import annotations
 
+import sys
+import threading
+import time
 from collections.abc import Callable
+from typing import Any
 
+import rclpy
+from rclpy._rclpy_pybind11 import InvalidHandle, NodeNameNonExistentError, RCLError
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.ros.e_stop_thread import EStopThread
+from pendulum_msgs_py.ros.answers import answer_who_listens
+from pendulum_msgs_py.ros.leaving import leaving_graph
 
-__all__ = ["EStopServer"]
+__all__ = ["EStopServer", "EStopThread"]
+
+_JOIN = 2.0
+_DISCOVERY = 0.5
+"""Longest wait until all of the owner is known here, which takes 0.1 s from its beginning [s]."""
+_LOOK = 0.002
+_SWITCH = 0.001
+"""Time after which a thread that computes hands Python's lock to one that waits [s]; by default it is 5 ms."""
+_PAUSE = 0.01
+"""Time after an error before the thread serves again [s]."""
+
+
+class EStopThread:
+    """A node beside another one, served by a thread that does nothing else.
+
+    Args:
+        owner: The node whose e-stop it serves.
+        suffix: Of the node's and the thread's name.
+        press: Latches the e-stop, with the reason; called in the thread, must be quick and wait for nobody.
+
+    Attributes:
+        node: The node; give it what it has to serve, then :meth:`start`.
+    """
+
+    def __init__(self, owner: Node, suffix: str, press: Callable[[str], None]) -> None:
+        self._press = press
+        self._owner = owner
+        self._context = rclpy.Context()
+        # With the process's arguments, which may name a security enclave.
+        rclpy.init(args=sys.argv, context=self._context, domain_id=owner.context.get_domain_id())
+        # Without the process's remaps: they were for the owner, whose names are resolved there already.
+        self.node = Node(
+            f"{owner.get_name()}_{suffix}",
+            context=self._context,
+            namespace=owner.get_namespace(),
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=suffix, daemon=True)
+        # An owner that could not be made is not closed, and a thread that spins ends no process cleanly.
+        owner.context.on_shutdown(self.close)
+
+    def start(self) -> None:
+        """Begin to serve."""
+        answer_who_listens(self.node)
+        sys.setswitchinterval(min(_SWITCH, sys.getswitchinterval()))
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop to serve; at the latest the end of the owner's context does so."""
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        self._executor.shutdown()
+        if self._thread.is_alive():
+            self._thread.join(_JOIN)
+        # Where a node is ended as soon as it is made, its participant is told of the owner's entities just then.
+        entities, deadline = self._entities_of_owner(self._owner), time.monotonic() + _DISCOVERY
+        while entities and self._entities_of_owner(self.node) != entities and time.monotonic() < deadline:
+            time.sleep(_LOOK)
+        with leaving_graph():
+            self.node.destroy_node()
+            rclpy.try_shutdown(context=self._context)
+
+    def _entities_of_owner(self, seen_by: Node) -> list[Any]:
+        """Return what a node knows of the owner: its publishers, subscriptions and services; nothing if it cannot."""
+        try:
+            owner = (self._owner.get_name(), self._owner.get_namespace())
+            return [
+                seen_by.get_publisher_names_and_types_by_node(*owner),
+                seen_by.get_subscriber_names_and_types_by_node(*owner),
+                seen_by.get_service_names_and_types_by_node(*owner),
+            ]
+        # Not discovered yet, or destroyed or shut down already.
+        except (NodeNameNonExistentError, InvalidHandle, RCLError):
+            return []
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._executor.spin()
+            except ExternalShutdownException:
+                return
+            # An answer that cannot be sent raises as well: whoever waits for this e-stop must still find it.
+            except Exception as error:  # noqa: BLE001
+                self._fail(error)
+                self._closing.wait(_PAUSE)
+            else:
+                return
+
+    def _fail(self, error: Exception) -> None:
+        if self._closing.is_set():
+            return
+        reason = f"e-stop itself failed: {type(error).__name__}: {error}"
+        self.node.get_logger().error(reason)
+        try:
+            self._press(reason)
+        except Exception as second:  # noqa: BLE001
+            self.node.get_logger().error(f"e-stop could not be latched: {type(second).__name__}: {second}")
 
 
 class EStopServer:
