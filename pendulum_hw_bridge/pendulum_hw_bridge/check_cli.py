@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -156,6 +157,4 @@ def _print(found: Checklist) -> None:
         )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the checklist."""
-    return cli_main(app, argv, name="python -m pendulum_hw_bridge check", takes_ros_arguments=True)
+main = partial(cli_main, app, name="python -m pendulum_hw_bridge check", takes_ros_arguments=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -54,6 +54,4 @@ def convert(
     print(f"{target}: {len(kept['time'])} records, {kept['time'][-1]:.2f} s, {len(kept) - 1} quantities")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the conversion."""
-    return cli_main(app, argv, name="python -m pendulum_hw_bridge convert")
+main = partial(cli_main, app, name="python -m pendulum_hw_bridge convert")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -112,11 +112,6 @@ def emulator_fault(
     print("faults in force: " + (", ".join(backend.status()["faults"]) or "none"))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the emulator."""
-    return cli_main(app, argv, name="python -m pendulum_hw_bridge emulator")
-
-
 @hand_app.command()
 def emulator_hand(
     clockwise: Annotated[bool, typer.Option("--clockwise", help="The other way.")] = False,
@@ -148,11 +143,6 @@ def emulator_hand(
     print(f"turned by {turned:+.2f} rad, and let go")
 
 
-def hand_main(argv: Sequence[str] | None = None) -> int:
-    """Run the hand."""
-    return cli_main(hand_app, argv, name="python -m pendulum_hw_bridge emulator_hand")
-
-
-def fault_main(argv: Sequence[str] | None = None) -> int:
-    """Run the fault switch."""
-    return cli_main(fault_app, argv, name="python -m pendulum_hw_bridge emulator_fault")
+main = partial(cli_main, app, name="python -m pendulum_hw_bridge emulator")
+hand_main = partial(cli_main, hand_app, name="python -m pendulum_hw_bridge emulator_hand")
+fault_main = partial(cli_main, fault_app, name="python -m pendulum_hw_bridge emulator_fault")

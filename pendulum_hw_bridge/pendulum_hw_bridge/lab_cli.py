@@ -6,7 +6,8 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -302,6 +303,4 @@ def _keep(file: Path, procedure: str, result: str, **values: Any) -> None:
     print(f"{file}: {procedure}: {result}")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a guided procedure."""
-    return cli_main(app, argv, name="python -m pendulum_hw_bridge lab")
+main = partial(cli_main, app, name="python -m pendulum_hw_bridge lab")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -158,6 +158,4 @@ def _print(modules: list[ModuleRecord], chosen: ModuleRecord | None, reason: str
         console.print(reason, style="bold red", highlight=False)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the scan."""
-    return cli_main(app, argv, name="python -m pendulum_hw_bridge scan")
+main = partial(cli_main, app, name="python -m pendulum_hw_bridge scan")

@@ -7,6 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -176,21 +177,7 @@ def _run(
     print(report.sentence())
 
 
-def convert_main(argv: list[str] | None = None) -> int:
-    """Run ``convert``."""
-    return cli_main(convert_app, argv, name="python -m pendulum_rosbag convert")
-
-
-def merge_main(argv: list[str] | None = None) -> int:
-    """Run ``merge``."""
-    return cli_main(merge_app, argv, name="python -m pendulum_rosbag merge")
-
-
-def cut_main(argv: list[str] | None = None) -> int:
-    """Run ``cut``."""
-    return cli_main(cut_app, argv, name="python -m pendulum_rosbag cut")
-
-
-def filter_main(argv: list[str] | None = None) -> int:
-    """Run ``filter``."""
-    return cli_main(filter_app, argv, name="python -m pendulum_rosbag filter")
+convert_main = partial(cli_main, convert_app, name="python -m pendulum_rosbag convert")
+merge_main = partial(cli_main, merge_app, name="python -m pendulum_rosbag merge")
+cut_main = partial(cli_main, cut_app, name="python -m pendulum_rosbag cut")
+filter_main = partial(cli_main, filter_app, name="python -m pendulum_rosbag filter")

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -300,6 +301,4 @@ def play(
     )
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the player; arguments from ``--ros-args`` on belong to ROS."""
-    return cli_main(app, argv, name="python -m pendulum_rosbag play", takes_ros_arguments=True)
+main = partial(cli_main, app, name="python -m pendulum_rosbag play", takes_ros_arguments=True)

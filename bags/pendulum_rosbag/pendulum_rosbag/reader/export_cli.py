@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -51,6 +52,4 @@ def export(
     return 0
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command."""
-    return cli_main(app, argv, name="python -m pendulum_rosbag export")
+main = partial(cli_main, app, name="python -m pendulum_rosbag export")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -105,6 +106,4 @@ def _alarm(count: int) -> str:
     return f"[bold red]{count}[/]" if count else "0"
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command."""
-    return cli_main(app, argv, name="python -m pendulum_rosbag info")
+main = partial(cli_main, app, name="python -m pendulum_rosbag info")

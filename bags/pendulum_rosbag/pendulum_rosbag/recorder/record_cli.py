@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -68,6 +69,4 @@ def record(
     )
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the recorder; arguments from ``--ros-args`` on belong to ROS."""
-    return cli_main(app, argv, name="python -m pendulum_rosbag record", takes_ros_arguments=True)
+main = partial(cli_main, app, name="python -m pendulum_rosbag record", takes_ros_arguments=True)

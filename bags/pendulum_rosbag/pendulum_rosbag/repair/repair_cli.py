@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -46,6 +47,4 @@ def repair(
     return 0
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command."""
-    return cli_main(app, argv, name="python -m pendulum_rosbag repair")
+main = partial(cli_main, app, name="python -m pendulum_rosbag repair")
