@@ -72,7 +72,6 @@ def test_a_bag_whose_torque_was_never_recorded_is_refused_in_a_sentence(
 def test_a_series_elastic_plant_can_be_replayed_too() -> None:
     recording = swinging("x5_9", duration=1.0)
     result = replay_input(recording, load_plant("x5_9"), window=0.5)
-    assert not result.from_fitted_state
     assert result.by_window.size == 2
     assert result.rms < 0.02
 

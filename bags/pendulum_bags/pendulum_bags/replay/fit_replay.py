@@ -6,19 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pendulum_bags.identification.model import FitModel, from_plant, to_plant
 from pendulum_bags.identification.problem import Piece, prepare, simulate
 from pendulum_bags.identification.result import load_fit_model
 from pendulum_bags.identification.window_score import free_run, window_score
-from pendulum_bags.replay.result import (
-    DIVERGED,
-    MOST_STARTS,
-    HorizonError,
-    InputReplay,
-    fit_percent,
-    horizon_steps,
-)
+from pendulum_bags.replay.result import HorizonError, InputReplay, horizon_errors
 from pendulum_bags.runs.datasets import INPUT_KINDS, Recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
@@ -47,12 +41,8 @@ def replay_fit(recording: Recording, plant: str | Path | PlantParameters, *, win
     if not window > 0.0:
         raise DataError(f"window is {window} s; expected > 0")
     model, name = _model_of(recording, plant)
-    servo = model.input_kind == "position_goal"
     score = window_score(model, recording, window)
-    run = free_run(model, recording, fitted=not servo)
-    error = run.simulated - run.measured
-    threshold = DIVERGED * float(np.ptp(recording.position))
-    beyond = np.flatnonzero(np.abs(error) > threshold)
+    run = free_run(model, recording, fitted=model.input_kind != "position_goal")
     return InputReplay(
         name=recording.name,
         plant=replace(to_plant(model), name=name),
@@ -64,12 +54,7 @@ def replay_fit(recording: Recording, plant: str | Path | PlantParameters, *, win
         time=run.time,
         measured=run.measured,
         free_run=run.simulated,
-        free_run_rms=run.rms,
-        fit=fit_percent(run.measured, run.simulated),
-        diverges_at=float(run.time[beyond[0]] - run.time[0]) if beyond.size else None,
-        threshold=threshold,
         horizons=_horizons(model, recording, window),
-        from_fitted_state=not servo,
         driven_by=_WORDS[recording.input_kind],
     )
 
@@ -99,20 +84,15 @@ def _model_of(recording: Recording, plant: str | Path | PlantParameters) -> tupl
 
 
 def _horizons(model: FitModel, recording: Recording, longest: float) -> tuple[HorizonError, ...]:
-    """Return errors of predictions from measured states after 1, 2, 5, 10, ... samples."""
+    """Return errors of predictions from measured states."""
     size = recording.time.size
-    reach = min(max(1, round(longest / recording.period)), size - 1)
-    starts = np.unique(np.linspace(0, size - 1 - reach, MOST_STARTS).astype(int))
     whole = prepare(recording, None, across_gaps=True)
-    errors = []
-    for first in starts:
-        tail = prepare(recording.rows(int(first)), None, across_gaps=True) if size - first >= 3 else whole
-        window = np.array([[first, first + reach + 1]], dtype=np.int64)
+
+    def error_from(first: int, steps: int) -> NDArray[np.float64]:
+        tail = prepare(recording.rows(first), None, across_gaps=True) if size - first >= 3 else whole
+        part = slice(first, first + steps + 1)
+        window = np.array([[part.start, part.stop]], dtype=np.int64)
         piece = Piece(recording, window, tail.states, whole.integral, whole.enabled)
-        part = slice(int(first), int(first) + reach + 1)
-        errors.append(simulate(model, piece).theta[part] - recording.position[part])
-    error = np.stack(errors)
-    return tuple(
-        HorizonError(k, k * recording.period, float(np.sqrt(np.mean(error[:, k] ** 2))), starts.size)
-        for k in horizon_steps(reach)
-    )
+        return simulate(model, piece).theta[part] - recording.position[part]
+
+    return horizon_errors(size, recording.period, longest, error_from)

@@ -12,14 +12,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.replay.fit_replay import replay_fit
-from pendulum_bags.replay.result import (
-    DIVERGED,
-    MOST_STARTS,
-    HorizonError,
-    InputReplay,
-    fit_percent,
-    horizon_steps,
-)
+from pendulum_bags.replay.result import InputReplay, horizon_errors
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
@@ -107,10 +100,6 @@ def replay_input(recording: Recording, parameters: PlantParameters, *, window: f
         window_time, window_angle, by_window = _windows(driven, window)
         rms = float(np.sqrt(np.mean((window_angle - np.interp(window_time, driven.time, driven.position)) ** 2)))
         start = (float(driven.position[0]), float(driven.velocity[0]))
-    free = driven.run(0, driven.time.size - 1, (float(start[0]), float(start[1])))
-    error = free - driven.position
-    threshold = DIVERGED * float(np.ptp(driven.position))
-    beyond = np.flatnonzero(np.abs(error) > threshold)
     return InputReplay(
         name=recording.name,
         plant=parameters,
@@ -121,13 +110,13 @@ def replay_input(recording: Recording, parameters: PlantParameters, *, window: f
         window_angle=window_angle,
         time=driven.time,
         measured=driven.position,
-        free_run=free,
-        free_run_rms=float(np.sqrt(np.mean(error**2))),
-        fit=fit_percent(driven.position, free),
-        diverges_at=float(driven.time[beyond[0]] - driven.time[0]) if beyond.size else None,
-        threshold=threshold,
-        horizons=_horizons(driven, window),
-        from_fitted_state=parameters.drivetrain is None,
+        free_run=driven.run(0, driven.time.size - 1, (float(start[0]), float(start[1]))),
+        horizons=horizon_errors(
+            driven.time.size,
+            float(driven.time[1] - driven.time[0]),
+            window,
+            lambda first, steps: driven.run(first, steps) - driven.position[first : first + steps + 1],
+        ),
     )
 
 
@@ -204,15 +193,3 @@ def _windows(driven: _Driven, window: float) -> tuple[Array, Array, Array]:
         angle = driven.run(0, driven.time.size - 1)
         return driven.time, angle, np.array([float(np.sqrt(np.mean((angle - driven.position) ** 2)))])
     return np.concatenate(times), np.concatenate(angles), np.array(errors)
-
-
-def _horizons(driven: _Driven, longest: float) -> tuple[HorizonError, ...]:
-    """Return errors after 1, 2, 5, 10, ... samples, up to the longest horizon."""
-    period = float(driven.time[1] - driven.time[0])
-    reach = min(max(1, round(longest / period)), driven.time.size - 1)
-    starts = np.unique(np.linspace(0, driven.time.size - 1 - reach, MOST_STARTS).astype(int))
-    error = np.stack([driven.run(int(first), reach) - driven.position[first : first + reach + 1] for first in starts])
-    return tuple(
-        HorizonError(k, k * period, float(np.sqrt(np.mean(error[:, k] ** 2))), starts.size)
-        for k in horizon_steps(reach)
-    )

@@ -56,6 +56,9 @@ def replay(
 
     Example: python -m pendulum_bags replay measured.csv --params dfki
     """
+    from pendulum_bags.figures.render_files import write_figures
+    from pendulum_bags.runs.run_folder import write_json
+
     folder = out or Path("bags", "runs", f"replay_{recording.stem}")
     result: InputReplay | ControllerReplay
     if controller:
@@ -83,21 +86,13 @@ def replay(
             namespace=prefix or None,
         )
     content = result.as_dict()
-    files = _write(folder, result, content)
+    files = write_figures([result.figure()], folder)
+    write_json(folder / "replay.json", content)
     if json_output:
         print(json.dumps(content, indent=2, allow_nan=False))
         return
     _print(result, content, chosen=bool(params))
     print(f"\nfigure  {files[0]}")
-
-
-def _write(folder: Path, result: Any, content: dict[str, Any]) -> list[Path]:
-    from pendulum_bags.figures.render_files import write_figures
-    from pendulum_bags.runs.run_folder import write_json
-
-    files = write_figures([result.figure()], folder)
-    write_json(folder / "replay.json", content)
-    return files
 
 
 def _print(result: InputReplay | ControllerReplay, content: dict[str, Any], *, chosen: bool) -> None:
@@ -106,12 +101,7 @@ def _print(result: InputReplay | ControllerReplay, content: dict[str, Any], *, c
     console = make_console()
     if "horizons" in content:
         table = WholeTable(title="Error of predictions from measured states, by horizon", title_justify="left")
-        for heading in (
-            "samples",
-            "time [s]".replace("[", r"\["),
-            "rms [rad]".replace("[", r"\["),
-            "predictions",
-        ):
+        for heading in ("samples", r"time \[s]", r"rms \[rad]", "predictions"):
             table.add_column(heading, justify="right")
         for row in content["horizons"]:
             table.add_row(str(row["steps"]), f"{row['time_s']:.4g}", f"{row['rms_rad']:.3g}", str(row["starts"]))

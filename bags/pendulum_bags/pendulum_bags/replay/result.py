@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["DIVERGED", "MOST_STARTS", "HorizonError", "InputReplay", "fit_percent", "horizon_steps"]
+__all__ = ["HorizonError", "InputReplay", "fit_percent", "horizon_errors"]
 
 Array = NDArray[np.float64]
 
@@ -51,12 +52,7 @@ class InputReplay:
         by_window: The same of each window, shape (w,) [rad].
         window_time, window_angle: Simulated angle in windows, shape (n,) [s], [rad].
         time, measured, free_run: Measured angle, and simulated from the first state alone, shape (n,) [s], [rad].
-        free_run_rms: Angle error of the free run [rad].
-        fit: Fit of the free run [%]: 100 is perfect, 0 is as good as the mean.
-        diverges_at: Time at which the free run first errs by a tenth of the measured range [s]; None if never.
-        threshold: That tenth [rad].
         horizons: Errors of predictions over growing horizons.
-        from_fitted_state: Whether windows and free run start from fitted states rather than smoothed measured ones.
         driven_by: What drove the plant, in words.
     """
 
@@ -70,13 +66,29 @@ class InputReplay:
     time: Array
     measured: Array
     free_run: Array
-    free_run_rms: float
-    fit: float
-    diverges_at: float | None
-    threshold: float
     horizons: tuple[HorizonError, ...]
-    from_fitted_state: bool
     driven_by: str = "the measured torque"
+
+    @property
+    def free_run_rms(self) -> float:
+        """Angle error of the free run [rad]."""
+        return float(np.sqrt(np.mean((self.free_run - self.measured) ** 2)))
+
+    @property
+    def fit(self) -> float:
+        """Fit of the free run [%]: 100 is perfect, 0 is as good as the mean."""
+        return fit_percent(self.measured, self.free_run)
+
+    @property
+    def threshold(self) -> float:
+        """Angle error from which a free run counts as diverged [rad]."""
+        return DIVERGED * float(np.ptp(self.measured))
+
+    @property
+    def diverges_at(self) -> float | None:
+        """Time at which the free run first errs by more than that [s]; None if never."""
+        beyond = np.flatnonzero(np.abs(self.free_run - self.measured) > self.threshold)
+        return float(self.time[beyond[0]] - self.time[0]) if beyond.size else None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON."""
@@ -134,6 +146,19 @@ def fit_percent(measured: Array, simulated: Array) -> float:
     return 100.0 * (1.0 - float(np.linalg.norm(measured - simulated)) / spread) if spread > 0.0 else math.nan
 
 
-def horizon_steps(reach: int) -> list[int]:
-    """Return 1, 2, 5, 10, 20, ... samples up to the longest horizon."""
-    return sorted({k for k in (m * 10**e for e in range(7) for m in (1, 2, 5)) if k < reach} | {reach})
+def horizon_errors(
+    size: int, period: float, longest: float, error_from: Callable[[int, int], Array]
+) -> tuple[HorizonError, ...]:
+    """Return errors of predictions after 1, 2, 5, 10, 20, ... samples, up to the longest horizon.
+
+    Args:
+        size: Number of samples.
+        period: Time between two [s].
+        longest: Longest horizon [s].
+        error_from: Maps the sample of a start and a number of steps to the angle errors there and after each [rad].
+    """
+    reach = min(max(1, round(longest / period)), size - 1)
+    starts = np.unique(np.linspace(0, size - 1 - reach, MOST_STARTS).astype(int))
+    error = np.stack([error_from(int(first), reach) for first in starts])
+    steps = sorted({k for k in (m * 10**e for e in range(7) for m in (1, 2, 5)) if k < reach} | {reach})
+    return tuple(HorizonError(k, k * period, float(np.sqrt(np.mean(error[:, k] ** 2))), starts.size) for k in steps)
