@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.model import LinearModel, sort_poles
 from pendulum_lqr.sampled_design import DiscreteModel, discretise
-from pendulum_msgs_py.contract.values import finite
+from pendulum_msgs_py.json_values import without_nan
 
 __all__ = [
     "LoopReport",
@@ -85,7 +85,7 @@ class LoopReport:
         """Return plain values for JSON; complex poles as [re, im], infinities as None."""
         plain = asdict(self)
         plain["poles"] = [[pole.real, pole.imag] for pole in self.poles]
-        return finite(plain)
+        return without_nan(plain)
 
 
 def closed_loop_poles(model: LinearModel, K: ArrayLike) -> NDArray[np.complex128]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-__all__ = ["NANOSECONDS", "JointCommand", "JointSample", "Vector", "finite", "written"]
+__all__ = ["NANOSECONDS", "JointCommand", "JointSample", "Vector", "written"]
 
 NANOSECONDS = 1_000_000_000
 """Nanoseconds in a second; stamps are integers of nanoseconds so that no time is ever rounded."""
@@ -74,12 +73,3 @@ def written(values: Vector, digits: str = "") -> str:
     """
     texts = [format(value, digits) if digits else str(value) for value in values]
     return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
-
-
-def finite(value: Any) -> Any:
-    """Return mappings, lists and what they hold with None for NaN and infinity, which JSON does not know."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {key: finite(item) for key, item in value.items()}
-    return [finite(item) for item in value] if isinstance(value, (list, tuple)) else value

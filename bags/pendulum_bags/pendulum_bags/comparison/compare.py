@@ -19,8 +19,8 @@ from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_test
 from pendulum_bags.runs.run_data import OpenBag, RunData, is_emulated, noise_hold_time, plant_summary, read_run
 from pendulum_bags.runs.run_folder import pair_folders, read_looks, read_stalls
 from pendulum_bags.runs.run_record import run_record
-from pendulum_msgs_py.contract.values import finite
 from pendulum_msgs_py.errors import BagError, DataError
+from pendulum_msgs_py.json_values import without_nan
 from pendulum_rosbag.reader import read_bag
 
 __all__ = ["Comparison", "compare", "compare_folders", "compare_runs"]
@@ -148,7 +148,7 @@ class Comparison:
     def to_json(self) -> dict[str, Any]:
         """Return everything that a program may want to read; numbers that do not exist are None."""
         told = run_record(self.pairs[0].hardware.metadata)
-        content = {
+        content: dict[str, Any] = {
             "seed": told.get("seed"),
             "strategy": told.get("strategy"),
             "versions": told.get("versions", {}),
@@ -164,8 +164,7 @@ class Comparison:
             "metrics": self.metrics,
             "verdict": self.verdict.as_dict(),
         }
-        result: dict[str, Any] = finite(content)
-        return result
+        return without_nan(content)
 
     def _why_not_paired(self) -> str:
         return next(pair.why_not_paired for pair in self.pairs if not pair.is_paired)

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from pendulum_bags.ranking.contender import PARTS, Contender, Interval, compared_runs, refuse_no_number
 from pendulum_bags.ranking.regret import regret_share
-from pendulum_msgs_py.contract.values import finite
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.json_values import without_nan
 
 __all__ = ["Ranking", "WrongPair", "mmrv", "rank"]
 
@@ -97,7 +97,7 @@ class Ranking:
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON values; infinities and what does not exist as None."""
-        return finite(asdict(self))
+        return without_nan(asdict(self))
 
 
 def mmrv(sim: Array, hw: Array) -> float:

@@ -7,15 +7,15 @@ is a value: whoever measures it makes a :class:`LayerResult`, and :func:`sum_up`
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.json_values import without_nan
 
 __all__ = [
     "Answer",
@@ -105,16 +105,7 @@ class Evidence:
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON values; numbers that do not exist are None."""
-        return {
-            "quantity": self.quantity,
-            "unit": self.unit,
-            "estimate": _finite(self.estimate),
-            "low": _finite(self.low),
-            "high": _finite(self.high),
-            "expected": self.expected,
-            "mark": self.mark.value,
-            "note": self.note,
-        }
+        return without_nan({**asdict(self), "mark": self.mark.value})
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Evidence:
@@ -327,7 +318,3 @@ def read_layers(folder: Path) -> list[LayerResult]:
 
 def _reasons(results: Sequence[LayerResult]) -> str:
     return "; ".join(result.reason or result.sentence.rstrip(".") for result in results)
-
-
-def _finite(value: float | None) -> float | None:
-    return float(value) if value is not None and math.isfinite(value) else None

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pendulum_msgs_py.contract.values import NANOSECONDS, finite
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_msgs_py.json_values import without_nan
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.decode import store_for
@@ -119,7 +120,7 @@ def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
 
 def _json(value: Any) -> str:
     """Return a list as JSON, which knows neither NaN nor infinity: those become null."""
-    return json.dumps(finite(value), allow_nan=False)
+    return json.dumps(without_nan(value), allow_nan=False)
 
 
 def _write_parquet(path: Path, table: pd.DataFrame, info: TopicInfo) -> None:
