@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -83,7 +84,7 @@ class Comparison:
         """Whether the verdict's tests look at both motions at the same times, under one disturbance."""
         return self.is_paired and not self.unlike_references
 
-    @property
+    @cached_property
     def band(self) -> float:
         """Frequency up to which the tests compare spreads and distances [Hz]."""
         if self.is_tested_in_pairs:
@@ -103,7 +104,7 @@ class Comparison:
         """Why the moving references of a pair are not one, see :attr:`Pair.unlike_references`; empty where they are."""
         return next((pair.unlike_references for pair in self.pairs if pair.unlike_references), "")
 
-    @property
+    @cached_property
     def plants(self) -> dict[str, dict[str, Any]]:
         """Figures of each plant over all samples of its runs, so that a run counts by their number, as in the tests."""
         groups = {
@@ -119,7 +120,7 @@ class Comparison:
         """Statistics of the paired difference; only a reason where the disturbances differ."""
         first = self.pairs[0]
         if not self.is_paired:
-            return {"reason": self._why_not_paired()}
+            return {"reason": next(pair.why_not_paired for pair in self.pairs if not pair.is_paired)}
         result = first.as_dict()
         if len(self.pairs) > 1:
             result["runs"] = [pair.as_dict() for pair in self.pairs]
@@ -142,13 +143,12 @@ class Comparison:
     def metrics(self) -> list[dict[str, Any]]:
         """Metrics of the regulation, one row each, simulation and hardware of the first run side by side."""
         pair = self.pairs[0]
-        episodes = {"sim": episode_of(pair.simulation.window), "hw": episode_of(pair.hardware.window)}
-        return summarise_metrics(episodes)
+        return summarise_metrics({"sim": episode_of(pair.simulation.window), "hw": episode_of(pair.hardware.window)})
 
     def to_json(self) -> dict[str, Any]:
         """Return everything that a program may want to read; numbers that do not exist are None."""
         told = run_record(self.pairs[0].hardware.metadata)
-        content: dict[str, Any] = {
+        content = {
             "seed": told.get("seed"),
             "strategy": told.get("strategy"),
             "versions": told.get("versions", {}),
@@ -165,9 +165,6 @@ class Comparison:
             "verdict": self.verdict.as_dict(),
         }
         return without_nan(content)
-
-    def _why_not_paired(self) -> str:
-        return next(pair.why_not_paired for pair in self.pairs if not pair.is_paired)
 
 
 def compare(
@@ -244,11 +241,7 @@ def compare_runs(
     margins = Margins.parse(margin)
     simulation = read_run(sim_bag, prefix=sim_prefix, label="simulation", joint=joint, open_bag=open_bag)
     hardware = read_run(hw_bag, prefix=hw_prefix, label="hardware", joint=joint, open_bag=open_bag)
-    own = (
-        []
-        if own_protocol is None
-        else [read_run(own_protocol, label="simulation, own noise", joint=joint, open_bag=open_bag)]
-    )
+    own = [] if own_protocol is None else [_read_own(own_protocol, joint, open_bag)]
     return compare([(simulation, hardware)], own=own, margin=margins)
 
 
@@ -297,7 +290,7 @@ def compare_folders(
             else:
                 pairs.append(pair)
         if (folder / "sim_500hz").is_dir():
-            own.append(read_run(folder / "sim_500hz", label="simulation, own noise", joint=joint, open_bag=open_bag))
+            own.append(_read_own(folder / "sim_500hz", joint, open_bag))
     looked = looks or Looks(max(read_looks(Path(folder)) for folder in folders) if folders else 0)
     return replace(compare(pairs, own=own, margin=margins, looks=looked), left_out=tuple(left_out), stalls=stalls)
 
@@ -305,11 +298,15 @@ def compare_folders(
 def _in_words(stalls: Sequence[Mapping[str, str]]) -> str:
     """Say that runs were broken off, and why: a fault of the bridge's own may look the same."""
     told = "; ".join(stall["reason"] + (f" (logs: {stall['logs']})" if stall["logs"] else "") for stall in stalls)
-    if len(stalls) == 1:
-        return f"1 run broke off before this one and does not count, taken for a standstill of this machine: {told}."
+    runs, does, what = ("run", "does", "a standstill") if len(stalls) == 1 else ("runs", "do", "standstills")
     return (
-        f"{len(stalls)} runs broke off before this one and do not count, taken for standstills of this machine: {told}."
+        f"{len(stalls)} {runs} broke off before this one and {does} not count, taken for {what} of this machine: "
+        f"{told}."
     )
+
+
+def _read_own(bag: PathArgument, joint: str | None, open_bag: OpenBag) -> RunData:
+    return read_run(bag, label="simulation, own noise", joint=joint, open_bag=open_bag)
 
 
 def _read_pair(folder: Path, joint: str | None, open_bag: OpenBag) -> tuple[RunData, RunData]:

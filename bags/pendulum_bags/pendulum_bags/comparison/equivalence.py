@@ -81,16 +81,20 @@ class EquivalenceTest:
 
     def sentence(self) -> str:
         """Return the result in words."""
-        unit = f" {self.unit}" if self.unit not in {"", "-"} else ""
+        if math.isnan(self.interval.estimate):
+            return f"{self.quantity}: {_UNTOLD}"
+        unit = _behind_a_number(self.unit)
         text = (
             f"{self.quantity}: {self.interval.estimate:.3g}{unit}, {self.interval.title} {self.interval.low:.3g} to "
             f"{self.interval.high:.3g}{unit}, {self.margin_text()}{unit}: {self.outcome.value}"
         )
-        if math.isnan(self.interval.estimate):
-            return f"{self.quantity}: {_UNTOLD}"
         if self.outcome is Outcome.UNDECIDED:
             text += f": {_more(self.more_runs)}"
         return text
+
+
+def _behind_a_number(unit: str) -> str:
+    return f" {unit}" if unit not in {"", "-"} else ""
 
 
 def _more(runs: int | None) -> str:
@@ -120,7 +124,7 @@ def equivalence_test(
         runs: Runs that the interval rests on.
         ratio: Whether it is a ratio, whose distances are logarithms.
     """
-    scale = _logarithm if ratio else _same
+    scale = _logarithm if ratio else float
     estimate, left, right = (scale(value) for value in (interval.estimate, interval.low, interval.high))
     bottom, top = (scale(value) for value in (low, high))
     if left > bottom and right < top:
@@ -137,10 +141,6 @@ def equivalence_test(
         error = max(right - left, 0.0) / (2.0 * reach)
         more = _runs_to_decide(estimate, bottom, top, error, runs, reach)
     return EquivalenceTest(quantity, unit, interval, low, high, outcome, more, smallest)
-
-
-def _same(value: float) -> float:
-    return value
 
 
 def _logarithm(value: float) -> float:
@@ -250,8 +250,7 @@ def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, sec
 
 
 def _short(test: EquivalenceTest) -> str:
-    unit = f" {test.unit}" if test.unit not in {"", "-"} else ""
     return (
-        f"{test.quantity} is {test.interval.estimate:.3g}{unit} "
+        f"{test.quantity} is {test.interval.estimate:.3g}{_behind_a_number(test.unit)} "
         f"({test.interval.title} {test.interval.low:.3g} to {test.interval.high:.3g}; {test.margin_text()})"
     )

@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.runs.series import Array, Series
 from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.json_values import without_nan
 
 __all__ = ["METRICS", "Episode", "Metric", "episode_of", "metrics_of", "summarise_metrics"]
 
@@ -77,53 +79,6 @@ def _settling_time(episode: Episode) -> float:
     return float(episode.t[last + 1]) if last + 1 < episode.t.size else float("inf")
 
 
-def _steady_state_error(episode: Episode) -> float:
-    """Mean error over the last tenth."""
-    return float(episode.error[-max(1, episode.error.size // 10) :].mean())
-
-
-def _rms_error(episode: Episode) -> float:
-    return float(np.sqrt(np.mean(episode.error**2)))
-
-
-def _rms_velocity(episode: Episode) -> float:
-    return float(np.sqrt(np.mean(episode.velocity**2)))
-
-
-def _ise(episode: Episode) -> float:
-    return _integral(episode, episode.error**2)
-
-
-def _iae(episode: Episode) -> float:
-    return _integral(episode, np.abs(episode.error))
-
-
-def _itae(episode: Episode) -> float:
-    return _integral(episode, episode.t * np.abs(episode.error))
-
-
-def _effort_energy(episode: Episode) -> float:
-    """Integral of squared torque: what the winding pays in heat, up to a constant of the motor."""
-    return _integral(episode, episode.effort**2)
-
-
-def _max_effort(episode: Episode) -> float:
-    return float(np.max(np.abs(episode.effort)))
-
-
-def _rms_effort(episode: Episode) -> float:
-    return float(np.sqrt(np.mean(episode.effort**2)))
-
-
-def _work(episode: Episode) -> float:
-    """Mechanical work of the controller's torque; positive where it drives, negative where it brakes."""
-    return _integral(episode, episode.effort * episode.velocity)
-
-
-def _absolute_work(episode: Episode) -> float:
-    return _integral(episode, np.abs(episode.effort * episode.velocity))
-
-
 def _smoothness(episode: Episode) -> float:
     """Root mean square change of the torque within ``CHANGE_TIME``, per that time; small is smooth.
 
@@ -138,7 +93,7 @@ def _smoothness(episode: Episode) -> float:
         return float("nan")
     # Half a microsecond later: rounding of stamps must not pick the sample before.
     index = np.searchsorted(t, first + CHANGE_TIME + 5e-7, side="right") - 1
-    return float(np.sqrt(np.mean((episode.effort[index] - episode.effort[: first.size]) ** 2))) / CHANGE_TIME
+    return rms(episode.effort[index] - episode.effort[: first.size]) / CHANGE_TIME
 
 
 class Metric(NamedTuple):
@@ -154,23 +109,30 @@ METRICS: tuple[Metric, ...] = (
     Metric("overshoot", "-", "largest excursion beyond the set-point per step", _overshoot),
     Metric("rise_time", "s", "time from 10 to 90 % of the step", _rise_time),
     Metric("settling_time", "s", "time after which the error stays within 2 % of the step", _settling_time),
-    Metric("steady_state_error", "rad", "mean error over the last tenth", _steady_state_error),
-    Metric("rms_error", "rad", "root mean square error", _rms_error),
-    Metric("rms_velocity", "rad/s", "root mean square velocity", _rms_velocity),
-    Metric("ise", "rad^2 s", "integral of squared error", _ise),
-    Metric("iae", "rad s", "integral of absolute error", _iae),
-    Metric("itae", "rad s^2", "integral of time times absolute error", _itae),
-    Metric("max_effort", "N m", "largest absolute torque", _max_effort),
-    Metric("rms_effort", "N m", "root mean square torque", _rms_effort),
-    Metric("effort_energy", "N^2 m^2 s", "integral of squared torque", _effort_energy),
-    Metric("work", "J", "mechanical work of the torque", _work),
-    Metric("absolute_work", "J", "integral of absolute mechanical power", _absolute_work),
     Metric(
-        "smoothness",
-        "N m/s",
-        "root mean square change of the torque within 20 ms, per that time",
-        _smoothness,
+        "steady_state_error",
+        "rad",
+        "mean error over the last tenth",
+        lambda e: e.error[-max(1, e.error.size // 10) :].mean(),
     ),
+    Metric("rms_error", "rad", "root mean square error", lambda e: rms(e.error)),
+    Metric("rms_velocity", "rad/s", "root mean square velocity", lambda e: rms(e.velocity)),
+    Metric("ise", "rad^2 s", "integral of squared error", lambda e: _integral(e, e.error**2)),
+    Metric("iae", "rad s", "integral of absolute error", lambda e: _integral(e, np.abs(e.error))),
+    Metric("itae", "rad s^2", "integral of time times absolute error", lambda e: _integral(e, e.t * np.abs(e.error))),
+    Metric("max_effort", "N m", "largest absolute torque", lambda e: np.max(np.abs(e.effort))),
+    Metric("rms_effort", "N m", "root mean square torque", lambda e: rms(e.effort)),
+    # What the winding pays in heat, up to a constant of the motor.
+    Metric("effort_energy", "N^2 m^2 s", "integral of squared torque", lambda e: _integral(e, e.effort**2)),
+    # Positive where the controller's torque drives, negative where it brakes.
+    Metric("work", "J", "mechanical work of the torque", lambda e: _integral(e, e.effort * e.velocity)),
+    Metric(
+        "absolute_work",
+        "J",
+        "integral of absolute mechanical power",
+        lambda e: _integral(e, np.abs(e.effort * e.velocity)),
+    ),
+    Metric("smoothness", "N m/s", "root mean square change of the torque within 20 ms, per that time", _smoothness),
 )
 
 
@@ -186,13 +148,6 @@ def summarise_metrics(episodes: Mapping[str, Episode]) -> list[dict[str, float |
     rows: list[dict[str, float | str | None]] = []
     for metric in METRICS:
         if any(metric.name in found for found in values.values()):
-            row: dict[str, float | str | None] = {
-                "metric": metric.name,
-                "unit": metric.unit,
-                "meaning": metric.meaning,
-            }
-            for name, found in values.items():
-                value = found.get(metric.name, float("nan"))
-                row[name] = value if np.isfinite(value) else None
-            rows.append(row)
+            row = {"metric": metric.name, "unit": metric.unit, "meaning": metric.meaning}
+            rows.append({**row, **{name: without_nan(found.get(metric.name)) for name, found in values.items()}})
     return rows

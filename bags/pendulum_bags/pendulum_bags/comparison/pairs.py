@@ -11,7 +11,7 @@ import numpy as np
 from pendulum_bags.comparison.alignment import Alignment, align_motion
 from pendulum_bags.comparison.same_signal import AMPLITUDE, SharedSignal, compare_signals
 from pendulum_bags.comparison.spectra import Spectra, spectra_of
-from pendulum_bags.comparison.statistics import describe, kolmogorov_smirnov
+from pendulum_bags.comparison.statistics import describe, kolmogorov_smirnov, rms
 from pendulum_bags.runs.run_data import RunData, noise_hold_time
 from pendulum_bags.runs.series import Array, Series, shared_span
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -163,8 +163,8 @@ class Pair:
         if ours.reference is None or theirs.reference is None or ours.tracking_error is None:
             return "a moving reference was followed, and it is not known on both sides which and since when"
         common = np.interp(theirs.window.t, ours.window.t, ours.reference)
-        apart = _rms(common - theirs.reference)
-        errors = _rms(ours.tracking_error), _rms(theirs.window.position - UPRIGHT - theirs.reference)
+        apart = rms(common - theirs.reference)
+        errors = rms(ours.tracking_error), rms(theirs.window.position - UPRIGHT - theirs.reference)
         if apart <= _ONE_REFERENCE * min(errors):
             return ""
         return (
@@ -188,12 +188,12 @@ class Pair:
         """Return the figures of this pair for JSON."""
         return {
             **self.difference.statistics(),
-            "rms_position": _rms(self.difference.position),
-            "rms_velocity": _rms(self.difference.velocity),
-            "path": _rms(self.difference.position) / float(self.difference.hardware.position.std()),
+            "rms_position": rms(self.difference.position),
+            "rms_velocity": rms(self.difference.velocity),
+            "path": rms(self.difference.position) / float(self.difference.hardware.position.std()),
             "disturbance_alignment": None if self.signal is None else self.signal.as_dict(),
             "response_alignment": self.response.as_dict(),
-            "aligned": {**self.aligned.statistics(), "rms_position": _rms(self.aligned.position)},
+            "aligned": {**self.aligned.statistics(), "rms_position": rms(self.aligned.position)},
             "coherent_up_to_hz": self.spectra.coherent_up_to,
         }
 
@@ -209,10 +209,6 @@ def _turned(hardware: RunData, simulation: RunData) -> RunData:
         return hardware
     window, whole = (replace(one, position=one.position - offset) for one in (hardware.window, hardware.whole))
     return replace(hardware, window=window, whole=whole)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def distribution_tests(simulation: Series, hardware: Series) -> dict[str, dict[str, Any]]:

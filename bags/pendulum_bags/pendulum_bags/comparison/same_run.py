@@ -125,11 +125,12 @@ def paired_tests(
     columns = [one.columns(centre or 0.0) for one in seen]
     resampled = resample(columns, runs_differ=runs_differ)
     kind = _Kind.of([one for pair in pairs for one in pair], margins, looks, len(pairs))
-    tests = [_mean_test(resampled, _column(0), margins, kind)]
+    tests = [_mean_test(resampled, lambda means: np.asarray(means[..., 0]), margins, kind)]
     tests += _spread_tests(resampled, _SIMULATION, _HARDWARE, margins, kind)
-    tests.append(
-        _delay_test(resampled, centre, margins.delay, kind) if centre is not None else _no_delay(margins, kind)
-    )
+    if centre is None:
+        tests.append(_no_delay(margins, kind))
+    else:
+        tests.append(_within(resampled, "delay", lambda means: centre + _lag(means), margins.delay, kind))
     for index, what, margin in (
         (1, "angle", margins.path_angle),
         (2, "velocity", margins.path_velocity),
@@ -260,10 +261,6 @@ def _likeness(products: Array, squares: Array) -> Array:
 # -- statistics --------------------------------------------------------------------------------------------------
 
 
-def _column(index: int) -> Statistic:
-    return lambda means: np.asarray(means[..., index])
-
-
 def _variance(means: Array, first: int) -> Array:
     """Return the variance from the means of x and x^2 in two neighbouring columns."""
     return np.maximum(np.asarray(means[..., first + 1] - means[..., first] ** 2), 1e-300)
@@ -290,9 +287,13 @@ def _lag(means: Array) -> Array:
 
 def _mean_test(resampled: Resampled, statistic: Statistic, margins: Margins, kind: _Kind) -> EquivalenceTest:
     margin = margins.mean_position if kind.slides else margins.mean_angle
+    return _within(resampled, f"mean {kind.name('angle')} difference", statistic, margin, kind)
+
+
+def _within(resampled: Resampled, name: str, statistic: Statistic, margin: Margin, kind: _Kind) -> EquivalenceTest:
+    """Test a statistic in SI units against a margin on both sides."""
     scale = margin.per_si
     interval = bootstrap_interval(resampled, lambda means: scale * statistic(means), level=kind.looks.level)
-    name = f"mean {kind.name('angle')} difference"
     return equivalence_test(name, margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
 
 
@@ -312,36 +313,21 @@ def _spread_tests(
 def _spread_test(
     resampled: Resampled, below: int, above: int, what: str, margin: Margin, kind: _Kind
 ) -> EquivalenceTest:
-    level = kind.looks.level
-    if margin.is_share:
-        interval = bootstrap_interval(
-            resampled,
-            lambda means: np.asarray(np.sqrt(_variance(means, above) / _variance(means, below))),
-            level=level,
-        )
-        top = 1.0 + margin.si
-        return equivalence_test(
-            f"spread of {kind.name(what)} (ratio)", "-", interval, 1.0 / top, top, runs=kind.runs, ratio=True
-        )
-    scale = margin.per_si
+    if not margin.is_share:
+
+        def difference(means: Array) -> Array:
+            return np.asarray(np.sqrt(_variance(means, above)) - np.sqrt(_variance(means, below)))
+
+        return _within(resampled, f"spread of {kind.name(what)} difference", difference, margin, kind)
     interval = bootstrap_interval(
         resampled,
-        lambda means: np.asarray(scale * (np.sqrt(_variance(means, above)) - np.sqrt(_variance(means, below)))),
-        level=level,
-    )
-    return equivalence_test(
-        f"spread of {kind.name(what)} difference", margin.unit, interval, -margin.value, margin.value, runs=kind.runs
-    )
-
-
-def _delay_test(resampled: Resampled, centre: float, margin: Margin, kind: _Kind) -> EquivalenceTest:
-    scale = margin.per_si
-    interval = bootstrap_interval(
-        resampled,
-        lambda means: scale * (centre + _lag(means)),
+        lambda means: np.asarray(np.sqrt(_variance(means, above) / _variance(means, below))),
         level=kind.looks.level,
     )
-    return equivalence_test("delay", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
+    top = 1.0 + margin.si
+    return equivalence_test(
+        f"spread of {kind.name(what)} (ratio)", "-", interval, 1.0 / top, top, runs=kind.runs, ratio=True
+    )
 
 
 def _no_delay(margins: Margins, kind: _Kind) -> EquivalenceTest:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pendulum_bags.comparison.alignment import LONGEST_LAG, Alignment, align_signals
+from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.runs.series import Signal
 
@@ -76,8 +77,8 @@ def compare_signals(first: Signal | None, second: Signal | None, period: float) 
     if first is None or second is None or min(first.t.size, second.t.size) < 12:
         return None
     alignment = align_signals(first, second, period)
-    sizes = [float(np.sqrt(np.mean(one.value**2))) for one in (first, second)]
-    amplitude = sizes[1] / sizes[0] if sizes[0] > 0.0 else float("inf")
+    size = rms(first.value)
+    amplitude = rms(second.value) / size if size > 0.0 else float("inf")
     changes = min(_changes(first), _changes(second))
     return SharedSignal(alignment, amplitude, _threshold(changes, float(np.ptp(first.t))), changes)
 

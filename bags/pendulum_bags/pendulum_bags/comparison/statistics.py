@@ -29,6 +29,7 @@ __all__ = [
     "kolmogorov_smirnov",
     "quantile_pairs",
     "resample",
+    "rms",
 ]
 
 RESAMPLES = 2000
@@ -64,6 +65,11 @@ def describe(values: ArrayLike) -> dict[str, float]:
         "75%": float(third),
         "max": float(high),
     }
+
+
+def rms(values: Array) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def block_length(values: ArrayLike) -> int:

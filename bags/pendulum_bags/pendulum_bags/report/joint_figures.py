@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pendulum_bags.comparison import Comparison
+from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.report.analysis_figures import coherent_up_to, spectrum_panels
@@ -79,7 +80,7 @@ def joint_differences(comparisons: Mapping[str, Comparison]) -> Figure | str:
                 )
             ]
             panels.append(Panel(TIME, label, traces))
-        before, after = (float(np.sqrt(np.mean(one.position**2))) for one in (pair.difference, pair.aligned))
+        before, after = (rms(one.position) for one in (pair.difference, pair.aligned))
         share = 100.0 * before / float(pair.difference.hardware.position.std())
         words.append(
             f"of {joint} {quantity(before, unit)} apart (rms, {share:.0f} % of the hardware's spread), with the delay "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pendulum_bags.comparison.pairs import Difference
+from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.figures.figure import Figure, Kind, Panel, Trace
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.report.data import ReportData
@@ -72,7 +73,7 @@ def both_together(data: ReportData) -> Figure:
     pair = data.comparison.pairs[0]
     sim, hw = pair.simulation.window, pair.hardware.window
     ratio = float(hw.position.std() / sim.position.std())
-    fit = 100.0 * (1.0 - float(np.sqrt(np.mean(pair.difference.position**2)) / pair.difference.hardware.position.std()))
+    fit = 100.0 * (1.0 - float(rms(pair.difference.position) / pair.difference.hardware.position.std()))
     shared = "the same noise" if pair.is_paired else "noise of their own"
     follows = f", and the simulated angle fits the measured one to {fit:.0f} %" if pair.is_paired else ""
     sentence = (
@@ -217,7 +218,7 @@ def paired_difference(data: ReportData) -> Figure | str:
     pair = data.comparison.pairs[0]
     if not pair.is_paired:
         return str(data.comparison.paired.get("reason", "the disturbances differ"))
-    before, after = (float(np.sqrt(np.mean(one.position**2))) for one in (pair.difference, pair.aligned))
+    before, after = (rms(one.position) for one in (pair.difference, pair.aligned))
     delay = 1e3 * pair.response.delay
     sentence = (
         f"As recorded, the paths are {quantity(before, 'rad')} apart (rms), which is "
