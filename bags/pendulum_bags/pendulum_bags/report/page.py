@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from typing import Any
 
-from pendulum_bags.figures.embed import packed_plotly, script_json
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.numbers import quantity
-from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.emulator_table import emulator_table
+from pendulum_bags.report.html import render, script_json
 from pendulum_bags.report.provenance import provenance_table, seed_of, settings_table
-from pendulum_bags.report.terms import Terms
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.runs.run_data import stand_in_of, timing_warning
 from pendulum_bags.verdict import Answer
@@ -140,39 +136,20 @@ def page_of(
 
 def render_page(page: Page) -> str:
     """Return the HTML text of a report."""
-    import jinja2
-
-    templates = resources.files("pendulum_bags.report").joinpath("templates")
-
-    def read(name: str) -> str:
-        return templates.joinpath(name).read_text(encoding="utf-8")
-
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(read), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
-    terms = Terms()
-    environment.filters["marked"] = terms.mark
     figures, tables, facts, noise_note, provenance = name_in(
         (page.figures, page.tables, page.facts, page.noise_note, page.provenance), emulated=page.emulated
     )
     sections = []
-    graphs: dict[str, Any] = {}
-    packed = {name: base64.b64encode(content).decode("ascii") for name, content in page.pictures.items()}
     named = [figure.section for figure in figures] + [table.section for table in tables]
     for heading in dict.fromkeys((*SECTIONS, *named)):
-        items: list[dict[str, Any]] = []
-        for figure in figures:
-            if figure.section == heading:
-                parts = graphs_of(figure)
-                names = [f"{figure.name}-{i}" for i in range(len(parts))]
-                graphs.update(zip(names, parts, strict=True))
-                items.append({"figure": figure, "graphs": names, "picture": packed.get(figure.name)})
-        items += [{"table": table} for table in tables if table.section == heading]
-        if items:
-            sections.append({"title": heading, "anchor": _anchor(heading), "entries": items})
-    return environment.get_template("report.html.j2").render(
+        shown, listed = ([one for one in ones if one.section == heading] for ones in (figures, tables))
+        if shown or listed:
+            sections.append({"title": heading, "anchor": _anchor(heading), "figures": shown, "tables": listed})
+    return render(
+        "report.html.j2",
+        figures,
+        page.pictures,
         page=page,
-        terms=terms,
         sentence=_without_mark(page.answer),
         signs=SIGNS,
         noise_note=noise_note,
@@ -181,11 +158,6 @@ def render_page(page: Page) -> str:
         sections=sections,
         provenance=provenance,
         animation=script_json(page.animation),
-        graphs=script_json(graphs),
-        plotly=packed_plotly(),
-        style=read("report.css"),
-        script=read("report.js"),
-        diagram=read("block_diagram.svg"),
     )
 
 

@@ -6,13 +6,13 @@ import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figures import make_figures
+from pendulum_bags.report.html import minute
 from pendulum_bags.report.joint_page import joint_page
 from pendulum_bags.report.page import Page, page_of, render_page
 from pendulum_bags.report.tables import make_tables
@@ -99,7 +99,7 @@ def write_report(
         make_tables(data),
         missing,
         title=title_of([Path(folder) for folder in folders] or [out], len(comparison.pairs)),
-        made_at=_now(),
+        made_at=minute(),
     )
     return _save(out, page, formats)
 
@@ -128,11 +128,7 @@ def write_joint_report(
         BagError: The folder cannot be written.
     """
     pairs = len(next(iter(comparisons.values())).pairs)
-    return _save(out, joint_page(comparisons, answer, title=title_of(folders, pairs), made_at=_now()), formats)
-
-
-def _now() -> str:
-    return datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    return _save(out, joint_page(comparisons, answer, title=title_of(folders, pairs), made_at=minute()), formats)
 
 
 def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
