@@ -22,7 +22,6 @@ __all__ = [
     "distributions",
     "effort",
     "equivalence",
-    "equivalence_of",
     "pooled_runs",
     "spectra",
     "spectrum_panels",
@@ -34,20 +33,13 @@ def _relative(test: EquivalenceTest) -> tuple[float, float, float]:
     """Return estimate and interval in units of the margin, so that tests of all units share one axis."""
     interval = test.interval
     values = (interval.estimate, interval.low, interval.high)
-    if not math.isfinite(test.low):
-        return values[0] / test.high, values[1] / test.high, values[2] / test.high
-    if math.isclose(test.low, -test.high):
+    if not math.isfinite(test.low) or math.isclose(test.low, -test.high):
         return values[0] / test.high, values[1] / test.high, values[2] / test.high
     scale = math.log(test.high)
     return tuple(math.log(max(value, 1e-9)) / scale for value in values)  # type: ignore[return-value]
 
 
-def equivalence(data: ReportData) -> Figure:
-    """Return every test of the verdict against its margin."""
-    return equivalence_of(data.comparison.verdict)
-
-
-def equivalence_of(verdict: Verdict) -> Figure:
+def equivalence(verdict: Verdict) -> Figure:
     """Return every test of a verdict against its margin."""
     tests = list(verdict.tests)[::-1]
     told = [test for test in tests if math.isfinite(test.interval.estimate)]
@@ -145,15 +137,14 @@ def spectrum_panels(result: Spectra, unit: str = "rad", of: str = "") -> list[Pa
         unit: Of the position.
         of: Whose they are, for the titles, such as ``, elbow``.
     """
-    inside = slice(1, None)
-    frequency = result.frequency[inside]
+    frequency = result.frequency[1:]
     return [
         Panel(
             "frequency [Hz]",
             f"velocity PSD [({unit}/s)²/Hz]",
             [
-                Trace(frequency, result.first[inside], "simulation", "sim"),
-                Trace(frequency, result.second[inside], "hardware", "hw"),
+                Trace(frequency, result.first[1:], "simulation", "sim"),
+                Trace(frequency, result.second[1:], "hardware", "hw"),
             ],
             x_log=True,
             y_log=True,
@@ -162,7 +153,7 @@ def spectrum_panels(result: Spectra, unit: str = "rad", of: str = "") -> list[Pa
         Panel(
             "frequency [Hz]",
             "coherence [−]",
-            [Trace(frequency, result.coherence[inside], "coherence", "difference")],
+            [Trace(frequency, result.coherence[1:], "coherence", "difference")],
             marks=[Mark(result.threshold, "y", "5 % level of independent signals")],
             x_log=True,
             y_range=(0.0, 1.02),
@@ -181,10 +172,8 @@ def spectra(data: ReportData) -> Figure:
     """Return power spectra and coherence of the velocities."""
     pair = data.comparison.pairs[0]
     result = pair.spectra
-    inside = slice(1, None)
-    frequency = result.frequency[inside]
-    power = [float(np.sum(one[inside]) * (frequency[1] - frequency[0])) for one in (result.first, result.second)]
-    panels = spectrum_panels(result)
+    step = result.frequency[2] - result.frequency[1]
+    power = [float(np.sum(one[1:]) * step) for one in (result.first, result.second)]
     sentence = (
         f"The hardware's velocity has {quantity(power[1] / power[0])} times the power of the simulation's; the two are "
         f"coherent {coherent_up_to(result)} ({result.segments:.1f} independent segments)."
@@ -193,7 +182,7 @@ def spectra(data: ReportData) -> Figure:
         "spectra",
         "Spectra and coherence",
         sentence,
-        panels,
+        spectrum_panels(result),
         stacked=False,
         section="Paired comparison",
         panel_height=230,

@@ -20,7 +20,7 @@ __all__ = ["FIGURES", "comparison_figures", "make_figures"]
 Maker = Callable[[ReportData], Figure | str]
 
 FIGURES: tuple[tuple[str, Maker], ...] = (
-    ("Equivalence tests", analysis_figures.equivalence),
+    ("Equivalence tests", lambda data: analysis_figures.equivalence(data.comparison.verdict)),
     ("Gap per frequency", certified_figures.gap),
     ("Gains that carry over", certified_figures.gains),
     ("LQR weights that carry over", certified_figures.weights),

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import attrgetter
 
 import numpy as np
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.comparison.statistics import rms
-from pendulum_bags.figures.figure import Figure, Panel, Trace
+from pendulum_bags.figures.figure import Figure, Panel
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.report.analysis_figures import coherent_up_to, spectrum_panels
-from pendulum_bags.report.motion_figures import TIME
+from pendulum_bags.report.motion_figures import both_panel, difference_panels
 
 __all__ = ["joint_differences", "joint_spectra", "joints_together"]
 
@@ -27,20 +28,11 @@ def joints_together(comparisons: Mapping[str, Comparison]) -> Figure:
     for joint, comparison in comparisons.items():
         sim, hw = comparison.pairs[0].simulation.window, comparison.pairs[0].hardware.window
         unit = sim.unit
-        rows = [(f"{joint} [{unit}]", "position", "line"), (f"velocity of {joint} [{unit}/s]", "velocity", "line")]
+        panels.append(both_panel(f"{joint} [{unit}]", sim, hw, attrgetter("position")))
+        panels.append(both_panel(f"velocity of {joint} [{unit}/s]", sim, hw, attrgetter("velocity")))
         if np.ptp(sim.effort) > 0.0 or np.ptp(hw.effort) > 0.0:
-            rows.append((f"{'force' if sim.slides else 'torque'} at {joint} [{sim.effort_unit}]", "effort", "step"))
-        panels += [
-            Panel(
-                TIME,
-                label,
-                [
-                    Trace(one.t, getattr(one, name), title, role, kind)  # type: ignore[arg-type]
-                    for one, title, role in ((sim, "simulation", "sim"), (hw, "hardware", "hw"))
-                ],
-            )
-            for label, name, kind in rows
-        ]
+            label = f"{'force' if sim.slides else 'torque'} at {joint} [{sim.effort_unit}]"
+            panels.append(both_panel(label, sim, hw, attrgetter("effort"), "step"))
         ours, theirs = float(sim.position.std(ddof=1)), float(hw.position.std(ddof=1))
         spreads.append(
             f"that of {joint} is {quantity(theirs, unit)} against {quantity(ours, unit)} "
@@ -71,15 +63,11 @@ def joint_differences(comparisons: Mapping[str, Comparison]) -> Figure | str:
             return str(comparison.paired.get("reason", "the disturbances differ"))
         unit = pair.simulation.window.unit
         delay = 1e3 * pair.response.delay
-        for label, name in ((f"Δ {joint} [{unit}]", "position"), (f"Δ velocity of {joint} [{unit}/s]", "velocity")):
-            traces = [
-                Trace(one.t, getattr(one, name), title, role)
-                for one, title, role in (
-                    (pair.difference, "as recorded", "difference"),
-                    (pair.aligned, "its delay taken out", "aligned"),
-                )
-            ]
-            panels.append(Panel(TIME, label, traces))
+        panels += difference_panels(
+            [("as recorded", "difference", pair.difference), ("its delay taken out", "aligned", pair.aligned)],
+            f"Δ {joint} [{unit}]",
+            f"Δ velocity of {joint} [{unit}/s]",
+        )
         before, after = (rms(one.position) for one in (pair.difference, pair.aligned))
         share = 100.0 * before / float(pair.difference.hardware.position.std())
         words.append(

@@ -12,15 +12,14 @@ from pendulum_bags.comparison import Comparison
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
-from pendulum_bags.report.analysis_figures import equivalence_of, timing
+from pendulum_bags.report.analysis_figures import equivalence, timing
 from pendulum_bags.report.animation import joint_animation
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.joint_figures import joint_differences, joint_spectra, joints_together
 from pendulum_bags.report.page import Page
-from pendulum_bags.report.provenance import provenance_table, settings_table
+from pendulum_bags.report.provenance import provenance_table, seed_of, settings_table
 from pendulum_bags.report.tables import tests_table
 from pendulum_bags.runs.run_data import stand_in_of, timing_warning
-from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Answer
 
 __all__ = ["joint_page"]
@@ -37,10 +36,10 @@ def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: 
     """
     first = next(iter(comparisons.values()))
     # What a bag says of its run it says of all joints.
-    data = ReportData(first, {"seed": _seed(first)}, answer=answer)
+    data = ReportData(first, {"seed": seed_of(first.pairs[0].simulation)}, answer=answer)
     differences = joint_differences(comparisons)
     figures = [
-        *(_of_joint(joint, equivalence_of(comparison.verdict)) for joint, comparison in comparisons.items()),
+        *(_of_joint(joint, equivalence(comparison.verdict)) for joint, comparison in comparisons.items()),
         joints_together(comparisons),
         *([] if isinstance(differences, str) else [differences]),
         joint_spectra(comparisons),
@@ -74,13 +73,9 @@ def _of_joint(joint: str, figure: Figure) -> Figure:
     return replace(figure, name=f"{figure.name}_{joint}", title=f"{figure.title}: {joint}")
 
 
-def _seed(comparison: Comparison) -> str:
-    return str(run_record(comparison.pairs[0].simulation.metadata).get("seed", "unknown"))
-
-
 def _facts(comparisons: Mapping[str, Comparison]) -> list[tuple[str, str]]:
     first = next(iter(comparisons.values()))
-    facts = [("runs", str(len(first.pairs))), ("seed", _seed(first))]
+    facts = [("runs", str(len(first.pairs))), ("seed", seed_of(first.pairs[0].simulation))]
     for joint, comparison in comparisons.items():
         pair = comparison.pairs[0]
         sim, hw = pair.simulation.window, pair.hardware.window

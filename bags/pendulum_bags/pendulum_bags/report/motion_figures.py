@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+
 import numpy as np
 
 from pendulum_bags.comparison.pairs import Difference
@@ -13,7 +16,9 @@ from pendulum_bags.runs.run_data import RunData, noise_hold_time
 from pendulum_bags.runs.series import Array, Series
 
 __all__ = [
+    "both_panel",
     "both_together",
+    "difference_panels",
     "hardware_under_noise",
     "interpolation",
     "paired_difference",
@@ -68,6 +73,12 @@ def hardware_under_noise(data: ReportData) -> Figure:
     return _under_noise(run, "hw alone", "hardware_under_noise", "Hardware under noise", "Plants under noise")
 
 
+def both_panel(label: str, sim: Series, hw: Series, values: Callable[[Series], Array], kind: Kind = "line") -> Panel:
+    """Return one quantity of both plants over time."""
+    sides = ((sim, "simulation", "sim"), (hw, "hardware", "hw"))
+    return Panel(TIME, label, [Trace(one.t, values(one), title, role, kind) for one, title, role in sides])
+
+
 def both_together(data: ReportData) -> Figure:
     """Return both plants in one figure."""
     pair = data.comparison.pairs[0]
@@ -80,21 +91,10 @@ def both_together(data: ReportData) -> Figure:
         f"Under {shared}, the spread of the hardware's angle is {quantity(float(hw.position.std(ddof=1)), 'rad')} "
         f"against {quantity(float(sim.position.std(ddof=1)), 'rad')} in simulation ({ratio_in_words(ratio)}){follows}."
     )
-    rows: tuple[tuple[str, Array, Array, Kind], ...] = (
-        (ANGLE, _deviation(sim), _deviation(hw), "line"),
-        (VELOCITY, sim.velocity, hw.velocity, "line"),
-        ("controller torque u [N m]", sim.effort, hw.effort, "step"),
-    )
     panels = [
-        Panel(
-            TIME,
-            label,
-            [
-                Trace(sim.t, first, "simulation", "sim", kind),
-                Trace(hw.t, second, "hardware", "hw", kind),
-            ],
-        )
-        for label, first, second, kind in rows
+        both_panel(ANGLE, sim, hw, _deviation),
+        both_panel(VELOCITY, sim, hw, attrgetter("velocity")),
+        both_panel("controller torque u [N m]", sim, hw, attrgetter("effort"), "step"),
     ]
     return Figure(
         "both_together",
@@ -126,13 +126,8 @@ def torque_and_noise(data: ReportData) -> Figure | str:
         f"Below, the noise is scaled by {factor:.3g}."
     )
     panels = [
-        Panel(TIME, TORQUE, [Trace(noise.t, noise.value, "noise d", "noise", "step"), *used], title="Unscaled"),
-        Panel(
-            TIME,
-            TORQUE,
-            [Trace(noise.t, factor * noise.value, "noise d", "noise", "step"), *used],
-            title="Noise scaled to the controllers' torque",
-        ),
+        Panel(TIME, TORQUE, [Trace(noise.t, scale * noise.value, "noise d", "noise", "step"), *used], title=title)
+        for scale, title in ((1.0, "Unscaled"), (factor, "Noise scaled to the controllers' torque"))
     ]
     return Figure("torque_and_noise", "Torque and noise", sentence, panels, section="Paired comparison")
 
@@ -175,14 +170,13 @@ def interpolation(data: ReportData) -> Figure:
     )
 
 
-def _difference_panels(differences: list[tuple[str, str, Difference]]) -> list[Panel]:
+def difference_panels(
+    differences: Sequence[tuple[str, str, Difference]], position: str = "Δθ [rad]", velocity: str = "Δθ′ [rad/s]"
+) -> list[Panel]:
+    """Return differences over time, each with its legend and role, under labels for position and velocity."""
     return [
-        Panel(
-            TIME,
-            label,
-            [Trace(one.t, getattr(one, name), text, role) for text, role, one in differences],
-        )
-        for name, label in (("position", "Δθ [rad]"), ("velocity", "Δθ′ [rad/s]"))
+        Panel(TIME, label, [Trace(one.t, getattr(one, name), text, role) for text, role, one in differences])
+        for name, label in (("position", position), ("velocity", velocity))
     ]
 
 
@@ -208,7 +202,7 @@ def unpaired_difference(data: ReportData) -> Figure:
         "unpaired_difference",
         "Difference over time",
         sentence,
-        _difference_panels([("hardware − simulation", "difference", difference)]),
+        difference_panels([("hardware − simulation", "difference", difference)]),
         section="The thesis's analysis",
     )
 
@@ -233,7 +227,7 @@ def paired_difference(data: ReportData) -> Figure | str:
         "paired_difference",
         "Difference under the same noise",
         sentence,
-        _difference_panels(differences),
+        difference_panels(differences),
         section="Paired comparison",
     )
 

@@ -104,23 +104,24 @@ def seed_of(run: RunData) -> str:
 
 def _occasion(data: ReportData) -> list[tuple[str, str]]:
     """Return when, on which computers and by which command the first run was recorded, as far as its bags say."""
-    pair = data.comparison.pairs[0]
-    tellers = [record_named(one.metadata, "pendulum.recorder") for one in (pair.simulation, pair.hardware)]
     rows = []
     if when := _began(data):
         rows.append(("recorded", f"{when:%Y-%m-%d %H:%M} UTC"))
     if "command" in data.run:
         rows.append(("command", str(data.run["command"])))
     computers = (
-        " · ".join(str(teller[key]) for key in ("host", "system", "rmw") if key in teller) for teller in tellers
+        " · ".join(str(told[key]) for key in ("host", "system", "rmw") if key in told) for told in _recorders(data)
     )
     return [*rows, *(("computer", text) for text in dict.fromkeys(computers) if text)]
 
 
-def _began(data: ReportData) -> datetime | None:
+def _recorders(data: ReportData) -> list[Mapping[str, Any]]:
     pair = data.comparison.pairs[0]
-    tellers = [record_named(one.metadata, "pendulum.recorder") for one in (pair.simulation, pair.hardware)]
-    begun = [began for teller in tellers if isinstance(began := teller.get("started_ns"), int)]
+    return [record_named(one.metadata, "pendulum.recorder") for one in (pair.simulation, pair.hardware)]
+
+
+def _began(data: ReportData) -> datetime | None:
+    begun = [began for told in _recorders(data) if isinstance(began := told.get("started_ns"), int)]
     return datetime.fromtimestamp(min(begun) * 1e-9, timezone.utc) if begun else None
 
 

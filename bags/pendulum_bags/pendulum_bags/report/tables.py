@@ -30,9 +30,9 @@ WEIGHTS = ((1.0, 0.01, 0.1), (1.0, 0.1, 0.1), (100.0, 0.01, 0.1), (100.0, 0.1, 0
 def make_tables(data: ReportData) -> list[Table]:
     """Return all tables that the data allow, in the order of the report."""
     regressions = [table for trials in data.trials for table in _regression(trials)]
-    makers = (_plants, _tests, _paired, _unpaired, _metrics, _eigenvalues, _model)
+    own = (_plants(data), tests_table(data.comparison), _paired(data), _unpaired(data), _metrics(data))
     layers = [evidence_table(result) for result in data.answer.layers if _is_further(result)]
-    return [table for maker in makers for table in [maker(data)] if table is not None] + layers + regressions
+    return [one for one in (*own, _eigenvalues(data), _model(data)) if one is not None] + layers + regressions
 
 
 def _is_further(result: LayerResult) -> bool:
@@ -69,10 +69,6 @@ def _plants(data: ReportData) -> Table:
         f"hardware. {seen_note(data.comparison)}"
     )
     return Table("Plants under noise", sentence, ("", *(_PLANT_NAMES[name] for name in plants)), rows, "Verdict")
-
-
-def _tests(data: ReportData) -> Table:
-    return tests_table(data.comparison)
 
 
 def tests_table(comparison: Comparison) -> Table:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
+
 import numpy as np
 
 from pendulum_bags.figures.figure import Figure, Panel, Trace, thinned
 from pendulum_bags.figures.numbers import quantity
-from pendulum_bags.identification.thesis import (
-    static_holds,
-)
+from pendulum_bags.identification.thesis import static_holds
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.trials import TrialSet
 
@@ -28,8 +29,21 @@ ROLES = 6
 """Looks there are for trials; a seventh looks like the first."""
 
 
-def _of_kind(data: ReportData, kind: str) -> TrialSet | None:
-    return next((one for one in data.trials if one.result.kind == kind), None)
+def _of_experiment(
+    number: int,
+) -> Callable[[Callable[[TrialSet], Figure | str]], Callable[[ReportData], Figure | str]]:
+    """Make a figure of a report from one of the trials of an experiment: without them it says that it needs them."""
+
+    def decorate(draw: Callable[[TrialSet], Figure | str]) -> Callable[[ReportData], Figure | str]:
+        @wraps(draw)
+        def drawn(data: ReportData) -> Figure | str:
+            kind = {1: "inertia_damping", 2: "gravity"}[number]
+            trials = next((one for one in data.trials if one.result.kind == kind), None)
+            return f"needs the trials of experiment {number}" if trials is None else draw(trials)
+
+        return drawn
+
+    return decorate
 
 
 def _found(trials: TrialSet) -> str:
@@ -69,27 +83,21 @@ def _cloud(trials: TrialSet, column: int, label: str, name: str, title: str) -> 
     )
 
 
-def effort_over_velocity(data: ReportData) -> Figure | str:
+@_of_experiment(1)
+def effort_over_velocity(trials: TrialSet) -> Figure:
     """Return effort over velocity, trial by trial."""
-    trials = _of_kind(data, "inertia_damping")
-    if trials is None:
-        return "needs the trials of experiment 1"
     return _cloud(trials, 0, "θ′ [rad/s]", "effort_over_velocity", "Effort over velocity")
 
 
-def effort_over_acceleration(data: ReportData) -> Figure | str:
+@_of_experiment(1)
+def effort_over_acceleration(trials: TrialSet) -> Figure:
     """Return effort over acceleration, trial by trial."""
-    trials = _of_kind(data, "inertia_damping")
-    if trials is None:
-        return "needs the trials of experiment 1"
     return _cloud(trials, 1, "θ″ [rad/s²]", "effort_over_acceleration", "Effort over acceleration")
 
 
-def effort_over_time(data: ReportData) -> Figure | str:
+@_of_experiment(1)
+def effort_over_time(trials: TrialSet) -> Figure:
     """Return measured and fitted effort over time, trial by trial."""
-    trials = _of_kind(data, "inertia_damping")
-    if trials is None:
-        return "needs the trials of experiment 1"
     panels = []
     for number, (trial, recording) in enumerate(zip(trials.result.trials, trials.recordings, strict=True), start=1):
         t = recording.time - recording.time[0]
@@ -103,11 +111,9 @@ def effort_over_time(data: ReportData) -> Figure | str:
     return Figure("trials", "Trials by hand", sentence, panels, stacked=False, section=INERTIA, panel_height=180)
 
 
-def dynamic_phase(data: ReportData) -> Figure | str:
+@_of_experiment(2)
+def dynamic_phase(trials: TrialSet) -> Figure:
     """Return position, velocity and effort of the staircases over time."""
-    trials = _of_kind(data, "gravity")
-    if trials is None:
-        return "needs the trials of experiment 2"
     rows: dict[str, list[Trace]] = {"θ [rad]": [], "θ′ [rad/s]": [], "effort [N m]": []}
     for i, recording in enumerate(trials.recordings):
         start, label, role = float(recording.time[0]), f"trial {i + 1}", f"trial {i % ROLES + 1}"
@@ -123,11 +129,9 @@ def dynamic_phase(data: ReportData) -> Figure | str:
     return Figure("dynamic_phase", "Dynamic phase", sentence, panels, section=GRAVITY, panel_height=150)
 
 
-def static_phase(data: ReportData) -> Figure | str:
+@_of_experiment(2)
+def static_phase(trials: TrialSet) -> Figure | str:
     """Return the effort of the holds at 10, 90 and -10 degrees, all trials, both ways."""
-    trials = _of_kind(data, "gravity")
-    if trials is None:
-        return "needs the trials of experiment 2"
     panels = []
     for degrees in (10.0, 90.0, -10.0):
         traces = []
@@ -155,11 +159,9 @@ def static_phase(data: ReportData) -> Figure | str:
     return Figure("static_phase", "Static phase", sentence, panels, stacked=False, section=GRAVITY, panel_height=200)
 
 
-def effort_over_sine(data: ReportData) -> Figure | str:
+@_of_experiment(2)
+def effort_over_sine(trials: TrialSet) -> Figure:
     """Return the mean effort of each hold over the sine of its angle, with the fit."""
-    trials = _of_kind(data, "gravity")
-    if trials is None:
-        return "needs the trials of experiment 2"
     traces = [
         Trace(trial.regressors[:, 0], trial.response, f"trial {i + 1}", f"trial {i % ROLES + 1}", "points")
         for i, trial in enumerate(trials.result.trials)
