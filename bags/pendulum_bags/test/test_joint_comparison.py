@@ -21,8 +21,7 @@ from pendulum_bags.report.joint_page import joint_page
 from pendulum_bags.report.report_cli import main as report_main
 from pendulum_bags.runs.run_data import joints_of, read_run
 from pendulum_bags.runs.run_record import RUN_RECORD
-from pendulum_bags.verdict.answer import answer_of_joints
-from pendulum_bags.verdict.joints import join_joints
+from pendulum_bags.verdict.answer import answer_of_joints, join_joints
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_msgs_py.contract.cdr import encode_joints

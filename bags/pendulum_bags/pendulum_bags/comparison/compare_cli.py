@@ -164,7 +164,7 @@ class _Told:
         write_figures(comparison_figures(alone) if alone else [joints_together(self.comparisons)], out / "figures")
 
     def print(self) -> None:
-        from pendulum_bags.frequency_response.designs_table import designs_table
+        from pendulum_bags.frequency_response.designs import designs_table
         from pendulum_bags.verdict.terminal import print_answer
         from pendulum_msgs_py.programs.terminal import make_console
 

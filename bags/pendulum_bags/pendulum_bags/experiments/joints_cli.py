@@ -105,7 +105,7 @@ def joints(
         record_joints,
         stand_in_for,
     )
-    from pendulum_bags.frequency_response.designs_table import designs_table
+    from pendulum_bags.frequency_response.designs import designs_table
     from pendulum_bags.frequency_response.joint_designs import joint_designs
     from pendulum_bags.frequency_response.joint_experiment import FOLDER, JointMultisine, measure_joints
     from pendulum_bags.ranking.joint_choice import COST, DURATION, rank_joints, rankable

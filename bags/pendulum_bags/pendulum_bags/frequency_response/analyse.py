@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +31,7 @@ from pendulum_lqr.measured_response import MeasuredResponse, read_response, writ
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 __all__ = [
@@ -61,9 +62,6 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, 
         BagError: A bag cannot be read.
         DataError: It holds no excited plant, or both are of one side.
     """
-    # Late: it needs a reader, which the rest of this room does not.
-    from pendulum_bags.comparison import compare_runs  # noqa: F401
-
     if len(paths) == 1 and (paths[0] / "sim").is_dir() and (paths[0] / "hw").is_dir():
         paths = [paths[0] / "sim", paths[0] / "hw"]
     if len(paths) not in {1, 2}:
@@ -142,63 +140,49 @@ def analyse_responses(
         ParameterError: A text is no design; or the plant has other joints than the responses, or several motors.
         DataError: A policy file cannot be read.
     """
-    if responses[0].joints:
-        return _analyse_joints(
-            responses, plant, designs, scaling, margin, longer or f"{LONGER_OF_JOINTS} --plant {plant}"
-        )
-    parameters = load_plant(plant)
-    model = linearise(parameters)
-    scaling, margin = scaling or DEFAULT_SCALING, GAP_MARGIN if margin is None else margin
     by_label = {response.label: response for response in responses}
-    difference = certifier = None
+    certify: Callable[[Certifier], list[DesignResult]]
+    if responses[0].joints:
+        mechanism = load_mechanism(plant)
+        _refuse_other_joints(mechanism, responses[0])
+        model, (q, r) = linearise_mechanism(mechanism), mechanism.mechanism.weights
+        joints, effort_unit = mechanism.coordinates.joints, mechanism.coordinates.drive_unit
+        units = [joint.unit for joint in joints] + [joint.velocity_unit for joint in joints]
+        scaling = scaling or JointScaling.of_weights(model.states, units, q, r, effort_unit)
+        machine = Machine.beside(by_label["hw"], model) if "hw" in by_label else None
+        longer = longer or f"{LONGER_OF_JOINTS} --plant {plant}"
+        certify = partial(certify_joint_designs, designs, mechanism)
+    else:
+        parameters = load_plant(plant)
+        model = linearise(parameters)
+        scaling, margin = scaling or DEFAULT_SCALING, GAP_MARGIN if margin is None else margin
+        machine = Machine.of(by_label["hw"]) if "hw" in by_label else None
+        longer = longer or LONGER
+        certify = partial(certify_designs, designs, parameters, model, recorded=recorded)
+    certifier = Certifier(model, machine, scaling) if machine is not None else None
+    difference = None
     results: list[DesignResult] = []
     layers: list[LayerResult] = []
-    if "sim" in by_label and "hw" in by_label:
+    if certifier is not None and "sim" in by_label:
+        if margin is None:  # of several joints alone
+            margin = certifier.gain(mechanism_lqr(model, q, r).K[0]).margin
         difference = compare_responses(by_label["sim"], by_label["hw"], model, scaling)
-        layers.append(same_plant(by_label["sim"], by_label["hw"], difference, margin, longer=longer or LONGER))
-    if "hw" in by_label:
-        certifier = Certifier(model, Machine.of(by_label["hw"]), scaling)
-        results = certify_designs(designs, parameters, model, certifier, recorded=recorded)
-        layers.append(which_controllers(certifier, results, longer=longer or LONGER))
+        layers.append(same_plant(by_label["sim"], by_label["hw"], difference, margin, longer=longer))
+    if certifier is not None:
+        results = certify(certifier)
+        layers.append(which_controllers(certifier, results, longer=longer))
     return Analysis(responses, model, plant, difference, certifier, results, layers, scaling)
 
 
-def _analyse_joints(
-    responses: Sequence[MeasuredResponse],
-    plant: str,
-    designs: Sequence[str],
-    scaling: SignalScaling | None,
-    margin: float | None,
-    longer: str,
-) -> Analysis:
-    """Return what responses of a plant of several joints tell; arguments as of :func:`analyse_responses`."""
-    parameters = load_mechanism(plant)
-    coordinates, joints = parameters.coordinates, responses[0].joints
-    driven = joints[responses[0].driven]
+def _refuse_other_joints(parameters: MechanismParameters, measured: MeasuredResponse) -> None:
+    coordinates, joints = parameters.coordinates, measured.joints
+    driven = joints[measured.driven]
     if coordinates.names != joints or coordinates.driven_names != (driven,):
         raise ParameterError(
             f"plant {parameters.name} has joints {', '.join(coordinates.names)}, driven: "
             f"{', '.join(coordinates.driven_names) or 'none'}; expected {', '.join(joints)}, driven: {driven} alone, "
             "as they were measured"
         )
-    model = linearise_mechanism(parameters)
-    q, r = parameters.mechanism.weights
-    units = [joint.unit for joint in coordinates.joints] + [joint.velocity_unit for joint in coordinates.joints]
-    scaling = scaling or JointScaling.of_weights(model.states, units, q, r, coordinates.drive_unit)
-    by_label = {response.label: response for response in responses}
-    difference = certifier = None
-    results: list[DesignResult] = []
-    layers: list[LayerResult] = []
-    if "hw" in by_label:
-        certifier = Certifier(model, Machine.beside(by_label["hw"], model), scaling)
-        results = certify_joint_designs(designs, parameters, certifier)
-        layers.append(which_controllers(certifier, results, longer=longer))
-    if "sim" in by_label and certifier is not None:
-        if margin is None:
-            margin = certifier.gain(mechanism_lqr(model, q, r).K[0]).margin
-        difference = compare_responses(by_label["sim"], by_label["hw"], model, scaling)
-        layers.insert(0, same_plant(by_label["sim"], by_label["hw"], difference, margin, longer=longer))
-    return Analysis(responses, model, plant, difference, certifier, results, layers, scaling)
 
 
 def find_machine(folders: Sequence[Path]) -> Path | None:

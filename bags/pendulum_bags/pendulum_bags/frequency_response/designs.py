@@ -18,8 +18,9 @@ from pendulum_lqr.model import LinearModel
 from pendulum_lqr.policy_file import POLICY_SUFFIX, load_policy
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.programs.terminal import WholeTable
 
-__all__ = ["DesignResult", "certify_designs", "design_rows", "design_text", "policies_of"]
+__all__ = ["DesignResult", "certify_designs", "design_rows", "design_text", "designs_table", "policies_of"]
 
 _NUMBER = r"[-+0-9.eE]+"
 _WEIGHTS = re.compile(rf"q=({_NUMBER}),({_NUMBER})(?:[ ;]+r=({_NUMBER}))?")
@@ -127,6 +128,15 @@ def design_rows(designs: Sequence[DesignResult]) -> list[tuple[str, ...]]:
             )
         )
     return rows
+
+
+def designs_table(designs: Sequence[DesignResult]) -> WholeTable:
+    """Return the table of designs for the terminal."""
+    headings = ("row", "design", "margin b", "loop distance", "modulus on hw", "certified")
+    table = WholeTable(*headings, title="\nDesigns", title_justify="left")
+    for row in design_rows(designs):
+        table.add_row(*row)
+    return table
 
 
 def design_text(name: str) -> str:

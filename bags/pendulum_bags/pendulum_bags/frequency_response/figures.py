@@ -226,7 +226,9 @@ def certified_weights_figure(certifier: Certifier, model: LinearModel) -> Figure
 
 def certified_gains_figure(certifier: Certifier, designs: Sequence[DesignResult]) -> Figure:
     """Draw which gains of u = -kp theta - kd theta_dot are certified, and where the designs lie."""
-    stiffness = max(float(abs(certifier.plant.A[1, 0] / certifier.plant.B[1, 0])), 1e-3) if _rigid(certifier) else 1.0
+    A, B = certifier.plant.A, certifier.plant.B
+    is_rigid = A.shape[0] == 2
+    stiffness = max(float(abs(A[1, 0] / B[1, 0])), 1e-3) if is_rigid else 1.0
     known = [design.K for design in designs if design.K is not None]
     low = 0.5 * min([stiffness, *(K[0] for K in known)])
     high = 20.0 * max([stiffness, *(K[0] for K in known)])
@@ -240,10 +242,6 @@ def certified_gains_figure(certifier: Certifier, designs: Sequence[DesignResult]
     return _set_figure(
         "certified_gains", "Gains that carry over", points, "kp [N m/rad]", "kd [N m s/rad]", "gains", more
     )
-
-
-def _rigid(certifier: Certifier) -> bool:
-    return certifier.plant.A.shape[0] == 2
 
 
 def _class(certifier: Certifier, K: Array) -> int:

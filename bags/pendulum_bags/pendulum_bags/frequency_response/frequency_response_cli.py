@@ -183,7 +183,7 @@ def experiment(
 
 def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output: bool) -> None:
     from pendulum_bags.frequency_response.analyse import write_analysis
-    from pendulum_bags.frequency_response.designs_table import designs_table
+    from pendulum_bags.frequency_response.designs import designs_table
 
     page = None
     if out is not None:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pendulum_bags.comparison import Comparison
-from pendulum_bags.verdict.joints import join_joints
 from pendulum_bags.verdict.layers import Answer, Layer, LayerResult, Mark, read_layers, sum_up
 from pendulum_bags.verdict.same_run import design_plant, same_run_layer
 
-__all__ = ["answer_of", "answer_of_joints"]
+__all__ = ["answer_of", "answer_of_joints", "join_joints"]
 
-
+_WORST_FIRST = (Mark.NO, Mark.UNDECIDED, Mark.NOT_MEASURED, Mark.YES)
 _HOW = {
     Layer.SAME_PLANT: "{} measures it where one joint is driven.",
     Layer.WHICH_CONTROLLERS: "{} measures it where one joint is driven.",
@@ -43,6 +43,29 @@ def answer_of(
     known = {Layer.SAME_RUN, *(one.layer for one in anew)}
     others = [one for folder in folders for one in read_layers(folder) if one.layer not in known]
     return sum_up([same_run_layer(comparison, more=more), *anew, *others], emulated=comparison.is_emulated)
+
+
+def join_joints(results: Mapping[str, LayerResult]) -> LayerResult:
+    """Return what a layer says of a plant, from what it says of each joint: yes where it does of all.
+
+    Since all joints have to agree, more of them make a wrong yes no likelier (an intersection-union test).
+
+    Args:
+        results: The layer's result for each joint, at least one, all of one layer.
+    """
+    first = next(iter(results.values()))
+    mark = next(mark for mark in _WORST_FIRST if any(one.mark is mark for one in results.values()))
+    because = {joint: one for joint, one in results.items() if one.mark is mark}
+    return LayerResult(
+        first.layer,
+        mark,
+        " ".join(f"{joint}: {one.sentence}" for joint, one in because.items()),
+        tuple(
+            replace(row, quantity=f"{joint}: {row.quantity}") for joint, one in results.items() for row in one.evidence
+        ),
+        tuple(dict.fromkeys(step for one in because.values() for step in one.next_steps)),
+        reason="; ".join(f"{joint}: {one.reason}" for joint, one in because.items()),
+    )
 
 
 def answer_of_joints(comparisons: Mapping[str, Comparison], folders: Sequence[Path] = ()) -> Answer:

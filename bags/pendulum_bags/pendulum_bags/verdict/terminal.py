@@ -35,9 +35,7 @@ _STYLES = {
 
 def layers_table(answer: Answer) -> WholeTable:
     """Return the table of the layers: question, mark, sentence."""
-    table = WholeTable(title="The layers of the answer", title_justify="left")
-    for heading in ("layer", "answer", "because"):
-        table.add_column(heading)
+    table = WholeTable("layer", "answer", "because", title="The layers of the answer", title_justify="left")
     for number, result in enumerate(answer.layers, start=1):
         mark = Text(SIGNS[result.mark], _STYLES[result.mark])
         because = Text(textwrap.fill(result.layer.question, _WIDTH), "italic")
