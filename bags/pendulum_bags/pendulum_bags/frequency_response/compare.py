@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.distributions import f_quantile, f_tail
+from pendulum_bags.runs.series import Array
 from pendulum_lqr.gap_metric import DEFAULT_SCALING, SignalScaling, chordal_distance, nu_gap
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.measured_response import MeasuredResponse
@@ -18,7 +19,6 @@ from pendulum_msgs_py.errors import DataError
 
 __all__ = ["SMALLEST", "Difference", "Estimate", "compare_responses", "continuous"]
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 SMALLEST = 0.1

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.frequency_response.record import Record
+from pendulum_bags.runs.series import Array
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_lqr.measured_response import MeasuredResponse
 from pendulum_lqr.multisine import multisine_harmonics
@@ -32,7 +33,6 @@ from pendulum_msgs_py.parameters import validate
 
 __all__ = ["estimate", "periodic_lines"]
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 TRANSIENT = 1.0

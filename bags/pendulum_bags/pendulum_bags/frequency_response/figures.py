@@ -12,6 +12,7 @@ from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.frequency_response.compare import SMALLEST, Difference, continuous
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_bags.frequency_response.result import Analysis
+from pendulum_bags.runs.series import Array
 from pendulum_lqr.certificate import Certifier
 from pendulum_lqr.design import DesignError, output_lqr
 from pendulum_lqr.gap_metric import JointScaling, SignalScaling
@@ -21,7 +22,6 @@ from pendulum_lqr.sampled_response import model_response
 
 __all__ = ["certified_gains_figure", "certified_weights_figure", "gap_figure", "response_figures"]
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 SECTION = "Frequency response"

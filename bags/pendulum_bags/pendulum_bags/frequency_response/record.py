@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from pendulum_bags.experiments.in_process import RunArrays
 from pendulum_bags.runs.run_record import run_record
-from pendulum_bags.runs.series import Signal, unwrap_near_upright
+from pendulum_bags.runs.series import Array, Signal, unwrap_near_upright
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
 
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from pendulum_bags.runs.run_data import RunData
 
 __all__ = ["Record", "record_of_arrays", "record_of_joints", "record_of_run"]
-
-Array = NDArray[np.float64]
 
 _EXACT = 1e-6
 """Largest deviation of a stamp from the raster that counts as none, as a share of the period."""

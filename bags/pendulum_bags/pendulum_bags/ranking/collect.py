@@ -9,19 +9,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_bags.comparison.metrics import episode_of, metrics_of
 from pendulum_bags.ranking.contender import Contender, contenders_of
 from pendulum_bags.runs.find_bags import bags_below
 from pendulum_bags.runs.run_data import is_emulated, read_run
 from pendulum_bags.runs.run_record import run_record
+from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
 from pendulum_rosbag.reader import read_bag
 
 __all__ = ["WEIGHTS", "collect_contenders", "cost_parts"]
-
-Array = NDArray[np.float64]
 
 WEIGHTS = (100.0, 0.01, 0.1)
 """q11 [1/rad^2], q22 [s^2/rad^2] and r [1/(N m)^2] of the thesis's choice: the cost that its LQR minimises."""

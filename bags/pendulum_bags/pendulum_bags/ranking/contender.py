@@ -6,13 +6,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["PARTS", "Contender", "Interval", "compared_runs", "contenders_of", "refuse_no_number"]
-
-Array = NDArray[np.float64]
 
 PARTS = ("angle", "velocity", "torque")
 """Parts of the cost: q11 e^2, q22 v^2 and r u^2, each a mean over the run."""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.joint_run import JointRun, JointSettings, design_file, fall_time
@@ -16,6 +15,7 @@ from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.frequency_response.joint_designs import JointDesign
 from pendulum_bags.ranking.contender import contenders_of
 from pendulum_bags.ranking.ranking import Ranking, rank
+from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.contract.names import EFFORT_COMMAND, JOINT_STATES
 from pendulum_msgs_py.errors import ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
@@ -29,8 +29,6 @@ COST = "Cost: mean of x' Q x + u' R u with the weights of the plant's own LQR, w
 DURATION = 5.0
 """Longest noise of each run [s]."""
 _LEAST = 3
-
-Array = NDArray[np.float64]
 
 
 def rankable(designs: Sequence[JointDesign]) -> Sequence[JointDesign]:

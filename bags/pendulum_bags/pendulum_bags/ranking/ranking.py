@@ -23,12 +23,11 @@ from numpy.typing import NDArray
 
 from pendulum_bags.ranking.contender import PARTS, Contender, Interval, compared_runs, refuse_no_number
 from pendulum_bags.ranking.regret import regret_share
+from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import without_nan
 
 __all__ = ["Ranking", "WrongPair", "mmrv", "rank"]
-
-Array = NDArray[np.float64]
 
 _REPLICATES = 2000
 _LEAST = 3

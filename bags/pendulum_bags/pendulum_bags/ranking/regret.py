@@ -6,14 +6,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.ranking.contender import Contender, Interval, compared_runs
 
 __all__ = ["regret_share"]
-
-Array = NDArray[np.float64]
 
 _NAMED = 3
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.runs.run_data import find_prefix
 from pendulum_bags.runs.run_record import run_record
+from pendulum_bags.runs.series import Array
 from pendulum_lqr.controller import controller_parameters, make_controller
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import from_upright
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from pendulum_bags.figures.figure import Figure
 
 __all__ = ["ControllerReplay", "parse_values", "recorded_controller", "replay_controller"]
-
-Array = NDArray[np.float64]
 
 SETTLED = 1e-9
 """Torque difference up to which two commands count as equal [N m]."""

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_bags.identification.model import FitModel, from_plant, to_plant
 from pendulum_bags.identification.problem import Piece, prepare, simulate
@@ -14,6 +13,7 @@ from pendulum_bags.identification.result import load_fit_model
 from pendulum_bags.identification.window_score import free_run, window_score
 from pendulum_bags.replay.result import HorizonError, InputReplay, horizon_errors
 from pendulum_bags.runs.datasets import INPUT_KINDS, Recording
+from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
@@ -88,7 +88,7 @@ def _horizons(model: FitModel, recording: Recording, longest: float) -> tuple[Ho
     size = recording.time.size
     whole = prepare(recording, None, across_gaps=True)
 
-    def error_from(first: int, steps: int) -> NDArray[np.float64]:
+    def error_from(first: int, steps: int) -> Array:
         tail = prepare(recording.rows(first), None, across_gaps=True) if size - first >= 3 else whole
         part = slice(first, first + steps + 1)
         window = np.array([[part.start, part.stop]], dtype=np.int64)

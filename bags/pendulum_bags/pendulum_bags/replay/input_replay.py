@@ -8,21 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.replay.fit_replay import replay_fit
 from pendulum_bags.replay.result import InputReplay, horizon_errors
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.read_recording import read_recording
+from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.plant import Plant
 from pendulum_sim.plants import make_plant
 
 __all__ = ["replay_input", "replay_recording"]
-
-Array = NDArray[np.float64]
 
 SMOOTHING = 0.02
 """Half width of the parabola that gives the measured state at a sample [s]: quantised angles have no velocity."""

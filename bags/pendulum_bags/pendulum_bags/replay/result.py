@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_bags.figures.figure import Figure, Panel, Trace
+from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["HorizonError", "InputReplay", "fit_percent", "horizon_errors"]
-
-Array = NDArray[np.float64]
 
 MOST_STARTS = 60
 """Starts of k-step predictions: enough for a smooth curve, spread over the recording."""
