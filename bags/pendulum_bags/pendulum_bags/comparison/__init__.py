@@ -3,19 +3,16 @@
 from pendulum_bags.comparison.compare import Comparison, compare, compare_folders, compare_runs
 from pendulum_bags.comparison.equivalence import EquivalenceTest, Outcome, Verdict
 from pendulum_bags.comparison.margins import Margins
-from pendulum_bags.comparison.pairs import Difference, Pair, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks
 from pendulum_bags.runs.run_data import RunData, read_run
 from pendulum_bags.runs.series import Series, Signal
 
 __all__ = [
     "Comparison",
-    "Difference",
     "EquivalenceTest",
     "Looks",
     "Margins",
     "Outcome",
-    "Pair",
     "RunData",
     "Series",
     "Signal",
@@ -23,6 +20,5 @@ __all__ = [
     "compare",
     "compare_folders",
     "compare_runs",
-    "interpolated_difference",
     "read_run",
 ]

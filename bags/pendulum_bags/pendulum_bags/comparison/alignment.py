@@ -62,8 +62,8 @@ def cross_correlation(first: Array, second: Array, reach: int) -> Array:
     return curve
 
 
-def _peak(first: Array, second: Array, period: float, of: str, longest: float) -> Alignment:
-    reach = round(longest / period)
+def _peak(first: Array, second: Array, period: float, of: str) -> Alignment:
+    reach = round(LONGEST_LAG / period)
     if first.size < 2 * reach + 8:
         reach = max(1, (first.size - 8) // 2)
     if reach < 1 or first.size < 10:
@@ -80,7 +80,7 @@ def _peak(first: Array, second: Array, period: float, of: str, longest: float) -
     return Alignment(period * (top - reach + offset), float(curve[top]), float(curve[reach]), lags, curve, of)
 
 
-def align_motion(first: Series, second: Series, longest: float = LONGEST_LAG) -> Alignment:
+def align_motion(first: Series, second: Series) -> Alignment:
     """Estimate how much the second motion lags the first, from their velocities.
 
     Velocity, not angle: the angle of a regulated pendulum changes slowly, and its correlation has a flat top.
@@ -89,21 +89,20 @@ def align_motion(first: Series, second: Series, longest: float = LONGEST_LAG) ->
     start, stop = max(first.t[0], second.t[0]), min(first.t[-1], second.t[-1])
     times = uniform_times(float(start), float(stop), period)
     a, b = (np.interp(times, one.t, one.velocity) for one in (first, second))
-    return _peak(a, b, period, "velocity", longest)
+    return _peak(a, b, period, "velocity")
 
 
-def align_signals(first: Signal, second: Signal, period: float, longest: float = LONGEST_LAG) -> Alignment:
+def align_signals(first: Signal, second: Signal, period: float) -> Alignment:
     """Estimate how much the second signal lags the first; both are held from sample to sample.
 
     Args:
         first: Signal.
         second: Signal.
         period: Resolution of the lags [s].
-        longest: Largest lag [s].
     """
     start, stop = max(first.t[0], second.t[0]), min(first.t[-1], second.t[-1])
     if not stop > start:
         raise DataError(f"{first.name} and {second.name} share no time; expected signals that overlap")
     # In the middle of each period, so that rounding of stamps does not pick the neighbouring sample.
     times = uniform_times(float(start), float(stop), period) + 0.5 * period
-    return _peak(first.held_at(times), second.held_at(times), period, first.name, longest)
+    return _peak(first.held_at(times), second.held_at(times), period, first.name)

@@ -40,10 +40,9 @@ class Episode:
     step: float = 0.0
 
 
-def episode_of(series: Series, set_point: float = UPRIGHT, *, step: bool = False) -> Episode:
-    """Return the episode of a motion; ``step`` takes its first angle as the start of a step to the set-point."""
-    error = series.position - set_point
-    return Episode(series.t - series.t[0], error, series.velocity, series.effort, float(error[0]) if step else 0.0)
+def episode_of(series: Series, set_point: float = UPRIGHT) -> Episode:
+    """Return the episode of a motion that is to stay at the set-point."""
+    return Episode(series.t - series.t[0], series.position - set_point, series.velocity, series.effort)
 
 
 def _integral(episode: Episode, values: Array) -> float:

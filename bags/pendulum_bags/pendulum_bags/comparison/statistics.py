@@ -24,7 +24,6 @@ __all__ = [
     "Resampled",
     "block_length",
     "bootstrap_interval",
-    "bootstrap_means",
     "describe",
     "kolmogorov_smirnov",
     "quantile_pairs",
@@ -102,25 +101,13 @@ def block_length(values: ArrayLike) -> int:
     return int(np.clip(math.ceil(best), 1, longest))
 
 
-def bootstrap_means(
-    runs: Sequence[Array],
-    lengths: Sequence[int],
-    *,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-    runs_differ: bool = True,
+def _bootstrap_means(
+    runs: Sequence[Array], lengths: Sequence[int], *, resamples: int, seed: int, runs_differ: bool
 ) -> tuple[Array, Array]:
     """Resample runs, and blocks within each run, and return the mean of every column.
 
     Several runs are drawn with replacement first, so that what differs from run to run counts; the blocks inside
-    them are circular. With one run only the blocks are drawn.
-
-    Args:
-        runs: Samples of each run, shape (n_i, m).
-        lengths: Block length of each run, in samples.
-        resamples: Number of resamples, B.
-        seed: Seed of the resampling; the same data give the same interval.
-        runs_differ: Whether runs may differ by more than their seeds; else only blocks are drawn.
+    them, whose lengths are in samples, are circular. With one run only the blocks are drawn.
 
     Returns:
         Means of the columns over all samples of each resample, shape (B, m); and the same with each run drawn once,
@@ -220,7 +207,7 @@ def resample(
     Args:
         runs: Samples of each run, shape (n_i, m).
         resamples: Number of resamples, B.
-        seed: Seed of the resampling.
+        seed: Seed of the resampling; the same data give the same interval.
         runs_differ: Whether runs may differ by more than their seeds, as those of a real machine do; lockstep repeats
             of an emulator do not, and their blocks are all alike.
     """
@@ -235,7 +222,7 @@ def resample(
     pooled = np.concatenate(runs).mean(axis=0)
     # Sums of large equal numbers would lose what differs between resamples.
     centred = [samples - pooled for samples in runs]
-    draws, within = bootstrap_means(centred, lengths, resamples=resamples, seed=seed, runs_differ=runs_differ)
+    draws, within = _bootstrap_means(centred, lengths, resamples=resamples, seed=seed, runs_differ=runs_differ)
     return Resampled(pooled, pooled + draws, pooled + within, blocks, len(runs) if runs_differ else 1)
 
 
@@ -321,7 +308,7 @@ def kolmogorov_smirnov(first: ArrayLike, second: ArrayLike) -> KolmogorovSmirnov
     return KolmogorovSmirnov(distance, float(values[index]), sizes, p_value)
 
 
-def quantile_pairs(first: ArrayLike, second: ArrayLike, count: int = 99) -> tuple[Array, Array]:
-    """Return equal quantiles of two samples, for a quantile plot; each of shape (count,)."""
-    levels = (np.arange(count) + 0.5) / count
+def quantile_pairs(first: ArrayLike, second: ArrayLike) -> tuple[Array, Array]:
+    """Return 99 equal quantiles of two samples, for a quantile plot; each of shape (99,)."""
+    levels = (np.arange(99) + 0.5) / 99
     return np.quantile(np.asarray(first), levels), np.quantile(np.asarray(second), levels)

@@ -267,15 +267,14 @@ def noise_ratio(tasks: Tasks) -> float:
     return long / std_under_held_noise(PERIOD["sim"])
 
 
-def std_under_held_noise(hold_time: float, amplitude: float = 2.5) -> float:
-    """Return the standard deviation of theta of the thesis's loop under uniform noise, for a run without end.
+def std_under_held_noise(hold_time: float) -> float:
+    """Return the standard deviation of theta of the thesis's loop under uniform noise of 2.5 N m, for an endless run.
 
     The covariance at the moments at which the noise changes solves P = A P A' + B B' var; between them it is carried
     on, and averaged.
 
     Args:
         hold_time: How long each sample of the noise is held, a multiple of 2 ms [s].
-        amplitude: Largest torque of the noise [N m].
 
     Returns:
         Standard deviation [rad].
@@ -285,7 +284,7 @@ def std_under_held_noise(hold_time: float, amplitude: float = 2.5) -> float:
     period = PERIOD["sim"]
     sampled = discretise(_thesis_model(), period)
     closed = sampled.A - sampled.B @ np.atleast_2d(_gain(0.1))
-    variance = amplitude**2 / 3.0
+    variance = 2.5**2 / 3.0
     steps = round(hold_time / period)
     powers = [np.eye(2)]
     inputs = [np.zeros((2, 1))]

@@ -25,12 +25,12 @@ def quantity(value: float, unit: str = "", digits: int = 3) -> str:
     return f"{text.replace('-', '−')} {unit}".rstrip()
 
 
-def ratio_in_words(ratio: float, larger: str = "larger", smaller: str = "smaller") -> str:
+def ratio_in_words(ratio: float) -> str:
     """Return a ratio as a reader would say it, such as ``12 % smaller`` or ``2.2 times as large``."""
     if 0.995 <= ratio <= 1.005:
         return "equal within half a per cent"
     if ratio >= 1.75:
-        return f"{ratio:.2g} times as {larger.removesuffix('r') if larger == 'larger' else larger}"
+        return f"{ratio:.2g} times as large"
     if ratio > 1.0:
-        return f"{100.0 * (ratio - 1.0):.2g} % {larger}"
-    return f"{100.0 * (1.0 - ratio):.2g} % {smaller}"
+        return f"{100.0 * (ratio - 1.0):.2g} % larger"
+    return f"{100.0 * (1.0 - ratio):.2g} % smaller"

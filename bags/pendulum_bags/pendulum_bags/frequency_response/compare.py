@@ -26,6 +26,8 @@ SMALLEST = 0.1
 ones are often real and never matter: an encoder's step that falls alike in every period, friction under a slightly
 other motion."""
 _LEAST_LINES = 5
+_ERROR = 0.05
+"""Probability of an error over all lines together."""
 
 
 @dataclass(frozen=True)
@@ -45,46 +47,39 @@ class Difference:
         frequency: Shape (n,) [Hz].
         first, second: Responses, shape (outputs, n) [rad/(N m), rad/s/(N m)].
         ratio: Second over first by the velocity, of several joints that of the driven one, shape (n,).
-        ratio_radius: Radius of its 95 % disc, joint over all frequencies, shape (n,).
         probability: Of a difference at least as large at a line if the plants differed by no more than ``SMALLEST``,
             shape (outputs, n).
         gap: Chordal distance at each frequency, shape (n,).
-        gap_low: Lower joint limit of it, shape (n,).
-        gap_high: Upper one, shape (n,).
+        gap_high: Upper joint limit of it, shape (n,).
         nu_gap: Largest gap with its joint interval; 1 where the winding number condition fails.
         gap_at: Frequency of the largest gap [Hz].
         delay: By which the second answers later than the first [s].
         gain: Second's answer beside the first's, over the octaves [-].
         scaling: Units of the gap.
-        confidence: Of all intervals and of ``found``.
     """
 
     frequency: Array
     first: Complex
     second: Complex
     ratio: Complex
-    ratio_radius: Array
     probability: Array
     gap: Array
-    gap_low: Array
     gap_high: Array
     nu_gap: Estimate
     gap_at: float
     delay: Estimate
     gain: Estimate
     scaling: SignalScaling
-    confidence: float = 0.95
 
     @property
     def found(self) -> bool:
         """Whether one that counts was found anywhere, with an error of at most 5 % over all lines (Bonferroni)."""
-        return bool(self.probability.size * float(self.probability.min()) < 1.0 - self.confidence)
+        return bool(self.probability.size * float(self.probability.min()) < _ERROR)
 
     @property
     def lines_that_differ(self) -> int:
         """Number of lines at which angle or velocity differ."""
-        limit = (1.0 - self.confidence) / self.probability.size
-        return int(np.sum(np.any(self.probability < limit, axis=0)))
+        return int(np.sum(np.any(self.probability < _ERROR / self.probability.size, axis=0)))
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as JSON values."""
@@ -129,8 +124,7 @@ def compare_responses(
     freedom = variance**2 / (spread_one**4 / (first.blocks - 1.0) + spread_two**4 / (second.blocks - 1.0))
     excess = np.maximum(np.abs(two - moved) - SMALLEST * np.abs(moved), 0.0)
     probability = f_tail(excess**2 / variance, 2.0, 2.0 * freedom)
-    tail = 0.05 / probability.size
-    quantile = np.sqrt(f_quantile(1.0 - tail, 2.0, 2.0 * freedom))
+    quantile = np.sqrt(f_quantile(1.0 - _ERROR / probability.size, 2.0, 2.0 * freedom))
     moves = second.driven_velocity
     ratio = two[moves] / moved[moves]
     relative = np.sqrt(variance[moves]) / np.abs(moved[moves])
@@ -139,8 +133,8 @@ def compare_responses(
     at = int(np.argmax(gap))
     whole = Estimate(found.value, float(low.max()), float(high.max())) if found.winding else Estimate(1.0, 1.0, 1.0)
     return Difference(
-        lines, moved, two, ratio, quantile[moves] * relative, np.asarray(probability, dtype=np.float64), gap, low, high,
-        whole, float(lines[at]), _delay(lines, ratio, relative), _gain(ratio, relative), scaling,
+        lines, moved, two, ratio, np.asarray(probability, dtype=np.float64), gap, high, whole,
+        float(lines[at]), _delay(lines, ratio, relative), _gain(ratio, relative), scaling,
     )  # fmt: skip
 
 

@@ -63,14 +63,13 @@ class Narrowed:
         return {**asdict(self), "worth": self.worth if math.isfinite(self.worth) else None}
 
 
-def narrow(hardware: ArrayLike, simulation: ArrayLike, further: ArrayLike, level: float = 0.95) -> Narrowed:
-    """Return the mean on the hardware with its interval, without and with simulated runs.
+def narrow(hardware: ArrayLike, simulation: ArrayLike, further: ArrayLike) -> Narrowed:
+    """Return the mean on the hardware with its 95 % interval, without and with simulated runs.
 
     Args:
         hardware: Costs of n runs, shape (n,).
         simulation: Costs of the simulated runs under the same seeds, shape (n,).
         further: Costs of simulated runs under other seeds, shape (N,).
-        level: Probability of the intervals.
 
     Raises:
         DataError: There are too few pairs, or no further runs.
@@ -82,7 +81,7 @@ def narrow(hardware: ArrayLike, simulation: ArrayLike, further: ArrayLike, level
             f"got {n} hardware and {s.size} simulated runs under their seeds, and {more.size} under others; expected "
             f"at least {LEAST_PAIRS} pairs and 1 more simulated run"
         )
-    alone = Interval(*mean_interval(h, level))
+    alone = Interval(*mean_interval(h))
     mean = alone.value
     every = np.concatenate([s, more])
     around = s - s.mean()
@@ -97,7 +96,7 @@ def narrow(hardware: ArrayLike, simulation: ArrayLike, further: ArrayLike, level
     variance = noise + rest
     freedom = variance**2 / (noise**2 / (n - 2) + rest**2 / (every.size - 1))
     value = mean + slope * shift
-    half = float(student_quantile(0.5 + 0.5 * level, freedom)) * math.sqrt(variance)
+    half = float(student_quantile(0.975, freedom)) * math.sqrt(variance)
     together = Interval(value, value - half, value + half)
     return Narrowed(alone, together, n, more.size, float(np.corrcoef(h, s)[0, 1]))
 

@@ -40,14 +40,13 @@ class Words:
     cost: str = "Cost: mean of q11 e² + q22 v² + r u², that of the thesis's LQR unless other weights were asked for."
 
 
-def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN, words: Words = Words()) -> LayerResult:
+def same_choice(ranking: Ranking, words: Words = Words()) -> LayerResult:
     """Return layer 4: yes where the regret is small, no where large, undecided where its runs scatter or are few.
 
     A pick that fails on the hardware in any run is a no, whatever it costs.
 
     Args:
         ranking: The ranking.
-        margin: Regret that does not matter, as a share of the hardware's best cost.
         words: How its runs were made.
     """
     regret = ranking.regret_share
@@ -55,9 +54,9 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN, words: Words = 
     fails = ""
     if ranking.pick_failed:
         fails = f"which fails on the hardware in {ranking.pick_failed} of {ranking.pick_runs} runs"
-    if fails or share[1] > margin:
+    if fails or share[1] > REGRET_MARGIN:
         mark = Mark.NO
-    elif share[2] <= margin:
+    elif share[2] <= REGRET_MARGIN:
         mark = Mark.YES
     else:
         mark = Mark.UNDECIDED
@@ -81,7 +80,7 @@ def same_choice(ranking: Ranking, margin: float = REGRET_MARGIN, words: Words = 
             ends[0],
             ends[1],
             ends[2],
-            f"at most {100.0 * margin:g} %",
+            f"at most {100.0 * REGRET_MARGIN:g} %",
             mark,
             note,
         ),

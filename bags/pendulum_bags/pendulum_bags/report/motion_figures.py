@@ -38,7 +38,7 @@ def _deviation(series: Series) -> Array:
     return np.asarray(series.position - np.pi)
 
 
-def _under_noise(run: RunData, role: str, name: str, title: str, section: str) -> Figure:
+def _under_noise(run: RunData, role: str, name: str, title: str) -> Figure:
     window = run.window
     torque = [Trace(window.t, window.effort, "controller torque u", role, "step")]
     if run.disturbance is not None:
@@ -56,7 +56,7 @@ def _under_noise(run: RunData, role: str, name: str, title: str, section: str) -
         Panel(TIME, VELOCITY, [Trace(window.t, window.velocity, "", role)]),
         Panel(TIME, TORQUE, torque),
     ]
-    return Figure(name, title, sentence, panels, section=section, panel_height=150)
+    return Figure(name, title, sentence, panels, section="Plants under noise", panel_height=150)
 
 
 def simulation_under_noise(data: ReportData) -> Figure:
@@ -64,13 +64,13 @@ def simulation_under_noise(data: ReportData) -> Figure:
     run = data.comparison.own[0]
     own = run is not data.comparison.pairs[0].simulation
     title = "Simulation under noise" + (", by the thesis's own protocol" if own else "")
-    return _under_noise(run, "own alone" if own else "sim", "simulation_under_noise", title, "Plants under noise")
+    return _under_noise(run, "own alone" if own else "sim", "simulation_under_noise", title)
 
 
 def hardware_under_noise(data: ReportData) -> Figure:
     """Return the hardware under noise."""
     run = data.comparison.pairs[0].hardware
-    return _under_noise(run, "hw alone", "hardware_under_noise", "Hardware under noise", "Plants under noise")
+    return _under_noise(run, "hw alone", "hardware_under_noise", "Hardware under noise")
 
 
 def both_panel(label: str, sim: Series, hw: Series, values: Callable[[Series], Array], kind: Kind = "line") -> Panel:

@@ -43,7 +43,6 @@ def write_report(
     folders: Sequence[str | os.PathLike[str]] = (),
     trials: Sequence[str | os.PathLike[str]] = (),
     recordings: Sequence[Path] | None = (),
-    margin: MarginArgument = None,
     formats: Sequence[str] = ("png", "pdf"),
     answer: Answer | None = None,
     certified: Analysis | None = None,
@@ -60,7 +59,6 @@ def write_report(
         trials: Folders of the thesis's identification experiments, each with bags ``trial_1``, ``trial_2``, ...
         recordings: Recordings of real pendulums to replay; ``None`` for the one that lies beside the project, if any:
             the project's own experiment shows that one, a report of other runs only what was asked for.
-        margin: What difference does not matter.
         formats: Formats of the figures.
         answer: The sum of all layers; by default of the comparison and of what the run folder keeps.
         certified: Which designs carry over to the measured machine; by default as the run folder's response says.
@@ -78,9 +76,7 @@ def write_report(
 
     out = Path(run_folder)
     if comparison is None:
-        comparison = compare_folders(
-            list(folders) or [out], margin=margin_of(summary) if margin is None else margin, open_bag=open_bag
-        )
+        comparison = compare_folders(list(folders) or [out], margin=margin_of(summary), open_bag=open_bag)
     content = {**comparison.to_json(), **(summary or {})}
     found = [find_real_recording()] if recordings is None else list(recordings)
     replays = [

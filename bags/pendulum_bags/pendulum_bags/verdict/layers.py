@@ -24,7 +24,6 @@ __all__ = [
     "LayerResult",
     "Mark",
     "name_hardware",
-    "not_measured",
     "read_layers",
     "sum_up",
     "write_layer",
@@ -172,16 +171,6 @@ class LayerResult:
             raise DataError(f"the content is no result of a layer: {error}") from error
 
 
-def not_measured(layer: Layer, how: str) -> LayerResult:
-    """Return the result of a layer that nobody measured.
-
-    Args:
-        layer: Which.
-        how: The command that measures it.
-    """
-    return LayerResult(layer, Mark.NOT_MEASURED, f"Not measured yet; to measure it: {how}.", reason=how)
-
-
 @dataclass(frozen=True)
 class Answer:
     """The sum of all layers.
@@ -208,7 +197,7 @@ class Answer:
         }
 
 
-HOW = {
+_HOW = {
     Layer.SAME_RUN: "make experiment",
     Layer.SAME_PLANT: "python -m pendulum_bags experiment frequency_response",
     Layer.WHICH_CONTROLLERS: "python -m pendulum_bags experiment frequency_response",
@@ -236,7 +225,7 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
         if result.layer in given:
             raise DataError(f"layer {result.layer.title!r} was given twice; expected each once")
         given[result.layer] = _named(result, emulated=emulated)
-    layers = tuple(given.get(layer) or not_measured(layer, HOW[layer]) for layer in Layer)
+    layers = tuple(given.get(layer) or _not_measured(layer) for layer in Layer)
     by_mark = {mark: [result for result in layers if result.mark is mark] for mark in Mark}
     measured = [result for result in layers if result.mark is not Mark.NOT_MEASURED]
     if by_mark[Mark.NO]:
@@ -261,6 +250,11 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
         titles = [f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED] if result.reason == how]
         steps[f"Measure {_listed(titles)}: {how}"] = None
     return Answer(mark, text, layers, tuple(steps))
+
+
+def _not_measured(layer: Layer) -> LayerResult:
+    how = _HOW[layer]
+    return LayerResult(layer, Mark.NOT_MEASURED, f"Not measured yet; to measure it: {how}.", reason=how)
 
 
 def _listed(names: Sequence[str]) -> str:
