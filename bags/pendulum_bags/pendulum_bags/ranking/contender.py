@@ -47,6 +47,12 @@ class Contender:
         rows = self.sim if side == "sim" else self.hw
         return np.asarray(rows.mean(axis=0), dtype=np.float64)
 
+    def by_seed(self, side: str) -> dict[int, float]:
+        """Return the mean cost under each seed on a side: runs that repeat a seed are no independent ones."""
+        rows, seeds = (self.sim, self.sim_seeds) if side == "sim" else (self.hw, self.hw_seeds)
+        costs = rows.sum(axis=1)
+        return {seed: float(np.mean(costs[np.array(seeds) == seed])) for seed in sorted(set(seeds))}
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -70,21 +76,16 @@ def contenders_of(
     for name, sides in costs.items():
         if not (sides.get("sim") and sides.get("hw")):
             continue
-        rows: dict[str, Array] = {}
-        failed: dict[str, int] = {}
-        seeds: dict[str, tuple[int, ...]] = {}
-        for side in ("sim", "hw"):
-            runs = sorted(sides[side], key=lambda run: run[0])
-            kept = [parts for _, parts in runs if parts is not None]
-            rows[side] = np.array(kept, dtype=np.float64).reshape(-1, len(PARTS))
-            failed[side] = len(runs) - len(kept)
-            seeds[side] = tuple(seed for seed, parts in runs if parts is not None)
-        found.append(
-            Contender(
-                name, rows["sim"], rows["hw"], failed["sim"], failed["hw"], seeds["sim"], seeds["hw"], name not in real
-            )
-        )
+        (sim, sim_failed, sim_seeds), (hw, hw_failed, hw_seeds) = (_side(sides[side]) for side in ("sim", "hw"))
+        found.append(Contender(name, sim, hw, sim_failed, hw_failed, sim_seeds, hw_seeds, name not in real))
     return found
+
+
+def _side(runs: Sequence[tuple[int, Array | None]]) -> tuple[Array, int, tuple[int, ...]]:
+    """Return rows by seed, how many runs failed, and the seeds of the rows."""
+    kept = sorted(((seed, parts) for seed, parts in runs if parts is not None), key=lambda run: run[0])
+    rows = np.array([parts for _, parts in kept], dtype=np.float64).reshape(-1, len(PARTS))
+    return rows, len(runs) - len(kept), tuple(seed for seed, _ in kept)
 
 
 def refuse_no_number(contenders: Sequence[Contender]) -> None:
@@ -108,10 +109,8 @@ def compared_runs(one: Contender, other: Contender) -> tuple[Array, Array, bool]
     Runs under one seed share their disturbance. Where both ran under two common seeds or more, these alone are
     compared, with the mean of what was repeated under a seed; otherwise all runs of both, as independent ones.
     """
-    both = sorted(set(one.hw_seeds) & set(other.hw_seeds))
+    ones, others = one.by_seed("hw"), other.by_seed("hw")
+    both = sorted(ones.keys() & others.keys())
     if len(both) < 2:
         return one.hw.sum(axis=1), other.hw.sum(axis=1), False
-    first, second = (
-        np.array([who.hw.sum(axis=1)[np.array(who.hw_seeds) == seed].mean() for seed in both]) for who in (one, other)
-    )
-    return first, second, True
+    return np.array([ones[seed] for seed in both]), np.array([others[seed] for seed in both]), True

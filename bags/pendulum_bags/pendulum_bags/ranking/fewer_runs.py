@@ -107,14 +107,7 @@ def narrow_all(contenders: Sequence[Contender]) -> dict[str, Narrowed]:
     for one in contenders:
         if one.sim_failed or one.hw_failed or not (one.sim_seeds and one.hw_seeds):
             continue
-        # A seed that was repeated is no independent run: its mean counts once.
-        sim, hw = (
-            {
-                seed: float(np.mean([cost for at, cost in zip(seeds, rows.sum(axis=1), strict=True) if at == seed]))
-                for seed in sorted(set(seeds))
-            }
-            for seeds, rows in ((one.sim_seeds, one.sim), (one.hw_seeds, one.hw))
-        )
+        sim, hw = one.by_seed("sim"), one.by_seed("hw")
         both = sorted(sim.keys() & hw.keys())
         more = sorted(sim.keys() - hw.keys())
         if len(both) >= LEAST_PAIRS and more:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report.data import ReportData
-from pendulum_bags.report.tables import typeset
+from pendulum_bags.report.tables import parameter_rows
 from pendulum_bags.runs.run_data import OpenBag, RunData, is_emulated
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.contract import names
@@ -22,11 +21,7 @@ def emulator_table(data: ReportData) -> Table | None:
     plant = _emulated_plant(hardware, data.open_bag) if is_emulated(hardware) else None
     if plant is None:
         return None
-    rows = [
-        (spec.name, quantity(getattr(part, spec.name), "", 6), typeset(spec.unit), typeset(spec.description))
-        for specs, part in ((PLANT_SPECS, plant), (DRIVETRAIN_SPECS, plant.drivetrain))
-        for spec in specs
-    ]
+    rows = [*parameter_rows(PLANT_SPECS, plant), *parameter_rows(DRIVETRAIN_SPECS, plant.drivetrain)]
     return Table(
         "Constants of the emulator",
         f"No machine was measured: these constants ({plant.name}) took the place of one, those of the link first, then "

@@ -75,7 +75,7 @@ def report(
             raise BagError(f"run folder {bad} does not exist")
         raise BagError(f"run folder {bad} has no bags sim and hw; expected run folders, or two bags")
     alone = folders[0] if pooled and len(folders) == 1 else None
-    target = out or alone or _common(folders)
+    target = out or alone or folders[0].resolve().parent / "report"
     kept = [*([alone] if alone else ()), *(layers or ())]
     formats = ("png",) if png_only else ("png", "pdf")
     with KeptBags() as bags:
@@ -133,11 +133,6 @@ def _summary(folder: Path) -> dict[str, object] | None:
         return None
     kept = ("experiment", "seed", "strategy", "versions", "git_revision", "verdict")
     return {key: content[key] for key in kept if key in content} if isinstance(content, dict) else None
-
-
-def _common(folders: Sequence[Path]) -> Path:
-    """Return where a report of several goes: ``report`` beside the first."""
-    return folders[0].resolve().parent / "report"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,10 @@ from pendulum_bags.verdict.evidence import evidence_table
 from pendulum_bags.verdict.same_run import seen_note
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
+from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 
-__all__ = ["make_tables", "tests_table", "typeset"]
+__all__ = ["make_tables", "parameter_rows", "tests_table", "typeset"]
 
 WEIGHTS = ((1.0, 0.01, 0.1), (1.0, 0.1, 0.1), (100.0, 0.01, 0.1), (100.0, 0.1, 0.1))
 """q11, q22 and r of the combinations in the thesis."""
@@ -222,13 +223,17 @@ def _model(data: ReportData) -> Table | None:
     plant = data.plant
     if plant is None:
         return None
-    rows = [
-        (spec.name, quantity(getattr(plant, spec.name), "", 6), typeset(spec.unit), typeset(spec.description))
-        for spec in PLANT_SPECS
-    ]
     sentence = f"Simulation and design of the controller use the plant {plant.name!r}: M θ″ + b θ′ + G sin θ = u + d."
     head = ("parameter", "value", "unit", "meaning")
-    return Table("Parameters of the model", sentence, head, rows, "Model", folded=True)
+    return Table("Parameters of the model", sentence, head, parameter_rows(PLANT_SPECS, plant), "Model", folded=True)
+
+
+def parameter_rows(specs: Sequence[ParameterSpec], values: object) -> list[tuple[str, ...]]:
+    """Return name, value, unit and meaning of parameters, which are attributes of an object."""
+    return [
+        (spec.name, quantity(getattr(values, spec.name), "", 6), typeset(spec.unit), typeset(spec.description))
+        for spec in specs
+    ]
 
 
 def _regression(trials: TrialSet) -> list[Table]:

@@ -14,6 +14,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import without_nan
 
@@ -43,27 +44,25 @@ class Mark(str, Enum):
 
 
 class Layer(Enum):
-    """The four questions, from the narrowest to the widest."""
+    """The four questions, from the narrowest to the widest.
+
+    Attributes:
+        key: Name in JSON and of files.
+        title: Name in tables.
+        question: What it answers.
+    """
+
+    key: str
+    title: str
+    question: str
 
     SAME_RUN = ("same_run", "same run", "Do both move alike under one controller and one disturbance?")
     SAME_PLANT = ("same_plant", "same plant", "Where in frequency do the plants differ, and how surely?")
     WHICH_CONTROLLERS = ("which_controllers", "which controllers", "Which designs are safe to carry over?")
     SAME_CHOICE = ("same_choice", "same choice", "Would the simulation have picked the right controller?")
 
-    @property
-    def key(self) -> str:
-        """Name in JSON and of files."""
-        return self.value[0]
-
-    @property
-    def title(self) -> str:
-        """Name in tables."""
-        return self.value[1]
-
-    @property
-    def question(self) -> str:
-        """What it answers."""
-        return self.value[2]
+    def __init__(self, key: str, title: str, question: str) -> None:
+        self.key, self.title, self.question = key, title, question
 
     @classmethod
     def of(cls, key: str) -> Layer:
@@ -288,8 +287,7 @@ def _named(result: LayerResult, *, emulated: bool) -> LayerResult:
 def write_layer(folder: Path, result: LayerResult) -> Path:
     """Keep a layer's result in a run folder, where the report finds it; return the file."""
     path = folder / FOLDER / f"{result.layer.key}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result.to_json(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(path, result.to_json())
     return path
 
 

@@ -33,7 +33,6 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
     """
     verdict = comparison.verdict
     tests = verdict.tests
-    evidence = tuple(_evidence(test) for test in tests)
     mark = _MARKS[verdict.outcome]
     runs = "this run" if len(comparison.pairs) == 1 else f"these {len(comparison.pairs)} runs"
     whose = verdict.margins.whose
@@ -54,7 +53,7 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
             reason = f"{runs} cannot tell yet in {', '.join(test.quantity for test in open_tests)}"
         steps = (_what_it_takes(comparison, more),)
     sentence = f"{reason[0].upper()}{reason[1:]}."
-    return LayerResult(Layer.SAME_RUN, mark, sentence, evidence, steps, reason=reason)
+    return LayerResult(Layer.SAME_RUN, mark, sentence, tuple(map(_evidence, tests)), steps, reason=reason)
 
 
 def in_words(test: EquivalenceTest, seen: str) -> str:
@@ -224,8 +223,7 @@ def _late(test: EquivalenceTest) -> str:
 
 def _foreign_simulation(comparison: Comparison) -> str:
     """Return the name of the simulation where it is not ours, else nothing."""
-    told = comparison.pairs[0].simulation.metadata.get("pendulum.run")
-    simulation = told.get("simulation") if isinstance(told, Mapping) else None
+    simulation = run_record(comparison.pairs[0].simulation.metadata).get("simulation")
     return str(simulation.get("name", "")) if isinstance(simulation, Mapping) else ""
 
 
