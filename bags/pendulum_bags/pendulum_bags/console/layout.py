@@ -122,24 +122,16 @@ class Layout:
 
     def _plant_card(self, space: str, node: str) -> ControllerChoice:
         """Make the buttons for one plant alone; return the choice of its controller."""
-
-        def move_text(goal: str) -> str:
-            end = "the controller takes over" if goal == "upright" else "the plant is disarmed"
-            return (
-                f"{space} will be armed and will move {goal} under position control, at most 0.3 rad/s, for up to 16 s."
-                f" Its controller waits meanwhile. At the end {end}. Keep clear of the pendulum; the e-stop ends it."
-            )
-
         _heading(space)
         with ui.row():
-            _button("Arm", lambda: self._one(self._graph.arm(node, on=True)), filled=True, of=space)
-            _button("Disarm", lambda: self._one(self._graph.arm(node, on=False)), of=space)
+            _button("Arm", lambda: self._carefully(self._graph.arm(node, on=True)), filled=True, of=space)
+            _button("Disarm", lambda: self._carefully(self._graph.arm(node, on=False)), of=space)
             # The page's script sends it, as it does the e-stop of all: repeated until it is answered.
             _button("Stop", lambda: None, of=space, danger=True).props(f'data-stop="{node}"')
-            _button("Reset e-stop", lambda: self._one(self._graph.reset(node)), of=space)
+            _button("Reset e-stop", lambda: self._carefully(self._graph.reset(node)), of=space)
         with ui.row():
             for goal in ("upright", "down"):
-                _button(f"Bring {goal} ...", partial(self._ask_to_move, space, goal, move_text(goal)), of=space)
+                _button(f"Bring {goal} ...", partial(self._ask_to_move, space, goal), of=space)
             _button("Cancel the move", lambda: self._finish(f"move{space}"), of=space)
         self._job_line(f"move{space}")
         choice = ControllerChoice(self._graph, self._jobs, space, node, self._carefully, _button)
@@ -181,25 +173,23 @@ class Layout:
             self._notices.say(str(answer))
         return True
 
-    async def _one(self, work: Awaitable[Any]) -> None:
-        await self._carefully(work)
-
     async def _each(self, service: str) -> None:
         for space in self._graph.plants():
             await self._carefully(self._graph.trigger(f"{space}/{service}"))
 
-    def _ask_to_move(self, space: str, goal: str, text: str) -> None:
-        self._ask(text, lambda: self._jobs.move(space, goal))
-
-    def _ask(self, text: str, work: Callable[[], object]) -> None:
-        """Say what a button will do, and do it when the person agrees."""
+    def _ask_to_move(self, space: str, goal: str) -> None:
+        """Say what a plant will do, and let it do so when the person agrees."""
+        end = "the controller takes over" if goal == "upright" else "the plant is disarmed"
         with ui.dialog() as dialog, ui.card():
-            ui.label(text)
+            ui.label(
+                f"{space} will be armed and will move {goal} under position control, at most 0.3 rad/s, for up to 16 s."
+                f" Its controller waits meanwhile. At the end {end}. Keep clear of the pendulum; the e-stop ends it."
+            )
             with ui.row():
 
                 def agree() -> None:
                     dialog.close()
-                    self._try(work)
+                    self._try(lambda: self._jobs.move(space, goal))
 
                 _button("Move it", agree, filled=True)
                 _button("Leave it", dialog.close)

@@ -139,16 +139,13 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
         line = ax.axhline if mark.axis == "y" else ax.axvline
         line(mark.value, color="#555555", linewidth=0.9, linestyle=(0, (3, 2)))
         if mark.label:
+            small: Any = {"fontsize": 7.5, "color": "#333333"}
             if mark.axis == "y":
-                place: dict[str, Any] = {
-                    "xy": (1.0, mark.value),
-                    "xycoords": ("axes fraction", "data"),
-                    "ha": "right",
-                }
-                ax.annotate(mark.label, va="bottom", fontsize=7.5, color="#333333", **place)
+                place: Any = ("axes fraction", "data")
+                ax.annotate(mark.label, (1.0, mark.value), xycoords=place, ha="right", va="bottom", **small)
             else:
-                place = {"xy": (mark.value, 1.0), "xycoords": ("data", "axes fraction"), "ha": "left"}
-                ax.annotate(" " + mark.label, va="top", fontsize=7.5, color="#333333", **place)
+                place = ("data", "axes fraction")
+                ax.annotate(f" {mark.label}", (mark.value, 1.0), xycoords=place, ha="left", va="top", **small)
     ax.set_xlabel(panel.x_label)
     ax.set_ylabel(panel.y_label)
     if panel.title:
@@ -174,6 +171,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
 def _draw_trace(ax: Axes, trace: Trace) -> None:
     style = ROLES[trace.role]
     label = trace.label or "_nolegend_"
+    line: Any = {"color": style.colour, "linewidth": style.width, "linestyle": _DASHES[style.dash], "label": label}
     marker: Any = _MARKERS[style.marker]
     if trace.kind == "points":
         ax.plot(trace.x, trace.y, linestyle="none", marker=marker, markersize=3.2, color=style.colour, label=label)
@@ -195,15 +193,7 @@ def _draw_trace(ax: Axes, trace: Trace) -> None:
         ax.fill_between(trace.x, trace.low, trace.high, color=style.colour, alpha=0.25, linewidth=0.0, label=label)
         return
     if trace.kind == "step":
-        ax.step(
-            trace.x,
-            trace.y,
-            where="post",
-            color=style.colour,
-            linewidth=style.width,
-            linestyle=_DASHES[style.dash],
-            label=label,
-        )
+        ax.step(trace.x, trace.y, where="post", **line)
         return
     x, y = thinned(trace.x, trace.y) if bool((trace.x[1:] >= trace.x[:-1]).all()) else (trace.x, trace.y)
-    ax.plot(x, y, color=style.colour, linewidth=style.width, linestyle=_DASHES[style.dash], label=label)
+    ax.plot(x, y, **line)

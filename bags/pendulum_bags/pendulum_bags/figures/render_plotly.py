@@ -78,13 +78,12 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
             x_axis["showticklabels"] = False
         if i:
             x_axis["matches"] = "x"
-        for limits, target, log in (
-            (panel.x_range, x_axis, panel.x_log),
-            (panel.y_range, y_axis, panel.y_log),
+        for letter, target, limits, log in (
+            ("x", x_axis, panel.x_range, panel.x_log),
+            ("y", y_axis, panel.y_range, panel.y_log),
         ):
             if limits:
                 target["range"] = [float(np.log10(v)) if log else float(v) for v in limits]
-        for log, target, letter in ((panel.x_log, x_axis, "x"), (panel.y_log, y_axis, "y")):
             if log:
                 target.update(_log_ticks([getattr(trace, letter) for trace in panel.traces]))
         if panel.y_ticks:

@@ -181,22 +181,25 @@ def _gaps(first: Complex, second: Complex, a: Array, b: Array, scaling: SignalSc
 
 
 def _delay(lines: Array, ratio: Complex, relative: Array) -> Estimate:
-    """Return the slope of the phase of the ratio through 0, weighted; differences of dynamics widen its interval."""
-    omega = 2.0 * np.pi * lines
-    phase = np.unwrap(np.angle(ratio))
-    weight = 1.0 / np.maximum(relative, 1e-6) ** 2
-    slope = -float(np.sum(weight * omega * phase) / np.sum(weight * omega**2))
-    residual = phase + slope * omega
-    misfit = max(1.0, float(np.sum(weight * residual**2)) / max(1, lines.size - 1))
-    half = 1.96 * np.sqrt(misfit / float(np.sum(weight * omega**2)))
-    return Estimate(slope, slope - half, slope + half)
+    found = _slope(2.0 * np.pi * lines, np.unwrap(np.angle(ratio)), relative)
+    return Estimate(-found.value, -found.high, -found.low)
 
 
 def _gain(ratio: Complex, relative: Array) -> Estimate:
-    """Return the weighted mean of the ratio's logarithm, as a factor; differences of dynamics widen its interval."""
-    weight = 1.0 / np.maximum(relative, 1e-6) ** 2
-    logarithm = np.log(np.abs(ratio))
-    mean = float(np.sum(weight * logarithm) / np.sum(weight))
-    misfit = max(1.0, float(np.sum(weight * (logarithm - mean) ** 2)) / max(1, ratio.size - 1))
-    half = 1.96 * np.sqrt(misfit / float(np.sum(weight)))
-    return Estimate(float(np.exp(mean)), float(np.exp(mean - half)), float(np.exp(mean + half)))
+    found = _slope(np.ones(ratio.size), np.log(np.abs(ratio)), relative)
+    return Estimate(float(np.exp(found.value)), float(np.exp(found.low)), float(np.exp(found.high)))
+
+
+def _slope(x: Array, y: Array, deviation: Array) -> Estimate:
+    """Return the weighted slope of y over x through 0; differences of dynamics, which it has not, widen its interval.
+
+    Args:
+        x: Shape (n,).
+        y: Shape (n,).
+        deviation: Standard deviations of y, shape (n,).
+    """
+    weight = 1.0 / np.maximum(deviation, 1e-6) ** 2
+    slope = float(np.sum(weight * x * y) / np.sum(weight * x**2))
+    misfit = max(1.0, float(np.sum(weight * (y - slope * x) ** 2)) / max(1, x.size - 1))
+    half = 1.96 * np.sqrt(misfit / float(np.sum(weight * x**2)))
+    return Estimate(slope, slope - half, slope + half)

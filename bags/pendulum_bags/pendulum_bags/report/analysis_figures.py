@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from pendulum_bags.comparison.alignment import Alignment
 from pendulum_bags.comparison.equivalence import EquivalenceTest, Verdict
 from pendulum_bags.comparison.spectra import Spectra
 from pendulum_bags.comparison.statistics import kolmogorov_smirnov, quantile_pairs
@@ -77,34 +78,26 @@ def equivalence(verdict: Verdict) -> Figure:
     )
 
 
+def _lags(found: Alignment, label: str, role: str, title: str) -> Panel:
+    return Panel(
+        "lag of the hardware [ms]",
+        "correlation [−]",
+        [Trace(1e3 * found.lags, found.curve, label, role)],
+        marks=[Mark(1e3 * found.delay, "x", f"{1e3 * found.delay:.2f} ms")],
+        title=title,
+        x_range=(-100.0, 100.0),
+    )
+
+
 def alignment(data: ReportData) -> Figure:
     """Return the cross-correlations from which clocks and delay were taken."""
     pair = data.comparison.pairs[0]
     response = pair.response
-    panels = [
-        Panel(
-            "lag of the hardware [ms]",
-            "correlation [−]",
-            [Trace(1e3 * response.lags, response.curve, "velocities", "hw")],
-            marks=[Mark(1e3 * response.delay, "x", f"{1e3 * response.delay:.2f} ms")],
-            title="Response",
-            x_range=(-100.0, 100.0),
-        )
-    ]
+    panels = [_lags(response, "velocities", "hw", "Response")]
     text = ""
     if pair.clock is not None:
         clock = pair.clock
-        panels.insert(
-            0,
-            Panel(
-                "lag of the hardware [ms]",
-                "correlation [−]",
-                [Trace(1e3 * clock.lags, clock.curve, "disturbances", "noise")],
-                marks=[Mark(1e3 * clock.delay, "x", f"{1e3 * clock.delay:.2f} ms")],
-                title="Clock",
-                x_range=(-100.0, 100.0),
-            ),
-        )
+        panels.insert(0, _lags(clock, "disturbances", "noise", "Clock"))
         same = "are one signal" if pair.is_paired else "are not one signal"
         if pair.is_paired and clock.correlation < 0.98:
             same = "are one signal, but for samples that a plant skipped or repeated"
