@@ -10,11 +10,12 @@ import pytest
 from pendulum_bags.experiments.experiment_cli import main as experiment_main
 from pendulum_bags.experiments.in_process import simulate_plant
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.frequency_response.analyse import analyse_responses, write_analysis
+from pendulum_bags.frequency_response.analyse import analyse_responses
 from pendulum_bags.frequency_response.compare import compare_responses, continuous
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.frequency_response_cli import main
 from pendulum_bags.frequency_response.record import Record, record_of_arrays, record_of_run
+from pendulum_bags.frequency_response.write import write_analysis
 from pendulum_bags.runs.run_data import RunData
 from pendulum_bags.runs.series import Series, Signal
 from pendulum_bags.verdict import Layer, Mark

@@ -9,25 +9,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from threadpoolctl import threadpool_limits
-
-from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.frequency_response.compare import compare_responses
 from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, design_text, policies_of
 from pendulum_bags.frequency_response.estimate import estimate
-from pendulum_bags.frequency_response.figures import response_figures
 from pendulum_bags.frequency_response.joint_designs import certify_joint_designs
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, LONGER, same_plant, which_controllers
-from pendulum_bags.frequency_response.page import write_page
 from pendulum_bags.frequency_response.record import Record, record_of_joints, record_of_run
 from pendulum_bags.frequency_response.result import Analysis
-from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.runs.run_record import run_record
-from pendulum_bags.verdict import LayerResult, write_layer
+from pendulum_bags.verdict import LayerResult
 from pendulum_lqr.certificate import Certifier
 from pendulum_lqr.gap_metric import DEFAULT_SCALING, JointScaling, Scaling, SignalScaling
 from pendulum_lqr.machine_response import Machine
-from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
+from pendulum_lqr.measured_response import MeasuredResponse, read_response
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.errors import DataError, ParameterError
@@ -40,7 +34,6 @@ __all__ = [
     "analyse_responses",
     "find_machine",
     "read_responses",
-    "write_analysis",
 ]
 
 
@@ -75,10 +68,10 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, 
         label = side if side in {"sim", "hw"} else ("hw" if len(paths) == 1 or i else "sim")
         plant = _design_plant(path, facts) or plant
         policies |= dict.fromkeys(policies_of(facts))
-        found.append(_labelled(estimate(record), label))
+        found.append(replace(estimate(record), label=label))
     if len(found) == 2 and found[0].label == found[1].label:
         # Two of one kind: the order in which they were given tells which is held against which.
-        found = [_labelled(found[0], "sim"), _labelled(found[1], "hw")]
+        found = [replace(one, label=label) for one, label in zip(found, ("sim", "hw"), strict=True)]
     return sorted(found, key=lambda response: response.label, reverse=True), plant, list(policies)
 
 
@@ -108,10 +101,6 @@ def _design_plant(bag: Path, facts: Mapping[str, Any]) -> str:
     if isinstance(linearised, str) and (bag.parent / linearised).is_file():
         return str(bag.parent / linearised)
     return str(facts.get("design_plant") or "")
-
-
-def _labelled(measured: MeasuredResponse, label: str) -> MeasuredResponse:
-    return MeasuredResponse.from_json({**measured.to_json(), "label": label})
 
 
 def analyse_responses(
@@ -232,31 +221,3 @@ def _kept(machine: Path) -> _Kept:
         )
     except (OSError, ValueError, KeyError, TypeError):
         return _Kept()
-
-
-def write_analysis(
-    folder: Path,
-    analysis: Analysis,
-    formats: Sequence[str] = ("png", "pdf"),
-    step: Callable[[str], None] = lambda _: None,
-) -> Path:
-    """Write responses, layers, numbers, figures and a page into a folder; return the page.
-
-    Args:
-        folder: Where to.
-        analysis: What to write.
-        formats: Of the figures.
-        step: Called with what is written next.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    for response in analysis.responses:
-        write_response(folder / f"{response.label}_response.json", response)
-    for layer in analysis.layers:
-        write_layer(folder, layer)
-    write_json(folder / NUMBERS, analysis.to_json())
-    step("drawing")
-    # Thousands of small matrices: threads of the linear algebra would only get into each other's way.
-    with threadpool_limits(1):
-        figures = response_figures(analysis)
-    write_figures(figures, folder / "figures", formats)
-    return write_page(folder / "frequency_response.html", analysis, figures)

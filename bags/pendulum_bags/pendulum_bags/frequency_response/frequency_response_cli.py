@@ -182,8 +182,8 @@ def experiment(
 
 
 def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output: bool) -> None:
-    from pendulum_bags.frequency_response.analyse import write_analysis
     from pendulum_bags.frequency_response.designs import designs_table
+    from pendulum_bags.frequency_response.write import write_analysis
 
     page = None
     if out is not None:

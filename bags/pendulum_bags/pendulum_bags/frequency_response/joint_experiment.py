@@ -9,8 +9,9 @@ from typing import Any
 
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.joint_run import JointSettings, record_joints
-from pendulum_bags.frequency_response.analyse import LONGER_OF_JOINTS, analyse_responses, read_responses, write_analysis
+from pendulum_bags.frequency_response.analyse import LONGER_OF_JOINTS, analyse_responses, read_responses
 from pendulum_bags.frequency_response.result import Analysis
+from pendulum_bags.frequency_response.write import write_analysis
 from pendulum_bags.verdict import write_layer
 
 __all__ = ["FOLDER", "JointMultisine", "measure_joints"]
