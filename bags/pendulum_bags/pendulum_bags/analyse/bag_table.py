@@ -57,7 +57,8 @@ class Piece:
     def fingerprint(self, questions: Sequence[str]) -> str:
         """Return a hash of what it holds, by sizes and times of its files, of what is asked, and of who answers."""
         path = Path(self.path)
-        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if _is_content(file))
+        inside = (file for file in path.rglob("*") if file.name == METADATA_NAME or is_storage_file(file))
+        files = [path] if path.is_file() else sorted(filter(Path.is_file, inside))
         seen = [(str(file.relative_to(path)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
         content = json.dumps([self.name, self.is_run, list(questions), seen, program_hash()])
         return hashlib.sha256(content.encode()).hexdigest()[:16]
@@ -119,16 +120,16 @@ def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece
             below = folder.name if path == folder else str(path.relative_to(folder))
             name = f"{folder.name}/{below}" if len(folders) > 1 and path != folder else below
             bags.setdefault(path.resolve(), name)
+    kinds = {QUESTIONS[question].of_runs for question in questions}
     found: list[Piece] = []
     for path, name in _distinct(bags).items():
-        if any(not QUESTIONS[question].of_runs for question in questions):
+        if False in kinds:
             found.append(Piece(name, str(path), False))
         run = path.parent
-        asked = any(QUESTIONS[question].of_runs for question in questions)
-        if asked and path.name == "sim" and (run / "hw").is_dir() and not is_repeat(run):
+        if True in kinds and path.name == "sim" and (run / "hw").is_dir() and not is_repeat(run):
             found.append(Piece(str(Path(name).parent) if len(Path(name).parts) > 1 else run.name, str(run), True))
     if not found:
-        what = " or ".join(sorted({_wanted(question) for question in questions}))
+        what = " or ".join(sorted("run folder with the bags sim and hw" if of_runs else "bag" for of_runs in kinds))
         raise BagError(f"{', '.join(map(str, folders))}: no {what} in there")
     return sorted(found, key=lambda piece: (piece.name, piece.is_run))
 
@@ -192,12 +193,11 @@ def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: 
     piece = pieces[index]
     if not Path(piece.path).exists():
         raise BagError(f"{piece.path} is not on this machine; expected the bags under the same path on every worker")
+    chosen = [QUESTIONS[question].answer for question in questions if QUESTIONS[question].of_runs is piece.is_run]
     if piece.is_run:
         row: Row = {"bag": piece.name, "plant": "", "error": ""}
-        asked = [QUESTIONS[question].answer for question in questions if QUESTIONS[question].of_runs]
-        _answer(row, asked, Path(piece.path), Path(out), piece.name)
+        _answer(row, chosen, Path(piece.path), Path(out), piece.name)
         return [row]
-    chosen = [QUESTIONS[question].answer for question in questions if not QUESTIONS[question].of_runs]
     try:
         with read_bag(piece.path) as bag:
             plants = _plants(bag)
@@ -229,14 +229,6 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, PendulumError):
         return str(error)
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-
-
-def _is_content(path: Path) -> bool:
-    return is_storage_file(path) or (path.is_file() and path.name == METADATA_NAME)
-
-
-def _wanted(question: str) -> str:
-    return "run folder with the bags sim and hw" if QUESTIONS[question].of_runs else "bag"
 
 
 def _plants(bag: Bag) -> list[str]:

@@ -20,7 +20,7 @@ class Table:
         sentence: What it shows.
         head: Column headings; the first column holds row names.
         rows: Cells as text.
-        section: Heading of the section it belongs to.
+        section: Heading of the section it belongs to; empty on a page without sections.
         folded: Whether a page shows it only to who asks, for its length; paper shows it always.
     """
 
@@ -28,7 +28,7 @@ class Table:
     sentence: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
-    section: str
+    section: str = ""
     folded: bool = False
 
     @property

@@ -81,7 +81,8 @@ def _bode(analysis: Analysis) -> Figure:
                 room = np.degrees(np.arcsin(np.minimum(share[channel], 1.0)))
             else:
                 room = values * np.minimum(share[channel], 0.99)
-            row.append(_band(measured.frequency, values - room, values + room, role, name))
+            low, high = values - room, values + room
+            row.append(Trace(measured.frequency, 0.5 * (low + high), f"{name}, 95 %", role, "band", low, high))
             row.append(Trace(measured.frequency, values, name, role, "points"))
     for row, (channel, _, drawn) in zip(rows, channels, strict=True):
         row.append(Trace(grid, drawn(line[channel]), "model", "model"))
@@ -112,10 +113,6 @@ def difference_sentence(difference: Difference) -> str:
         f"{difference.gap_at:.2g} Hz. Over all, the hardware answers {abs(delay.value) * 1e3:.2f} ms "
         f"{'later' if delay.value >= 0.0 else 'earlier'} and {gain.value:.3g} times as strongly."
     )
-
-
-def _band(x: Array, low: Array, high: Array, role: str, name: str) -> Trace:
-    return Trace(x, 0.5 * (low + high), f"{name}, 95 %", role, "band", low, high)
 
 
 def _phase(values: NDArray[np.complex128]) -> Array:

@@ -68,7 +68,6 @@ def write_analysis(
                 "or loop distance below 1 at every frequency.",
                 ("row", "design", "margin b(P, K)", "loop distance", "modulus margin on the hardware", "certified"),
                 design_rows(analysis.designs),
-                "",
             )
         )
     page = folder / "frequency_response.html"

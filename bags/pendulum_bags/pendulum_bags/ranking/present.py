@@ -196,15 +196,7 @@ def write_ranking(
     write_layer(folder, layer)
     figures = [ranking_figure(ranking)]
     write_figures(figures, folder / "figures", formats)
-    tables = [
-        Table(
-            "Controllers",
-            words.cost,
-            _HEAD,
-            ranking_rows(ranking),
-            "",
-        )
-    ]
+    tables = [Table("Controllers", words.cost, _HEAD, ranking_rows(ranking))]
     if ranking.wrong:
         tables.append(
             Table(
@@ -219,7 +211,6 @@ def write_ranking(
                     "reason",
                 ),
                 _pair_rows(ranking),
-                "",
             )
         )
     return write_layer_page(folder / "ranking.html", "Ranking of controllers", [layer], figures, tables)
