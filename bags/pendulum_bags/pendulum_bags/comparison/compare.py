@@ -126,7 +126,7 @@ class Comparison:
             result["runs"] = [pair.as_dict() for pair in self.pairs]
         return result
 
-    @property
+    @cached_property
     def unpaired(self) -> dict[str, Any]:
         """Statistics of the thesis's difference and of both distributions."""
         hold = {"sim": noise_hold_time(self.own[0]), "hw": noise_hold_time(self.pairs[0].hardware)}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.runs.run_data import find_prefix
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.runs.series import Array
@@ -64,12 +65,12 @@ class ControllerReplay:
             "description": self.description,
             "commands": int(self.t.size),
             "unanswered_states": self.unanswered,
-            "rms_difference_nm": float(np.sqrt(np.mean(difference**2))),
+            "rms_difference_nm": rms(difference),
             "max_difference_nm": float(difference.max()),
             "equal_share": float(np.mean(difference <= SETTLED)),
             "first_difference_s": float(self.t[apart[0]]) if apart.size else None,
-            "rms_recorded_nm": float(np.sqrt(np.mean(self.recorded**2))),
-            "rms_replayed_nm": float(np.sqrt(np.mean(self.replayed**2))),
+            "rms_recorded_nm": rms(self.recorded),
+            "rms_replayed_nm": rms(self.replayed),
         }
 
     def sentence(self) -> str:

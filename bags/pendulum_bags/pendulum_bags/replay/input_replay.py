@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import scipy
 
+from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.replay.fit_replay import replay_fit
 from pendulum_bags.replay.result import InputReplay, horizon_errors
@@ -91,18 +92,18 @@ def replay_input(recording: Recording, parameters: PlantParameters, *, window: f
     driven = _Driven.of(recording, parameters)
     if parameters.drivetrain is None:
         score = window_score(parameters, recording, window)
-        rms, by_window = score.rms, score.by_window
+        overall, by_window = score.rms, score.by_window
         window_time, window_angle = score.time, score.simulated
         start = tuple(score.states[0])
     else:
         window_time, window_angle, by_window = _windows(driven, window)
-        rms = float(np.sqrt(np.mean((window_angle - np.interp(window_time, driven.time, driven.position)) ** 2)))
+        overall = rms(window_angle - np.interp(window_time, driven.time, driven.position))
         start = (float(driven.position[0]), float(driven.velocity[0]))
     return InputReplay(
         name=recording.name,
         plant=parameters,
         window=window,
-        rms=float(rms),
+        rms=overall,
         by_window=by_window,
         window_time=window_time,
         window_angle=window_angle,
@@ -179,15 +180,12 @@ def _mean_input(recording: Recording, time: Array) -> Array:
 
 def _windows(driven: _Driven, window: float) -> tuple[Array, Array, Array]:
     period = float(driven.time[1] - driven.time[0])
-    length = max(2, round(window / period))
+    length = min(max(2, round(window / period)), driven.time.size)
     times, angles, errors = [], [], []
     for first in range(0, driven.time.size - length + 1, length):
         angle = driven.run(first, length - 1)
         part = slice(first, first + length)
         times.append(driven.time[part])
         angles.append(angle)
-        errors.append(float(np.sqrt(np.mean((angle - driven.position[part]) ** 2))))
-    if not times:
-        angle = driven.run(0, driven.time.size - 1)
-        return driven.time, angle, np.array([float(np.sqrt(np.mean((angle - driven.position) ** 2)))])
+        errors.append(rms(angle - driven.position[part]))
     return np.concatenate(times), np.concatenate(angles), np.array(errors)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -70,7 +71,7 @@ class InputReplay:
     @property
     def free_run_rms(self) -> float:
         """Angle error of the free run [rad]."""
-        return float(np.sqrt(np.mean((self.free_run - self.measured) ** 2)))
+        return rms(self.free_run - self.measured)
 
     @property
     def fit(self) -> float:
@@ -159,4 +160,4 @@ def horizon_errors(
     starts = np.unique(np.linspace(0, size - 1 - reach, MOST_STARTS).astype(int))
     error = np.stack([error_from(int(first), reach) for first in starts])
     steps = sorted({k for k in (m * 10**e for e in range(7) for m in (1, 2, 5)) if k < reach} | {reach})
-    return tuple(HorizonError(k, k * period, float(np.sqrt(np.mean(error[:, k] ** 2))), starts.size) for k in steps)
+    return tuple(HorizonError(k, k * period, rms(error[:, k]), starts.size) for k in steps)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from pendulum_bags.comparison import Comparison
@@ -44,23 +45,22 @@ class ReportData:
     answer: Answer = None  # type: ignore[assignment]  # filled in below
     certified: Analysis | None = None
     open_bag: OpenBag = read_bag
-    plant: PlantParameters | None = field(init=False)
 
     def __post_init__(self) -> None:
-        """Find the plant that the run was designed on, and the answer."""
+        """Find the answer."""
         if self.answer is None:
             object.__setattr__(self, "answer", answer_of(self.comparison))  # type: ignore[unreachable]
-        object.__setattr__(self, "plant", self._find_plant())
 
     @property
     def run(self) -> Mapping[str, Any]:
         """Return what the simulation's bag says about its run."""
         return run_record(self.comparison.pairs[0].simulation.metadata)
 
-    def _find_plant(self) -> PlantParameters | None:
-        name = self.run.get("plant", "thesis")
+    @cached_property
+    def plant(self) -> PlantParameters | None:
+        """Return the plant that the run was designed on."""
         try:
-            return load_plant(str(name))
+            return load_plant(str(self.run.get("plant", "thesis")))
         except ParameterError:
             # The file that the run was made with is gone: figures of the model are left out, and say so.
             return None
