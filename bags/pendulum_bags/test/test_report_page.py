@@ -22,10 +22,9 @@ from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report import FIGURES, write_report
 from pendulum_bags.report.data import ReportData
-from pendulum_bags.report.emulator_table import emulator_table
 from pendulum_bags.report.figures import comparison_figures, make_figures
 from pendulum_bags.report.page import page_of
-from pendulum_bags.report.provenance import provenance_table, settings_table
+from pendulum_bags.report.provenance import emulator_table, provenance_table, settings_table
 from pendulum_bags.report.report_cli import main
 from pendulum_bags.report.tables import make_tables
 from pendulum_bags.report.terms import Terms

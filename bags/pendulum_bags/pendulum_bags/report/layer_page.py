@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pendulum_bags.figures.figure import Figure
+from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report.html import minute, render
 from pendulum_bags.verdict import LayerResult
-from pendulum_bags.verdict.evidence import evidence_table
 from pendulum_msgs_py.errors import BagError
 
-__all__ = ["write_layer_page"]
+__all__ = ["evidence_table", "write_layer_page"]
 
 
 def write_layer_page(
@@ -50,3 +50,16 @@ def write_layer_page(
     except OSError as error:
         raise BagError(f"page {path} cannot be written: {error.strerror or error}") from error
     return path
+
+
+def evidence_table(result: LayerResult) -> Table:
+    """Return what a layer of the answer rests on."""
+    rows = []
+    for row in result.evidence:
+        ends = ("–" if end is None else quantity(end) for end in (row.low, row.high))
+        interval = "–" if row.low is None and row.high is None else " to ".join(ends)
+        name = row.quantity + (f" [{row.unit}]" if row.unit else "")
+        estimate = "–" if row.estimate is None else quantity(row.estimate)
+        rows.append((name, estimate, interval, row.expected or "–", row.mark.value if row.expected else "–", row.note))
+    head = ("quantity", "estimate", "interval", "expected", "result", "note")
+    return Table(f"Evidence: {result.layer.title}", result.sentence, head, rows, "Verdict")

@@ -12,10 +12,10 @@ from pendulum_bags.comparison import Comparison
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
 from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.layer_page import evidence_table
 from pendulum_bags.report.trial_figures import GRAVITY, INERTIA, UNITS
 from pendulum_bags.report.trials import TrialSet
 from pendulum_bags.verdict import Layer, LayerResult, Mark
-from pendulum_bags.verdict.evidence import evidence_table
 from pendulum_bags.verdict.same_run import seen_note
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise, sort_poles
