@@ -4,26 +4,55 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from threadpoolctl import threadpool_limits
+
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.figures.figure import Figure
-from pendulum_bags.report import (
-    analysis_figures,
-    certified_figures,
-    model_figures,
-    motion_figures,
-    trial_figures,
-)
+from pendulum_bags.frequency_response.figures import certified_gains_figure, certified_weights_figure, gap_figure
+from pendulum_bags.frequency_response.result import Analysis
+from pendulum_bags.report import analysis_figures, model_figures, motion_figures, trial_figures
 from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.trials import TrialSet
+from pendulum_lqr.certificate import Certifier
 
 __all__ = ["FIGURES", "comparison_figures", "make_figures"]
 
 Maker = Callable[[ReportData], Figure | str]
 
+
+def _of_experiment(number: int, draw: Callable[[TrialSet], Figure | str]) -> Maker:
+    """Return what draws a figure from the trials of an experiment, or says that it needs them."""
+    kind = {1: "inertia_damping", 2: "gravity"}[number]
+
+    def make(data: ReportData) -> Figure | str:
+        trials = next((one for one in data.trials if one.result.kind == kind), None)
+        return f"needs the trials of experiment {number}" if trials is None else draw(trials)
+
+    return make
+
+
+def _certified(draw: Callable[[Analysis, Certifier], Figure]) -> Maker:
+    """Return what draws a figure of the designs that carry over to a measured machine, or says that it needs one."""
+
+    def make(data: ReportData) -> Figure | str:
+        found = data.certified
+        if found is None or found.certifier is None:
+            return "needs the hardware's measured response (python -m pendulum_bags experiment frequency_response)"
+        # Thousands of small matrices: threads of the linear algebra would only get into each other's way.
+        with threadpool_limits(1):
+            return draw(found, found.certifier)
+
+    return make
+
+
 FIGURES: tuple[tuple[str, Maker], ...] = (
     ("Equivalence tests", lambda data: analysis_figures.equivalence(data.comparison.verdict)),
-    ("Gap per frequency", certified_figures.gap),
-    ("Gains that carry over", certified_figures.gains),
-    ("LQR weights that carry over", certified_figures.weights),
+    ("Gap per frequency", _certified(lambda found, certifier: gap_figure(certifier, None, found.designs))),
+    ("Gains that carry over", _certified(lambda found, certifier: certified_gains_figure(certifier, found.designs))),
+    (
+        "LQR weights that carry over",
+        _certified(lambda found, certifier: certified_weights_figure(certifier, found.model)),
+    ),
     ("Simulation and hardware together", motion_figures.both_together),
     ("Torque and noise", motion_figures.torque_and_noise),
     ("Difference under the same noise", motion_figures.paired_difference),
@@ -38,12 +67,12 @@ FIGURES: tuple[tuple[str, Maker], ...] = (
     ("Difference over time", motion_figures.unpaired_difference),
     ("Ramps up and down", motion_figures.ramps),
     ("Torque over sin θ", model_figures.gravity_fit),
-    ("Effort over velocity", trial_figures.effort_over_velocity),
-    ("Effort over acceleration", trial_figures.effort_over_acceleration),
-    ("Trials by hand", trial_figures.effort_over_time),
-    ("Dynamic phase", trial_figures.dynamic_phase),
-    ("Static phase", trial_figures.static_phase),
-    ("Effort over sin θ, static", trial_figures.effort_over_sine),
+    ("Effort over velocity", _of_experiment(1, trial_figures.effort_over_velocity)),
+    ("Effort over acceleration", _of_experiment(1, trial_figures.effort_over_acceleration)),
+    ("Trials by hand", _of_experiment(1, trial_figures.effort_over_time)),
+    ("Dynamic phase", _of_experiment(2, trial_figures.dynamic_phase)),
+    ("Static phase", _of_experiment(2, trial_figures.static_phase)),
+    ("Effort over sin θ, static", _of_experiment(2, trial_figures.effort_over_sine)),
     ("Timing of the states", analysis_figures.timing),
     ("Overdamped phase plot", model_figures.overdamped_phase),
     ("Replay of a real pendulum", model_figures.replay),

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
-
 import numpy as np
 
 from pendulum_bags.figures.figure import Figure, Panel, Trace, thinned
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.identification.thesis import static_holds
-from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.trials import TrialSet
 
 __all__ = [
@@ -27,23 +23,6 @@ GRAVITY = "Experiment 2: gravity"
 UNITS = {"inertia": "kg m²", "damping": "N m s/rad", "gravity": "N m"}
 ROLES = 6
 """Looks there are for trials; a seventh looks like the first."""
-
-
-def _of_experiment(
-    number: int,
-) -> Callable[[Callable[[TrialSet], Figure | str]], Callable[[ReportData], Figure | str]]:
-    """Make a figure of a report from one of the trials of an experiment: without them it says that it needs them."""
-
-    def decorate(draw: Callable[[TrialSet], Figure | str]) -> Callable[[ReportData], Figure | str]:
-        @wraps(draw)
-        def drawn(data: ReportData) -> Figure | str:
-            kind = {1: "inertia_damping", 2: "gravity"}[number]
-            trials = next((one for one in data.trials if one.result.kind == kind), None)
-            return f"needs the trials of experiment {number}" if trials is None else draw(trials)
-
-        return drawn
-
-    return decorate
 
 
 def _found(trials: TrialSet) -> str:
@@ -83,19 +62,16 @@ def _cloud(trials: TrialSet, column: int, label: str, name: str, title: str) -> 
     )
 
 
-@_of_experiment(1)
 def effort_over_velocity(trials: TrialSet) -> Figure:
     """Return effort over velocity, trial by trial."""
     return _cloud(trials, 0, "θ′ [rad/s]", "effort_over_velocity", "Effort over velocity")
 
 
-@_of_experiment(1)
 def effort_over_acceleration(trials: TrialSet) -> Figure:
     """Return effort over acceleration, trial by trial."""
     return _cloud(trials, 1, "θ″ [rad/s²]", "effort_over_acceleration", "Effort over acceleration")
 
 
-@_of_experiment(1)
 def effort_over_time(trials: TrialSet) -> Figure:
     """Return measured and fitted effort over time, trial by trial."""
     panels = []
@@ -111,7 +87,6 @@ def effort_over_time(trials: TrialSet) -> Figure:
     return Figure("trials", "Trials by hand", sentence, panels, stacked=False, section=INERTIA, panel_height=180)
 
 
-@_of_experiment(2)
 def dynamic_phase(trials: TrialSet) -> Figure:
     """Return position, velocity and effort of the staircases over time."""
     rows: dict[str, list[Trace]] = {"θ [rad]": [], "θ′ [rad/s]": [], "effort [N m]": []}
@@ -129,7 +104,6 @@ def dynamic_phase(trials: TrialSet) -> Figure:
     return Figure("dynamic_phase", "Dynamic phase", sentence, panels, section=GRAVITY, panel_height=150)
 
 
-@_of_experiment(2)
 def static_phase(trials: TrialSet) -> Figure | str:
     """Return the effort of the holds at 10, 90 and -10 degrees, all trials, both ways."""
     panels = []
@@ -159,7 +133,6 @@ def static_phase(trials: TrialSet) -> Figure | str:
     return Figure("static_phase", "Static phase", sentence, panels, stacked=False, section=GRAVITY, panel_height=200)
 
 
-@_of_experiment(2)
 def effort_over_sine(trials: TrialSet) -> Figure:
     """Return the mean effort of each hold over the sine of its angle, with the fit."""
     traces = [
