@@ -264,7 +264,6 @@ def _kept(path: Path) -> list[Row] | None:
 def _write_table(path: Path, rows: Sequence[Row]) -> None:
     columns = list(dict.fromkeys((*_LABELS, *(name for row in rows for name in row))))
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        for row in rows:
-            writer.writerow(["" if row.get(name) is None else row[name] for name in columns])
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)

@@ -105,8 +105,8 @@ def _periodic(record: Record, length: float, harmonics: NDArray[np.int64]) -> Me
     end = (skip + blocks) * size
     r, u = spectra(record.excitation[:end]), spectra(record.torque[:end])
     y = np.stack([spectra(output[:end]) for output in record.outputs])
-    result = _joint(record, used / length, r[:, used], u[:, used], y[:, :, used], float(blocks))
-    return _with(result, record, blocks, length, _distortion(y, harmonics))
+    found = _joint(record, used / length, r[:, used], u[:, used], y[:, :, used], float(blocks))
+    return replace(found, distortion=_distortion(y, harmonics), facts=_facts(record, "whole periods", blocks, length))
 
 
 def _segments(record: Record) -> MeasuredResponse:
@@ -138,8 +138,9 @@ def _segments(record: Record) -> MeasuredResponse:
     lines = lines[power[lines] > _WEAK**2 * power.max()]
     if not lines.size:
         raise DataError(f"{record.label}: the disturbance has no power below {0.5 * _TOP / record.period:g} Hz")
-    result = _joint(record, lines / (size * record.period), r[:, lines], u[:, lines], y[:, :, lines], effective)
-    return _with(result, record, count, size * record.period, (np.nan, np.nan))
+    length = size * record.period
+    found = _joint(record, lines / length, r[:, lines], u[:, lines], y[:, :, lines], effective)
+    return replace(found, facts=_facts(record, "windowed segments", count, length))
 
 
 def _joint(record: Record, frequency: Array, r: Complex, u: Complex, y: Complex, blocks: float) -> MeasuredResponse:
@@ -186,32 +187,26 @@ def _distortion(y: Complex, harmonics: NDArray[np.int64]) -> tuple[float, float]
     return float(np.max(ratio[:half])), float(np.max(ratio[half:]))
 
 
-def _with(
-    result: MeasuredResponse, record: Record, blocks: int, length: float, distortion: tuple[float, float]
-) -> MeasuredResponse:
-    facts = {
-        **record.facts,
-        "method": "whole periods" if periodic_lines(record.disturbance) else "windowed segments",
-        "blocks": blocks,
-        "block_length_s": length,
-        "excitation": {k: v for k, v in record.disturbance.items() if isinstance(v, (int, float, str))},
-        **_extent(record),
-    }
-    return replace(result, distortion=distortion, facts=facts)
-
-
-def _extent(record: Record) -> dict[str, Any]:
-    """Return how far the plant moved and how hard it was driven."""
+def _facts(record: Record, method: str, blocks: int, length: float) -> dict[str, Any]:
+    """Return how it was measured, how far the plant moved, and how hard it was driven."""
     deviations = record.outputs - record.outputs.mean(axis=1, keepdims=True)
     largest = np.max(np.abs(deviations), axis=1)
     effort = float(np.max(np.abs(record.torque)))
+    extent: dict[str, Any] = {
+        "rms_angle_rad": float(np.std(record.outputs[0])),
+        "largest_angle_rad": float(largest[0]),
+        "largest_torque_nm": effort,
+    }
     if record.joints:
-        return {
+        extent = {
             "largest_deviation": {name: float(value) for name, value in zip(record.joints, largest)},  # noqa: B905
             "largest_effort": effort,
         }
     return {
-        "rms_angle_rad": float(np.std(record.outputs[0])),
-        "largest_angle_rad": float(largest[0]),
-        "largest_torque_nm": effort,
+        **record.facts,
+        "method": method,
+        "blocks": blocks,
+        "block_length_s": length,
+        "excitation": {k: v for k, v in record.disturbance.items() if isinstance(v, (int, float, str))},
+        **extent,
     }
