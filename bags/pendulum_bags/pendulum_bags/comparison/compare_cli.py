@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -94,8 +93,11 @@ def compare(
     Example: python -m pendulum_bags compare runs/today/sim runs/today/hw --margin delay=8ms --margin spread_angle=20%
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
+    from pendulum_bags.frequency_response.designs import designs_table
     from pendulum_bags.runs.kept_bags import KeptBags
     from pendulum_bags.runs.run_data import joints_of
+    from pendulum_bags.verdict.terminal import print_answer
+    from pendulum_msgs_py.programs.terminal import make_console
 
     margins = Margins.of(margins_file, margin)
     with KeptBags() as bags:
@@ -123,79 +125,55 @@ def compare(
                 raise DataError("--machine and --design are of plants of one joint; expected neither for several")
             # Bags of one joint are closed one by one: of a hundred runs not all need be open.
             run = partial(run, open_bag=bags)
-            told = _tell_joints({name: run(joint=name) for name in ([joint] if joint else joints)}, kept)
+            results = {name: run(joint=name) for name in ([joint] if joint else joints)}
         else:
-            told = _tell(run(), kept, machine, design or ())
+            results = {"": run()}
+        answer, content, certified = _judge(results, kept, machine, design or ())
     if out is not None:
-        told.write(out)
+        _write(out, results, content)
     if json_output:
-        print(json.dumps(told.content, indent=2, allow_nan=False))
-    else:
-        told.print()
-        if out is not None:
-            print(f"\nwritten: {out / 'comparison.json'} and figures beside it")
+        print(json.dumps(content, indent=2, allow_nan=False))
+        return
+    console = make_console()
+    for name, result in results.items():
+        if name:
+            console.print(f"Joint {name}", style="bold")
+        _print(console, result, content["joints"][name] if name else content)
+    if certified:
+        console.print(designs_table(certified))
+    print_answer(console, answer)
+    if out is not None:
+        print(f"\nwritten: {out / 'comparison.json'} and figures beside it")
 
 
-@dataclass(frozen=True)
-class _Told:
-    """What is told of a comparison, or of those of several joints.
-
-    Args:
-        comparisons: The comparison of each joint, by its name; of a plant of one joint by no name.
-        answer: The answer.
-        content: All of it, for JSON.
-        designs: Designs and whether they carry over.
-    """
-
-    comparisons: Mapping[str, Comparison]
-    answer: Answer
-    content: dict[str, Any]
-    designs: Sequence[DesignResult] = ()
-
-    def write(self, out: Path) -> None:
-        from pendulum_bags.figures.render_files import write_figures
-        from pendulum_bags.report.figures import comparison_figures
-        from pendulum_bags.report.joint_figures import joints_together
-        from pendulum_bags.runs.run_folder import write_json
-
-        out.mkdir(parents=True, exist_ok=True)
-        write_json(out / "comparison.json", self.content)
-        alone = self.comparisons.get("")
-        write_figures(comparison_figures(alone) if alone else [joints_together(self.comparisons)], out / "figures")
-
-    def print(self) -> None:
-        from pendulum_bags.frequency_response.designs import designs_table
-        from pendulum_bags.verdict.terminal import print_answer
-        from pendulum_msgs_py.programs.terminal import make_console
-
-        console = make_console()
-        for joint, result in self.comparisons.items():
-            if joint:
-                console.print(f"Joint {joint}", style="bold")
-            _print(console, result, self.content["joints"][joint] if joint else self.content)
-        if self.designs:
-            console.print(designs_table(self.designs))
-        print_answer(console, self.answer)
-
-
-def _tell(result: Comparison, kept: Sequence[Path], machine: Path | None, designs: Sequence[str]) -> _Told:
+def _judge(
+    results: Mapping[str, Comparison], kept: Sequence[Path], machine: Path | None, designs: Sequence[str]
+) -> tuple[Answer, dict[str, Any], Sequence[DesignResult]]:
+    """Return the answer, all of it for JSON, and designs of which it is known whether they carry over."""
     from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
-    from pendulum_bags.verdict.answer import answer_of
+    from pendulum_bags.verdict.answer import answer_of, answer_of_joints
 
-    certified = carry_over(result, kept, machine, designs)
-    answer = answer_of(result, kept, anew=layers_of(certified))
-    content = {**result.to_json(), "answer": answer.to_json()}
-    if certified is not None:
-        content["designs"] = [one.to_json() for one in certified.designs]
-    return _Told({"": result}, answer, content, certified.designs if certified else ())
+    if "" not in results:
+        answer = answer_of_joints(results, kept)
+        joints = {joint: result.to_json() for joint, result in results.items()}
+        return answer, {"joints": joints, "answer": answer.to_json()}, ()
+    certified = carry_over(results[""], kept, machine, designs)
+    answer = answer_of(results[""], kept, anew=layers_of(certified))
+    content = {**results[""].to_json(), "answer": answer.to_json()}
+    if certified is None:
+        return answer, content, ()
+    return answer, {**content, "designs": [one.to_json() for one in certified.designs]}, certified.designs
 
 
-def _tell_joints(results: Mapping[str, Comparison], kept: Sequence[Path]) -> _Told:
-    from pendulum_bags.verdict.answer import answer_of_joints
+def _write(out: Path, results: Mapping[str, Comparison], content: dict[str, Any]) -> None:
+    from pendulum_bags.figures.render_files import write_figures
+    from pendulum_bags.report.figures import comparison_figures
+    from pendulum_bags.report.joint_figures import joints_together
+    from pendulum_bags.runs.run_folder import write_json
 
-    answer = answer_of_joints(results, kept)
-    joints = {joint: result.to_json() for joint, result in results.items()}
-    return _Told(results, answer, {"joints": joints, "answer": answer.to_json()})
+    write_json(out / "comparison.json", content)
+    figures = comparison_figures(results[""]) if "" in results else [joints_together(results)]
+    write_figures(figures, out / "figures")
 
 
 def _print(console: Console, result: Comparison, content: dict[str, Any]) -> None:
