@@ -18,14 +18,12 @@ from pendulum_bags.report.trials import TrialSet
 from pendulum_bags.verdict import Layer, LayerResult, Mark
 from pendulum_bags.verdict.same_run import seen_note
 from pendulum_lqr.design import output_lqr
+from pendulum_lqr.design_cli import THESIS_WEIGHTS
 from pendulum_lqr.model import linearise, sort_poles
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 
 __all__ = ["make_tables", "parameter_rows", "tests_table", "typeset"]
-
-WEIGHTS = ((1.0, 0.01, 0.1), (1.0, 0.1, 0.1), (100.0, 0.01, 0.1), (100.0, 0.1, 0.1))
-"""q11, q22 and r of the combinations in the thesis."""
 
 
 def make_tables(data: ReportData) -> list[Table]:
@@ -195,15 +193,13 @@ def _eigenvalues(data: ReportData) -> Table | None:
     model = linearise(data.plant)
     open_loop = sort_poles(np.linalg.eigvals(model.A).astype(complex))
     rows = [("none", "–", "–", "–", _poles(open_loop), "–")]
-    for number, (q11, q22, r) in enumerate(WEIGHTS, start=1):
-        gain = output_lqr(model, [q11, q22], r)
-        values = (f"{q11:g}", f"{q22:g}", f"{r:g}", _poles(gain.poles), ", ".join(f"{k:.6f}" for k in gain.K))
+    for number, (q, r) in enumerate(THESIS_WEIGHTS, start=1):
+        gain = output_lqr(model, q, r)
+        values = (f"{q[0]:g}", f"{q[1]:g}", f"{r:g}", _poles(gain.poles), ", ".join(f"{k:.6f}" for k in gain.K))
         rows.append((str(number), *values))
     chosen = data.run.get("controller", {})
-    used = next(
-        (n for n, w in enumerate(WEIGHTS, 1) if [*chosen.get("q", ()), chosen.get("r")] == [w[0], w[1], w[2]]),
-        None,
-    )
+    ran = [*chosen.get("q", ()), chosen.get("r")]
+    used = next((number for number, (q, r) in enumerate(THESIS_WEIGHTS, start=1) if ran == [*q, r]), None)
     unstable = float(np.max(open_loop.real))
     sentence = f"Upright, the plant runs away at {unstable:.6f} s⁻¹ without control; " + (
         f"this run used combination {used}." if used else "this run used other weights than these."
