@@ -271,7 +271,7 @@ def test_a_page_of_several_runs_says_where_it_shows_the_first(bags: dict[str, Pa
     one = {joint: compare_runs(bags["sim"], bags["alike"], joint=joint) for joint in JOINTS}
     three = {joint: replace(found, pairs=[*found.pairs] * 3) for joint, found in one.items()}
     for comparisons, runs, words in ((one, 1, "all samples; "), (three, 3, "all samples of the first of 3 runs; ")):
-        page = joint_page(comparisons, answer_of_joints(comparisons), title="", made_at="")
+        page = joint_page(comparisons, answer_of_joints(comparisons), title="")
         assert page.runs == runs
         sentence = page.tables[0].sentence
         assert sentence.startswith(f"Spreads are of {words}the tests take both motions at the slower plant's sampling")

@@ -413,10 +413,10 @@ def test_a_pooled_run_of_other_software_tells_its_own(comparison: Comparison) ->
 def test_the_head_of_a_page_names_some_seeds_of_many(comparison: Comparison) -> None:
     many = replace(comparison, pairs=[*comparison.pairs] * 4)
     data = ReportData(many, {"seed": 7})
-    page = page_of(data, [], [], [], title="", made_at="")
+    page = page_of(data, [], [], [], title="")
     assert dict(page.facts)["seeds"] == "1, 1, 1, …"
     assert "paths apart (rms), run 1" in dict(page.facts)
-    alone = dict(page_of(ReportData(comparison, {"seed": 7}), [], [], [], title="", made_at="").facts)
+    alone = dict(page_of(ReportData(comparison, {"seed": 7}), [], [], [], title="").facts)
     assert alone["seed"] == "7"
     assert "paths apart (rms)" in alone
 

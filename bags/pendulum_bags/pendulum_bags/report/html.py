@@ -16,12 +16,7 @@ from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.report.terms import Terms
 
-__all__ = ["minute", "render", "script_json"]
-
-
-def minute() -> str:
-    """Return the time as pages write when they were made."""
-    return datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+__all__ = ["render", "script_json"]
 
 
 def render(
@@ -55,6 +50,7 @@ def render(
         figures=figures,
         pictures={name: base64.b64encode(picture).decode("ascii") for name, picture in pictures.items()},
         terms=terms,
+        made_at=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         graph_names={name: list(parts) for name, parts in graphs.items()},
         graphs=script_json({name: graph for parts in graphs.values() for name, graph in parts.items()}),
         plotly=_packed_plotly(),

@@ -25,14 +25,13 @@ from pendulum_bags.verdict import Answer
 __all__ = ["joint_page"]
 
 
-def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: str, made_at: str) -> Page:
+def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: str) -> Page:
     """Return the page.
 
     Args:
         comparisons: The comparison of each joint, by its name, at least one.
         answer: The answer for all joints.
         title: What the page is about.
-        made_at: When it was made.
     """
     first = next(iter(comparisons.values()))
     # What a bag says of its run it says of all joints.
@@ -49,7 +48,6 @@ def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: 
     warning = timing_warning(first.plants)
     return Page(
         title=title,
-        made_at=made_at,
         answer=answer,
         hardware=first.hardware_name,
         emulated=first.is_emulated,

@@ -8,7 +8,7 @@ from pathlib import Path
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
-from pendulum_bags.report.html import minute, render
+from pendulum_bags.report.html import render
 from pendulum_bags.verdict import LayerResult
 from pendulum_msgs_py.errors import BagError
 
@@ -43,7 +43,6 @@ def write_layer_page(
         layers=layers,
         tables=[*(evidence_table(layer) for layer in layers), *tables],
         notes=notes,
-        made_at=minute(),
     )
     try:
         path.write_text(text, encoding="utf-8")

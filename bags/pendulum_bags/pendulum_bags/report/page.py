@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from pendulum_bags.figures.figure import Figure
@@ -50,7 +50,6 @@ class Page:
 
     Attributes:
         title: What it is about.
-        made_at: When it was made.
         answer: The answer, with its layers.
         hardware: What the simulation was compared with, as in sentences.
         emulated: Whether an emulator stood in for the hardware; all texts say so then.
@@ -66,11 +65,9 @@ class Page:
         runs: How many runs there are; sections that show the first of several say so.
         unpaired: The answer without pairs, told with the thesis's analysis.
         noise_note: A sentence about noise that was held differently, told there too.
-        pictures: The figures as PNG by name, for paper and for readers without scripts.
     """
 
     title: str
-    made_at: str
     answer: Answer
     hardware: str
     emulated: bool
@@ -86,7 +83,6 @@ class Page:
     runs: int = 1
     unpaired: str = ""
     noise_note: str = ""
-    pictures: Mapping[str, bytes] = field(default_factory=dict)
 
 
 def page_of(
@@ -96,7 +92,6 @@ def page_of(
     missing: Sequence[tuple[str, str]],
     *,
     title: str,
-    made_at: str,
 ) -> Page:
     """Return the page of plants of one joint.
 
@@ -106,13 +101,11 @@ def page_of(
         tables: Tables.
         missing: Figures that the data do not allow, each with the reason.
         title: What the page is about.
-        made_at: When it was made.
     """
     comparison = data.comparison
     warning = timing_warning(comparison.plants)
     return Page(
         title=title,
-        made_at=made_at,
         answer=data.answer,
         hardware=comparison.hardware_name,
         emulated=comparison.is_emulated,
@@ -133,8 +126,8 @@ def page_of(
     )
 
 
-def render_page(page: Page) -> str:
-    """Return the HTML text of a report."""
+def render_page(page: Page, pictures: Mapping[str, bytes]) -> str:
+    """Return the HTML text of a report; the pictures are its figures as PNG, by name."""
     figures, tables, facts, noise_note, provenance = name_in(
         (page.figures, page.tables, page.facts, page.noise_note, page.provenance), emulated=page.emulated
     )
@@ -147,7 +140,7 @@ def render_page(page: Page) -> str:
     return render(
         "report.html.j2",
         figures,
-        page.pictures,
+        pictures,
         page=page,
         sentence=_without_mark(page.answer),
         signs=SIGNS,

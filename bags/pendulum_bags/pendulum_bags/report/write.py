@@ -5,14 +5,12 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figures import make_figures
-from pendulum_bags.report.html import minute
 from pendulum_bags.report.joint_page import joint_page
 from pendulum_bags.report.page import Page, page_of, render_page
 from pendulum_bags.report.tables import make_tables
@@ -95,7 +93,6 @@ def write_report(
         make_tables(data),
         missing,
         title=title_of([Path(folder) for folder in folders] or [out], len(comparison.pairs)),
-        made_at=minute(),
     )
     return _save(out, page, formats)
 
@@ -124,7 +121,7 @@ def write_joint_report(
         BagError: The folder cannot be written.
     """
     pairs = len(next(iter(comparisons.values())).pairs)
-    return _save(out, joint_page(comparisons, answer, title=title_of(folders, pairs), made_at=minute()), formats)
+    return _save(out, joint_page(comparisons, answer, title=title_of(folders, pairs)), formats)
 
 
 def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
@@ -132,7 +129,7 @@ def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
     figures = [name_in(figure, emulated=page.emulated) for figure in page.figures]
     # Paper has no scripts: whoever prints the page gets these pictures.
     drawn = write_figures(figures, out / "figures", formats)
-    text = render_page(replace(page, pictures={path.stem: _for_paper(path) for path in drawn if path.suffix == ".png"}))
+    text = render_page(page, {path.stem: _for_paper(path) for path in drawn if path.suffix == ".png"})
     target = out / "report.html"
     try:
         out.mkdir(parents=True, exist_ok=True)
