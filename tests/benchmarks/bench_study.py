@@ -19,8 +19,10 @@ from pathlib import Path
 
 from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
 from pendulum_bags.studies.chunks import cluster_client
-from pendulum_bags.studies.monte_carlo import MonteCarlo, run_chunk, run_monte_carlo
-from pendulum_bags.studies.region_map import RegionMap, run_region_map
+from pendulum_bags.studies.monte_carlo import MonteCarlo
+from pendulum_bags.studies.random_runs import run_chunk, run_monte_carlo
+from pendulum_bags.studies.region_map import RegionMap
+from pendulum_bags.studies.start_grid import run_map
 from tests.benchmarks import Row, measured, peer
 from tests.benchmarks.bench_sim import _mujoco_rollout, _numpy_speed
 from tests.tools.faults.delay_margin import find_delay_margin
@@ -188,9 +190,9 @@ def _network(folder: Path) -> Iterator[Row]:
 
 def _region(folder: Path) -> Iterator[Row]:
     settings = RegionMap(plants=100)
-    run_region_map(folder / "warm", replace(settings, plants=1, points=3, duration=0.1))
+    run_map(folder / "warm", replace(settings, plants=1, points=3, duration=0.1))
     began = time.perf_counter()
-    result = run_region_map(folder / "region", settings)
+    result = run_map(folder / "region", settings)
     wall = time.perf_counter() - began
     if result.counterexamples or result.share_in_ellipse < 1.0:
         raise AssertionError("a start of the proven ellipse does not reach upright")

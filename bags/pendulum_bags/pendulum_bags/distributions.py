@@ -22,6 +22,7 @@ __all__ = [
     "mean_interval",
     "normal_probability",
     "normal_quantile",
+    "share_interval",
     "student_quantile",
     "student_tail",
 ]
@@ -97,3 +98,19 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> MeanInterval:
     quantile = float(student_quantile(0.5 + 0.5 * level, values.size - 1))
     half = quantile * float(values.std(ddof=1)) / math.sqrt(values.size)
     return MeanInterval(mean, mean - half, mean + half)
+
+
+def share_interval(hits: int, runs: int) -> tuple[float, float]:
+    """Return the 95 % interval of a probability, which is good at 0 and 1 too.
+
+    Args:
+        hits: Runs in which it happened.
+        runs: Of so many, at least one.
+
+    Source:
+        Wilson, Journal of the American Statistical Association 22 (1927), as in statsmodels.
+    """
+    from statsmodels.stats.proportion import proportion_confint
+
+    low, high = proportion_confint(hits, runs, alpha=0.05, method="wilson")
+    return float(low), float(high)

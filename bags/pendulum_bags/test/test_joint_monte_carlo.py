@@ -11,13 +11,8 @@ import numpy as np
 import pytest
 
 from pendulum_bags.experiments.experiment_cli import main
-from pendulum_bags.studies.joint_monte_carlo import (
-    JointMonteCarlo,
-    joint_shares,
-    replay_joints,
-    run_joint_chunk,
-    run_joint_monte_carlo,
-)
+from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo, joint_shares
+from pendulum_bags.studies.random_runs import replay, run_chunk, run_monte_carlo
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 
@@ -26,15 +21,15 @@ SMALL = JointMonteCarlo("cart_pole", runs=250, chunk=100, duration=0.5, shares=S
 
 
 def test_a_chunk_depends_on_settings_and_index_alone() -> None:
-    first, again = run_joint_chunk(SMALL, 1), run_joint_chunk(SMALL, 1, threads=1)
+    first, again = run_chunk(SMALL, 1), run_chunk(SMALL, 1, threads=1)
     for name, values in first.items():
         assert np.array_equal(values, again[name]), name
-    assert len(run_joint_chunk(SMALL, 2)["max_pole"]) == 50
-    assert not np.array_equal(first["max_pole"], run_joint_chunk(SMALL, 0)["max_pole"])
+    assert len(run_chunk(SMALL, 2)["max_pole"]) == 50
+    assert not np.array_equal(first["max_pole"], run_chunk(SMALL, 0)["max_pole"])
 
 
 def test_parameters_scatter_as_told_about_their_value() -> None:
-    drawn = run_joint_chunk(replace(SMALL, runs=20_000, chunk=20_000, duration=0.01), 0)
+    drawn = run_chunk(replace(SMALL, runs=20_000, chunk=20_000, duration=0.01), 0)
     plant = load_mechanism("cart_pole")
     for name, share in SHARES.items():
         assert drawn[name].mean() == pytest.approx(plant.value(name), rel=0.02)
@@ -49,14 +44,14 @@ def test_parameters_scatter_as_told_about_their_value() -> None:
 
 @pytest.mark.parametrize("change", [{"shares": {}}, {"amplitude": 0.0}, {"start": 0.0}])
 def test_plants_noise_and_starts_each_make_a_difference(change: dict[str, object]) -> None:
-    without = run_joint_chunk(replace(SMALL, **change), 0)  # type: ignore[arg-type]
-    assert not np.allclose(run_joint_chunk(SMALL, 0)["std_pole"], without["std_pole"], rtol=1e-6)
+    without = run_chunk(replace(SMALL, **change), 0)  # type: ignore[arg-type]
+    assert not np.allclose(run_chunk(SMALL, 0)["std_pole"], without["std_pole"], rtol=1e-6)
     assert np.ptp(without["std_pole"]) > 0.0
 
 
 def test_one_run_replayed_alone_is_the_run_of_the_batch() -> None:
-    columns = run_joint_chunk(SMALL, 1)
-    row, motion = replay_joints(SMALL, 100 + 17)
+    columns = run_chunk(SMALL, 1)
+    row, motion = replay(SMALL, 100 + 17)
     for name in ("max_cart", "max_pole", "end_pole", "cart_mass", "noise_seed"):
         assert row[name] == columns[name][17]
     assert motion.shape == (SMALL.steps, 6)
@@ -71,24 +66,24 @@ def test_runs_are_summed_up_gone_on_with_and_added_to(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_joint_monte_carlo(tmp_path / "one", SMALL, on_progress=stop)
-    one = run_joint_monte_carlo(tmp_path / "one", SMALL)
-    assert one == run_joint_monte_carlo(tmp_path / "other", SMALL)
+        run_monte_carlo(tmp_path / "one", SMALL, on_progress=stop)
+    one = run_monte_carlo(tmp_path / "one", SMALL)
+    assert one == run_monte_carlo(tmp_path / "other", SMALL)
     farthest = np.concatenate(
-        [np.maximum(c["max_cart"], c["max_pole"]) for c in (run_joint_chunk(SMALL, i) for i in range(3))]
+        [np.maximum(c["max_cart"], c["max_pole"]) for c in (run_chunk(SMALL, i) for i in range(3))]
     )
     assert one["probability_inside"] == np.mean(farthest <= SMALL.bound)
     assert one["worst"][0]["run"] == int(np.argmax(farthest))
     assert one["worst"][0]["max_deviation"] == farthest.max()
     tight = float(np.median(farthest))
-    half = run_joint_monte_carlo(tmp_path / "tight", replace(SMALL, bound=tight))
+    half = run_monte_carlo(tmp_path / "tight", replace(SMALL, bound=tight))
     assert half["probability_inside"] == pytest.approx(0.5, abs=0.01)
     low, high = half["probability_interval"]
     assert low < 0.5 < high
     with pytest.raises(BagError, match="of 250 runs; expected at most the 100 of this one"):
-        run_joint_monte_carlo(tmp_path / "one", replace(SMALL, runs=100))
+        run_monte_carlo(tmp_path / "one", replace(SMALL, runs=100))
     with pytest.raises(BagError, match="other settings"):
-        run_joint_monte_carlo(tmp_path / "one", replace(SMALL, seed=2))
+        run_monte_carlo(tmp_path / "one", replace(SMALL, seed=2))
 
 
 def test_shares_are_read_by_name_for_all_or_from_intervals(tmp_path: Path) -> None:

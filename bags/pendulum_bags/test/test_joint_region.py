@@ -11,7 +11,8 @@ import pytest
 
 from pendulum_bags.experiments.experiment_cli import main
 from pendulum_bags.studies.chunks import chunk_path, read_columns
-from pendulum_bags.studies.joint_region import JointRegion, JointRegionResult, run_joint_region
+from pendulum_bags.studies.joint_region import JointRegion, JointRegionResult
+from pendulum_bags.studies.start_grid import run_map
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
@@ -25,7 +26,7 @@ SMALL = JointRegion("cart_pole", plants=3, points=9, spans=(0.4, 1.2), duration=
 def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, JointRegionResult]:
     """Return the small map and its folder, for tests that read it."""
     folder = tmp_path_factory.mktemp("small")
-    return folder, run_joint_region(folder, SMALL)
+    return folder, run_map(folder, SMALL)
 
 
 def test_near_starts_are_caught_far_ones_are_not_and_the_sampled_region_is_inside(
@@ -44,10 +45,10 @@ def test_near_starts_are_caught_far_ones_are_not_and_the_sampled_region_is_insid
 
 def test_axes_are_the_ones_that_were_asked_for(tmp_path: Path) -> None:
     there = replace(SMALL, plants=1, axes=("pole", "cart"), spans=(1.2, 0.4))
-    own, other = run_joint_region(tmp_path / "own", replace(SMALL, plants=1)), run_joint_region(tmp_path / "t", there)
+    own, other = run_map(tmp_path / "own", replace(SMALL, plants=1)), run_map(tmp_path / "t", there)
     assert not np.array_equal(own.believed, own.believed.T)
     assert np.array_equal(own.believed, other.believed.T)
-    fast = run_joint_region(tmp_path / "fast", replace(SMALL, plants=1, axes=("pole", "pole_dot"), spans=(0.8, 4.0)))
+    fast = run_map(tmp_path / "fast", replace(SMALL, plants=1, axes=("pole", "pole_dot"), spans=(0.8, 4.0)))
     # Falling outwards is lost where falling back is caught.
     lean, speed = fast.settings.starts()
     x, v = np.meshgrid(lean, speed)
@@ -67,10 +68,10 @@ def test_plant_0_is_the_believed_one_and_the_others_differ(small: tuple[Path, Jo
 def test_a_map_is_gone_on_with_and_others_are_refused(small: tuple[Path, JointRegionResult]) -> None:
     folder, first = small
     before = chunk_path(folder, 0).stat().st_mtime_ns
-    assert np.array_equal(run_joint_region(folder, SMALL).share, first.share)
+    assert np.array_equal(run_map(folder, SMALL).share, first.share)
     assert chunk_path(folder, 0).stat().st_mtime_ns == before
     with pytest.raises(BagError, match="other settings"):
-        run_joint_region(folder, replace(SMALL, seed=2))
+        run_map(folder, replace(SMALL, seed=2))
 
 
 @pytest.mark.parametrize(

@@ -15,14 +15,8 @@ import pytest
 
 from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
 from pendulum_bags.studies.chunks import cluster_client
-from pendulum_bags.studies.monte_carlo import (
-    MonteCarlo,
-    draw_chunk,
-    replay,
-    run_chunk,
-    run_monte_carlo,
-    sobol,
-)
+from pendulum_bags.studies.monte_carlo import MonteCarlo, sobol
+from pendulum_bags.studies.random_runs import draw_chunk, replay, run_chunk, run_monte_carlo
 from pendulum_bags.studies.uncertain import Uncertainty, parse_uncertainty, uncertainty_of
 from pendulum_msgs_py.errors import BagError, ParameterError
 from tests.fixtures import wait_for

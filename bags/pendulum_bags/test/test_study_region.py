@@ -12,7 +12,8 @@ import pytest
 
 from pendulum_bags.studies.chunks import cluster_client, read_columns
 from pendulum_bags.studies.region_figure import region_sentence, write_region_figure
-from pendulum_bags.studies.region_map import RegionMap, run_region_map
+from pendulum_bags.studies.region_map import RegionMap
+from pendulum_bags.studies.start_grid import run_map
 from pendulum_bags.studies.uncertain import Uncertainty
 from pendulum_lqr.roa import rigid_rollout
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -34,7 +35,7 @@ def weak(tmp_path_factory: pytest.TempPathFactory) -> RegionMap:
 
 
 def test_map_has_the_ellipse_inside_and_agrees_with_another_integrator(tmp_path: Path, weak: RegionMap) -> None:
-    result = run_region_map(tmp_path, weak)
+    result = run_map(tmp_path, weak)
     assert result.level > 0.0
     assert result.counterexamples == 0
     assert result.share_in_ellipse == 1.0
@@ -61,9 +62,9 @@ def test_interrupted_map_goes_on_and_keeps_every_bit(tmp_path: Path, weak: Regio
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_region_map(tmp_path / "one", settings, on_progress=stop)
-    run_region_map(tmp_path / "one", settings)
-    run_region_map(tmp_path / "other", settings)
+        run_map(tmp_path / "one", settings, on_progress=stop)
+    run_map(tmp_path / "one", settings)
+    run_map(tmp_path / "other", settings)
     files = sorted(path.name for path in (tmp_path / "one").glob("*.parquet"))
     assert files == ["map.parquet", "runs_00000.parquet", "runs_00001.parquet", "runs_00002.parquet"]
     for name in files:
@@ -71,13 +72,13 @@ def test_interrupted_map_goes_on_and_keeps_every_bit(tmp_path: Path, weak: Regio
     believed = read_columns(tmp_path / "one" / "runs_00000.parquet", ["gravity"])["gravity"][: 21 * 21]
     assert (believed == 3.0).all()
     with pytest.raises(BagError, match="other settings"):
-        run_region_map(tmp_path / "one", replace(settings, seed=2))
+        run_map(tmp_path / "one", replace(settings, seed=2))
 
 
 def test_picture_is_grey_and_the_sentence_says_what_was_found(tmp_path: Path, weak: RegionMap) -> None:
     from matplotlib.image import imread
 
-    result = run_region_map(tmp_path / "map", replace(weak, plants=2))
+    result = run_map(tmp_path / "map", replace(weak, plants=2))
     picture = imread(write_region_figure(tmp_path / "region.png", result))
     assert picture.shape[0] > 500
     assert np.abs(picture[..., 0] - picture[..., 1]).max() < 0.02

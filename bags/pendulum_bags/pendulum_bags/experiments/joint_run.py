@@ -26,6 +26,7 @@ from pendulum_rosbag.reader.bag import read_bag
 
 __all__ = [
     "HOLDING",
+    "LIMIT_PER_NOISE",
     "JointRun",
     "JointSettings",
     "design_file",
@@ -46,7 +47,7 @@ _UNCHANGED = frozenset(
 _DELAY = "transport_delay"
 HOLDING = ("lqr", "discrete_lqr", "lqi", "lqg", "mpc")
 """Controllers that hold a plant upright; ``tvlqr`` and ``ilqr`` begin at hanging, and ``nmpc`` is an LQR there."""
-_LIMIT_PER_NOISE = 10.0
+LIMIT_PER_NOISE = 10.0
 """Effort limit of the joint per amplitude of the noise [-]: the LQR holds every preset under it on both sides,
 the acrobot and the pendubot with dry friction up to 0.16, and their joints slide in it instead of standing still."""
 _SLIDING = 0.5
@@ -96,7 +97,7 @@ class JointSettings:
         object.__setattr__(self, "joint", self.joint or driven[0])
         if self.amplitude is None:
             limit = plant.effort_limits[driven.index(self.joint)]
-            object.__setattr__(self, "amplitude", limit / _LIMIT_PER_NOISE)
+            object.__setattr__(self, "amplitude", limit / LIMIT_PER_NOISE)
         if self.controller not in HOLDING:
             raise ParameterError(f"controller is {self.controller!r}; expected one of {', '.join(HOLDING)}")
         for name in ("amplitude", "hold_time", "duration", "period"):

@@ -7,8 +7,7 @@ engine; chunks and files are those of :mod:`pendulum_bags.studies.start_grid`. P
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.experiments.joint_run import design_for
-from pendulum_bags.studies.chunks import Connect, chunk_path, read_columns
+from pendulum_bags.studies.chunks import chunk_path, read_columns
 from pendulum_bags.studies.joint_monte_carlo import scatter
-from pendulum_bags.studies.start_grid import StartGrid, carry_out_map, inside_ellipse, share_inside
+from pendulum_bags.studies.random_runs import Array, Columns
+from pendulum_bags.studies.start_grid import StartGrid, inside_ellipse, share_inside
 from pendulum_lqr.design import DesignError, Gain
 from pendulum_lqr.mechanism_catch import CaughtRegion, sample_caught_region
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
@@ -28,9 +28,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.mechanism_batch import simulate_mechanisms
 
-__all__ = ["Axis", "JointRegion", "JointRegionResult", "run_joint_region"]
-
-Array = NDArray[np.float64]
+__all__ = ["Axis", "JointRegion", "JointRegionResult"]
 
 VELOCITY = "_dot"
 """Ending of the names of velocities, as the linear model's states have it."""
@@ -112,6 +110,65 @@ class JointRegion(StartGrid):
         """Return all numbers of the plant, for a fingerprint."""
         return load_mechanism(self.plant).numbers
 
+    def job(self) -> MechanismParameters:
+        """Return the plant that is believed in."""
+        return load_mechanism(self.plant)
+
+    def run_chunk(self, plant: MechanismParameters, index: int, threads: int | None) -> Columns:
+        """Run a chunk and return its columns."""
+        numbers, generator = self.chunk(index)
+        count = len(numbers)
+        drawn = scatter(plant, self.shares, self.plants_of_chunk, generator)
+        if index == 0:
+            for name, values in drawn.items():
+                values[0] = plant.value(name)
+        x, y = np.meshgrid(*self.starts())
+        size, n = x.size, len(plant.joints)
+        states = np.tile(np.array([*plant.coordinates.goal, *(0.0,) * n]), (size, 1))
+        for axis, deviation in zip(self.both, (x, y), strict=True):
+            states[:, axis.index] += deviation.ravel()
+        result = simulate_mechanisms(
+            plant,
+            variations={name: np.repeat(values[:count], size) for name, values in drawn.items()},
+            steps=self.steps,
+            dt=self.dt,
+            position=np.tile(states[:, :n], (count, 1)),
+            velocity=np.tile(states[:, n:], (count, 1)),
+            gain=_gain(plant).K,
+            threads=threads,
+        )
+        off = np.array([plant.coordinates.deviation(tuple(position)) for position in result.position])
+        near = (np.abs(off) < self.tolerance[0]).all(axis=1)
+        near &= (np.abs(result.velocity) < self.tolerance[1]).all(axis=1)
+        plants = np.repeat(numbers, size)
+        every = {name: np.repeat(values[:count], size) for name, values in drawn.items()}
+        ends = {f"end_{name}": off[:, i] for i, name in enumerate(plant.coordinates.names)}
+        return {"plant": plants, **every, **ends, "attracted": near}
+
+    def summarise(self, folder: Path) -> JointRegionResult:
+        """Return the map, from the Parquet files."""
+        plant = load_mechanism(self.plant)
+        shape = (self.points, self.points)
+        hits, believed = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.bool_)
+        for index in range(self.chunks):
+            attracted = read_columns(chunk_path(folder, index), ("attracted",))["attracted"].reshape(-1, *shape)
+            hits += attracted.sum(axis=0)
+            if index == 0:
+                believed = attracted[0]
+        gain = _gain(plant)
+        try:
+            caught: CaughtRegion | None = sample_caught_region(plant, gain)
+        except DesignError:
+            caught = None
+        if caught is None:
+            return JointRegionResult(self, hits / self.plants, believed, None, np.empty((0, 2)), math.nan)
+        at = [axis.index for axis in self.both]
+        S = np.asarray(gain.S)[np.ix_(at, at)]
+        inside = inside_ellipse(S, caught.level, *np.meshgrid(*self.starts()))
+        share = share_inside(hits, inside, self.plants)
+        section = sublevel_ellipse(S, caught.level)
+        return JointRegionResult(self, hits / self.plants, believed, caught, section, share)
+
 
 @dataclass(frozen=True)
 class JointRegionResult:
@@ -145,7 +202,7 @@ class JointRegionResult:
             "share_in_section": self.share_in_section if math.isfinite(self.share_in_section) else None,
         }
 
-    def columns(self) -> dict[str, NDArray[Any]]:
+    def columns(self) -> Columns:
         """Return the map, a row for each start."""
         first, second = np.meshgrid(*self.settings.starts())
         names = [axis.name for axis in self.settings.both]
@@ -153,86 +210,5 @@ class JointRegionResult:
         return {**columns, "attracted_believed": self.believed.ravel()}
 
 
-def run_joint_region(
-    folder: Path,
-    settings: JointRegion,
-    *,
-    connect: Connect = nullcontext,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> JointRegionResult:
-    """Run what is not on disk yet, and write the map and its figures, as :func:`carry_out_map` does.
-
-    Args:
-        folder: Where the files go.
-        settings: What to map.
-        connect: To a Dask cluster; by default in this process, on all cores.
-        on_progress: Called with chunks done and in all.
-
-    Raises:
-        BagError: The folder holds something else.
-        ParameterError: A start lies beyond an end stop, or a drawn plant has no positive inertia.
-    """
-    job = (settings, load_mechanism(settings.plant))
-    return carry_out_map(folder, settings, _run_chunk, job, _summarise, connect=connect, on_progress=on_progress)
-
-
 def _gain(plant: MechanismParameters) -> Gain:
     return mechanism_lqr(linearise_mechanism(design_for(plant)), *plant.mechanism.weights)
-
-
-def _run_chunk(
-    job: tuple[JointRegion, MechanismParameters], index: int, threads: int | None
-) -> dict[str, NDArray[Any]]:
-    settings, plant = job
-    numbers, generator = settings.chunk(index)
-    count = len(numbers)
-    drawn = scatter(plant, settings.shares, settings.plants_of_chunk, generator)
-    if index == 0:
-        for name, values in drawn.items():
-            values[0] = plant.value(name)
-    x, y = np.meshgrid(*settings.starts())
-    size, n = x.size, len(plant.joints)
-    states = np.tile(np.array([*plant.coordinates.goal, *(0.0,) * n]), (size, 1))
-    for axis, deviation in zip(settings.both, (x, y), strict=True):
-        states[:, axis.index] += deviation.ravel()
-    result = simulate_mechanisms(
-        plant,
-        variations={name: np.repeat(values[:count], size) for name, values in drawn.items()},
-        steps=settings.steps,
-        dt=settings.dt,
-        position=np.tile(states[:, :n], (count, 1)),
-        velocity=np.tile(states[:, n:], (count, 1)),
-        gain=_gain(plant).K,
-        threads=threads,
-    )
-    off = np.array([plant.coordinates.deviation(tuple(position)) for position in result.position])
-    near = (np.abs(off) < settings.tolerance[0]).all(axis=1)
-    near &= (np.abs(result.velocity) < settings.tolerance[1]).all(axis=1)
-    plants = np.repeat(numbers, size)
-    every = {name: np.repeat(values[:count], size) for name, values in drawn.items()}
-    ends = {f"end_{name}": off[:, i] for i, name in enumerate(plant.coordinates.names)}
-    return {"plant": plants, **every, **ends, "attracted": near}
-
-
-def _summarise(folder: Path, settings: JointRegion) -> JointRegionResult:
-    plant = load_mechanism(settings.plant)
-    shape = (settings.points, settings.points)
-    hits, believed = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.bool_)
-    for index in range(settings.chunks):
-        attracted = read_columns(chunk_path(folder, index), ("attracted",))["attracted"].reshape(-1, *shape)
-        hits += attracted.sum(axis=0)
-        if index == 0:
-            believed = attracted[0]
-    gain = _gain(plant)
-    try:
-        caught: CaughtRegion | None = sample_caught_region(plant, gain)
-    except DesignError:
-        caught = None
-    if caught is None:
-        return JointRegionResult(settings, hits / settings.plants, believed, None, np.empty((0, 2)), math.nan)
-    at = [axis.index for axis in settings.both]
-    S = np.asarray(gain.S)[np.ix_(at, at)]
-    inside = inside_ellipse(S, caught.level, *np.meshgrid(*settings.starts()))
-    share = share_inside(hits, inside, settings.plants)
-    section = sublevel_ellipse(S, caught.level)
-    return JointRegionResult(settings, hits / settings.plants, believed, caught, section, share)

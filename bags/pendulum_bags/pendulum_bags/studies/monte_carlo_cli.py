@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.table import Column
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counted_progress
@@ -19,10 +20,10 @@ from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
-    from pendulum_bags.studies.chunks import Connect
+    from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo
+    from pendulum_bags.studies.monte_carlo import MonteCarlo
 
-__all__ = ["monte_carlo"]
-
+__all__ = ["monte_carlo", "options_of_several"]
 
 _OF_ONE_JOINT = {"q", "r", "sobol"}
 """Options that plants of several joints do not have."""
@@ -70,156 +71,164 @@ def monte_carlo(
 
     Example: python -m pendulum_bags experiment monte_carlo --runs 100000 --out /tmp/mc
     """
-    from pendulum_bags.studies import monte_carlo as engine
     from pendulum_bags.studies.chunks import cluster_client
+    from pendulum_bags.studies.monte_carlo import MonteCarlo
+    from pendulum_bags.studies.monte_carlo import sobol as sobol_indices
+    from pendulum_bags.studies.random_runs import run_monte_carlo
     from pendulum_bags.studies.uncertain import parse_uncertainty
     from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 
     folder = out or Path("bags", "runs", "monte_carlo")
     console = make_console(stderr=json_output, highlight=False)
-    connect = partial(cluster_client, scheduler, workers)
+    settings: MonteCarlo | JointMonteCarlo
     if is_mechanism(plant):
-        _joints(context, console, folder, connect, replay, json_output=json_output)
-        return
-    settings = engine.MonteCarlo(
-        plant=plant,
-        runs=runs,
-        seed=seed,
-        uncertainty=parse_uncertainty(uncertainty, plant),
-        q=q,
-        r=r,
-        amplitude=amplitude,
-        hold_time=hold_time,
-        start=start,
-        duration=duration,
-        bound=bound,
-    )
+        settings = _joints(context)
+    else:
+        settings = MonteCarlo(
+            plant=plant,
+            runs=runs,
+            seed=seed,
+            uncertainty=parse_uncertainty(uncertainty, plant),
+            q=q,
+            r=r,
+            amplitude=amplitude,
+            hold_time=hold_time,
+            start=start,
+            duration=duration,
+            bound=bound,
+        )
     if replay >= 0:
         _replay(console, settings, replay, folder)
         return
     started = time.monotonic()
     with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
-        result = engine.run_monte_carlo(folder, settings, connect=connect, on_progress=on_progress)
-    if sobol:
-        result["sobol"] = engine.sobol(settings, base=sobol)
+        connect = partial(cluster_client, scheduler, workers)
+        result = run_monte_carlo(folder, settings, connect=connect, on_progress=on_progress)
+    if sobol and isinstance(settings, MonteCarlo):
+        result["sobol"] = sobol_indices(settings, base=sobol)
     elapsed = time.monotonic() - started
     if json_output:
         print(json.dumps(result, indent=2))
+        return
+    if isinstance(settings, MonteCarlo):
+        _print_one(console, result)
     else:
-        _print(console, result, folder)
-        console.print(f"({elapsed:.0f} s)")
-
-
-def _joints(
-    context: typer.Context, console: Console, folder: Path, connect: Connect, number: int, *, json_output: bool
-) -> None:
-    """Run the Monte Carlo of a plant of several joints, with the options that were typed."""
-    from pendulum_bags.studies import joint_monte_carlo as engine
-    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-
-    given, plant = context.params, context.params["plant"]
-    if typed := typed_options(context, _OF_ONE_JOINT):
-        raise ParameterError(f"{typed[0]} is for a plant of one joint, and {plant} has several: its own LQR holds it")
-    told = given["uncertainty"] if typed_options(context, {"uncertainty"}) else "0.05"
-    chosen = {
-        name: given[name]
-        for name in ("runs", "seed", "bound", "start", "amplitude", "hold_time", "duration")
-        if typed_options(context, {name})
-    }
-    settings = engine.JointMonteCarlo(plant=plant, shares=engine.joint_shares(told, plant), **chosen)
-    if number >= 0:
-        joints = load_mechanism(plant).coordinates.joints
-        header = [f"{joint.name}_{joint.unit}" for joint in joints]
-        header += [f"{joint.name}_{joint.velocity_unit.replace('/', '_')}" for joint in joints]
-        header += [f"{joint.name}_effort_{joint.effort_unit.replace(' ', '_').lower()}" for joint in joints]
-        _tell_replay(console, folder, number, settings.dt, header, *engine.replay_joints(settings, number))
-        return
-    started = time.monotonic()
-    with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
-        result = engine.run_joint_monte_carlo(folder, settings, connect=connect, on_progress=on_progress)
-    if json_output:
-        print(json.dumps(result, indent=2))
-        return
-    low, high = result["probability_interval"]
-    console.print(
-        f"{result['runs']} runs: {' and '.join(result['joints'])} stay within {settings.bound:g} rad or m of upright "
-        f"with probability {result['probability_inside']:.5f} (95 % interval {low:.5f} to {high:.5f})"
-    )
-    told = ", ".join(f"{name} {100.0 * share:.2g} %" for name, share in settings.shares.items()) or "nothing"
-    console.print(f"uncertain: {told}")
-    _print_quantiles(console, result["quantiles"], result["units"])
-    table = WholeTable(title="Worst runs", title_justify="left")
-    names = [f"max_{joint}" for joint in result["joints"]]
-    for heading in ("run", "noise seed", *(f"{name} \\[{result['units'][name]}]" for name in names)):
-        table.add_column(heading, justify="right")
-    for row in result["worst"][:5]:
-        table.add_row(str(row["run"]), f"{row['noise_seed']:.0f}", *(f"{row[name]:.5f}" for name in names))
-    console.print(table)
+        _print_several(console, result)
     console.print(f"replay  add --replay {result['worst'][0]['run']}\nruns    {folder}")
-    console.print(f"({time.monotonic() - started:.0f} s)")
+    console.print(f"({elapsed:.0f} s)")
 
 
-def _replay(console: Console, settings: Any, number: int, folder: Path) -> None:
-    from pendulum_bags.studies.monte_carlo import replay
+def options_of_several(
+    context: typer.Context, of_one_joint: Collection[str], shared: Collection[str]
+) -> tuple[str, dict[str, Any]]:
+    """Return the uncertainty, and the other options that were typed, of a command on a plant of several joints.
 
-    header = ["theta_rad", "theta_dot_rad_s", "effort_n_m"]
-    _tell_replay(console, folder, number, settings.dt, header, *replay(settings, number))
+    Args:
+        context: Of the command; the defaults of its options are those of one joint.
+        of_one_joint: Options that plants of several joints do not have.
+        shared: Those that they have.
+
+    Raises:
+        ParameterError: One was typed that is not for several joints.
+    """
+    given = context.params
+    if typed := typed_options(context, of_one_joint):
+        raise ParameterError(
+            f"{typed[0]} is for a plant of one joint, and {given['plant']} has several: its own LQR holds it"
+        )
+    told = given["uncertainty"] if typed_options(context, {"uncertainty"}) else "0.05"
+    return told, {name: given[name] for name in shared if typed_options(context, {name})}
 
 
-def _tell_replay(
-    console: Console, folder: Path, number: int, dt: float, header: Sequence[str], row: Mapping[str, float], motion: Any
-) -> None:
+def _joints(context: typer.Context) -> JointMonteCarlo:
+    """Return the settings for a plant of several joints, of the options that were typed."""
+    from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo, joint_shares
+
+    plant = context.params["plant"]
+    shared = ("runs", "seed", "bound", "start", "amplitude", "hold_time", "duration")
+    told, chosen = options_of_several(context, _OF_ONE_JOINT, shared)
+    return JointMonteCarlo(plant=plant, shares=joint_shares(told, plant), **chosen)
+
+
+def _replay(console: Console, settings: MonteCarlo | JointMonteCarlo, number: int, folder: Path) -> None:
     """Write the motion of a run as CSV, and print what was drawn for it."""
     import numpy as np
 
+    from pendulum_bags.studies.monte_carlo import MonteCarlo
+    from pendulum_bags.studies.random_runs import replay
+
+    if isinstance(settings, MonteCarlo):
+        header = ["theta_rad", "theta_dot_rad_s", "effort_n_m"]
+    else:
+        joints = settings.load().coordinates.joints
+        header = [f"{joint.name}_{joint.unit}" for joint in joints]
+        header += [f"{joint.name}_{joint.velocity_unit.replace('/', '_')}" for joint in joints]
+        header += [f"{joint.name}_effort_{joint.effort_unit.replace(' ', '_').lower()}" for joint in joints]
+    row, motion = replay(settings, number)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"replay_{number}.csv"
-    table = np.column_stack([dt * np.arange(len(motion)), motion])
+    table = np.column_stack([settings.dt * np.arange(len(motion)), motion])
     np.savetxt(path, table, delimiter=",", header=",".join(["time_s", *header]), comments="")
     for name, value in row.items():
         console.print(f"{name:<14} {value:.9g}")
     console.print(f"motion  {path}")
 
 
-def _print_quantiles(console: Console, quantiles: Mapping[str, Mapping[str, float]], units: Mapping[str, str]) -> None:
-    table = WholeTable(title="Quantiles", title_justify="left")
-    for heading in ("", *next(iter(quantiles.values()))):
-        table.add_column(heading, justify="right")
+def _print_result(
+    console: Console,
+    result: dict[str, Any],
+    stays: str,
+    shares: Mapping[str, float],
+    source: str,
+    units: Mapping[str, str],
+) -> None:
+    """Print the probability, what is uncertain, and the quantiles."""
+    low, high = result["probability_interval"]
+    console.print(
+        f"{result['runs']} runs: {stays} of upright with probability {result['probability_inside']:.5f} "
+        f"(95 % interval {low:.5f} to {high:.5f})"
+    )
+    told = ", ".join(f"{name} {100.0 * share:.2g} %" for name, share in shares.items()) or "nothing"
+    console.print(f"uncertain: {told}{source}")
+    quantiles = result["quantiles"]
+    table = _right("Quantiles", ("", *next(iter(quantiles.values()))))
     for name, values in quantiles.items():
-        unit = f" \\[{units[name]}]" if name in units else ""
-        table.add_row(f"{name}{unit}", *(f"{value:.5g}" for value in values.values()))
+        table.add_row(_with_unit(name, units), *(f"{value:.5g}" for value in values.values()))
     console.print(table)
 
 
-def _units() -> dict[str, str]:
-    """Return the units of parameters and outcomes."""
+def _right(title: str, headings: Sequence[str]) -> WholeTable:
+    """Return a table with all columns at the right."""
+    return WholeTable(*(Column(heading, justify="right") for heading in headings), title=title, title_justify="left")
+
+
+def _with_unit(name: str, units: Mapping[str, str]) -> str:
+    """Return the name of a parameter or an outcome with its unit, as a cell of a table."""
+    return f"{name} \\[{units[name]}]" if name in units else name
+
+
+def _print_several(console: Console, result: dict[str, Any]) -> None:
+    settings, units = result["settings"], result["units"]
+    stays = f"{' and '.join(result['joints'])} stay within {settings['bound']:g} rad or m"
+    _print_result(console, result, stays, settings["shares"], "", units)
+    names = [f"max_{joint}" for joint in result["joints"]]
+    table = _right("Worst runs", ("run", "noise seed", *(_with_unit(name, units) for name in names)))
+    for row in result["worst"][:5]:
+        table.add_row(str(row["run"]), f"{row['noise_seed']:.0f}", *(f"{row[name]:.5f}" for name in names))
+    console.print(table)
+
+
+def _print_one(console: Console, result: dict[str, Any]) -> None:
     from pendulum_bags.identification.model import UNITS
 
-    return {**UNITS, "max_theta": "rad", "std_theta": "rad", "max_effort": "N m"}
-
-
-def _with_unit(name: str) -> str:
-    """Return the name of a parameter or an outcome with its unit, as a cell of a table."""
-    known = _units()
-    return f"{name} \\[{known[name]}]" if name in known else name
-
-
-def _print(console: Console, result: dict[str, Any], folder: Path) -> None:
-    settings = result["settings"]
-    low, high = result["probability_interval"]
-    console.print(
-        f"{result['runs']} runs: theta stays within {settings['bound']:g} rad of upright with probability "
-        f"{result['probability_inside']:.5f} (95 % interval {low:.5f} to {high:.5f})"
-    )
+    settings, units = result["settings"], {**UNITS, "max_theta": "rad", "std_theta": "rad", "max_effort": "N m"}
     uncertain = settings["uncertainty"]
-    told = ", ".join(f"{name} {100.0 * share:.2g} %" for name, share in uncertain["shares"].items()) or "nothing"
-    correlated = ", correlated" if uncertain["correlation"] else ""
-    console.print(f"uncertain: {told}{correlated} ({uncertain['source']})")
-    _print_quantiles(console, result["quantiles"], _units())
-    table = WholeTable(title="Worst runs", title_justify="left")
     names = list(uncertain["shares"])
-    for heading in ("run", *map(_with_unit, names), "noise seed", "max theta \\[rad]"):
-        table.add_column(heading, justify="right")
+    source = f"{', correlated' if uncertain['correlation'] else ''} ({uncertain['source']})"
+    stays = f"theta stays within {settings['bound']:g} rad"
+    _print_result(console, result, stays, uncertain["shares"], source, units)
+    headings = ("run", *(_with_unit(name, units) for name in names), "noise seed", "max theta \\[rad]")
+    table = _right("Worst runs", headings)
     for row in result["worst"][:5]:
         table.add_row(
             str(row["run"]),
@@ -229,9 +238,7 @@ def _print(console: Console, result: dict[str, Any], folder: Path) -> None:
         )
     console.print(table)
     if "sobol" in result:
-        table = WholeTable(title=f"Sobol indices of {result['sobol']['output']}", title_justify="left")
-        for heading in ("factor", "first order", "total"):
-            table.add_column(heading, justify="right")
+        table = _right(f"Sobol indices of {result['sobol']['output']}", ("factor", "first order", "total"))
         for entry in result["sobol"]["indices"]:
             table.add_row(
                 entry["factor"],
@@ -239,4 +246,3 @@ def _print(console: Console, result: dict[str, Any], folder: Path) -> None:
                 f"{entry['total']:.4f} ± {entry['total_confidence']:.4f}",
             )
         console.print(table)
-    console.print(f"replay  add --replay {result['worst'][0]['run']}\nruns    {folder}")

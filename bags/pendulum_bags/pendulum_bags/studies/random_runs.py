@@ -7,6 +7,7 @@ import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.distributions import share_interval
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.chunks import (
     Connect,
@@ -24,12 +26,13 @@ from pendulum_bags.studies.chunks import (
     run_chunks,
     write_results_marker,
 )
-from pendulum_bags.studies.shares import share_interval
 from pendulum_msgs_py.errors import BagError, ParameterError
 
-__all__ = ["RandomRuns", "carry_out_runs", "figures_of_runs"]
+__all__ = ["Columns", "RandomRuns", "draw_chunk", "figures_of_runs", "replay", "run_chunk", "run_monte_carlo"]
 
 Array = NDArray[np.float64]
+Columns = dict[str, NDArray[Any]]
+"""Columns of a table by name, shape (n,) each; SI units."""
 
 _SEEDS_OF_ONE = 10_000_000_000
 """Distance between the noise seeds of two Monte Carlos."""
@@ -89,8 +92,26 @@ class RandomRuns(ABC):
                 raise ParameterError(f"{name} is {value} {unit}; expected a finite number >= {least:g}")
 
     @abstractmethod
+    def load(self) -> Any:
+        """Return the plant that is believed in."""
+
     def numbers_of_plant(self) -> Any:
         """Return all numbers of the plant, for a fingerprint."""
+        return self.load()
+
+    @abstractmethod
+    def draw(self, plant: Any, count: int, generator: np.random.Generator) -> Columns:
+        """Return parameters and starts of so many runs."""
+
+    @abstractmethod
+    def simulate(
+        self, plant: Any, drawn: Columns, threads: int | None = None, *, record: bool = False
+    ) -> tuple[Columns, Array | None]:
+        """Run what was drawn; return all columns, and where it is to be recorded the motion, shape (steps, k, n)."""
+
+    @abstractmethod
+    def summarise(self, folder: Path) -> dict[str, Any]:
+        """Return what the files of a folder say, by :func:`figures_of_runs`."""
 
     @property
     def steps(self) -> int:
@@ -108,54 +129,74 @@ class RandomRuns(ABC):
         content = json.dumps([settings, self.numbers_of_plant()], sort_keys=True, default=asdict)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
-    def draw(
-        self, index: int, draw: Callable[[np.random.Generator, int], Mapping[str, NDArray[Any]]]
-    ) -> dict[str, NDArray[Any]]:
-        """Return what is drawn for a chunk, and its noise seeds, shape (n,) each.
 
-        A chunk is drawn whole and then cut, so that a run is the same however many follow it.
+def draw_chunk(settings: RandomRuns, index: int, plant: Any = None) -> Columns:
+    """Return what is drawn for a chunk: plants, starts and noise seeds.
 
-        Args:
-            index: Of the chunk.
-            draw: Draws so many from a generator.
-        """
-        first = index * self.chunk
-        count = min(self.chunk, self.runs - first)
-        drawn = draw(np.random.Generator(np.random.Philox(key=[self.seed, index])), self.chunk)
-        seeds = self.seed * _SEEDS_OF_ONE + first + np.arange(count, dtype=np.int64)
-        return {**{name: values[:count] for name, values in drawn.items()}, "noise_seed": seeds}
+    A chunk is drawn whole and then cut, so that a run is the same however many follow it.
 
-    def place(self, number: int) -> tuple[int, slice]:
-        """Return the chunk of a run, numbered from 0, and where in it the run is."""
-        if not 0 <= number < self.runs:
-            raise ParameterError(f"run is {number}; expected 0 to {self.runs - 1}")
-        index, offset = divmod(number, self.chunk)
-        return index, slice(offset, offset + 1)
+    Args:
+        settings: Of the Monte Carlo.
+        index: Of the chunk.
+        plant: The plant that is believed in; by default the one that the settings name.
+    """
+    first = index * settings.chunk
+    count = min(settings.chunk, settings.runs - first)
+    generator = np.random.Generator(np.random.Philox(key=[settings.seed, index]))
+    drawn = settings.draw(plant or settings.load(), settings.chunk, generator)
+    seeds = settings.seed * _SEEDS_OF_ONE + first + np.arange(count, dtype=np.int64)
+    return {**{name: values[:count] for name, values in drawn.items()}, "noise_seed": seeds}
 
 
-def carry_out_runs(
+def run_chunk(settings: RandomRuns, index: int, threads: int | None = None) -> Columns:
+    """Run a chunk and return its columns; a pure function of settings and index."""
+    return _run_chunk((settings, settings.load()), index, threads)
+
+
+def _run_chunk(job: tuple[RandomRuns, Any], index: int, threads: int | None) -> Columns:
+    # The plant travels with the job: its file need not be where a worker runs.
+    settings, plant = job
+    return settings.simulate(plant, draw_chunk(settings, index, plant), threads)[0]
+
+
+def replay(settings: RandomRuns, number: int) -> tuple[dict[str, float], Array]:
+    """Run one run again, alone, and return what was drawn for it and its motion.
+
+    Args:
+        settings: As of the Monte Carlo.
+        number: Of the run, from 0.
+
+    Returns:
+        The row of the table, and positions, velocities and efforts of all n joints at each step, shape (steps, 3 n).
+    """
+    if not 0 <= number < settings.runs:
+        raise ParameterError(f"run is {number}; expected 0 to {settings.runs - 1}")
+    index, place = divmod(number, settings.chunk)
+    plant = settings.load()
+    drawn = {name: values[place : place + 1] for name, values in draw_chunk(settings, index, plant).items()}
+    columns, motion = settings.simulate(plant, drawn, record=True)
+    assert motion is not None
+    return {name: float(values[0]) for name, values in columns.items()}, motion[:, :, 0]
+
+
+def run_monte_carlo(
     folder: Path,
     settings: RandomRuns,
-    run_chunk: Callable[[Any, int, int | None], Mapping[str, NDArray[Any]]],
-    job: Any,
-    summarise: Callable[[Path, Any], dict[str, Any]],
     *,
-    connect: Connect,
-    on_progress: Callable[[int, int], None],
+    connect: Connect = nullcontext,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Run all chunks that are not on disk yet, one Parquet file each, sum up and write that beside them.
 
     Args:
         folder: Where the files go; a folder of the same settings is gone on with, one of fewer runs is added to.
         settings: What to run.
-        run_chunk: Runs a chunk of a job.
-        job: What it needs besides the number of the chunk.
-        summarise: Returns the result, of the folder and the settings.
-        connect: To a Dask cluster.
+        connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
         on_progress: Called with chunks done and in all.
 
     Raises:
         BagError: The folder holds something else, or more runs.
+        ParameterError: A drawn plant has no positive inertia.
     """
     fingerprint, content = settings.fingerprint(), asdict(settings)
     before = int(kept_settings(folder, fingerprint).get("runs", settings.runs))
@@ -169,8 +210,9 @@ def carry_out_runs(
             chunk_path(folder, before // settings.chunk).unlink(missing_ok=True)
         write_results_marker(folder, fingerprint, content)
     open_results(folder, "Monte Carlo", fingerprint, content)
-    run_chunks(folder, run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
-    result = summarise(folder, settings)
+    job = (settings, settings.load())
+    run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
+    result = settings.summarise(folder)
     write_json(folder / "monte_carlo.json", result)
     return result
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
+from pendulum_bags.studies.monte_carlo_cli import options_of_several
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counted_progress
 from pendulum_msgs_py.programs.executables import typed_options
@@ -18,10 +18,9 @@ from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
-    from pendulum_bags.studies.chunks import Connect
+    from pendulum_bags.studies.joint_region import JointRegion
 
 __all__ = ["region_of_attraction"]
-
 
 _OF_ONE_JOINT = {"q", "r", "effort_limit", "angle_span", "velocity_span"}
 """Options that plants of several joints do not have."""
@@ -71,34 +70,36 @@ def region_of_attraction(
     """
     from pendulum_bags.studies.chunks import cluster_client
     from pendulum_bags.studies.region_figure import region_sentence, write_region_figure
-    from pendulum_bags.studies.region_map import RegionMap, run_region_map
+    from pendulum_bags.studies.region_map import RegionMap
+    from pendulum_bags.studies.start_grid import run_map
     from pendulum_bags.studies.uncertain import parse_uncertainty
     from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 
     folder = out or Path("bags", "runs", "region_of_attraction")
     console = make_console(stderr=json_output, highlight=False)
-    connect = partial(cluster_client, scheduler, workers)
+    settings: RegionMap | JointRegion
     if is_mechanism(plant):
-        _joints(context, console, folder, connect, axes, spans, json_output=json_output)
-        return
-    if typed := typed_options(context, {"axes", "spans"}):
+        settings = _joints(context, axes, spans)
+    elif typed := typed_options(context, {"axes", "spans"}):
         raise ParameterError(f"{typed[0]} is for a plant of several joints, and {plant} has one")
-    settings = RegionMap(
-        plant=plant,
-        uncertainty=parse_uncertainty(uncertainty, plant),
-        plants=plants,
-        q=q,
-        r=r,
-        effort_limit=effort_limit,
-        points=points,
-        angle_span=angle_span,
-        velocity_span=velocity_span,
-        duration=duration,
-        seed=seed,
-    )
+    else:
+        settings = RegionMap(
+            plant=plant,
+            uncertainty=parse_uncertainty(uncertainty, plant),
+            plants=plants,
+            q=q,
+            r=r,
+            effort_limit=effort_limit,
+            points=points,
+            angle_span=angle_span,
+            velocity_span=velocity_span,
+            duration=duration,
+            seed=seed,
+        )
     started = time.monotonic()
     with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
-        result = run_region_map(folder, settings, connect=connect, on_progress=on_progress)
+        connect = partial(cluster_client, scheduler, workers)
+        result = run_map(folder, settings, connect=connect, on_progress=on_progress)
     picture = write_region_figure(folder / "region.png", result)
     if json_output:
         print(json.dumps(result.to_json(), indent=2))
@@ -108,36 +109,12 @@ def region_of_attraction(
     console.print(f"\npicture {picture}\nmap     {folder / 'map.parquet'}\n({elapsed:.0f} s)", soft_wrap=True)
 
 
-def _joints(
-    context: typer.Context,
-    console: Console,
-    folder: Path,
-    connect: Connect,
-    axes: str,
-    spans: tuple[float, float],
-    *,
-    json_output: bool,
-) -> None:
-    """Map a plant of several joints, with the options that were typed."""
+def _joints(context: typer.Context, axes: str, spans: tuple[float, float]) -> JointRegion:
+    """Return the settings for a plant of several joints, of the options that were typed."""
     from pendulum_bags.studies.joint_monte_carlo import joint_shares
-    from pendulum_bags.studies.joint_region import JointRegion, run_joint_region
-    from pendulum_bags.studies.region_figure import joint_region_sentence, write_joint_region_figure
+    from pendulum_bags.studies.joint_region import JointRegion
 
-    given, plant = context.params, context.params["plant"]
-    if typed := typed_options(context, _OF_ONE_JOINT):
-        raise ParameterError(f"{typed[0]} is for a plant of one joint, and {plant} has several: its own LQR holds it")
-    told = given["uncertainty"] if typed_options(context, {"uncertainty"}) else "0.05"
-    names = ("plants", "points", "duration", "seed")
-    chosen = {name: given[name] for name in names if typed_options(context, {name})}
+    plant = context.params["plant"]
+    told, chosen = options_of_several(context, _OF_ONE_JOINT, ("plants", "points", "duration", "seed"))
     both = tuple(part.strip() for part in axes.split(",") if part.strip())
-    settings = JointRegion(plant=plant, axes=both, spans=spans, shares=joint_shares(told, plant), **chosen)
-    started = time.monotonic()
-    with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
-        result = run_joint_region(folder, settings, connect=connect, on_progress=on_progress)
-    picture = write_joint_region_figure(folder / "region.png", result)
-    if json_output:
-        print(json.dumps(result.to_json(), indent=2))
-        return
-    console.print(joint_region_sentence(result))
-    elapsed = time.monotonic() - started
-    console.print(f"\npicture {picture}\nmap     {folder / 'map.parquet'}\n({elapsed:.0f} s)", soft_wrap=True)
+    return JointRegion(plant=plant, axes=both, spans=spans, shares=joint_shares(told, plant), **chosen)

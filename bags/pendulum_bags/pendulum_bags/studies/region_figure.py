@@ -12,7 +12,7 @@ from pendulum_bags.studies.joint_region import JointRegionResult
 from pendulum_bags.studies.region_map import RegionResult
 from pendulum_msgs_py.contract.angles import UPRIGHT
 
-__all__ = ["joint_region_sentence", "region_sentence", "write_joint_region_figure", "write_region_figure"]
+__all__ = ["region_sentence", "write_region_figure"]
 
 
 @dataclass(frozen=True)
@@ -41,57 +41,40 @@ class _Picture:
     title: str
 
 
-def write_region_figure(path: Path, result: RegionResult) -> Path:
+def _picture(result: RegionResult | JointRegionResult) -> _Picture:
+    settings = result.settings
+    if isinstance(result, RegionResult):
+        return _Picture(
+            result.theta - UPRIGHT,
+            result.theta_dot,
+            ("theta - pi at the start [rad]", "theta' at the start [rad/s]"),
+            result.share,
+            result.believed,
+            settings.plants,
+            result.ellipse,
+            f"proven: $x^T S x \\leq$ {result.level:.3g}",
+            f"Starts from which LQR at {result.limit:g} N m reaches upright",
+        )
+    first, second = (f"{axis.name} from upright at the start [{axis.unit}]" for axis in result.settings.both)
+    return _Picture(
+        *result.settings.starts(),
+        (first, second),
+        result.share,
+        result.believed,
+        settings.plants,
+        result.section,
+        "" if result.caught is None else f"sampled, without dry friction: $x^T S x \\leq$ {result.caught.level:.3g}",
+        f"Starts from which the LQR of {settings.plant} reaches upright",
+    )
+
+
+def write_region_figure(path: Path, result: RegionResult | JointRegionResult) -> Path:
     """Draw the map and return the path.
 
     Args:
         path: The picture; its ending says of what kind.
         result: The map.
     """
-    return _draw(
-        path,
-        _Picture(
-            result.theta - UPRIGHT,
-            result.theta_dot,
-            ("theta - pi at the start [rad]", "theta' at the start [rad/s]"),
-            result.share,
-            result.believed,
-            result.settings.plants,
-            result.ellipse,
-            f"proven: $x^T S x \\leq$ {result.level:.3g}",
-            f"Starts from which LQR at {result.limit:g} N m reaches upright",
-        ),
-    )
-
-
-def write_joint_region_figure(path: Path, result: JointRegionResult) -> Path:
-    """Draw the map of a plant of several joints and return the path.
-
-    Args:
-        path: The picture; its ending says of what kind.
-        result: The map.
-    """
-    x, y = result.settings.starts()
-    labels = [f"{axis.name} from upright at the start [{axis.unit}]" for axis in result.settings.both]
-    return _draw(
-        path,
-        _Picture(
-            x,
-            y,
-            (labels[0], labels[1]),
-            result.share,
-            result.believed,
-            result.settings.plants,
-            result.section,
-            ""
-            if result.caught is None
-            else f"sampled, without dry friction: $x^T S x \\leq$ {result.caught.level:.3g}",
-            f"Starts from which the LQR of {result.settings.plant} reaches upright",
-        ),
-    )
-
-
-def _draw(path: Path, picture: _Picture) -> Path:
     from matplotlib import patheffects
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -100,6 +83,7 @@ def _draw(path: Path, picture: _Picture) -> Path:
     figure = Figure(figsize=(7.2, 5.8), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     ax = figure.subplots()
+    picture = _picture(result)
     x, y = picture.x, picture.y
     shades = ax.pcolormesh(x, y, 100.0 * picture.share, cmap="Greys", vmin=0.0, vmax=100.0, shading="nearest")
     # Full black would hide the curves.
@@ -127,47 +111,35 @@ def _draw(path: Path, picture: _Picture) -> Path:
     return path
 
 
-def region_sentence(result: RegionResult) -> str:
+def region_sentence(result: RegionResult | JointRegionResult) -> str:
     """Return what the map says."""
     plants = result.settings.plants
-    runs = plants * result.share.size
+    runs, reached = plants * result.share.size, 100.0 * float(result.share.mean())
+    sure, never = (100.0 * float(np.mean(result.share == share)) for share in (1.0, 0.0))
+    parts = f"; from {sure:.1f} % of the starts every plant does, from {never:.1f} % none" if plants > 1 else ""
+    if isinstance(result, JointRegionResult):
+        first, second = (f"{axis.name} within {axis.span:g} {axis.unit}" for axis in result.settings.both)
+        text = f"{runs} runs, {first} and {second} of upright at rest: {reached:.1f} % come to rest upright{parts}"
+        if result.caught is None:
+            return f"{text}. No state was found that the LQR surely catches."
+        if not np.isfinite(result.share_in_section):
+            return f"{text}. The states that the LQR catches, by sampling, hold no start of this grid."
+        inside = 100.0 * result.share_in_section
+        return f"{text}. Of the starts that the LQR catches, by sampling without dry friction, {inside:.2f} % do."
     grid = (result.theta[-1] - result.theta[0]) * (result.theta_dot[-1] - result.theta_dot[0])
-    parts = [f"{runs} runs, {result.limit:g} N m at most: "]
-    mean = 100.0 * float(result.share.mean())
-    parts.append(f"{mean:.1f} % of them reach upright from a grid of {grid:.3g} rad^2/s")
-    if plants > 1:
-        sure = 100.0 * float(np.mean(result.share == 1.0))
-        never = 100.0 * float(np.mean(result.share == 0.0))
-        parts.append(f"; from {sure:.1f} % of the starts every plant does, from {never:.1f} % none")
-    parts.append(". ")
+    text = (
+        f"{runs} runs, {result.limit:g} N m at most: {reached:.1f} % of them reach upright from a grid of {grid:.3g} "
+        f"rad^2/s{parts}. "
+    )
     if np.isfinite(result.share_in_ellipse):
-        parts.append(f"Inside the ellipse of the linear analysis {100.0 * result.share_in_ellipse:.2f} % reach it")
-        parts.append(
+        text += f"Inside the ellipse of the linear analysis {100.0 * result.share_in_ellipse:.2f} % reach it"
+        text += (
             ", the believed plant from every start."
             if not result.counterexamples
             else f"; the believed plant does not from {result.counterexamples} starts."
         )
     else:
-        parts.append("The ellipse of the linear analysis holds no start of this grid.")
+        text += "The ellipse of the linear analysis holds no start of this grid."
     if result.moving > 0.0:
-        parts.append(f" {100.0 * result.moving:.2g} % neither arrived nor rest; a longer --duration may decide.")
-    return "".join(parts)
-
-
-def joint_region_sentence(result: JointRegionResult) -> str:
-    """Return what the map of a plant of several joints says."""
-    plants = result.settings.plants
-    first, second = (f"{axis.name} within {axis.span:g} {axis.unit}" for axis in result.settings.both)
-    text = (
-        f"{plants * result.share.size} runs, {first} and {second} of upright at rest: "
-        f"{100.0 * float(result.share.mean()):.1f} % come to rest upright"
-    )
-    if plants > 1:
-        sure, never = (100.0 * float(np.mean(result.share == share)) for share in (1.0, 0.0))
-        text += f"; from {sure:.1f} % of the starts every plant does, from {never:.1f} % none"
-    if result.caught is None:
-        return f"{text}. No state was found that the LQR surely catches."
-    if not np.isfinite(result.share_in_section):
-        return f"{text}. The states that the LQR catches, by sampling, hold no start of this grid."
-    inside = 100.0 * result.share_in_section
-    return f"{text}. Of the starts that the LQR catches, by sampling without dry friction, {inside:.2f} % do."
+        text += f" {100.0 * result.moving:.2g} % neither arrived nor rest; a longer --duration may decide."
+    return text

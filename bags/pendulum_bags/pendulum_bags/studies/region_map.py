@@ -8,8 +8,6 @@ ellipse of the linear analysis, proven for that plant, belongs inside.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,8 +15,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_bags.studies.chunks import Connect, chunk_path, read_columns
-from pendulum_bags.studies.start_grid import StartGrid, carry_out_map, inside_ellipse, share_inside
+from pendulum_bags.studies.chunks import chunk_path, read_columns
+from pendulum_bags.studies.random_runs import Array, Columns
+from pendulum_bags.studies.start_grid import StartGrid, inside_ellipse, share_inside
 from pendulum_bags.studies.uncertain import VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import Gain, output_lqr
 from pendulum_lqr.model import linearise
@@ -28,15 +27,13 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.batch import simulate_batch
 
-__all__ = ["COLUMNS", "RegionMap", "RegionResult", "run_region_map"]
+__all__ = ["COLUMNS", "RegionMap", "RegionResult"]
 
 COLUMNS = ("plant", *VARIED, "theta_0", "theta_dot_0", "theta_end", "theta_dot_end", "attracted")
 """Columns of the Parquet files of the runs; SI units, ``plant`` counts the plants from 0."""
 MAP_COLUMNS = ("theta_0", "theta_dot_0", "plants", "attracted", "share", "attracted_believed", "turned")
 
 _TWO_PI = 2.0 * math.pi
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -101,6 +98,85 @@ class RegionMap(StartGrid):
         """Return all numbers of the plant, for a fingerprint."""
         return asdict(self.believed())
 
+    def job(self) -> tuple[PlantParameters, tuple[float, ...]]:
+        """Return the plant that is believed in, and the gain."""
+        return self.believed(), tuple(float(value) for value in self.gain().K)
+
+    def run_chunk(self, job: tuple[PlantParameters, tuple[float, ...]], index: int, threads: int | None) -> Columns:
+        """Run a chunk and return its columns."""
+        plant, gain = job
+        numbers, generator = self.chunk(index)
+        count = len(numbers)
+        drawn = self.uncertainty.draw(plant, count, generator)
+        if index == 0:
+            for name in VARIED:
+                drawn[name][0] = getattr(plant, name)
+        angles, velocities = self.grid()
+        theta_dot, theta = (axis.ravel() for axis in np.meshgrid(velocities, angles, indexing="ij"))
+        every = {name: np.repeat(values, theta.size) for name, values in drawn.items()}
+        starts, speeds = np.tile(theta, count), np.tile(theta_dot, count)
+        result = simulate_batch(
+            plant,
+            variations=batch_variations(plant, every),
+            steps=self.steps,
+            dt=self.dt,
+            method=self.method,
+            theta=starts,
+            theta_dot=speeds,
+            gain=gain,
+            threads=threads,
+        )
+        near = (np.abs(wrap(result.theta - UPRIGHT)) < self.tolerance[0]) & (
+            np.abs(result.theta_dot) < self.tolerance[1]
+        )
+        columns: Columns = {
+            "plant": np.repeat(numbers, theta.size),
+            **every,
+            "theta_0": starts,
+            "theta_dot_0": speeds,
+            "theta_end": result.theta,
+            "theta_dot_end": result.theta_dot,
+            "attracted": near,
+        }
+        return {name: columns[name] for name in COLUMNS}
+
+    def summarise(self, folder: Path) -> RegionResult:
+        """Return the map, from the Parquet files."""
+        shape = (self.points, self.points)
+        hits, rounds = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
+        believed = np.zeros(shape, dtype=np.bool_)
+        moving = 0
+        for index in range(self.chunks):
+            columns = read_columns(chunk_path(folder, index), ("attracted", "theta_end", "theta_dot_end"))
+            attracted = columns["attracted"].reshape(-1, *shape)
+            turns = np.round((columns["theta_end"].reshape(-1, *shape) - UPRIGHT) / _TWO_PI)
+            hits += attracted.sum(axis=0)
+            rounds += (attracted & (turns != 0.0)).sum(axis=0)
+            velocity = np.abs(columns["theta_dot_end"].reshape(-1, *shape))
+            # Written so that a run which is not a number any more counts as moving.
+            moving += int((~attracted & ~(velocity < self.tolerance[1])).sum())
+            if index == 0:
+                believed = attracted[0]
+        plant, gain = self.believed(), self.gain()
+        level = proven_level(plant, gain, plant.effort_limit)
+        theta, theta_dot = self.grid()
+        x, v = np.meshgrid(theta - UPRIGHT, theta_dot)
+        inside = inside_ellipse(gain.S, level, x, v)
+        return RegionResult(
+            settings=self,
+            limit=plant.effort_limit,
+            theta=theta,
+            theta_dot=theta_dot,
+            share=hits / self.plants,
+            believed=believed,
+            turned=rounds / self.plants,
+            moving=moving / (self.plants * self.points**2),
+            level=level,
+            ellipse=sublevel_ellipse(gain.S, level),
+            counterexamples=int(np.count_nonzero(inside & ~believed)),
+            share_in_ellipse=share_inside(hits, inside, self.plants),
+        )
+
 
 @dataclass(frozen=True)
 class RegionResult:
@@ -163,11 +239,11 @@ class RegionResult:
             "still_moving": self.moving,
         }
 
-    def columns(self) -> dict[str, NDArray[Any]]:
+    def columns(self) -> Columns:
         """Return the map, a row for each start."""
         theta, theta_dot = np.meshgrid(self.theta, self.theta_dot)
         plants = self.settings.plants
-        columns: dict[str, NDArray[Any]] = {
+        columns: Columns = {
             "theta_0": theta.ravel(),
             "theta_dot_0": theta_dot.ravel(),
             "plants": np.full(theta.size, plants, dtype=np.int64),
@@ -177,102 +253,3 @@ class RegionResult:
             "turned": self.turned.ravel(),
         }
         return {name: columns[name] for name in MAP_COLUMNS}
-
-
-def run_region_map(
-    folder: Path,
-    settings: RegionMap,
-    *,
-    connect: Connect = nullcontext,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> RegionResult:
-    """Run what is not on disk yet, and write the map and its figures, as :func:`carry_out_map` does.
-
-    Args:
-        folder: Where the files go.
-        settings: What to map.
-        connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
-        on_progress: Called with chunks done and in all.
-
-    Raises:
-        BagError: The folder holds something else.
-    """
-    job = (settings, settings.believed(), tuple(float(value) for value in settings.gain().K))
-    return carry_out_map(folder, settings, _run_chunk, job, _summarise, connect=connect, on_progress=on_progress)
-
-
-def _run_chunk(
-    job: tuple[RegionMap, PlantParameters, tuple[float, ...]], index: int, threads: int | None
-) -> dict[str, NDArray[Any]]:
-    settings, plant, gain = job
-    numbers, generator = settings.chunk(index)
-    count = len(numbers)
-    drawn = settings.uncertainty.draw(plant, count, generator)
-    if index == 0:
-        for name in VARIED:
-            drawn[name][0] = getattr(plant, name)
-    angles, velocities = settings.grid()
-    theta_dot, theta = (axis.ravel() for axis in np.meshgrid(velocities, angles, indexing="ij"))
-    every = {name: np.repeat(values, theta.size) for name, values in drawn.items()}
-    starts, speeds = np.tile(theta, count), np.tile(theta_dot, count)
-    result = simulate_batch(
-        plant,
-        variations=batch_variations(plant, every),
-        steps=settings.steps,
-        dt=settings.dt,
-        method=settings.method,
-        theta=starts,
-        theta_dot=speeds,
-        gain=gain,
-        threads=threads,
-    )
-    near = (np.abs(wrap(result.theta - UPRIGHT)) < settings.tolerance[0]) & (
-        np.abs(result.theta_dot) < settings.tolerance[1]
-    )
-    columns: dict[str, NDArray[Any]] = {
-        "plant": np.repeat(numbers, theta.size),
-        **every,
-        "theta_0": starts,
-        "theta_dot_0": speeds,
-        "theta_end": result.theta,
-        "theta_dot_end": result.theta_dot,
-        "attracted": near,
-    }
-    return {name: columns[name] for name in COLUMNS}
-
-
-def _summarise(folder: Path, settings: RegionMap) -> RegionResult:
-    shape = (settings.points, settings.points)
-    hits, rounds = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
-    believed = np.zeros(shape, dtype=np.bool_)
-    moving = 0
-    for index in range(settings.chunks):
-        columns = read_columns(chunk_path(folder, index), ("attracted", "theta_end", "theta_dot_end"))
-        attracted = columns["attracted"].reshape(-1, *shape)
-        turns = np.round((columns["theta_end"].reshape(-1, *shape) - UPRIGHT) / _TWO_PI)
-        hits += attracted.sum(axis=0)
-        rounds += (attracted & (turns != 0.0)).sum(axis=0)
-        velocity = np.abs(columns["theta_dot_end"].reshape(-1, *shape))
-        # Written so that a run which is not a number any more counts as moving.
-        moving += int((~attracted & ~(velocity < settings.tolerance[1])).sum())
-        if index == 0:
-            believed = attracted[0]
-    plant, gain = settings.believed(), settings.gain()
-    level = proven_level(plant, gain, plant.effort_limit)
-    theta, theta_dot = settings.grid()
-    x, v = np.meshgrid(theta - UPRIGHT, theta_dot)
-    inside = inside_ellipse(gain.S, level, x, v)
-    return RegionResult(
-        settings=settings,
-        limit=plant.effort_limit,
-        theta=theta,
-        theta_dot=theta_dot,
-        share=hits / settings.plants,
-        believed=believed,
-        turned=rounds / settings.plants,
-        moving=moving / (settings.plants * settings.points**2),
-        level=level,
-        ellipse=sublevel_ellipse(gain.S, level),
-        counterexamples=int(np.count_nonzero(inside & ~believed)),
-        share_in_ellipse=share_inside(hits, inside, settings.plants),
-    )

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
-from pendulum_bags.distributions import mean_interval
+from pendulum_bags.distributions import mean_interval, share_interval
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies.records import read_record
-from pendulum_bags.studies.shares import share_interval
 from pendulum_bags.studies.study_file import Study
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import NANOSECONDS

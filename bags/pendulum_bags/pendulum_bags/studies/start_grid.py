@@ -6,21 +6,21 @@ import hashlib
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.chunks import Connect, open_results, run_chunks, write_columns
+from pendulum_bags.studies.random_runs import Array, Columns
 from pendulum_msgs_py.errors import ParameterError
 
-__all__ = ["StartGrid", "carry_out_map", "inside_ellipse", "share_inside"]
-
-Array = NDArray[np.float64]
+__all__ = ["StartGrid", "inside_ellipse", "run_map", "share_inside"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,18 @@ class StartGrid(ABC):
     def numbers_of_plant(self) -> Any:
         """Return all numbers of the plant, for a fingerprint."""
 
+    @abstractmethod
+    def job(self) -> Any:
+        """Return what a chunk needs besides these settings; it travels to the workers, as its files need not."""
+
+    @abstractmethod
+    def run_chunk(self, job: Any, index: int, threads: int | None) -> Columns:
+        """Run a chunk and return its columns."""
+
+    @abstractmethod
+    def summarise(self, folder: Path) -> Any:
+        """Return what the files of a folder say: its figures by ``to_json``, the map, a row a start, by ``columns``."""
+
     @property
     def plants_of_chunk(self) -> int:
         """Plants in a chunk; part of the result's definition."""
@@ -97,50 +109,37 @@ class StartGrid(ABC):
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
-class MapResult(Protocol):
-    """What came of a map."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures as JSON values."""
-
-    def columns(self) -> Mapping[str, NDArray[Any]]:
-        """Return the map, a row for each start."""
-
-
-Result = TypeVar("Result", bound=MapResult)
-Settings = TypeVar("Settings", bound=StartGrid)
-
-
-def carry_out_map(
+def run_map(
     folder: Path,
-    settings: Settings,
-    run_chunk: Callable[[Any, int, int | None], Mapping[str, NDArray[Any]]],
-    job: Any,
-    summarise: Callable[[Path, Settings], Result],
+    settings: StartGrid,
     *,
-    connect: Connect,
-    on_progress: Callable[[int, int], None],
-) -> Result:
+    connect: Connect = nullcontext,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Any:
     """Run what is not on disk yet, one Parquet file for each chunk, and write the map and its figures.
 
     Args:
         folder: Where the files go; a folder of the same settings is gone on with.
         settings: What to map.
-        run_chunk: Runs a chunk of a job.
-        job: What it needs besides the number of the chunk.
-        summarise: Returns the result, of the folder and the settings.
-        connect: To a Dask cluster.
+        connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
         on_progress: Called with chunks done and in all.
 
     Raises:
         BagError: The folder holds something else.
+        ParameterError: A start lies beyond an end stop, or a drawn plant has no positive inertia.
     """
     open_results(folder, "map", settings.fingerprint(), asdict(settings))
-    run_chunks(folder, run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
-    result = summarise(folder, settings)
+    job = (settings, settings.job())
+    run_chunks(folder, _run_chunk, job, settings.chunks, connect=connect, on_progress=on_progress)
+    result = settings.summarise(folder)
     write_columns(folder / "map.parquet", result.columns())
     write_json(folder / "region.json", result.to_json())
     return result
+
+
+def _run_chunk(job: tuple[StartGrid, Any], index: int, threads: int | None) -> Columns:
+    settings, rest = job
+    return settings.run_chunk(rest, index, threads)
 
 
 def inside_ellipse(S: Array, level: float, x: Array, y: Array) -> NDArray[np.bool_]:
