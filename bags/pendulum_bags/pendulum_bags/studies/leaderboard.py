@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,9 +33,9 @@ __all__ = [
     "Entry",
     "contenders",
     "costs_of",
+    "entry_of",
     "evaluate",
     "model_errors",
-    "motion_of",
     "push_trains",
     "scores",
 ]
@@ -178,34 +179,60 @@ def push_trains(plant: PlantParameters, duration: float) -> list[dict[str, Any]]
     ]
 
 
-def _model_error(plant: PlantParameters, _duration: float) -> Sequence[Variation]:
-    return [(one, {}, {}) for one in model_errors(plant)]
-
-
-def _noise(plant: PlantParameters, _duration: float) -> Sequence[Variation]:
-    return [(plant, {}, {"position_noise": a, "velocity_noise": 10.0 * a}) for a in (0.001, 0.003, 0.01, 0.03)]
-
-
-def _delay(plant: PlantParameters, _duration: float) -> Sequence[Variation]:
-    return [(replace(plant, transport_delay=delay), {}, {}) for delay in (0.002, 0.005, 0.01, 0.02, 0.04)]
-
-
-def _torque_response(plant: PlantParameters, _duration: float) -> Sequence[Variation]:
-    return [(replace(plant, actuator_time_constant=lag), {}, {}) for lag in (0.005, 0.01, 0.02, 0.05)]
-
-
-def _pushes(plant: PlantParameters, duration: float) -> Sequence[Variation]:
-    return [(plant, push, {}) for push in push_trains(plant, duration)]
-
-
 PERTURBATIONS: Mapping[str, Callable[[PlantParameters, float], Sequence[Variation]]] = {
-    "model_error": _model_error,
-    "noise": _noise,
-    "delay": _delay,
-    "torque_response": _torque_response,
-    "pushes": _pushes,
+    "model_error": lambda plant, _: [(one, {}, {}) for one in model_errors(plant)],
+    "noise": lambda plant, _: [
+        (plant, {}, {"position_noise": a, "velocity_noise": 10.0 * a}) for a in (0.001, 0.003, 0.01, 0.03)
+    ],
+    "delay": lambda plant, _: [
+        (replace(plant, transport_delay=delay), {}, {}) for delay in (0.002, 0.005, 0.01, 0.02, 0.04)
+    ],
+    "torque_response": lambda plant, _: [
+        (replace(plant, actuator_time_constant=lag), {}, {}) for lag in (0.005, 0.01, 0.02, 0.05)
+    ],
+    "pushes": lambda plant, duration: [(plant, push, {}) for push in push_trains(plant, duration)],
 }
 """Kind of perturbation -> the plants, disturbances and sensors that it tries, in runs of some length [s]."""
+
+
+Run = Callable[[], RunArrays]
+
+
+def entry_of(
+    plant: str,
+    controller: str,
+    run: Run,
+    perturbed: Iterable[tuple[str, Sequence[Run]]],
+    patience: float = math.inf,
+) -> Entry:
+    """Return the line of a controller.
+
+    Args:
+        plant: As the board names it.
+        controller: Kind.
+        run: Carries out the plain run.
+        perturbed: Kind and runs of each perturbation; not asked for where the plain run fails.
+        patience: Wall time of the plain run beyond which no perturbation is tried [s].
+    """
+    began = time.perf_counter()
+    try:
+        arrays = run()
+    except (PendulumError, ArithmeticError) as error:
+        wall = time.perf_counter() - began
+        return Entry(plant, controller, str(error), False, {}, {}, {}, wall, np.empty((3, 0)))
+    success, uptime, costs = costs_of(arrays)
+    wall = time.perf_counter() - began
+    held: dict[str, float] = {}
+    if success and wall < patience:
+        held = {kind: float(np.mean([_succeeds(one) for one in runs])) for kind, runs in perturbed}
+    return Entry(plant, controller, "", success, costs, scores(success, uptime, costs), held, wall, motion_of(arrays))
+
+
+def _succeeds(run: Run) -> bool:
+    try:
+        return costs_of(run())[0]
+    except (PendulumError, ArithmeticError):
+        return False
 
 
 def evaluate(
@@ -238,28 +265,16 @@ def evaluate(
         "duration": duration,
         "method": "etd4",
     }
-    began = time.perf_counter()
-    try:
-        arrays = simulate_plant(RunSpec(**spec), true)
-    except (PendulumError, ArithmeticError) as error:
-        wall = time.perf_counter() - began
-        return Entry(plant, controller, str(error), False, {}, {}, {}, wall, np.empty((3, 0)))
-    success, uptime, costs = costs_of(arrays)
-    wall = time.perf_counter() - began
-    held: dict[str, float] = {}
-    if robustness and success and wall < patience:
-        for name, vary in PERTURBATIONS.items():
-            outcomes = []
+
+    def perturbed() -> Iterator[tuple[str, Sequence[Run]]]:
+        for kind, vary in PERTURBATIONS.items() if robustness else ():
+            runs = []
             for changed, disturbance, noise in vary(true, duration):
                 sensors = Sensors(np.random.default_rng(1), **noise)
-                run = RunSpec(**{**spec, "disturbance": dict(disturbance)})
-                try:
-                    outcomes.append(costs_of(simulate_plant(run, changed, sensors))[0])
-                except (PendulumError, ArithmeticError):
-                    outcomes.append(False)
-            held[name] = float(np.mean(outcomes))
-    score = scores(success, uptime, costs)
-    return Entry(plant, controller, "", success, costs, score, held, wall, motion_of(arrays))
+                runs.append(partial(simulate_plant, RunSpec(**{**spec, "disturbance": disturbance}), changed, sensors))
+            yield kind, runs
+
+    return entry_of(plant, controller, lambda: simulate_plant(RunSpec(**spec), true), perturbed(), patience)
 
 
 def motion_of(arrays: RunArrays) -> Array:

@@ -11,9 +11,9 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +21,10 @@ import numpy as np
 
 from pendulum_bags.experiments.in_process import RunArrays
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.studies.leaderboard import (
-    HARDWARE,
-    Entry,
-    costs_of,
-    model_errors,
-    motion_of,
-    push_trains,
-    scores,
-)
+from pendulum_bags.studies.leaderboard import HARDWARE, Entry, Run, entry_of, model_errors, push_trains
 from pendulum_lqr.controllers.policy import START_TIME
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.errors import DataError, FaultError, PendulumError
+from pendulum_msgs_py.errors import DataError, FaultError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_rosbag.reader import read_bag
 
@@ -77,23 +69,11 @@ def _model_error(folder: Path, _duration: float) -> Sequence[Mapping[str, Any]]:
     return found
 
 
-def _noise(_folder: Path, _duration: float) -> Sequence[Mapping[str, Any]]:
-    return [{"seed": seed} for seed in (2, 3, 4)]
-
-
-def _torque_response(_folder: Path, _duration: float) -> Sequence[Mapping[str, Any]]:
-    return [{"strategy": strategy} for strategy in ("direct_pwm_compensated", "effort_loop")]
-
-
-def _pushes(_folder: Path, duration: float) -> Sequence[Mapping[str, Any]]:
-    return [{"disturbance": push} for push in push_trains(load_plant(_PLANT), duration)]
-
-
 HARDWARE_PERTURBATIONS: Mapping[str, Callable[[Path, float], Sequence[Mapping[str, Any]]]] = {
     "model_error": _model_error,
-    "noise": _noise,
-    "torque_response": _torque_response,
-    "pushes": _pushes,
+    "noise": lambda _, __: [{"seed": seed} for seed in (2, 3, 4)],
+    "torque_response": lambda _, __: [{"strategy": strategy} for strategy in ("direct_pwm_compensated", "effort_loop")],
+    "pushes": lambda _, duration: [{"disturbance": push} for push in push_trains(load_plant(_PLANT), duration)],
 }
 """Kind of perturbation -> what it changes of the run. The machine has a delay of its own; seeds vary its noise."""
 
@@ -113,41 +93,24 @@ def evaluate_hardware(
         duration: Length of each run [s].
         robustness: Whether to try the perturbations.
     """
-    began = time.perf_counter()
-    try:
-        spec = RunSpec(
-            side="hw",
-            plant=_PLANT,
-            design_plant=_PLANT,
-            strategy=_STRATEGY,
-            controller=controller,
-            # A bridge lets nobody begin with much torque, and a hanging pendulum asks a swing-up for all of it.
-            controller_parameters={"start_time": START_TIME, **(parameters or {})},
-            theta=0.01,
-            duration=duration,
-        )
-        arrays = _run(spec)
-    except (PendulumError, ArithmeticError) as error:
-        wall = time.perf_counter() - began
-        return Entry(HARDWARE, controller, str(error), False, {}, {}, {}, wall, np.empty((3, 0)))
-    success, uptime, costs = costs_of(arrays)
-    wall = time.perf_counter() - began
-    held: dict[str, float] = {}
-    if robustness and success:
+    spec: dict[str, Any] = {
+        "side": "hw",
+        "plant": _PLANT,
+        "design_plant": _PLANT,
+        "strategy": _STRATEGY,
+        "controller": controller,
+        # A bridge lets nobody begin with much torque, and a hanging pendulum asks a swing-up for all of it.
+        "controller_parameters": {"start_time": START_TIME, **(parameters or {})},
+        "theta": 0.01,
+        "duration": duration,
+    }
+
+    def perturbed() -> Iterator[tuple[str, Sequence[Run]]]:
         with tempfile.TemporaryDirectory(prefix="pendulum_board_") as folder:
-            for name, vary in HARDWARE_PERTURBATIONS.items():
-                changes = vary(Path(folder), duration)
-                held[name] = float(np.mean([_succeeds(replace(spec, **change)) for change in changes]))
-    return Entry(
-        HARDWARE, controller, "", success, costs, scores(success, uptime, costs), held, wall, motion_of(arrays)
-    )
+            for kind, vary in HARDWARE_PERTURBATIONS.items() if robustness else ():
+                yield kind, [partial(_run, RunSpec(**{**spec, **change})) for change in vary(Path(folder), duration)]
 
-
-def _succeeds(spec: RunSpec) -> bool:
-    try:
-        return costs_of(_run(spec))[0]
-    except (PendulumError, ArithmeticError):
-        return False
+    return entry_of(HARDWARE, controller, lambda: _run(RunSpec(**spec)), perturbed())
 
 
 def _run(spec: RunSpec) -> RunArrays:
