@@ -9,7 +9,7 @@ from pendulum_bags.experiments.operator import ask_yes, real_machine
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.experiments.trials import GRAVITY, INERTIA_DAMPING, TrialSettings
-from pendulum_bags.studies.records import read_record
+from pendulum_bags.studies.results import read_record
 from pendulum_bags.studies.runner import default_workers, open_study_folder, run_study
 from pendulum_bags.studies.study_file import StudyRun, load_study
 from pendulum_msgs_py.errors import FaultError, ParameterError

@@ -19,13 +19,13 @@ from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies import pid_vs_lqr, pooled, runner
-from pendulum_bags.studies.records import read_record
 from pendulum_bags.studies.results import (
     Group,
     collect,
     episode_of_run,
     group_runs,
     groups_to_json,
+    read_record,
     run_metrics,
 )
 from pendulum_bags.studies.runner import open_study_folder, run_study

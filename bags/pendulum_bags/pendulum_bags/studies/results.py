@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,14 +16,22 @@ from numpy.typing import NDArray
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
 from pendulum_bags.distributions import mean_interval, share_interval
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.studies.records import read_record
-from pendulum_bags.studies.study_file import Study
+from pendulum_bags.studies.study_file import Study, StudyRun
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader import read_bag
 
-__all__ = ["Group", "collect", "episode_of_run", "group_runs", "groups_to_json", "run_metrics", "write_table"]
+__all__ = [
+    "Group",
+    "collect",
+    "episode_of_run",
+    "group_runs",
+    "groups_to_json",
+    "read_record",
+    "run_metrics",
+    "write_table",
+]
 
 SUCCESS_ERROR = 0.1
 """Mean distance from the set-point over the last tenth below which a run has succeeded [rad]."""
@@ -113,6 +122,15 @@ def run_metrics(place: Path, spec: RunSpec) -> dict[str, float | None]:
     tail = episode.error[-max(1, episode.error.size // 10) :]
     values["success"] = float(np.mean(np.abs(tail)) < SUCCESS_ERROR)
     return values
+
+
+def read_record(folder: Path, run: StudyRun) -> dict[str, Any] | None:
+    """Return what is known about a run that has ended, well or not; None for one that has not."""
+    path = folder / "runs" / run.name / "run.json"
+    if not path.is_file():
+        return None
+    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return record
 
 
 def collect(folder: Path, study: Study) -> list[dict[str, Any]]:

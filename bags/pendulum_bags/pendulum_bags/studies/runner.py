@@ -17,8 +17,7 @@ from typing import Any
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.runs.run_folder import write_json
-from pendulum_bags.studies.records import read_record
-from pendulum_bags.studies.results import run_metrics
+from pendulum_bags.studies.results import read_record, run_metrics
 from pendulum_bags.studies.study_file import Study, StudyRun
 from pendulum_msgs_py.errors import BagError, PendulumError
 

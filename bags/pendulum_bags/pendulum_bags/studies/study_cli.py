@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +17,6 @@ from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
 if TYPE_CHECKING:
-    from pendulum_bags.studies.results import Group
     from pendulum_bags.studies.study_file import Study, StudyRun
 
 __all__ = ["add_commands"]
@@ -212,49 +210,63 @@ def _study(
             console.print(f"run {record['number']} failed: {record['reason']}", markup=False)
     if end.failed == end.total:
         raise FaultError(f"all {end.total} runs failed; {folder}/runs holds their logs")
-    result = _analyse(folder, found, records)
+    result, tell = _analyse(folder, found, records)
     if json_output:
         print(json.dumps(result, indent=2))
     else:
-        _print_result(console, found, folder, result, records)
+        tell(console)
+        if found.analysis == "ranking":
+            console.print(f"page    {folder / 'ranking.html'}", soft_wrap=True)
+        wall = sum(record["wall_s"] for record in records)
+        simulated = sum(record["simulated_s"] or 0.0 for record in records)
+        of_them = f", {simulated:.0f} s simulated" if simulated else ""
+        console.print(
+            f"\nstudy   {folder}\ntable   {folder / 'runs.csv'}\n({len(records)} runs, {wall:.0f} s of runs{of_them})",
+            soft_wrap=True,
+        )
     if end.failed:
         console.print(f"{end.failed} of {end.total} runs failed; --retry-failed carries them out again")
         raise typer.Exit(1)
 
 
-def _analyse(folder: Path, found: Study, records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _analyse(
+    folder: Path, found: Study, records: Sequence[dict[str, Any]]
+) -> tuple[dict[str, Any], Callable[[Console], None]]:
+    """Return what the runs say, which is kept as ``results.json``, and what prints it."""
     from pendulum_bags.runs.run_folder import write_json
-    from pendulum_bags.studies import pid_vs_lqr as pid_analysis
-    from pendulum_bags.studies import pooled
-    from pendulum_bags.studies import strategies as strategies_analysis
+    from pendulum_bags.studies import pid_vs_lqr, pooled, strategies
     from pendulum_bags.studies.results import group_runs, groups_to_json
 
     result: dict[str, Any] = {"study": found.name, "runs": len(records)}
+    tell: Callable[[Console, Any], None]
     if found.experiment == "run":
-        result["groups"] = groups_to_json(group_runs(records))
+        key, tell = "groups", _print_groups
+        result[key] = groups_to_json(group_runs(records))
     else:
-        result["pooled"] = pooled.analyse(folder, found, records)
+        key, tell = "pooled", pooled.print_table
+        result[key] = pooled.analyse(folder, found, records)
     if found.analysis == "strategies":
-        result["strategies"] = strategies_analysis.analyse(folder, found)
+        key, tell = "strategies", strategies.print_table
+        result[key] = strategies.analyse(folder, found)
     elif found.analysis == "pid_vs_lqr":
-        result["pid_vs_lqr"] = pid_analysis.analyse(folder, found, records)
+        key, tell = "pid_vs_lqr", pid_vs_lqr.print_table
+        result[key] = pid_vs_lqr.analyse(folder, found, records)
     elif found.analysis == "ranking":
         from pendulum_bags.ranking.collect import collect_contenders
-        from pendulum_bags.ranking.present import write_ranking
+        from pendulum_bags.ranking.present import print_ranking, write_ranking
         from pendulum_bags.ranking.ranking import rank
 
         ranked = rank(collect_contenders([folder]))
         write_ranking(folder, ranked)
-        result["ranking"] = ranked.to_json()
+        key, tell = "ranking", lambda console, _: print_ranking(console, ranked)
+        result[key] = ranked.to_json()
     write_json(folder / "results.json", result)
-    return result
+    return result, lambda console: tell(console, result[key])
 
 
 def _print_matrix(console: Console, found: Study, workers: int) -> None:
     console.print(f"{found.name}: {found.description}" if found.description else found.name, markup=False)
-    table = WholeTable()
-    for heading in ("axis", "values"):
-        table.add_column(heading)
+    table = WholeTable("axis", "values")
     for axis in ("plant", "controller", "disturbance", "set_point", "start", "seed", "repeat"):
         values = list(dict.fromkeys(_label(run.labels[axis]) for run in found.runs))
         if values == [""]:
@@ -268,62 +280,25 @@ def _print_matrix(console: Console, found: Study, workers: int) -> None:
     console.print(f"{runs}, about {_duration(seconds)} with {workers} at once, about {size:.0f} MB on disk")
 
 
-def _print_result(
-    console: Console, found: Study, folder: Path, result: dict[str, Any], records: Sequence[dict[str, Any]]
-) -> None:
-    from pendulum_bags.studies import pid_vs_lqr as pid_analysis
-    from pendulum_bags.studies import pooled
-    from pendulum_bags.studies import strategies as strategies_analysis
-    from pendulum_bags.studies.results import group_runs
-
-    if found.analysis == "strategies":
-        strategies_analysis.print_table(console, result["strategies"])
-    elif found.analysis == "pid_vs_lqr":
-        pid_analysis.print_table(console, result["pid_vs_lqr"])
-    elif found.analysis == "ranking":
-        from pendulum_bags.ranking.collect import collect_contenders
-        from pendulum_bags.ranking.present import print_ranking
-        from pendulum_bags.ranking.ranking import rank
-
-        print_ranking(console, rank(collect_contenders([folder])))
-        console.print(f"page    {folder / 'ranking.html'}", soft_wrap=True)
-    elif found.experiment == "run":
-        _print_groups(console, group_runs(records))
-    else:
-        pooled.print_table(console, result["pooled"])
-    wall = sum(record["wall_s"] for record in records)
-    simulated = sum(record["simulated_s"] or 0.0 for record in records)
-    told = f", {simulated:.0f} s simulated" if simulated else ""
-    console.print(
-        f"\nstudy   {folder}\ntable   {folder / 'runs.csv'}\n({len(records)} runs, {wall:.0f} s of runs{told})",
-        soft_wrap=True,
-    )
-
-
-def _print_groups(console: Console, groups: Sequence[Group]) -> None:
-    table = WholeTable(title="Mean over seeds, 95 % interval", title_justify="left")
-    table.add_column("")
-    for group in groups:
-        table.add_column("\n".join(str(group.labels[axis]) for axis in ("plant", "controller", "disturbance", "start")))
-    table.add_row(
-        "runs",
-        *(f"{len(group.seeds)}" + (f" ({group.failed} failed)" if group.failed else "") for group in groups),
-    )
+def _print_groups(console: Console, groups: Sequence[Mapping[str, Any]]) -> None:
+    axes = ("plant", "controller", "disturbance", "start")
+    headings = ("\n".join(str(group[axis]) for axis in axes) for group in groups)
+    table = WholeTable("", *headings, title="Mean over seeds, 95 % interval", title_justify="left")
+    runs = (f"{group['runs']}" + (f" ({group['failed']} failed)" if group["failed"] else "") for group in groups)
+    table.add_row("runs", *runs)
     for metric in _SHOWN:
-        if any(metric in group.values for group in groups):
-            table.add_row(metric, *(_cell(group, metric) for group in groups))
+        if any(metric in group["metrics"] for group in groups):
+            table.add_row(metric, *(_cell(group["metrics"].get(metric)) for group in groups))
     console.print(table)
 
 
-def _cell(group: Group, metric: str) -> str:
-    if metric not in group.values:
+def _cell(found: Mapping[str, Any] | None) -> str:
+    if found is None:
         return "–"
-    mean, low, high = group.mean(metric)
-    never = sum(not math.isfinite(value) for value in group.values[metric])
-    if math.isnan(mean):
+    if found["mean"] is None:
         return "never"
-    interval = "" if math.isnan(low) else f"\n{low:.4g} to {high:.4g}"
-    return f"{mean:.4g}{interval}" + (f"\nnever in {never}" if never else "")
+    interval = "" if found["low"] is None else f"\n{found['low']:.4g} to {found['high']:.4g}"
+    return f"{found['mean']:.4g}{interval}" + (f"\nnever in {found['never']}" if found["never"] else "")
 
 
 def _label(value: Any) -> str:
