@@ -108,9 +108,8 @@ def excite(
         from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
         console = make_console()
-        table = WholeTable(title=f"{design.kind}, {duration:g} s: predicted 95 % intervals, if the prior plant is true")
-        for heading in ("parameter", "half width", "relative", "unit"):
-            table.add_column(heading)
+        title = f"{design.kind}, {duration:g} s: predicted 95 % intervals, if the prior plant is true"
+        table = WholeTable("parameter", "half width", "relative", "unit", title=title)
         for name, width in design.predicted.items():
             table.add_row(name, f"{width:.3g}", f"{100.0 * design.relative[name]:.2g} %", UNITS[name])
         console.print(table)

@@ -208,16 +208,14 @@ def _print_thesis(result: ThesisResult, *, verbose: bool) -> None:
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
     console = make_console()
-    table = WholeTable(title=f"Average over {len(result.trials)} trial{'s' if len(result.trials) != 1 else ''}")
-    for heading in ("coefficient", "value", "95 % interval", "unit"):
-        table.add_column(heading)
+    title = f"Average over {len(result.trials)} trial{'s' if len(result.trials) != 1 else ''}"
+    table = WholeTable("coefficient", "value", "95 % interval", "unit", title=title)
     for key, value in result.average.items():
         low, high = result.intervals[key]
         table.add_row(key, f"{value:.5g}", f"{low:.5g} to {high:.5g}", UNITS[key])
     console.print(table)
-    trials = WholeTable(title="Regression of each trial: value and standard error")
-    for heading in ("trial", *(f"{name} \\[{UNITS[name]}]" for name in result.trials[0].names), "R^2"):
-        trials.add_column(heading)
+    headings = ("trial", *(f"{name} \\[{UNITS[name]}]" for name in result.trials[0].names), "R^2")
+    trials = WholeTable(*headings, title="Regression of each trial: value and standard error")
     for regression in result.trials:
         figures = zip(regression.values, regression.errors, strict=True)
         cells = (f"{value:.5g} +- {error:.2g}" for value, error in figures)
@@ -252,10 +250,9 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
     console = make_console()
-    table = WholeTable(title=f"Identified by output error, friction {result.fit.chosen.friction}")
     predicted = result.predicted
-    for heading in ("parameter", "value", "95 % interval", *(["predicted"] if predicted else []), "unit"):
-        table.add_column(heading)
+    headings = ("parameter", "value", "95 % interval", *(["predicted"] if predicted else []), "unit")
+    table = WholeTable(*headings, title=f"Identified by output error, friction {result.fit.chosen.friction}")
     for key in (*result.fit.chosen.free, "natural_frequency"):
         unit = UNITS.get(key, "rad/s")
         interval = result.uncertainty.intervals.get(key)
@@ -265,9 +262,7 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
             cells.append(f"+-{predicted[key]:.2g}" if key in predicted else "-")
         table.add_row(*cells, unit)
     console.print(table)
-    models = WholeTable(title="Friction models")
-    for heading in ("model", "held-out rms \\[mrad]", "training rms \\[mrad]", ""):
-        models.add_column(heading)
+    models = WholeTable("model", "held-out rms \\[mrad]", "training rms \\[mrad]", "", title="Friction models")
     for candidate in result.fit.candidates:
         held = "-" if candidate.validation is None else f"{1e3 * candidate.validation.rms:.3f}"
         mark = "chosen" if candidate is result.fit.chosen else ""

@@ -68,18 +68,15 @@ def _print(result: MechanismResult, out: Path | None) -> None:
 
     console = make_console()
     model = result.model
-    table = WholeTable(title=f"{model.plant.mechanism.name}, identified by output error: {result.extras}")
-    for heading in ("parameter", "value", "95 % interval", "unit"):
-        table.add_column(heading)
+    title = f"{model.plant.mechanism.name}, identified by output error: {result.extras}"
+    table = WholeTable("parameter", "value", "95 % interval", "unit", title=title)
     for key in result.fit.free:
         interval = result.intervals[key]
         table.add_row(key, f"{model[key]:.5g}", f"{interval.low:.4g} to {interval.high:.4g}", model.unit(key))
     console.print(table)
-    errors = WholeTable(title=f"Free run over windows of {result.window:g} s, the start of each fitted: rms")
-    errors.add_column("recording")
-    for joint in model.plant.coordinates.joints:
-        errors.add_column(f"{joint.name} \\[m{joint.unit}]")
-    errors.add_column("of straight lines")
+    joints = (f"{joint.name} \\[m{joint.unit}]" for joint in model.plant.coordinates.joints)
+    title = f"Free run over windows of {result.window:g} s, the start of each fitted: rms"
+    errors = WholeTable("recording", *joints, "of straight lines", title=title)
     for label, found in (("", result.training), ("held out ", result.held_out)):
         for recording, score in found.items():
             cells = [f"{1e3 * value:.2f}" for value in score.rms]

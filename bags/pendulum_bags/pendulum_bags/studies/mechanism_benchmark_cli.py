@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.table import Column
 
 from pendulum_msgs_py.programs.counted_progress import results_at_once
 from pendulum_msgs_py.programs.options import Json, out_option
@@ -81,13 +82,18 @@ def benchmark(
     console.print(f"({time.monotonic() - started:.0f} s)")
 
 
+def _table(title: str, *figures: str) -> WholeTable:
+    """Return a table with a line a controller."""
+    columns = (Column(heading, justify="right") for heading in figures)
+    return WholeTable("controller", *columns, title=title, title_justify="left")
+
+
 def _print(console: Console, plant: str, rows: Sequence[Row], published: Sequence[Published]) -> None:
     from pendulum_bags.studies.mechanism_benchmark import CRITERIA
     from pendulum_bags.studies.mechanism_benchmark_runs import KINDS
 
-    board = WholeTable(title=f"Double-pendulum benchmark, {plant}", title_justify="left")
-    for heading in ("controller", "score v2", "robustness v2", "score v3", ""):
-        board.add_column(heading, justify="left" if heading in {"controller", ""} else "right")
+    board = _table(f"Double-pendulum benchmark, {plant}", "score v2", "robustness v2", "score v3")
+    board.add_column("")
 
     def number(value: float | None) -> str:
         return "–" if value is None else f"{value:.3f}"
@@ -102,18 +108,12 @@ def _print(console: Console, plant: str, rows: Sequence[Row], published: Sequenc
     for _, *cells in sorted(lines, key=lambda line: -line[0]):
         board.add_row(*cells)
     console.print(board)
-    costs = WholeTable(title="What the swing-ups cost", title_justify="left")
-    costs.add_column("controller")
-    for one in CRITERIA:
-        costs.add_column(f"{one.title} \\[{one.unit}]", justify="right")
+    costs = _table("What the swing-ups cost", *(f"{one.title} \\[{one.unit}]" for one in CRITERIA))
     for row in rows:
         costs.add_row(row.controller, *(f"{row.criteria[one.name]:.4g}" for one in CRITERIA))
     console.print(costs)
     if any(row.shares for row in rows):
-        held = WholeTable(title="Robustness: levels held \\[%]", title_justify="left")
-        held.add_column("controller")
-        for name in KINDS.values():
-            held.add_column(name, justify="right")
+        held = _table("Robustness: levels held \\[%]", *KINDS.values())
         for row in rows:
             held.add_row(row.controller, *(f"{100.0 * row.shares[kind]:.1f}" for kind in KINDS))
         console.print(held)
