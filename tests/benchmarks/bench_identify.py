@@ -19,7 +19,7 @@ from pendulum_bags.identification.identify import identify
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping
-from pendulum_bags.identification.window_score import free_run, free_run_rms, window_rms
+from pendulum_bags.identification.window_score import free_run, window_score
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_rosbag.reader import read_bag, same_messages
@@ -65,17 +65,17 @@ def _swing_up() -> Iterator[Row]:
     begin = time.perf_counter()
     result = identify([ddp])
     ours = time.perf_counter() - begin
-    theirs = Peer("published parameters", window_rms(published, ddp))
+    theirs = Peer("published parameters", window_score(published, ddp).rms)
     yield measured(
         "swing-up, 1 s windows, trained on it",
-        window_rms(result.model, ddp),
+        window_score(result.model, ddp).rms,
         "rad",
         peer=theirs,
         at_most=0.0036,
     )
-    theirs = Peer("published parameters", window_rms(published, pd))
+    theirs = Peer("published parameters", window_score(published, pd).rms)
     yield measured(
-        "PD run by the swing-up's parameters", window_rms(result.model, pd), "rad", peer=theirs, at_most=0.038
+        "PD run by the swing-up's parameters", window_score(result.model, pd).rms, "rad", peer=theirs, at_most=0.038
     )
     intervals = result.uncertainty.intervals
     yield measured(
@@ -181,11 +181,11 @@ def _disc() -> Iterator[Row]:
     )
     held_out = disc.rows(15000)
     result = identify([disc.rows(0, 15000)], profiles=0)
-    theirs = Peer("authors' parameters", free_run_rms(authors, held_out))
+    theirs = Peer("authors' parameters", free_run(authors, held_out).rms)
     note = f"delay {1e3 * result.model['transport_delay']:.2f} ms, angle offset {result.model['angle_offset']:.4f} rad"
     yield measured(
         "unbalanced disk, free run over rows 15001 to 20000",
-        free_run_rms(result.model, held_out),
+        free_run(result.model, held_out).rms,
         "rad",
         peer=theirs,
         at_most=0.014,

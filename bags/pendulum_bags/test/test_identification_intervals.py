@@ -15,7 +15,7 @@ from pendulum_bags.identification.output_error import fit_output_error
 from pendulum_bags.identification.selection import akaike_weights, choose
 from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.uncertainty import unresolved_offset
-from pendulum_bags.identification.window_score import window_rms
+from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from tests.benchmarks.identification_truths import OUTSIDE, TRUTHS, covered, outside
@@ -181,7 +181,7 @@ def test_friction_that_falls_with_speed_is_integrated_to_the_sensor_s_noise():
     time = np.arange(0.0, 6.0, 0.005)
     effort = 1.0 * np.sin(4.0 * time)
     clean = synthetic_recording(plant, effort, 0.005, np.random.default_rng(0), noise=0.0)
-    assert window_rms(plant, clean) < 1.5e-4
+    assert window_score(plant, clean).rms < 1.5e-4
 
 
 def test_a_frequency_that_is_hardly_known_has_a_positive_interval_and_warns_of_nothing(recwarn):

@@ -6,7 +6,7 @@ import pytest
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
 from pendulum_bags.identification.model import FitModel, from_plant, to_plant
 from pendulum_bags.identification.problem import cut_windows, prepare, simulate
-from pendulum_bags.identification.window_score import free_run_rms, window_rms, window_score
+from pendulum_bags.identification.window_score import free_run, window_score
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -34,7 +34,7 @@ def clean_run(plant=PLANT, seconds=6.0, seed=3):
 
 def test_the_kernel_agrees_with_rk4_on_the_shared_equations_of_motion():
     recording = clean_run()
-    assert window_rms(from_plant(PLANT), recording, 6.0) < 3e-4
+    assert window_score(from_plant(PLANT), recording, 6.0).rms < 3e-4
     assert np.ptp(recording.position) > 0.5
 
 
@@ -149,9 +149,9 @@ def test_the_window_score_fits_initial_states_only():
     score = window_score(from_plant(PLANT), recording)
     assert len(score.by_window) == 6
     assert score.rms == pytest.approx(np.sqrt(np.mean((score.simulated - score.measured) ** 2)))
-    worse = window_rms(from_plant(PLANT.with_values(gravity=1.8)), recording)
+    worse = window_score(from_plant(PLANT.with_values(gravity=1.8)), recording).rms
     assert worse > 20.0 * score.rms
-    assert free_run_rms(from_plant(PLANT), recording) < 1e-3
+    assert free_run(from_plant(PLANT), recording).rms < 1e-3
 
 
 def test_plant_and_fit_model_are_two_ways_to_write_the_same():
@@ -165,4 +165,4 @@ def test_the_score_of_the_geometry_on_the_real_swing_up_is_the_published_one(sha
 
     recording = read_recording(shared_data / "dfki_torque_limited_simple_pendulum" / "ddp_measured.csv")
     plant = PlantParameters(inertia=0.1495, damping=0.1, gravity=0.3055 * 9.81, coulomb_friction=0.093)
-    assert window_rms(plant, recording) == pytest.approx(0.038, rel=0.1)
+    assert window_score(plant, recording).rms == pytest.approx(0.038, rel=0.1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pendulum_bags.identification.identify_cli import main as identify_main
-from pendulum_bags.identification.window_score import window_rms
+from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.replay.controller_replay import replay_controller
 from pendulum_bags.replay.input_replay import replay_input, replay_recording
 from pendulum_bags.replay.replay_cli import main as replay_main
@@ -116,7 +116,7 @@ def test_a_real_pendulum_is_followed_as_well_as_its_geometry_allows(shared_data:
     from pendulum_bags.runs.read_recording import read_recording
 
     recording = read_recording(shared_data / DFKI / "ddp_measured.csv")
-    assert result.rms == window_rms(load_plant("dfki"), recording)
+    assert result.rms == window_score(load_plant("dfki"), recording).rms
 
 
 def test_command_shows_a_real_pendulum_in_one_figure(

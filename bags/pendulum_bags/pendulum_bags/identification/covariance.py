@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.identification.model import INDEX, FitModel
-from pendulum_bags.identification.problem import Piece, longest_step, simulate
+from pendulum_bags.identification.problem import Piece, longest_step, projected_sensitivities, simulate
 from pendulum_bags.identification.selection import Candidate, at_bounds
 
 __all__ = ["FREQUENCY", "Errors", "candidate_errors", "least_scale"]
@@ -120,18 +120,15 @@ def _information(
 ) -> _Information:
     """Return, by window, the sensitivities with the window's initial state projected out, and the residuals."""
     index = [INDEX[name] for name in names]
-    projected, residual, samples, count = [], [], 0, 0
+    projected: list[Array] = []
+    residual: list[Array] = []
+    samples = 0
     for piece, state in zip(pieces, states, strict=True):
         result = simulate(model, piece, state, free=index, step=longest_step(model, piece.recording))
-        for first, stop in piece.windows:
-            jacobian = result.jacobian[first:stop]
-            basis, _ = np.linalg.qr(jacobian[:, -2:])
-            sensitivity = jacobian[:, :-2]
-            projected.append(sensitivity - basis @ (basis.T @ sensitivity))
-            residual.append(result.theta[first:stop] - piece.recording.position[first:stop])
-            samples += stop - first
-            count += 2
-    return _Information(projected, residual, samples, count)
+        projected += projected_sensitivities(result, piece.windows)
+        residual += [result.theta[a:b] - piece.recording.position[a:b] for a, b in piece.windows]
+        samples += piece.samples
+    return _Information(projected, residual, samples, 2 * len(projected))
 
 
 def _influence(residual: Array, scale: float) -> tuple[Array, Array]:

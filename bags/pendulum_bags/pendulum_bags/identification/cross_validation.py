@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,7 @@ def _refit(
         return best.model
     for names, factor in ((_SCALED, 0.8), (_SCALED, 1.25), (_DRY, 0.5), (_DRY, 2.0)):
         values = {n: v * factor if n in names and n in free else v for n, v in model.values.items()}
-        trial = search(FitModel(values, model.input_kind, model.friction, model.duty_gain))
+        trial = search(replace(model, values=values))
         if trial.cost < best.cost:
             best = trial
     return best.model
@@ -111,8 +111,7 @@ def cross_validate(
                 train.append(piece.subset(rest))
                 train_states.append(state[rest])
             if out.size:
-                part = piece.subset(out)
-                test.append(Piece(part.recording, part.windows, state[out], part.integral, part.enabled))
+                test.append(replace(piece.subset(out), states=state[out]))
         fitted = _refit(model, train, train_states, free, scale)
         vectors.append(np.array(fitted.vector))
         total, loss, number = 0.0, 0.0, 0

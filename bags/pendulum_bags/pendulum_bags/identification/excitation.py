@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.identification.model import BOUNDS, INDEX, from_plant
-from pendulum_bags.identification.problem import prepare, simulate
+from pendulum_bags.identification.problem import prepare, projected_sensitivities, simulate
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -195,11 +195,11 @@ def _shape(kind: str, time: Array, genes: Array, plant: PlantParameters) -> Arra
     return np.asarray(signal * edge / max(peak, 1e-12))
 
 
-def _simulated(problem: _Problem, effort: Array, free: Sequence[int] | None) -> tuple[Array, Array, Array]:
+def _motion(problem: _Problem, effort: Array) -> tuple[Array, Array]:
     recording = Recording(problem.time, np.zeros_like(problem.time), None, effort, hold="zero")
     piece = replace(prepare(recording, None), states=np.zeros((1, 2)))
-    result = simulate(from_plant(problem.plant), piece, free=free)
-    return result.theta, result.omega, result.jacobian
+    result = simulate(from_plant(problem.plant), piece)
+    return result.theta, result.omega
 
 
 def _windowed(problem: _Problem, effort: Array, theta: Array, omega: Array, free: Sequence[int]) -> Array:
@@ -209,16 +209,11 @@ def _windowed(problem: _Problem, effort: Array, theta: Array, omega: Array, free
     first = piece.windows[:, 0]
     piece = replace(piece, states=np.stack((theta[first], omega[first]), axis=1))
     result = simulate(from_plant(problem.plant), piece, free=free)
-    parts = []
-    for start, stop in piece.windows:
-        jacobian = result.jacobian[start:stop]
-        basis, _ = np.linalg.qr(jacobian[:, -2:])
-        parts.append(jacobian[:, :-2] - basis @ (basis.T @ jacobian[:, :-2]))
-    return np.concatenate(parts)
+    return np.concatenate(projected_sensitivities(result, piece.windows))
 
 
 def _keeps(problem: _Problem, shape: Array) -> bool:
-    theta, omega, _ = _simulated(problem, problem.limits.effort * shape, None)
+    theta, omega = _motion(problem, problem.limits.effort * shape)
     return bool(np.max(np.abs(theta)) <= problem.limits.angle and np.max(np.abs(omega)) <= problem.limits.speed)
 
 
@@ -226,7 +221,7 @@ def _judge(problem: _Problem, kind: str, shape: Array) -> Excitation:
     effort = problem.limits.effort * shape
     others = [n for n in ("inertia", "damping", "gravity", "coulomb_friction") if n not in problem.parameters]
     names = [*problem.parameters, *others, *(n for n in NUISANCE if n not in problem.parameters)]
-    theta, omega, _ = _simulated(problem, effort, None)
+    theta, omega = _motion(problem, effort)
     jacobian = _windowed(problem, effort, theta, omega, [INDEX[name] for name in names])
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
     singular = np.linalg.svd(jacobian / scale, full_matrices=False)

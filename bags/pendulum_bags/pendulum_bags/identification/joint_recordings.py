@@ -18,7 +18,7 @@ check of the velocity against the position. Rows with a NaN are left out and cou
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -151,14 +151,15 @@ def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path 
                 f"{origin}: joints.{joint.name} has no effort, but the plant has an actuator there; expected the "
                 "column of its torque or force"
             )
-        scale = _force(own, joint.effort_unit)
+        if joint.effort_unit == "N":
+            own = _as_turning(own)
         part = read_csv(source, {**common, "drop_nan": True, **own}, also=others)
         if part.input_kind not in {"effort", "none"}:
             raise DataError(
                 f"{origin}: the input of {joint.name} is a {part.input_kind}; expected an effort in {joint.effort_unit}"
             )
         part = check_consistency(unwrap(part)) if joint.turns else check_consistency(part)
-        parts.append(Recording(part.time, part.position, None, scale * part.input, hold=part.hold, meta=part.meta))
+        parts.append(part)
     return JointRecording(
         source.name,
         parts[0].time,
@@ -210,20 +211,18 @@ def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
     )
 
 
-_SLIDING = {"m": "rad", "mm": "rad", "m/s": "rad/s", "N": "N m"}
+_SLIDING = {"m": "rad", "m/s": "rad/s", "N": "N m"}
 """Units of a joint that slides, and what the reader of one hinge calls them."""
 
 
-def _force(own: dict[str, Any], unit: str) -> float:
-    """Rewrite the units of a joint that slides into those that the reader knows; return the factor of its input."""
-    if unit != "N":
-        return 1.0
+def _as_turning(own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the sections of a joint that slides with those units that the reader knows."""
+    found = {}
     for key, section in own.items():
-        if isinstance(section, Mapping) and section.get("unit") in {"m", "m/s", "N"}:
-            own[key] = {**section, "unit": _SLIDING[section["unit"]]}
-        else:
+        if not isinstance(section, Mapping) or section.get("unit") not in _SLIDING:
             raise DataError(f"unit of {key} is {section!r}; expected m, m/s or N: this joint slides")
-    return 1.0
+        found[key] = {**section, "unit": _SLIDING[section["unit"]]}
+    return found
 
 
 def _rules(coordinates: Coordinates, mapping: str | Path | None) -> tuple[dict[str, Any], str]:
@@ -248,14 +247,10 @@ def _rules(coordinates: Coordinates, mapping: str | Path | None) -> tuple[dict[s
     if rules.get("format") != FORMAT:
         raise DataError(f"{origin}: format is {rules.get('format')!r}; expected {FORMAT!r}")
     joints = dict(require_mapping(rules.get("joints"), f"{origin}: joints"))
-    _check_names(list(joints), names, origin)
+    if list(joints) != list(names):
+        raise DataError(f"{origin}: joints are {', '.join(joints)}; expected {', '.join(names)}, in this order")
     _check_distinct_columns(joints, origin)
     return {**rules, "joints": joints}, origin
-
-
-def _check_names(given: Sequence[str], names: Sequence[str], origin: str) -> None:
-    if list(given) != list(names):
-        raise DataError(f"{origin}: joints are {', '.join(given)}; expected {', '.join(names)}, in this order")
 
 
 def _check_distinct_columns(joints: Mapping[str, Any], origin: str) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED
 from pendulum_bags.identification.joint_recordings import JointRecording
-from pendulum_bags.identification.mechanism_fit import MechanismFit, Windows, fit, line_errors
+from pendulum_bags.identification.mechanism_fit import MechanismFit, Windows, fit, line_errors, rms_by_joint
 from pendulum_bags.identification.mechanism_model import MechanismModel, tellable
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_msgs_py.errors import DataError
@@ -178,8 +178,7 @@ def _better_reading(plant: MechanismParameters, found: MechanismFit, data: Seque
 
 
 def _share(errors: Array, data: Windows) -> float:
-    rms = np.sqrt(np.mean(errors[data.inside] ** 2, axis=0))
-    return float(np.max(rms / np.maximum(line_errors(data), 1e-12)))
+    return Score(rms_by_joint(errors, data), line_errors(data)).share
 
 
 def unit_hint(plant: MechanismParameters, recordings: Sequence[JointRecording]) -> str | None:

@@ -20,7 +20,7 @@ from pendulum_bags.identification.mechanism_model import MechanismModel, step_fu
 from pendulum_bags.identification.problem import cut_windows
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["Blocks", "MechanismFit", "Windows", "fit", "line_errors", "prepare_windows", "scores"]
+__all__ = ["Blocks", "MechanismFit", "Windows", "fit", "line_errors", "prepare_windows", "rms_by_joint", "scores"]
 
 Array = NDArray[np.float64]
 
@@ -346,7 +346,7 @@ def scores(model: MechanismModel, data: Sequence[Windows]) -> list[Array]:
     """Return the rms errors of each joint of each recording with the start of each window fitted, shape (n,)."""
     weights = np.ones(len(model.plant.joints))
     found = [fit(model, [part], (), weights, most=12, tolerance=1e-6) for part in data]
-    return [_rms(one.residuals[0], part) for one, part in zip(found, data, strict=True)]
+    return [rms_by_joint(one.residuals[0], part) for one, part in zip(found, data, strict=True)]
 
 
 def line_errors(data: Windows) -> Array:
@@ -357,8 +357,9 @@ def line_errors(data: Windows) -> Array:
         base = np.column_stack((np.ones_like(t), t))
         y = data.position[i, inside]
         errors[i, inside] = y - base @ np.linalg.lstsq(base, y, rcond=None)[0]
-    return _rms(errors, data)
+    return rms_by_joint(errors, data)
 
 
-def _rms(errors: Array, data: Windows) -> Array:
+def rms_by_joint(errors: Array, data: Windows) -> Array:
+    """Return the rms of errors of shape (w, l, n) at the samples of the windows, shape (n,)."""
     return np.asarray(np.sqrt(np.mean(errors[data.inside] ** 2, axis=0)))

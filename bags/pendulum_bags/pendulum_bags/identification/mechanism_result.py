@@ -20,10 +20,10 @@ from pendulum_bags.identification.mechanism_choice import choose
 from pendulum_bags.identification.mechanism_doubt import Score, refusal, unit_hint
 from pendulum_bags.identification.mechanism_fit import (
     MechanismFit,
-    Windows,
     fit,
     line_errors,
     prepare_windows,
+    rms_by_joint,
     scores,
 )
 from pendulum_bags.identification.mechanism_model import DELAY, MechanismModel
@@ -127,10 +127,7 @@ class MechanismResult:
             "fitted": list(self.fit.free),
             "parameters": {name: model[name] for name in model.names},
             "units": {name: model.unit(name) for name in model.names},
-            "intervals": {
-                n: {"value": i.value, "low": i.low, "high": i.high, "standard_error": i.standard_error}
-                for n, i in self.intervals.items()
-            },
+            "intervals": {name: found.to_json() for name, found in self.intervals.items()},
             "extras": self.extras,
             "candidates": dict(self.candidates),
             "training": table(self.training),
@@ -220,10 +217,14 @@ def identify_mechanism(
         hint = unit_hint(plant, recordings)
         raise DataError(f"{error}: {hint}") if hint else error from None
     # Now that the errors are known, each joint counts by its own.
-    rms = np.sqrt(np.mean([s**2 for s in _training(found, data)], axis=0))
+    errors = [rms_by_joint(left, part) for left, part in zip(found.residuals, data, strict=True)]
+    rms = np.sqrt(np.mean([each**2 for each in errors], axis=0))
     found = fit(found.model, data, found.free, 1.0 / np.maximum(rms, 1e-9), states=found.states)
     names = _names([*recordings, *held_out])
-    training = {n: Score(s, line_errors(p)) for n, s, p in zip(names, _training(found, data), data, strict=False)}
+    training = {
+        name: Score(rms_by_joint(left, part), line_errors(part))
+        for name, left, part in zip(names, found.residuals, data, strict=False)
+    }
     others = [prepare_windows(recording, length, stride=stride) for recording in held_out]
     outside = {
         n: Score(s, line_errors(p))
@@ -255,12 +256,6 @@ def _check_distinct(recordings: Sequence[JointRecording], held_out: Sequence[Joi
         for other in everything[:i]:
             if one.position.shape == other.position.shape and np.array_equal(one.position, other.position):
                 raise DataError(f"{one.name} has the same samples as {other.name}; expected each recording once")
-
-
-def _training(found: MechanismFit, data: Sequence[Windows]) -> list[Array]:
-    return [
-        np.sqrt(np.mean(errors[part.inside] ** 2, axis=0)) for errors, part in zip(found.residuals, data, strict=True)
-    ]
 
 
 def _intervals(found: MechanismFit) -> dict[str, Interval]:

@@ -62,7 +62,7 @@ def missing_torques(model: FitModel, pieces: Sequence[Piece], parts: Sequence[Ar
         product = rest * response
         start, sums = 0, []
         for one in left:
-            edges = np.arange(0, one.size, _block(one.size))
+            edges = np.arange(0, one.size, max(1, one.size // 5))
             sums.append(np.add.reduceat(product[start : start + one.size], edges))
             start += one.size
         values = np.concatenate(sums)
@@ -87,10 +87,6 @@ _WORDS = (
 
 _FILTER = 0.1
 """Length of the modulating functions [s]."""
-
-
-def _block(size: int) -> int:
-    return max(1, size // 5)
 
 
 def _rows(model: FitModel, piece: Piece, part: Array) -> tuple[list[Array], list[Array], list[Array]]:
@@ -124,41 +120,25 @@ def _rows(model: FitModel, piece: Piece, part: Array) -> tuple[list[Array], list
         direction = np.tanh(speed / 0.05)
         gravity = np.sin(angle)
         left.append(response)
-        known.append(
-            np.stack(
-                [
-                    *(
-                        smooth(v)
-                        for v in (
-                            np.ones_like(u),
-                            gravity,
-                            np.cos(angle),
-                            speed,
-                            direction,
-                            u,
-                            np.gradient(u),
-                        )
-                    ),
-                    *(smooth(np.abs(gravity) * direction), smooth(angle, second)),
-                ],
-                axis=1,
-            )
+        own = (
+            np.ones_like(u),
+            gravity,
+            np.cos(angle),
+            speed,
+            direction,
+            u,
+            np.gradient(u),
+            np.abs(gravity) * direction,
         )
-        added.append(
-            np.stack(
-                [
-                    smooth(v)
-                    for v in (
-                        speed * np.abs(speed),
-                        np.sin(2.0 * angle),
-                        np.abs(speed),
-                        angle,
-                        u * np.cos(angle),
-                        u * np.abs(u),
-                        u * np.abs(speed),
-                    )
-                ],
-                axis=1,
-            )
+        known.append(np.stack([*map(smooth, own), smooth(angle, second)], axis=1))
+        others = (
+            speed * np.abs(speed),
+            np.sin(2.0 * angle),
+            np.abs(speed),
+            angle,
+            u * np.cos(angle),
+            u * np.abs(u),
+            u * np.abs(speed),
         )
+        added.append(np.stack([smooth(term) for term in others], axis=1))
     return left, known, added

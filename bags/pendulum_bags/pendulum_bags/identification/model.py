@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -150,7 +150,7 @@ class FitModel:
     def with_vector(self, vector: Array) -> FitModel:
         """Return the model with other values."""
         values = dict(zip(PARAMETER_NAMES, map(float, vector), strict=True))
-        return FitModel(values, self.input_kind, self.friction, self.duty_gain)
+        return replace(self, values=values)
 
 
 def from_plant(plant: PlantParameters) -> FitModel:

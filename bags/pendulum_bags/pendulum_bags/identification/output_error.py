@@ -250,7 +250,7 @@ def _offsets(
     for kept in dict.fromkeys(subsets):
         names = tuple(n for n in free if n not in offsets or n in kept)
         values = {k: v for k, v in best.model.values.items() if k not in offsets or k in kept}
-        start = replace(best, model=FitModel(values, best.model.input_kind, "coulomb", best.model.duty_gain))
+        start = replace(best, model=replace(best.model, values=values, friction="coulomb"))
         candidates.append(_fit_friction("coulomb", start, pieces, names, scale, (), options))
     # An offset that is kept by luck biases all others: the stricter penalty (Schwarz) keeps few of those.
     chosen = choose(candidates, strict=True)
@@ -259,8 +259,7 @@ def _offsets(
 
 def _robust_scale(solution: Solution, pieces: Sequence[Piece]) -> float:
     """Return three robust standard deviations of the residual: the loss leaves good samples quadratic [rad]."""
-    parts = residuals(solution.model, pieces, solution.states)
-    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
+    inside = _inside(solution, pieces)
     spread = 1.4826 * float(np.median(np.abs(inside - np.median(inside))))
     return max(3.0 * spread, 1e-6)
 
@@ -282,8 +281,7 @@ def _fit_friction(
     for previous in (start, *(c.solution for c in simpler if set(FRICTION_MODELS[c.friction]) <= set(names))):
         model = previous.model
         values = {k: v for k, v in model.values.items() if k in free or not _is_friction(k) or k in names}
-        plain = FitModel(values, model.input_kind, name, model.duty_gain)
-        begin.append((plain, previous.states))
+        begin.append((replace(model, values=values, friction=name), previous.states))
     contained = len(begin)
     kind = name.replace("stribeck_", "") if name != "stribeck" else name
     additions = _FRICTION_STARTS.get(kind, ()) + (_FRICTION_STARTS["stribeck"] if name.startswith("stribeck_") else ())
@@ -294,7 +292,7 @@ def _fit_friction(
             values["stribeck_excess"] = addition["stribeck_excess"] * coulomb
         else:
             values["coulomb_friction"] = 0.5 * coulomb
-        begin.append((FitModel(values, start.model.input_kind, name, start.model.duty_gain), start.states))
+        begin.append((replace(start.model, values=values, friction=name), start.states))
     solutions = [solve(m, pieces, everything, states=s, scale=scale, tolerance=1e-7, coarse=COARSE) for m, s in begin]
     # Long steps may have found what short ones do not confirm: those decide, between finds and starts too.
     solutions += [Solution(m, s, np.inf, converged=False, iterations=0) for m, s in begin[:contained]]
@@ -302,7 +300,7 @@ def _fit_friction(
     costs = [robust_cost(inside, scale) for inside in insides]
     number = int(np.argmin(np.nan_to_num(costs, nan=np.inf)))
     best, inside = replace(solutions[number], cost=costs[number]), insides[number]
-    best = replace(best, model=FitModel(best.model.values, best.model.input_kind, name, best.model.duty_gain))
+    best = replace(best, model=replace(best.model, friction=name))
     parts = residuals(best.model, pieces, best.states)
     validation = cross_validate(best.model, pieces, best.states, everything, scale, count=options.folds)
     mean_cost = robust_cost(inside, scale) / inside.size
@@ -325,12 +323,6 @@ def _finish(candidate: Candidate, pieces: Sequence[Piece], scale: float) -> Cand
     found = candidate.solution
     final = solve(found.model, pieces, candidate.free, states=found.states, scale=scale, tolerance=1e-8)
     final = refine(final, pieces, candidate.free, scale=scale)
-    model = FitModel(final.model.values, found.model.input_kind, candidate.friction, found.model.duty_gain)
-    parts = residuals(model, pieces, final.states)
-    inside = np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
-    return replace(
-        candidate,
-        solution=replace(final, model=model),
-        searched=found,
-        training_rms=float(np.sqrt(np.mean(inside**2))),
-    )
+    final = replace(final, model=replace(final.model, friction=candidate.friction))
+    rms = float(np.sqrt(np.mean(_inside(final, pieces) ** 2)))
+    return replace(candidate, solution=final, searched=found, training_rms=rms)

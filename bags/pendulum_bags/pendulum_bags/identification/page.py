@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,14 +38,10 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
         interval = result.uncertainty.intervals.get(name)
         ends = f"{interval.low:.4g} to {interval.high:.4g}" if interval else "at the edge of its domain"
         parameters.append((name, f"{value:.5g}", ends, UNITS.get(name, "rad/s")))
-    models = [
-        (
-            c.friction,
-            "-" if c.validation is None else f"{1e3 * c.validation.rms:.3f}",
-            f"{1e3 * c.training_rms:.3f}",
-        )
-        for c in result.fit.candidates
-    ]
+    models = []
+    for one in result.fit.candidates:
+        held_out = "-" if one.validation is None else f"{1e3 * one.validation.rms:.3f}"
+        models.append((one.friction, held_out, f"{1e3 * one.training_rms:.3f}"))
     held = [(n, f"{1e3 * s.rms:.3f}", f"{1e3 * s.mean_absolute:.3f}") for n, s in result.held_out.items()]
     names = result.uncertainty.names
     correlation = [
@@ -58,11 +54,7 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
         _table("Parameters", ("parameter", "value", "95 % interval", "unit"), parameters),
         _table("Friction models", ("model", "held-out rms [mrad]", "training rms [mrad]"), models),
         _table("Other recordings", ("recording", "rms [mrad]", "mean absolute [mrad]"), held),
-        _table(
-            f"Correlation (condition number {result.uncertainty.condition_number:.2g})",
-            ("", *names),
-            correlation,
-        ),
+        _table(f"Correlation (condition number {result.uncertainty.condition_number:.2g})", ("", *names), correlation),
         *map(_image, figures),
     ]
     return _write(target, "Identification", body)
@@ -109,12 +101,10 @@ def _image(path: Path) -> str:
 
 
 def _write(folder: Path, title: str, body: Sequence[str]) -> Path:
-    parts: Mapping[str, str] = {"title": escape(title), "style": _STYLE, "body": "\n".join(body)}
-    page = (
-        '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        "<title>{title}</title><style>{style}</style>"
-        "<h1>{title}</h1>{body}</html>\n"
-    ).format(**parts)
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+    style, lines = f"<title>{escape(title)}</title><style>{_STYLE}</style>", "\n".join(body)
     path = folder / "index.html"
-    path.write_text(page, encoding="utf-8")
+    path.write_text(
+        f'<!doctype html><html lang="en">{head}{style}<h1>{escape(title)}</h1>{lines}</html>\n', encoding="utf-8"
+    )
     return path

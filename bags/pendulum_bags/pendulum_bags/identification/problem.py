@@ -14,7 +14,15 @@ from pendulum_bags.identification.model import FitModel
 from pendulum_bags.runs.datasets import Recording, gaps
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["Piece", "Simulation", "cut_windows", "longest_step", "prepare"]
+__all__ = [
+    "Piece",
+    "Simulation",
+    "cut_windows",
+    "longest_step",
+    "prepare",
+    "projected_sensitivities",
+    "simulate",
+]
 
 Array = NDArray[np.float64]
 _NOTHING = np.zeros((0, 0))
@@ -165,6 +173,16 @@ def _supply(recording: Recording) -> float:
 
 def _servo_gain(model: FitModel, recording: Recording) -> float:
     return model.duty_gain * float(recording.meta.get("kp", 1.0))
+
+
+def projected_sensitivities(result: Simulation, windows: NDArray[np.int64]) -> list[Array]:
+    """Return those to the parameters of each window, what its initial state can take over projected out, (n, k)."""
+    parts = []
+    for first, stop in windows:
+        sensitivity, state = np.split(result.jacobian[first:stop], [-2], axis=1)
+        basis, _ = np.linalg.qr(state)
+        parts.append(sensitivity - basis @ (basis.T @ sensitivity))
+    return parts
 
 
 def simulate(

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pendulum_bags.distributions import chi_square_tail, student_quantile
 from pendulum_bags.identification.missing import missing_torques
 from pendulum_bags.identification.output_error import OutputErrorFit
-from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.selection import effective_samples, implausible_rival
 from pendulum_bags.identification.solver import residuals
 from pendulum_bags.runs.datasets import distinct_names
@@ -77,8 +76,8 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     labels: list[tuple[str, float, float]] = []
     names = distinct_names([piece.recording for piece in fit.pieces])
     for name, part, piece in zip(names, parts, fit.pieces, strict=True):
-        drive = _input_at_samples(piece)
-        time = piece.recording.time
+        recording, time = piece.recording, piece.recording.time
+        drive = np.interp(time, recording.input_stamps, recording.input)
         for first, stop in piece.windows:
             r = part[first:stop]
             segments.append(r)
@@ -215,13 +214,6 @@ def _depends(signals: Sequence[Array], segments: Sequence[Array], lag: int, bloc
     if values.size < 3 or scale <= 0.0:
         return False
     return bool(abs(values.sum()) / scale > student_quantile(1.0 - 0.005 / tests, values.size - 1))
-
-
-def _input_at_samples(piece: Piece) -> Array:
-    recording = piece.recording
-    if recording.input_time is None:
-        return recording.input
-    return np.asarray(np.interp(recording.time, recording.input_stamps, recording.input))
 
 
 def _correlation(first: Sequence[Array], second: Sequence[Array], lags: int) -> Array:

@@ -26,8 +26,9 @@ from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.residual_tests import INCOMPLETE, ResidualTests
 from pendulum_bags.identification.selection import Candidate
-from pendulum_bags.identification.uncertainty import Interval, Uncertainty
+from pendulum_bags.identification.uncertainty import Uncertainty
 from pendulum_bags.identification.window_score import WindowScore
+from pendulum_bags.identification.wording import Interval
 from pendulum_bags.runs.datasets import INPUT_KINDS, Recording, data_notes, distinct_names
 from pendulum_bags.runs.next_test import next_test_of, question_of
 from pendulum_bags.runs.run_record import run_record
@@ -214,10 +215,7 @@ class IdentificationResult:
             "parameters": {n: self.model[n] for n in UNITS},
             "units": dict(UNITS),
             "fitted": list(chosen.free),
-            "intervals": {
-                n: {"value": i.value, "low": i.low, "high": i.high, "standard_error": i.standard_error}
-                for n, i in self.uncertainty.intervals.items()
-            },
+            "intervals": {name: found.to_json() for name, found in self.uncertainty.intervals.items()},
             "profiles": {n: list(p) for n, p in self.uncertainty.profiles.items()},
             "covariance": {
                 "names": list(self.uncertainty.names),

@@ -7,6 +7,7 @@ friction, so starts spread around it in inertia, sign and delay, and a short sea
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,7 +133,7 @@ def _around(
                 values = {**fixed.values, **{name: guess[name] for name in guess if name in free}}
                 if "input_gain" not in free:
                     values["input_gain"] = flip * abs(fixed["input_gain"])
-                models.append(FitModel(values, fixed.input_kind, "coulomb", fixed.duty_gain))
+                models.append(replace(fixed, values=values, friction="coulomb"))
     return models
 
 
@@ -152,7 +153,7 @@ def _servo_models(fixed: FitModel, delays: Sequence[float], spread: bool) -> lis
                     "input_gain": gain * gravity,
                     "transport_delay": delay,
                 }
-                models.append(FitModel(values, fixed.input_kind, "coulomb", fixed.duty_gain))
+                models.append(replace(fixed, values=values, friction="coulomb"))
     return models
 
 

@@ -17,7 +17,7 @@ from pendulum_bags.identification.selection import Candidate, akaike_weights
 from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.wording import Interval, plain_sentences
 
-__all__ = ["Interval", "Uncertainty", "assess", "profile_interval", "unresolved_offset"]
+__all__ = ["Uncertainty", "assess", "profile_interval", "unresolved_offset"]
 
 RIVAL = 0.02
 """Share of the kept offset's Akaike weight from which on the other one counts as its equal (a difference of 8)."""

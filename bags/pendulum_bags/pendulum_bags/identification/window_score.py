@@ -16,7 +16,7 @@ from pendulum_bags.identification.solver import solve
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["WindowScore", "free_run", "free_run_rms", "window_rms", "window_score"]
+__all__ = ["WindowScore", "fit_states", "free_run", "window_score"]
 
 Array = NDArray[np.float64]
 
@@ -78,11 +78,6 @@ def fit_states(model: FitModel, piece: Piece) -> Array:
     return np.concatenate(states)
 
 
-def window_rms(model: FitModel | PlantParameters, recording: Recording, window: float = 1.0) -> float:
-    """Return the root mean square angle error over windows [rad]; see :func:`window_score`."""
-    return window_score(model, recording, window).rms
-
-
 def free_run(
     model: FitModel | PlantParameters, recording: Recording, *, settle: float = 1.0, fitted: bool = True
 ) -> WindowScore:
@@ -104,11 +99,6 @@ def free_run(
     elif recording.velocity is not None:
         states[0] = recording.position[0], recording.velocity[0]
     return _score(fit_model, piece, states)
-
-
-def free_run_rms(model: FitModel | PlantParameters, recording: Recording, *, settle: float = 1.0) -> float:
-    """Return the root mean square angle error in free run [rad]; see :func:`free_run`."""
-    return free_run(model, recording, settle=settle).rms
 
 
 def _score(model: FitModel, piece: Piece, states: Array) -> WindowScore:

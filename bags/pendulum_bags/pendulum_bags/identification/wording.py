@@ -39,6 +39,10 @@ class Interval:
         """Half width over value, inf at zero."""
         return 0.5 * (self.high - self.low) / abs(self.value) if self.value else float("inf")
 
+    def to_json(self) -> dict[str, float]:
+        """Return value, ends and standard error as JSON values."""
+        return {"value": self.value, "low": self.low, "high": self.high, "standard_error": self.standard_error}
+
 
 def plain_sentences(
     intervals: Mapping[str, Interval],
