@@ -15,7 +15,6 @@ from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.repeats import (
     record_simulation,
-    repeat_command,
     repeat_folder,
     repeat_settings,
 )
@@ -137,7 +136,7 @@ def test_repeats_have_noise_of_their_own_and_twice_as_much_each_time() -> None:
     chosen = [repeat_settings(SETTINGS, number).noise for number in (1, 2, 3)]
     assert len({noise.seed for noise in chosen} | {1, 2, 3}) == 6
     assert [noise.duration for noise in chosen] == [20.0, 40.0, 60.0]
-    command = repeat_command(Path("run"), SETTINGS, 2)
+    command = repeat_settings(SETTINGS, 2).lockstep_command(repeat_folder(Path("run"), 2) / "hw", side="hw")
     assert command[command.index("--seed") + 1] == str(chosen[1].seed)
     assert command[command.index("--bag") + 1] == "run/repeats/2/hw"
 

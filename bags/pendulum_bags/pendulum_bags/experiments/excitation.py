@@ -7,7 +7,7 @@ ended with it: whatever ends the run, no answers come any more and the plant goe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -92,9 +92,8 @@ def play_in_lockstep(
     plant: str,
     noise: float,
     seed: int,
-    design_plant: str = "",
+    design_plant: str,
     domain: int | None = None,
-    on_wait: Callable[[], None] = lambda: None,
 ) -> Path:
     """Start a simulator or an emulated actuator, play on it as fast as it answers, and record.
 
@@ -105,9 +104,8 @@ def play_in_lockstep(
         plant: What the simulator or the emulator is.
         noise: Standard deviation of the simulated angle sensor [rad]; the emulator has its own.
         seed: Of the sensors.
-        design_plant: What the excitation was designed for; by default what is played on.
+        design_plant: What the excitation was designed for.
         domain: ROS domain, or None for any free one.
-        on_wait: Called while waiting.
 
     Raises:
         BagError: The bag exists.
@@ -125,7 +123,7 @@ def play_in_lockstep(
     spec = _LockstepRun(
         side=side,
         plant=plant,
-        design_plant=design_plant or plant,
+        design_plant=design_plant,
         controller="playback",
         controller_parameters={"file": str(play.zero_file(bag.parent / "logs" / bag.name).resolve())},
         disturbance={"kind": "from_bag", "file": str(play.file.resolve()), "duration": float(play.duration)},
@@ -137,7 +135,7 @@ def play_in_lockstep(
         sampling=play.period,
         prediction=play.prediction,
     )
-    return record_run(bag, spec, domain=domain, on_wait=on_wait)
+    return record_run(bag, spec, domain=domain)
 
 
 def play_on_running_plant(
@@ -147,7 +145,6 @@ def play_on_running_plant(
     *,
     arm: bool,
     domain: int | None = None,
-    on_wait: Callable[[], None] = lambda: None,
 ) -> Path:
     """Play on a plant that runs already, in real time, and record.
 
@@ -157,7 +154,6 @@ def play_on_running_plant(
         namespace: Of the plant, such as ``/hw``.
         arm: Whether to arm a plant that is not; it is disarmed again at the end.
         domain: ROS domain; by default ``ROS_DOMAIN_ID``, or 0.
-        on_wait: Called while waiting.
 
     Raises:
         BagError: The bag exists.
@@ -166,8 +162,7 @@ def play_on_running_plant(
     """
     refuse_existing(bag)
     logs = bag.parent / "logs" / bag.name
-    chosen = check_domain(domain) or 0
-    with conduct(logs, chosen, on_wait) as session:
+    with conduct(logs, check_domain(domain) or 0) as session:
         conductor = session.conductor
         node_name = _find_plant(conductor, namespace)
         _refuse_others(conductor, namespace)
@@ -249,11 +244,10 @@ def _require_rest(conductor: Conductor, plant: PlantClient) -> None:
 
 
 def _is_armed(plant: PlantClient, *, may_arm: bool) -> bool:
-    mode = plant.newest_event(Event.PLANT_MODE)
-    if mode is not None and str(mode.get("mode", "")).startswith("armed"):
+    if plant.is_armed():
         return True
     if not may_arm:
-        told = "has not said its mode" if mode is None else f"is {mode.get('mode')}"
+        told = f"is {mode}" if (mode := plant.newest_mode()) else "has not said its mode"
         raise ParameterError(f"{plant.namespace} {told}; expected it armed, or --arm to arm it for the excitation")
     return False
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.options import Json, RunningDomain, out_option
-
-if TYPE_CHECKING:
-    from pendulum_bags.identification.excitation import Excitation, Limits
 
 __all__ = ["app", "main"]
 
@@ -119,52 +116,34 @@ def excite(
             highlight=False,
         )
         console.print(f"wrote {out}", highlight=False)
-    if play:
-        target = bag or out.with_suffix("")
-        _play(
-            design, limits, out, target, plant, on, namespace, simulate, arm=arm, noise=noise, seed=seed, domain=domain
-        )
-        typer.echo(f"played and recorded; next\n  python -m pendulum_bags identify {target}", err=as_json)
-
-
-def _play(
-    design: Excitation,
-    limits: Limits,
-    file: Path,
-    bag: Path,
-    plant: str,
-    on: str,
-    namespace: str,
-    simulated: str,
-    *,
-    arm: bool,
-    noise: float,
-    seed: int,
-    domain: int | None,
-) -> None:
+    if not play:
+        return
     from pendulum_bags.experiments.excitation import ExcitationPlay, play_in_lockstep, play_on_running_plant
 
+    target = bag or out.with_suffix("")
     period = float(design.time[1] - design.time[0])
-    prediction: dict[str, Any] = {
-        "kind": design.kind,
-        "plant": plant,
-        "predicted": design.predicted,
-        "noise": noise,
-    }
-    duration = period * len(design.time)
-    play = ExcitationPlay(file, duration, period, limits.effort, limits.speed, limits.angle, prediction)
+    prediction = {"kind": design.kind, "plant": plant, "predicted": design.predicted, "noise": noise}
+    signal = ExcitationPlay(
+        out, period * len(design.time), period, limits.effort, limits.speed, limits.angle, prediction
+    )
     try:
         if on == "running":
-            play_on_running_plant(bag, play, f"/{namespace.strip('/')}", arm=arm, domain=domain)
+            play_on_running_plant(target, signal, f"/{namespace.strip('/')}", arm=arm, domain=domain)
         else:
-            side = "sim" if on == "sim" else "hw"
-            true = simulated or plant
             play_in_lockstep(
-                bag, play, side=side, plant=true, design_plant=plant, noise=noise, seed=seed, domain=domain
+                target,
+                signal,
+                side="sim" if on == "sim" else "hw",
+                plant=simulate or plant,
+                design_plant=plant,
+                noise=noise,
+                seed=seed,
+                domain=domain,
             )
     except KeyboardInterrupt:
         typer.echo("interrupted: the torque is zero, all programs have ended", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    typer.echo(f"played and recorded; next\n  python -m pendulum_bags identify {target}", err=as_json)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -38,7 +38,7 @@ def running_namespace(name: str) -> str | None:
     return namespace
 
 
-def find_plant(conductor: Conductor, namespace: str, patience: float = _PATIENCE) -> str:
+def find_plant(conductor: Conductor, namespace: str) -> str:
     """Return the name of the node in a namespace that has an e-stop: that is a plant.
 
     Raises:
@@ -54,7 +54,7 @@ def find_plant(conductor: Conductor, namespace: str, patience: float = _PATIENCE
             if name.startswith(f"{space}/") and name.endswith(ends)
         ]
 
-    return conductor.wait_for(f"a plant in {namespace}", found, patience)[0]
+    return conductor.wait_for(f"a plant in {namespace}", found, _PATIENCE)[0]
 
 
 def join(conductor: Conductor, space: str) -> PlantClient:

@@ -128,10 +128,9 @@ def joints(
             f"{simulated.name} has {len(simulated.coordinates.driven)}"
         )
     on = design_for(simulated)
-    ranked = rankable(joint_designs(design or (), on, linearise_mechanism(on))) if rank_seeds else ()
-    if design:
-        # Before anything runs: a slip of the pen should not cost a minute.
-        joint_designs(design, on, linearise_mechanism(on))
+    # Before anything runs: a slip of the pen should not cost a minute.
+    designs = joint_designs(design or (), on, linearise_mechanism(on)) if design or rank_seeds else ()
+    ranked = rankable(designs) if rank_seeds else ()
     console = make_console(stderr=json_output, highlight=False)
     folder = create_run_folder(out, "joints")
     started = time.monotonic()

@@ -23,7 +23,6 @@ from pendulum_bags.experiments.session import (
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.runs.run_data import END_EVENT, START_EVENT
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import FaultError
@@ -57,7 +56,6 @@ def run_lockstep(
     settings: RegulationSettings,
     *,
     side: str = "sim",
-    theta: float = UPRIGHT,
     domain: int | None = None,
     on_wait: Callable[[], None] = lambda: None,
 ) -> Path:
@@ -67,7 +65,6 @@ def run_lockstep(
         bag: Folder of the bag.
         settings: What to run.
         side: ``sim`` for the simulator, ``hw`` for the emulated hardware.
-        theta: Initial angle [rad].
         domain: ROS domain, or None for any free one.
         on_wait: Called while waiting.
 
@@ -75,11 +72,10 @@ def run_lockstep(
         BagError: The bag exists.
         FaultError: A program ended or did not answer.
     """
-    spec = lockstep_spec(settings, side=side, theta=theta)
-    return record_run(bag, spec, domain=domain, on_wait=on_wait)
+    return record_run(bag, lockstep_spec(settings, side=side), domain=domain, on_wait=on_wait)
 
 
-def lockstep_spec(settings: RegulationSettings, *, side: str, theta: float = UPRIGHT) -> RunSpec:
+def lockstep_spec(settings: RegulationSettings, *, side: str) -> RunSpec:
     """Return one side of the thesis's experiment as a run in lockstep, for as long as the noise lasts."""
     noise, foreign = settings.noise, settings.foreign_of(side)
     return RunSpec(
@@ -95,7 +91,6 @@ def lockstep_spec(settings: RegulationSettings, *, side: str, theta: float = UPR
             "hold_time": noise.hold_time,
             "duration": noise.duration,
         },
-        theta=theta,
         duration=noise.duration,
         seed=noise.seed,
         method=settings.method,

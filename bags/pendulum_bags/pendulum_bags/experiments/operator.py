@@ -13,9 +13,11 @@ from pathlib import Path
 
 from rich.console import Console
 
+from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE
 from pendulum_bags.runs.bridge_programs import last_words, run_bridge_program
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS, LabFile, load_lab
+from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -38,10 +40,17 @@ class RealMachine:
     path: Path
     lab: LabFile
 
-    def bridge_parameters(self, **defaults: ParameterArgument) -> dict[str, ParameterArgument]:
-        """Return what the bridge is told: the lab file, and defaults for what the file leaves open."""
-        left_open = {name: value for name, value in defaults.items() if name not in self.lab.values}
-        return {"lab_file": str(self.path), **left_open}
+    def bridge_program(self, strategy: str, bag: Path | None = None) -> NodeProgram:
+        """Return the bridge to the machine; an emulator gets patience, as far as the lab file leaves it open.
+
+        Args:
+            strategy: How the actuator turns wanted torque into PWM.
+            bag: A real actuator's own log is written beside it.
+        """
+        patience = EMULATOR_PATIENCE if self.patient else {}
+        told = {name: value for name, value in patience.items() if name not in self.lab.values}
+        told |= self.log_parameters(bag)
+        return graph.bridge("/hw", lab_file=str(self.path), effort_strategy=strategy, **told)
 
     def log_parameters(self, bag: Path | None) -> dict[str, ParameterArgument]:
         """Return what makes hebi-py write its own log beside a bag; nothing for an emulator, which has none."""
@@ -186,14 +195,8 @@ def ask_yes(
         FaultError: The answer is another, or nobody can answer.
     """
     what = "an EMULATED machine (a rehearsal)" if machine.emulated else "a REAL machine"
-    console.print(
-        f"\nThis moves {what}: {machine.lab.describe()}, lab file {machine.path}.\n{plan}\n"
-        f"Largest torque: {machine.effort_limit}. Keep a hand on the motion stop, and nobody in the pendulum's plane.",
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
-    )
-    _await_yes(console, yes=yes, read=read)
+    moves = f"{what}: {machine.lab.describe()}, lab file {machine.path}"
+    _ask(console, moves, plan, f"{machine.effort_limit}. Keep a hand on the motion stop", yes=yes, read=read)
 
 
 def ask_for_running(
@@ -214,18 +217,17 @@ def ask_for_running(
     if not places:
         return
     console = make_console(stderr=True, highlight=False)
+    moves = f"what runs already in {' and '.join(places)} on ROS domain {domain}: it may be a REAL machine"
+    _ask(console, moves, plan, "what that plant allows. Keep a hand on its motion stop", yes=yes, read=read)
+
+
+def _ask(console: Console, moves: str, plan: str, limit: str, *, yes: bool, read: Callable[[], str]) -> None:
     console.print(
-        f"\nThis moves what runs already in {' and '.join(places)} on ROS domain {domain}: it may be a REAL machine.\n"
-        f"{plan}\nLargest torque: what that plant allows. Keep a hand on its motion stop, and nobody in the pendulum's "
-        "plane.",
+        f"\nThis moves {moves}.\n{plan}\nLargest torque: {limit}, and nobody in the pendulum's plane.",
         markup=False,
         highlight=False,
         soft_wrap=True,
     )
-    _await_yes(console, yes=yes, read=read)
-
-
-def _await_yes(console: Console, *, yes: bool, read: Callable[[], str]) -> None:
     if yes:
         console.print("(--yes: not asked)", markup=False)
         return

@@ -13,10 +13,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol
 
 from pendulum_bags.experiments.bound_process import start_bound_process
-from pendulum_bags.experiments.host_pool import HostPool
+from pendulum_bags.experiments.host_pool import HostedProgram, HostPool
 from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs.graph import NodeProgram
@@ -51,33 +50,12 @@ def _busy_note(words: str) -> str:
     )
 
 
-class RunningProgram(Protocol):
-    """What is asked of a program that was started, as of a ``subprocess.Popen``."""
-
-    @property
-    def pid(self) -> int:
-        """Process that it runs in, the leader of a group."""
-
-    @property
-    def returncode(self) -> int | None:
-        """Exit code, negative for a signal that ended it; None as long as nobody has seen it end."""
-
-    def poll(self) -> int | None:
-        """Return the exit code, None while it runs."""
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for the exit code, for a time at most [s]."""
-
-    def send_signal(self, number: int, /) -> None:
-        """Send a signal to it, if it still runs."""
-
-
 @dataclass
 class Child:
     """One running program."""
 
     name: str
-    process: RunningProgram
+    process: subprocess.Popen[bytes] | HostedProgram
     log: Path
     ends_last: bool = False
     ends_by_itself: bool = False
@@ -158,7 +136,7 @@ class ProcessSet:
         """
         log = self.log_folder / f"{name}.log"
         everything = {**os.environ, **self.environment, **(environment or {})}
-        process: RunningProgram | None = None
+        process: subprocess.Popen[bytes] | HostedProgram | None = None
         with log.open("wb") as sink:
             if self.hosts is not None and not alone:
                 process = self.hosts.start(command, environment=everything, log=log, niceness=niceness)

@@ -7,7 +7,6 @@ its nodes to the last bit in a tenth of the time; both are kept as bags.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.storage import BagWriter
 
-__all__ = ["SHORTEST", "record_repeat", "record_simulation", "repeat_command", "repeat_folder", "repeat_settings"]
+__all__ = ["SHORTEST", "record_repeat", "record_simulation", "repeat_folder", "repeat_settings"]
 
 SEED_STEP = 10_000_000
 """Added to the seed for each repeat, so that the repeats of one seed are not another seed's run."""
@@ -47,16 +46,6 @@ def repeat_settings(settings: RegulationSettings, number: int) -> RegulationSett
     noise = settings.noise
     duration = min(LONGEST, max(SHORTEST, noise.duration) * 2.0 ** (number - 1))
     return replace(settings, noise=replace(noise, seed=noise.seed + SEED_STEP * number, duration=duration))
-
-
-def repeat_command(folder: Path, settings: RegulationSettings, number: int) -> list[str]:
-    """Return the command that records the hardware's side of a repeat by itself."""
-    chosen = repeat_settings(settings, number)
-    return [
-        *(sys.executable, "-m", "pendulum_bags", "experiment", "lockstep"),
-        *("--side", "hw", "--bag", str(repeat_folder(folder, number) / "hw")),
-        *chosen.arguments(),
-    ]
 
 
 def record_repeat(

@@ -25,11 +25,13 @@ from pendulum_msgs_py.programs.graph import NodeProgram
 __all__ = [
     "CLOCKS",
     "EMULATOR_LIFETIME",
+    "EMULATOR_PATIENCE",
     "EMULATOR_WATCHDOG",
     "PERIODS",
     "SIDES",
     "THESIS_METHOD",
     "RunSpec",
+    "absolute_plant",
     "integrator_of",
 ]
 
@@ -39,6 +41,12 @@ EMULATOR_WATCHDOG = 50
 """Feedback periods that the bridge waits for an emulator, on a machine that does other things too."""
 EMULATOR_LIFETIME = 0.5
 """Command lifetime of an emulator on such a machine [s]."""
+EMULATOR_PATIENCE: Mapping[str, graph.ParameterArgument] = {
+    "feedback_watchdog": EMULATOR_WATCHDOG,
+    "command_lifetime": EMULATOR_LIFETIME,
+}
+"""What the bridge to an emulator in real time is told: its feedback is as punctual as this machine, which may be a busy
+one. A real actuator keeps the default."""
 _AT_REST = 1e-9
 THESIS_METHOD = "euler"
 """Integrator of the thesis's simulation, for rigid plants."""
@@ -175,11 +183,11 @@ class RunSpec:
                 lockstep_duration=float(self.duration),
             )
         elif self.has_bridge:
-            loop.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=EMULATOR_LIFETIME)
+            loop.update(EMULATOR_PATIENCE)
         loop.update(self.plant_parameters)
         foreign = self.foreign
         if foreign is None:
-            loop.setdefault("plant", _absolute(self.plant))
+            loop.setdefault("plant", absolute_plant(self.plant))
         if self.has_bridge:
             # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
             loop.update(initial_position=float(self.theta), seed=self.seed)
@@ -199,7 +207,7 @@ class RunSpec:
                     for name, value in self.controller_parameters.items()
                 },
                 "controller": self.controller,
-                "plant": _absolute(self.design_plant),
+                "plant": absolute_plant(self.design_plant),
                 "period": self.period,
                 "set_point": float(self.set_point),
                 "use_sim_time": self.simulated_time,
@@ -259,6 +267,6 @@ def integrator_of(plant: str, method: str) -> str:
     return "auto" if elastic and method == THESIS_METHOD else method
 
 
-def _absolute(plant: str) -> str:
+def absolute_plant(plant: str) -> str:
     """Return a preset as it is, and a file so that a node started elsewhere finds it."""
     return plant if Path(plant).suffix == "" else str(Path(plant).resolve())

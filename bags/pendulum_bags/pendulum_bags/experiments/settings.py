@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from pendulum_bags.experiments.graph_plant import PREFIX, running_namespace
 from pendulum_bags.experiments.operator import RealMachine, real_machine
-from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG, THESIS_METHOD, integrator_of
+from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE, THESIS_METHOD, absolute_plant, integrator_of
 from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
@@ -224,22 +225,17 @@ class RegulationSettings:
         """
         if (foreign := self.foreign_of("hw")) is not None:
             return foreign.program("/hw", clock="realtime")
-        # An emulator's feedback is as punctual as this machine, which may be a busy one; a real actuator keeps the
-        # default.
-        patience: dict[str, graph.ParameterArgument] = {
-            "feedback_watchdog": EMULATOR_WATCHDOG,
-            "command_lifetime": EMULATOR_LIFETIME,
-        }
-        machine = self.machine
-        if machine is None:
-            return graph.bridge("/hw", backend=self.hardware, effort_strategy=self.strategy, **patience)
-        told = machine.bridge_parameters(**(patience if machine.patient else {}))
-        return graph.bridge("/hw", **told, **machine.log_parameters(bag), effort_strategy=self.strategy)
+        if (machine := self.machine) is not None:
+            return machine.bridge_program(self.strategy, bag)
+        return graph.bridge("/hw", backend=self.hardware, effort_strategy=self.strategy, **EMULATOR_PATIENCE)
 
-    def arguments(self) -> list[str]:
-        """Return these settings as options of ``experiment lockstep``."""
+    def lockstep_command(self, bag: Path, *, side: str = "sim") -> list[str]:
+        """Return the command that records one side by itself, in lockstep."""
         noise = self.noise
         return [
+            *(sys.executable, "-m", "pendulum_bags", "experiment", "lockstep"),
+            *(("--side", side) if side != "sim" else ()),
+            *("--bag", str(bag)),
             *("--plant", self.plant, "--strategy", self.strategy),
             *("--controller", self.controller, "--q", *map(repr, self.q), "--r", repr(self.r)),
             *("--seed", str(noise.seed), "--amplitude", repr(noise.amplitude), "--hold-time", repr(noise.hold_time)),
@@ -250,20 +246,12 @@ class RegulationSettings:
 
     def controller_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:
         """Return the controller of one of the plants."""
-        plant = self.plant if Path(self.plant).suffix == "" else str(Path(self.plant).resolve())
-        parameters: dict[str, graph.ParameterArgument] = {"controller": self.kind, "plant": plant, **self.tuning}
+        parameters = {"controller": self.kind, "plant": absolute_plant(self.plant), **self.tuning}
         return graph.controller(namespace, **{**parameters, **changes})
 
     def disturbance_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:
         """Return the disturbance on one of the plants."""
-        parameters: dict[str, graph.ParameterArgument] = {
-            "kind": "uniform",
-            "seed": self.noise.seed,
-            "amplitude": self.noise.amplitude,
-            "hold_time": self.noise.hold_time,
-            "duration": self.noise.duration,
-        }
-        return graph.disturbance(namespace, **{**parameters, **changes})
+        return graph.disturbance(namespace, **{"kind": "uniform", **asdict(self.noise), **changes})
 
     def metadata(self, experiment: str, *, side: str = "sim", **more: Any) -> dict[str, Any]:
         """Return what one side's bag says about its run."""

@@ -39,7 +39,6 @@ def run_undisturbed(
     *,
     emulated: bool,
     tell: Callable[[str], None],
-    attempts: int = ATTEMPTS,
 ) -> None:
     """Carry out a run, and again where the machine stalled.
 
@@ -48,26 +47,25 @@ def run_undisturbed(
         folder: The run's folder; of a stalled run there remain its logs and its reason, which the result tells.
         emulated: Whether the hardware is emulated; a real machine moves when its operator wants it to.
         tell: Told what happened, one sentence.
-        attempts: Times that it is carried out at most.
 
     Raises:
         FaultError: It failed for another reason, or the machine stalled each time.
     """
-    for attempt in range(1, attempts + 1):
+    for attempt in range(1, ATTEMPTS + 1):
         try:
             run()
         except FaultError as error:
             if not emulated or not is_stall(error):
                 raise
-            last = attempt == attempts
+            last = attempt == ATTEMPTS
             # Before anything is removed: a fault of the bridge's own that looks like a stall must not be selected away.
             write_stall(folder, str(error), "" if not (folder / _LOGS).is_dir() else _LOGS if last else _kept(attempt))
             if last:
                 raise FaultError(
-                    f"this machine stood still in each of {attempts} runs, the last time so that {error}; close what "
+                    f"this machine stood still in each of {ATTEMPTS} runs, the last time so that {error}; close what "
                     "else runs on it, and measure again"
                 ) from error
-            tell(f"This machine stood still ({error}); measuring again, run {attempt + 1} of at most {attempts}.")
+            tell(f"This machine stood still ({error}); measuring again, run {attempt + 1} of at most {ATTEMPTS}.")
             _clear(folder, attempt)
         else:
             return

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -15,7 +13,7 @@ from pendulum_bags.experiments.graph_plant import join
 from pendulum_bags.experiments.lockstep import longest_run
 from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.repeats import SHORTEST, repeat_command
+from pendulum_bags.experiments.repeats import SHORTEST, repeat_folder, repeat_settings
 from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.experiments.session import (
     ANSWER_PRIORITY,
@@ -151,7 +149,8 @@ def _regulate(
     durations = _start_move(conductor, plants, 0.0, "ramp_down", progress)
     if repeat:
         # Idle again: the emulated hardware gets new noise, in case that this run alone does not decide.
-        beside.append(_start_beside(processes, "repeat_1", repeat_command(folder, settings, 1)))
+        command = repeat_settings(settings, 1).lockstep_command(repeat_folder(folder, 1) / "hw", side="hw")
+        beside.append(_start_beside(processes, "repeat_1", command))
     # Before the ramp ends: a controller that is still awake then would be handed a pendulum half a turn from upright.
     for plant in plants:
         plant.switch_controller(on=False)
@@ -174,8 +173,8 @@ def _start_own_protocol(processes: ProcessSet, folder: Path, settings: Regulatio
     foreign = settings.foreign
     hold_time = 0.002 if foreign is None else max(0.002, foreign.period)
     noise = replace(settings.noise, seed=settings.noise.seed + OWN_PROTOCOL_SEED_STEP, hold_time=hold_time)
-    command = [sys.executable, "-m", "pendulum_bags", "experiment", "lockstep", "--bag", str(folder / "sim_500hz")]
-    return _start_beside(processes, "sim_500hz", [*command, *replace(settings, noise=noise).arguments()])
+    command = replace(settings, noise=noise).lockstep_command(folder / "sim_500hz")
+    return _start_beside(processes, "sim_500hz", command)
 
 
 def _start_beside(processes: ProcessSet, name: str, command: list[str]) -> Child:
@@ -206,9 +205,7 @@ def _wait_for_goal(conductor: Conductor, plants: Sequence[PlantClient], duration
 
 def _refuse_occupied_domain(conductor: Conductor, settings: RegulationSettings) -> None:
     ours = {settings.namespace(side) for side in SIDES if settings.running(side) is None}
-    deadline = time.monotonic() + 0.5
-    while time.monotonic() < deadline:
-        conductor.spin(0.1)
+    conductor.spin(0.5)
     for name, namespace in conductor.node.get_node_names_and_namespaces():
         if namespace in ours:
             raise FaultError(

@@ -12,7 +12,7 @@ from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
+from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE
 from pendulum_bags.experiments.session import ANSWER_PRIORITY, PLANT_PRIORITY, START_TIMEOUT, conduct, start_loop
 from pendulum_bags.experiments.settings import HARDWARE
 from pendulum_bags.runs.run_folder import provenance
@@ -121,15 +121,15 @@ class TrialSettings:
         ramp = math.radians(self.step) / RAMP_INCREMENT * RAMP_PERIOD
         return _MARGIN + 4.0 * self.top / self.step * (self.hold + ramp)
 
+    @property
+    def expected_wall_time(self) -> float:
+        """Wall time of one trial, starting its nodes included [s]."""
+        return 4.0 + self.expected_duration / (10.0 if self.lockstep else 1.0)
+
     def plant_program(self, trial: int, bag: Path | None = None) -> graph.NodeProgram:
         """Return the bridge; a real actuator's own log is written beside the bag, where there is one."""
         if (machine := self.machine) is not None:
-            patience: dict[str, graph.ParameterArgument] = {
-                "feedback_watchdog": EMULATOR_WATCHDOG,
-                "command_lifetime": EMULATOR_LIFETIME,
-            }
-            told = machine.bridge_parameters(**(patience if machine.patient else {}))
-            return graph.bridge("/hw", **told, **machine.log_parameters(bag), effort_strategy="direct_pwm")
+            return machine.bridge_program("direct_pwm", bag)
         parameters: dict[str, graph.ParameterArgument] = {"plant": self.plant, "effort_strategy": "direct_pwm"}
         if self.hardware == "emulator":
             # Sensor noise differs from trial to trial, as it would.
@@ -143,7 +143,7 @@ class TrialSettings:
                     lockstep_duration=self.expected_duration,
                 )
             else:
-                parameters.update(feedback_watchdog=EMULATOR_WATCHDOG, command_lifetime=EMULATOR_LIFETIME)
+                parameters.update(EMULATOR_PATIENCE)
         return graph.bridge("/hw", backend=self.hardware, **parameters)
 
     def procedure_program(self, trial: int) -> graph.NodeProgram:
@@ -188,8 +188,7 @@ def run_trials(
     bags = []
     with reserve_domain(domain) as reserved, HostPool() as hosts:
         for trial in range(1, settings.trials + 1):
-            expected = 4.0 + settings.expected_duration / (10.0 if settings.lockstep else 1.0)
-            progress.phase(f"trial {trial} of {settings.trials}", expected)
+            progress.phase(f"trial {trial} of {settings.trials}", settings.expected_wall_time)
             bags.append(
                 _run_trial(folder, settings, trial, reserved, hosts if settings.lockstep else None, progress, ask)
             )

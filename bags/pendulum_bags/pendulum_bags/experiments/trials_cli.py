@@ -103,9 +103,8 @@ def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_out
     with confirmed(settings.machine, program, plan, yes=yes, flat=settings.kind.flat):
         folder = create_run_folder(out, name)
         started = time.monotonic()
-        total = settings.trials * (4.0 + settings.expected_duration / (10.0 if settings.lockstep else 1.0))
         try:
-            with PhaseProgress(total, console) as progress:
+            with PhaseProgress(settings.trials * settings.expected_wall_time, console) as progress:
                 bags = run_trials(folder, settings, domain, progress, ask=lambda sentence: _ask(console, sentence))
         except KeyboardInterrupt:
             nothing = discard_if_empty(folder)
