@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -303,10 +305,19 @@ def examples(
 
     Example: python -m pendulum_bags experiment examples --out bags/examples
     """
-    from pendulum_bags.experiments.examples import make_examples
+    from pendulum_bags.experiments.lockstep import run_lockstep
 
-    for bag in make_examples(out):
-        print(bag)
+    # Two runs give the same messages, field by field, so a change of an example is a change of the programs.
+    settings = RegulationSettings(noise=NoiseSettings(seed=1, hold_time=0.01))
+    out.mkdir(parents=True, exist_ok=True)
+    for side in SIDES:
+        with tempfile.TemporaryDirectory(prefix="pendulum_examples_") as scratch:
+            target = out / f"regulation_{side}"
+            recorded = run_lockstep(Path(scratch) / target.name, settings, side=side)
+            # Older ones are replaced when the new ones are whole.
+            shutil.rmtree(target, ignore_errors=True)
+            shutil.copytree(recorded, target)
+            print(target)
 
 
 def _running(settings: RegulationSettings, domain: int | None, plant: str | None) -> list[str]:
@@ -346,7 +357,8 @@ def _analyse(
         on_look=lambda number, duration: progress.phase(f"undecided: {duration:.0f} s more", 4.0 + 0.25 * duration),
         on_wait=progress.refresh,
     )
-    answer = answer_of(comparison, more=_how_to_go_on(comparison, budget))
+    again = f'make experiment ARGS="--budget {4 * budget:.0f}"' if comparison.is_emulated and budget else ""
+    answer = answer_of(comparison, more=again)
     progress.phase("writing the report", 4.0)
     summary = _summary(settings, comparison, answer)
     write_json(folder / "summary.json", summary)
@@ -365,10 +377,6 @@ def _summary(settings: RegulationSettings, comparison: Comparison, answer: Answe
         "versions": versions(),
         "answer": answer.to_json(),
     }
-
-
-def _how_to_go_on(comparison: Comparison, budget: float) -> str:
-    return f'make experiment ARGS="--budget {4 * budget:.0f}"' if comparison.is_emulated and budget else ""
 
 
 def _print_summary(console: Console, summary: dict[str, Any]) -> None:

@@ -232,7 +232,7 @@ def start_recorder(
     metadata: Path,
     storage: str,
     *,
-    log_time: str = "receive",
+    simulated: bool = False,
     priority: int = 0,
 ) -> Child:
     """Start the recorder of all topics of one plant, as the node ``recorder`` in the plant's namespace.
@@ -243,13 +243,13 @@ def start_recorder(
         namespace: Namespace of the plant.
         metadata: JSON file about the run.
         storage: ``mcap`` or ``sqlite3``.
-        log_time: ``receive``, or ``header`` for runs whose time is simulated.
+        simulated: Whether time is that of the plant and not that of the wall.
         priority: Its real-time priority; 0 for none.
     """
     command = [sys.executable, "-m", "pendulum_bags", "record", "-o", str(bag)]
     command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
-    command += ["--metadata", str(metadata), "--log-time", log_time]
-    if log_time == "header":
+    command += ["--metadata", str(metadata), "--log-time", "header" if simulated else "receive"]
+    if simulated:
         # What is stamped with wall time has no place in a bag whose time is simulated.
         command += ["--exclude", "^/diagnostics$|/transition_event$"]
     command += ["--ros-args", "-r", f"__ns:={namespace}"]

@@ -77,9 +77,8 @@ class Session:
         """
         told = self.logs / f"{bag.name}_metadata.json"
         write_json(told, dict(metadata))
-        log_time = "header" if simulated else "receive"
         priority = 0 if simulated else permitted(RECORDER_PRIORITY)
-        return start_recorder(self.processes, bag, namespace, told, storage, log_time=log_time, priority=priority)
+        return start_recorder(self.processes, bag, namespace, told, storage, simulated=simulated, priority=priority)
 
     def close(self, recorder: Child) -> None:
         """End a recorder now.

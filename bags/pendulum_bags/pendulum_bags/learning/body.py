@@ -219,7 +219,7 @@ def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]])
     columns = {name: k for k, name in enumerate(PACKED)}
     inertia, damping, gravity, coulomb = (columns[each] for each in VARIED)
     limit = plant.effort_limit
-    fastest = max(pair[1] for pair in (ranges.get("damping", (0.0, plant.damping)),))
+    fastest = ranges.get("damping", (0.0, plant.damping))[1]
     lightest = ranges.get("inertia", (plant.inertia, plant.inertia))[0]
     longest = min(_LONGEST, _GROWTH * lightest / fastest if fastest > 0.0 else _LONGEST)
 

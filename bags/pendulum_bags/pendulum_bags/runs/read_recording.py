@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pendulum_bags.runs.bag_recordings import read_bag_recording
+from pendulum_bags.runs.bridge_programs import last_words, run_bridge_program
 from pendulum_bags.runs.csv_mapping import read_csv
 from pendulum_bags.runs.datasets import Array, Recording, check_consistency, first_of_each_stamp, unwrap
-from pendulum_bags.runs.hebi_logs import read_hebi_log
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["read_recording", "read_servo_log"]
 
+_TIMEOUT = 300.0
+"""Longest time that reading a HEBI log may take [s]."""
 _SERVO_ENTRY_KEYS = ("timestamp", "position", "goal_position", "torque_enable")
 
 
@@ -55,7 +60,7 @@ def read_recording(
     if suffix in {".csv", ".txt"}:
         return check_consistency(unwrap(read_csv(source, mapping, hold=hold)))
     if suffix == ".hebilog":
-        return check_consistency(unwrap(read_hebi_log(source, mapping)))
+        return check_consistency(unwrap(_read_hebi_log(source, mapping)))
     raise DataError(
         f"{source} has the suffix {suffix!r}; expected .csv, .txt, .json, .hebilog, .mcap, .db3 or a bag folder"
     )
@@ -119,3 +124,30 @@ def read_servo_log(path: str | Path) -> Recording:
         enabled=columns["torque_enable"],
         meta=meta,
     )
+
+
+def _read_hebi_log(path: Path, lab: str | Path | Mapping[str, Any] | None) -> Recording:
+    """Read a ``.hebilog``; the input is the torque measured through the spring.
+
+    The vendor's library stays with the bridge, whose program ``convert`` reads it.
+
+    Args:
+        path: The file.
+        lab: Lab file with zero, sign and tare of the joint; None for those of the actuator.
+
+    Raises:
+        DataError: It cannot be read, or the lab file is something else.
+    """
+    if isinstance(lab, Mapping):
+        raise DataError(f"{path}: mapping is given as values; expected the lab file of a HEBI log")
+    with tempfile.TemporaryDirectory() as folder:
+        table = Path(folder) / "log.csv"
+        told = [] if lab is None else ["--lab", str(lab)]
+        try:
+            done = run_bridge_program("convert", str(path), "--out", str(table), *told, timeout=_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            raise DataError(f"{path} was not read within {_TIMEOUT:g} s") from None
+        if done.returncode != 0:
+            raise DataError(last_words(done.stderr, f"{path} cannot be read"))
+        recording = read_csv(table)
+    return replace(recording, meta={**recording.meta, "source": str(path), "mapping": str(lab or "")})

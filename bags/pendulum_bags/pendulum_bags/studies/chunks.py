@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -137,24 +137,16 @@ def cluster_client(scheduler: str = "", workers: int = 0) -> Iterator[Any]:
                 f"no Dask scheduler answers at {scheduler!r} within {_CONNECT_TIMEOUT:g} s ({reason}); "
                 "expected tcp://HOST:PORT of a running dask scheduler"
             ) from error
-        try:
+        with closing(client):
             yield client
-        finally:
-            client.close()
         return
     # What it says of a worker that died and was replaced is for those who run a cluster, not for whom it serves; its
     # status page takes any free port of this machine alone, so that two clusters do not meet on the usual one.
-    cluster = LocalCluster(
+    local = LocalCluster(
         n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL
     )
-    try:
-        client = Client(cluster)
-        try:
-            yield client
-        finally:
-            client.close()
-    finally:
-        cluster.close()
+    with closing(local) as cluster, closing(Client(cluster)) as client:
+        yield client
 
 
 def _on_cluster(

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from pendulum_bags.studies.random_runs import Array, Columns, RandomRuns, figures_of_runs, replay
-from pendulum_bags.studies.uncertain import VARIED, Uncertainty, batch_variations
+from pendulum_bags.studies.uncertain import THESIS_UNCERTAINTY, VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
@@ -45,9 +45,7 @@ class MonteCarlo(RandomRuns):
 
     plant: str = "thesis"
     runs: int = 1_000_000
-    uncertainty: Uncertainty = field(
-        default_factory=lambda: Uncertainty({"inertia": 0.3, "damping": 0.05, "gravity": 0.05})
-    )
+    uncertainty: Uncertainty = THESIS_UNCERTAINTY
     q: tuple[float, float] = (100.0, 0.01)
     r: float = 0.1
     amplitude: float = 2.5

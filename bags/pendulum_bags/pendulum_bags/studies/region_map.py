@@ -8,7 +8,7 @@ ellipse of the linear analysis, proven for that plant, belongs inside.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pendulum_bags.studies.chunks import chunk_path, read_columns
 from pendulum_bags.studies.random_runs import Array, Columns
 from pendulum_bags.studies.start_grid import StartGrid, inside_ellipse, share_inside
-from pendulum_bags.studies.uncertain import VARIED, Uncertainty, batch_variations
+from pendulum_bags.studies.uncertain import THESIS_UNCERTAINTY, VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import Gain, output_lqr
 from pendulum_lqr.model import linearise
 from pendulum_lqr.roa import proven_level, sublevel_ellipse
@@ -53,9 +53,7 @@ class RegionMap(StartGrid):
     RUNS_OF_CHUNK: ClassVar[int] = 50_000
 
     plant: str = "thesis"
-    uncertainty: Uncertainty = field(
-        default_factory=lambda: Uncertainty({"inertia": 0.3, "damping": 0.05, "gravity": 0.05})
-    )
+    uncertainty: Uncertainty = THESIS_UNCERTAINTY
     q: tuple[float, float] = (100.0, 0.01)
     r: float = 0.1
     effort_limit: float = 0.0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
 from pendulum_bags.distributions import mean_interval, share_interval
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.studies.study_file import Study, StudyRun
+from pendulum_bags.studies.study_file import AXES, Study, StudyRun
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
@@ -38,7 +38,6 @@ SUCCESS_ERROR = 0.1
 SHARES = frozenset({"success"})
 """Metrics that are 1 or 0 in each run: their mean is a share, and more is better."""
 _LEAST_STEP = 1e-6
-AXES = ("plant", "controller", "disturbance", "set_point", "start")
 
 Array = NDArray[np.float64]
 

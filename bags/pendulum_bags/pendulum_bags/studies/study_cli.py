@@ -265,9 +265,11 @@ def _analyse(
 
 
 def _print_matrix(console: Console, found: Study, workers: int) -> None:
+    from pendulum_bags.studies.study_file import AXES
+
     console.print(f"{found.name}: {found.description}" if found.description else found.name, markup=False)
     table = WholeTable("axis", "values")
-    for axis in ("plant", "controller", "disturbance", "set_point", "start", "seed", "repeat"):
+    for axis in (*AXES, "seed", "repeat"):
         values = list(dict.fromkeys(_label(run.labels[axis]) for run in found.runs))
         if values == [""]:
             continue  # this experiment has no such axis

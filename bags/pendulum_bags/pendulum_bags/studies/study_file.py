@@ -21,11 +21,13 @@ from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import DataError, ParameterError
 
-__all__ = ["ANALYSES", "EXPERIMENTS", "Study", "StudyRun", "load_study", "shipped_studies"]
+__all__ = ["ANALYSES", "AXES", "EXPERIMENTS", "Study", "StudyRun", "load_study", "shipped_studies"]
 
 FORMAT = "pendulum_study/1"
 EXPERIMENTS = ("run", "thesis", "inertia_damping", "gravity")
 ANALYSES = ("metrics", "strategies", "pid_vs_lqr", "ranking", "none")
+AXES = ("plant", "controller", "disturbance", "set_point", "start")
+"""Axes of a study's matrix; seeds and repeats are two more."""
 STARTS = {"upright": UPRIGHT, "bottom": 0.0}
 _KEYS = (
     "format", "name", "description", "experiment", "analysis", "clock", "duration", "plants", "controllers",
@@ -249,11 +251,9 @@ def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], 
                 clock=clock,
             )
         except ParameterError as error:
-            where = next(
-                (("controllers", controller) for word in ("controller",) if str(error).startswith(word)),
-                ("disturbances", disturbance) if str(error).startswith("disturbance") else ("plants", plant),
-            )
-            file.fail(str(error), *where)
+            named = {"controller": controller, "disturbance": disturbance, "plant": plant}
+            axis = next((axis for axis in named if str(error).startswith(axis)), "plant")
+            file.fail(str(error), f"{axis}s", named[axis])
         engine = settings.get("engine", "nodes")
         if engine not in ("nodes", "process") or (engine == "process" and spec.side != "sim"):
             plants[plant].fail(f"engine is {engine!r}; expected nodes, or process for a plain simulator", "engine")
@@ -261,15 +261,7 @@ def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], 
             plants[plant].fail(
                 "engine is 'process'; expected nodes for a plant with parameters of its own, and in real time", "engine"
             )
-        labels = {
-            "plant": plant,
-            "controller": controller,
-            "disturbance": disturbance,
-            "set_point": float(set_point),
-            "start": start,
-            "seed": seed,
-            "repeat": repeat,
-        }
+        labels = _labels(plant, controller, disturbance, float(set_point), start, seed, repeat)
         steps = duration / PERIODS[spec.side]
         seconds = 0.05 + 8e-5 * steps if engine == "process" else _NODE_START + _SECONDS_PER_STEP * steps
         if clock == "realtime":
@@ -277,6 +269,10 @@ def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], 
         size = 56 * steps if engine == "process" else _BYTES_PER_RUN + _BYTES_PER_STEP[spec.side] * steps
         runs.append(StudyRun(number, labels, spec, engine, (), seconds, round(size)))
     return runs
+
+
+def _labels(*names: Any) -> dict[str, Any]:
+    return dict(zip((*AXES, "seed", "repeat"), names, strict=True))
 
 
 def _limit_runs(file: LocatedMapping, axes: Sequence[Sized]) -> None:
@@ -294,10 +290,7 @@ def _named_runs(
         controllers = _axis(file, "controllers", {"lqr": {}})
         disturbances = _axis(file, "disturbances", {"uniform": {}})
     else:
-        controllers, disturbances = (
-            {"": LocatedMapping({}, file.path, {})},
-            {"": LocatedMapping({}, file.path, {})},
-        )
+        controllers = disturbances = {"": LocatedMapping({}, file.path, {})}
     trials = file.get("trials", int, 6 if experiment == "inertia_damping" else 3, "a whole number >= 1")
     axes = (plants, controllers, disturbances, seeds, range(1, repeats + 1))
     _limit_runs(file, axes)
@@ -322,15 +315,7 @@ def _named_runs(
         else:
             arguments += ["--trials", str(trials), *(["--realtime"] if clock == "realtime" else [])]
             seconds, size = trials * _TRIAL_SECONDS[experiment], trials * _TRIAL_BYTES[experiment]
-        labels = {
-            "plant": plant,
-            "controller": controller,
-            "disturbance": disturbance,
-            "set_point": 0.0,
-            "start": "",
-            "seed": seed,
-            "repeat": repeat,
-        }
+        labels = _labels(plant, controller, disturbance, 0.0, "", seed, repeat)
         runs.append(StudyRun(number, labels, None, "nodes", tuple(arguments), seconds, size))
     return runs
 

@@ -16,7 +16,15 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import load_yaml
 from pendulum_msgs_py.plants.plant_parameters import PRESETS, PlantParameters
 
-__all__ = ["VARIED", "Uncertainty", "batch_variations", "parse_uncertainty", "share_of_interval", "uncertainty_of"]
+__all__ = [
+    "THESIS_UNCERTAINTY",
+    "VARIED",
+    "Uncertainty",
+    "batch_variations",
+    "parse_uncertainty",
+    "share_of_interval",
+    "uncertainty_of",
+]
 
 VARIED = ("inertia", "damping", "gravity", "coulomb_friction")
 """Parameters that may be uncertain."""
@@ -99,6 +107,10 @@ class Uncertainty:
                 f"correlation {np.round(correlation, 4).tolist()} of {', '.join(self.shares)} is not positive definite"
             ) from None
         return factor, np.diag(covariance)
+
+
+THESIS_UNCERTAINTY = Uncertainty({"inertia": 0.3, "damping": 0.05, "gravity": 0.05})
+"""What is not known of the plant of the thesis, about."""
 
 
 def batch_variations(plant: PlantParameters, drawn: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
