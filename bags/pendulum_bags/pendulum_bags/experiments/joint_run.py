@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.lockstep import record_run
+from pendulum_bags.experiments.run_spec import lockstep_parameters
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_msgs_py.contract.names import JOINT_STATES
@@ -155,12 +156,7 @@ class JointRun:
     def plant_program(self, listeners: int) -> NodeProgram:
         """Return the simulator, paused, or the bridge; either waits for so many subscriptions to its states."""
         rate = 1.0 / self.settings.period
-        lockstep: dict[str, Any] = {
-            "clock": "lockstep",
-            "lockstep_inputs": ["effort_command", "disturbance"],
-            "lockstep_subscribers": listeners,
-            "lockstep_duration": float(self.duration),
-        }
+        lockstep: dict[str, Any] = lockstep_parameters(listeners, self.duration)
         if self.has_bridge:
             goal = list(load_mechanism(self.plant).coordinates.goal)
             return graph.bridge(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_lqr.controller import controller_parameters
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_lqr.policy_file import policy_record
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import reject_unknown, validate
@@ -33,6 +34,7 @@ __all__ = [
     "RunSpec",
     "absolute_plant",
     "integrator_of",
+    "lockstep_parameters",
 ]
 
 CLOCKS = ("lockstep", "realtime")
@@ -175,15 +177,10 @@ class RunSpec:
         Args:
             listeners: Subscriptions to its states that it waits for.
         """
-        loop: dict[str, graph.ParameterArgument] = {"clock": self.clock}
         if self.simulated_time:
-            loop.update(
-                lockstep_inputs=["effort_command", "disturbance"],
-                lockstep_subscribers=listeners,
-                lockstep_duration=float(self.duration),
-            )
-        elif self.has_bridge:
-            loop.update(EMULATOR_PATIENCE)
+            loop = lockstep_parameters(listeners, self.duration)
+        else:
+            loop = {"clock": self.clock, **(EMULATOR_PATIENCE if self.has_bridge else {})}
         loop.update(self.plant_parameters)
         foreign = self.foreign
         if foreign is None:
@@ -255,6 +252,18 @@ class RunSpec:
         """
         reject_unknown(values, cls.__dataclass_fields__, where="run")
         return cls(**values)
+
+
+def lockstep_parameters(
+    listeners: int, duration: float, inputs: Sequence[str] = (names.EFFORT_COMMAND, names.DISTURBANCE)
+) -> dict[str, graph.ParameterArgument]:
+    """Return what a plant in lockstep is told: how many hear its states, how long it runs [s], who answers a state."""
+    return {
+        "clock": "lockstep",
+        "lockstep_inputs": list(inputs),
+        "lockstep_subscribers": listeners,
+        "lockstep_duration": float(duration),
+    }
 
 
 def integrator_of(plant: str, method: str) -> str:

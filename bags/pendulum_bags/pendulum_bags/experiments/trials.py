@@ -12,7 +12,7 @@ from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE
+from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE, lockstep_parameters
 from pendulum_bags.experiments.session import ANSWER_PRIORITY, PLANT_PRIORITY, START_TIMEOUT, conduct, start_loop
 from pendulum_bags.experiments.settings import HARDWARE
 from pendulum_bags.runs.run_folder import provenance
@@ -136,12 +136,7 @@ class TrialSettings:
             parameters.update(flat=self.kind.flat, seed=1000 * self.seed + trial)
             if self.lockstep:
                 # It ends by simulated time, too: when the conductor sees the end depends on how busy the machine is.
-                parameters.update(
-                    clock="lockstep",
-                    lockstep_inputs=list(self.kind.inputs),
-                    lockstep_subscribers=_LISTENERS + 1,
-                    lockstep_duration=self.expected_duration,
-                )
+                parameters.update(lockstep_parameters(_LISTENERS + 1, self.expected_duration, self.kind.inputs))
             else:
                 parameters.update(EMULATOR_PATIENCE)
         return graph.bridge("/hw", backend=self.hardware, **parameters)

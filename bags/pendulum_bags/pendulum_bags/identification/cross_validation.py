@@ -31,13 +31,11 @@ class CrossValidation:
 
     Args:
         rms: Angle error over all held-out windows, their initial states fitted [rad].
-        by_fold: The same by fold, shape (f,) [rad].
         losses: Robust cost of each fold, shape (f,) [rad^2].
         vectors: Parameters fitted without each fold, shape (f, parameters).
     """
 
     rms: float
-    by_fold: Array
     losses: Array
     vectors: Array
 
@@ -126,7 +124,6 @@ def cross_validate(
         losses.append(loss)
     return CrossValidation(
         rms=float(np.sqrt(np.sum(squares) / np.sum(samples))),
-        by_fold=np.sqrt(np.array(squares) / np.array(samples)),
         losses=np.array(losses),
         vectors=np.array(vectors),
     )

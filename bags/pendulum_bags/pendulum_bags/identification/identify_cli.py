@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
 
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
@@ -17,6 +18,7 @@ from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
 
 if TYPE_CHECKING:
+    from pendulum_bags.identification.mechanism_result import MechanismResult
     from pendulum_bags.identification.result import IdentificationResult
     from pendulum_bags.identification.thesis import ThesisResult
     from pendulum_bags.runs.datasets import Recording
@@ -100,12 +102,10 @@ def identify(
     from pendulum_bags.runs.read_recording import read_recording
 
     if plant is not None:
-        from pendulum_bags.identification.mechanism_cli import run as run_mechanism
-
         _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS)
         others = held_out or []
         rules_of = _mappings(mapping, len(data), len(data) + len(others))
-        run_mechanism(plant, data, rules_of, others, window, out, name, as_json)
+        _several_joints(plant, data, rules_of, others, window, out, name, as_json)
         return
     if method not in {"output_error", "thesis"}:
         raise DataError(f"method is {method!r}; expected output_error or thesis")
@@ -246,7 +246,6 @@ def _narrow(summary: str, width: int = 78) -> str:
 
 def _print_result(result: IdentificationResult, out: Path | None) -> None:
     from pendulum_bags.identification.model import UNITS
-    from pendulum_bags.identification.result import ALARMS
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
     console = make_console()
@@ -272,14 +271,75 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
         console.print(
             f"held out {label}: rms {1e3 * score.rms:.3f} mrad, mean absolute {1e3 * score.mean_absolute:.3f} mrad"
         )
-    for sentence in result.sentences():
-        style = "bold red" if sentence.startswith(ALARMS) else None
-        console.print(f"- {sentence}", style=style, markup=False, highlight=False)
+    _print_sentences(console, result.sentences())
     if out is not None:
         console.print(f"wrote {out}", highlight=False)
         told, command = result.next_step(str(out))
         # The command is on a line of its own, to be copied.
         console.print(f"{told}\n  {command}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _several_joints(
+    plant: str,
+    data: Sequence[Path],
+    mappings: Sequence[str | None],
+    held_out: Sequence[Path],
+    window: float | None,
+    out: Path | None,
+    name: str,
+    as_json: bool,
+) -> None:
+    """Identify a plant of several joints, print, write; exit with 3 where the fit is refused."""
+    from pendulum_bags.identification.joint_recordings import read_joints
+    from pendulum_bags.identification.mechanism_result import identify_mechanism
+    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+
+    start = load_mechanism(plant)
+    if len(start.joints) == 1:
+        raise DataError(f"plant {start.name!r} has one joint; expected a mechanism, or no --plant for one joint")
+    paths = [*data, *held_out]
+    everything = [read_joints(path, start.coordinates, rules) for path, rules in zip(paths, mappings, strict=True)]
+    result = identify_mechanism(start, everything[: len(data)], held_out=everything[len(data) :], window=window)
+    if out is not None and not result.refused:
+        result.write(out, name=name)
+    if as_json:
+        typer.echo(json.dumps(result.to_dict(), indent=2))
+    else:
+        _print_mechanism(result, out)
+    if result.refused:
+        raise typer.Exit(3)
+
+
+def _print_mechanism(result: MechanismResult, out: Path | None) -> None:
+    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+
+    console = make_console()
+    model = result.model
+    title = f"{model.plant.mechanism.name}, identified by output error: {result.extras}"
+    table = WholeTable("parameter", "value", "95 % interval", "unit", title=title)
+    for key in result.fit.free:
+        interval = result.intervals[key]
+        table.add_row(key, f"{model[key]:.5g}", f"{interval.low:.4g} to {interval.high:.4g}", model.unit(key))
+    console.print(table)
+    joints = (f"{joint.name} \\[m{joint.unit}]" for joint in model.plant.coordinates.joints)
+    title = f"Free run over windows of {result.window:g} s, the start of each fitted: rms"
+    errors = WholeTable("recording", *joints, "of straight lines", title=title)
+    for label, found in (("", result.training), ("held out ", result.held_out)):
+        for recording, score in found.items():
+            cells = [f"{1e3 * value:.2f}" for value in score.rms]
+            errors.add_row(f"{label}{recording}", *cells, f"{100.0 * score.share:.1f} %")
+    console.print(errors)
+    _print_sentences(console, result.sentences())
+    if out is not None and not result.refused:
+        console.print(f"wrote {out}", highlight=False)
+
+
+def _print_sentences(console: Console, sentences: Sequence[str]) -> None:
+    from pendulum_bags.identification.result import ALARMS
+
+    for sentence in sentences:
+        style = "bold red" if sentence.startswith(ALARMS) else None
+        console.print(f"- {sentence}", style=style, markup=False, highlight=False)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -117,9 +117,7 @@ def train(
         there = f"the same command goes on from {kept}" if kept.exists() else "nothing was written"
         console.print(f"interrupted: {there}", soft_wrap=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
-    from pendulum_bags.learning.curves import write_curves
-
-    figure = write_curves(out, settings, curves)
+    figure = _write_curves(out, settings, curves)
     measured: Mapping[str, Any] = policy.provenance["evaluation"]
     if json_output:
         print(json.dumps({"policy": str(out), "steps": settings.steps, **measured}, indent=2))
@@ -154,6 +152,27 @@ def _settings(
             # the discount of one joint looks ahead.
             settings = replace(settings, ppo=replace(settings.ppo, least_spread=0.1, discount=0.998), updates=1500)
     return replace(settings, updates=updates) if updates else settings
+
+
+def _write_curves(out: Path, settings: Training, curves: Any) -> Path:
+    """Draw the curves of a training, as it returns them, beside the policy file; return the path."""
+    from pendulum_bags.figures.figure import Figure, Panel, Trace
+    from pendulum_bags.figures.render_files import write_figures
+
+    million, reward, _, spread = curves.T
+    million = million / 1e6
+    title = f"Training of {settings.task} on {settings.plant.name}, seed {settings.seed}"
+    figure = Figure(
+        f"{out.stem}_training",
+        title,
+        f"Mean reward a step over {settings.steps / 1e6:.2g} million steps.",
+        [
+            Panel("steps [million]", "mean reward a step [-]", [Trace(million, reward, "", "sim")]),
+            Panel("steps [million]", "spread of actions [-]", [Trace(million, spread, "", "difference")]),
+        ],
+        stacked=True,
+    )
+    return write_figures([figure], out.parent, formats=("png",))[0]
 
 
 def _sentence(measured: Mapping[str, Any]) -> str:

@@ -116,11 +116,9 @@ def _cell(value: float | None, form: str, scale: float = 1.0) -> tuple[str, floa
 
 
 def _image(entry: Entry) -> str:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     canvas = Figure(figsize=(6.6, 3.3), layout="constrained")
-    FigureCanvasAgg(canvas)
     upper, lower = canvas.subplots(2, 1, sharex=True)
     t, angle, torque = entry.motion
     upper.plot(t, angle, color="#0072b2", lw=1.2)

@@ -28,12 +28,10 @@ def write_swing_up_figure(path: Path, plant: MechanismParameters, rows: Sequence
         plant: The plant.
         rows: What was run.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     best = max(rows, key=lambda row: row.score)
     figure = Figure(figsize=(8.0, 6.0), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
     top, middle, bottom = figure.subplots(3, 1, height_ratios=(0.75, 1.0, 1.0))
     chain = in_arithmetic(plant.mechanism.chain, np)
     times, states, _ = best.run.rows

@@ -76,12 +76,10 @@ def write_region_figure(path: Path, result: RegionResult | JointRegionResult) ->
         result: The map.
     """
     from matplotlib import patheffects
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     figure = Figure(figsize=(7.2, 5.8), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
     ax = figure.subplots()
     picture = _picture(result)
     x, y = picture.x, picture.y
