@@ -266,12 +266,12 @@ class PlantClient:
         """Let a paused plant go."""
         self.conductor.call(self._pause, SetBool.Request(data=False), f"{self.namespace} to go on", timeout)
 
-    def disarm_quietly(self, timeout: float = 1.0) -> None:
+    def disarm_quietly(self) -> None:
         """Disarm on the way out, where a plant that no longer answers must not keep others from being disarmed."""
         if not self._arm.service_is_ready():
             return
         future = self._arm.call_async(SetBool.Request(data=False))
-        deadline = time.monotonic() + timeout
+        deadline = time.monotonic() + 1.0
         while not future.done() and time.monotonic() < deadline:
             self.conductor.listen(_SLICE)
 

@@ -179,16 +179,16 @@ def thesis(
     settings = RegulationSettings(
         plant=plant or "thesis",
         simulation=simulation,
-        mapping="" if mapping is None else str(mapping),
+        mapping=str(mapping or ""),
         hardware=hardware,
-        hardware_mapping="" if hardware_mapping is None else str(hardware_mapping),
+        hardware_mapping=str(hardware_mapping or ""),
         effort_strategy=strategy or "",
         controller=controller,
         q=q,
         r=r,
         noise=NoiseSettings(seed, amplitude, hold_time, duration),
         storage=storage,
-        lab="" if lab is None else str(lab),
+        lab=str(lab or ""),
     )
     margins = Margins.of(margins_file, margin)
     domain = check_domain(domain)
@@ -273,7 +273,7 @@ def lockstep(
     settings = RegulationSettings(
         plant=plant,
         simulation=simulation,
-        mapping="" if mapping is None else str(mapping),
+        mapping=str(mapping or ""),
         effort_strategy=strategy,
         controller=controller,
         q=q,

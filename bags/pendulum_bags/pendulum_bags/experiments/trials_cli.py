@@ -58,7 +58,9 @@ def inertia_damping(
     """
     from pendulum_bags.experiments.trials import INERTIA_DAMPING, TrialSettings
 
-    settings = TrialSettings(INERTIA_DAMPING, trials, hardware, plant, realtime, seed, storage=storage, lab=_text(lab))
+    settings = TrialSettings(
+        INERTIA_DAMPING, trials, hardware, plant, realtime, seed, storage=storage, lab=str(lab or "")
+    )
     _run(settings, out, domain, json_output, yes=yes)
 
 
@@ -84,12 +86,8 @@ def gravity(
     """
     from pendulum_bags.experiments.trials import GRAVITY, TrialSettings
 
-    settings = TrialSettings(GRAVITY, trials, hardware, plant, realtime, seed, step, top, hold, storage, _text(lab))
+    settings = TrialSettings(GRAVITY, trials, hardware, plant, realtime, seed, step, top, hold, storage, str(lab or ""))
     _run(settings, out, domain, json_output, yes=yes)
-
-
-def _text(lab: Path | None) -> str:
-    return "" if lab is None else str(lab)
 
 
 def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_output: bool, *, yes: bool) -> None:

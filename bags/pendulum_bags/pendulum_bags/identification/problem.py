@@ -73,13 +73,12 @@ class Simulation:
     jacobian: Array
 
 
-def cut_windows(time: Array, window: float | None, *, minimum: float = 0.5) -> NDArray[np.int64]:
-    """Return windows that follow one another, shape (w, 2); a rest of at least ``minimum`` windows counts as one.
+def cut_windows(time: Array, window: float | None) -> NDArray[np.int64]:
+    """Return windows that follow one another, shape (w, 2); a rest of at least half a window counts as one.
 
     Args:
         time: Sample stamps, shape (n,) [s].
         window: Length [s]; None or longer than the recording gives one window.
-        minimum: Share of a window that a last, shorter one must have.
     """
     if window is not None and not window > 0.0:
         raise DataError(f"window is {window} s; expected > 0")
@@ -94,7 +93,7 @@ def cut_windows(time: Array, window: float | None, *, minimum: float = 0.5) -> N
     lengths = windows[:, 1] - windows[:, 0]
     keep = lengths >= 4
     rest = float(time[-1] - time[windows[-1, 0]]) + period
-    keep[-1] &= rest >= minimum * window
+    keep[-1] &= rest >= 0.5 * window
     if not keep.any():
         raise DataError(f"window of {window} s holds fewer than 4 samples at a period of {period:.4g} s")
     return windows[keep].astype(np.int64)

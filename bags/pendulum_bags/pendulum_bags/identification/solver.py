@@ -147,8 +147,6 @@ def refine(
     free: Sequence[str],
     *,
     scale: float,
-    tolerance: float = 1e-8,
-    rounds: int = 3,
 ) -> Solution:
     """Return a solution that other initial states of single windows cannot better.
 
@@ -156,7 +154,7 @@ def refine(
     or it sticks first): a joint search stays in the one where it began. Each window tries others by itself, and
     what helps is taken into a new joint search.
     """
-    for _ in range(rounds):
+    for _ in range(3):
         states, gain = [], 0.0
         for piece, current in zip(pieces, solution.states, strict=True):
             better = current.copy()
@@ -174,7 +172,7 @@ def refine(
             states.append(better)
         if gain <= 1e-5 * solution.cost:
             break
-        renewed = solve(solution.model, pieces, free, states=states, scale=scale, tolerance=tolerance)
+        renewed = solve(solution.model, pieces, free, states=states, scale=scale, tolerance=1e-8)
         if renewed.cost >= solution.cost:
             break
         solution = renewed

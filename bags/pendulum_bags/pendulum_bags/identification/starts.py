@@ -162,13 +162,12 @@ def rank(
     pieces: Sequence[Piece],
     free: Sequence[str],
     *,
-    windows: int = 24,
     keep: int = 3,
     scale: float = 0.3,
 ) -> list[Solution]:
     """Return the ``keep`` most promising starts after a short search on some of the windows, best first."""
     total = sum(len(piece.windows) for piece in pieces)
-    stride = max(1, total // windows)
+    stride = max(1, total // 24)
     few = [piece.subset(range(0, len(piece.windows), stride)) for piece in pieces]
     trials = [solve(model, few, free, scale=scale, max_iterations=15, tolerance=1e-4, coarse=3.0) for model in models]
     trials.sort(key=lambda solution: solution.cost if np.isfinite(solution.cost) else np.inf)

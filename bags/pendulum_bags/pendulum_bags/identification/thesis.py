@@ -40,6 +40,8 @@ RECORD_SKEW = 0.5e-3
 
 _CORRELATED = 1.2
 """Inflation of an error from which it is told [-]."""
+_STILL, _SHORTEST_HOLD = 0.02, 0.4
+"""Without events: speed below which a joint stands still [rad/s], and how long a hold is at least [s]."""
 _HOLD_EVENTS = ("static", "hold")
 _TRIAL_EVENTS = (Event.TRIAL_START, Event.TRIAL_END)
 
@@ -262,15 +264,9 @@ def _noise_share(velocity: Array, acceleration: Array, period: float) -> float:
     return float(min(1.0, noise / (2.0 * period**2) / max(float(np.mean(acceleration**2)), 1e-300)))
 
 
-def static_holds(recording: Recording, *, speed: float = 0.02, least: float = 0.4) -> list[StaticHold]:
-    """Return the holds of a staircase: by the events of a bag, or else where the joint stands still.
-
-    Args:
-        recording: Staircase with measured effort.
-        speed: Without events: standing still means slower than this [rad/s].
-        least: Shortest hold [s].
-    """
-    spans = _event_spans(recording) or _still_spans(recording, speed, least)
+def static_holds(recording: Recording) -> list[StaticHold]:
+    """Return the holds of a staircase with measured effort: by the events of a bag, or where the joint stands still."""
+    spans = _event_spans(recording) or _still_spans(recording)
     holds: list[StaticHold] = []
     for start, stop in spans:
         # The first third of a hold still carries the motion before it.
@@ -392,12 +388,12 @@ def _event_spans(recording: Recording) -> list[tuple[float, float]]:
     return spans
 
 
-def _still_spans(recording: Recording, speed: float, least: float) -> list[tuple[float, float]]:
+def _still_spans(recording: Recording) -> list[tuple[float, float]]:
     count = max(3, round(0.1 / recording.period))
     smooth = np.convolve(np.pad(recording.position, count, mode="edge"), np.ones(count) / count, mode="same")
     velocity = np.gradient(smooth[count:-count], recording.time)
-    still = np.concatenate(([0], (np.abs(velocity) < speed).astype(int), [0]))
+    still = np.concatenate(([0], (np.abs(velocity) < _STILL).astype(int), [0]))
     edges = np.flatnonzero(np.diff(still))
     time = recording.time
     spans = [(float(time[a]), float(time[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    return [(a, b) for a, b in spans if b - a >= least]
+    return [(a, b) for a, b in spans if b - a >= _SHORTEST_HOLD]

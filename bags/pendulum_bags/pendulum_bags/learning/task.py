@@ -14,7 +14,7 @@ __all__ = ["VARIED", "SwingUpTask", "ranges_of", "value_of"]
 
 VARIED = ("inertia", "damping", "gravity", "coulomb_friction")
 """Parameters that differ from episode to episode; static friction keeps its ratio to Coulomb friction."""
-_OF_JOINTS = ("damping", "coulomb_friction", "static_friction")
+_OF_JOINTS = ("damping", "coulomb_friction")
 _FIXED = ("gravity", "pole_length", "gear_ratio")
 """What is known of a mechanism, or moves nothing."""
 _POSITIVE = ("period", "rate_time", "episode", "travel")
@@ -110,4 +110,4 @@ def value_of(plant: AnyPlant, name: str) -> float:
 
 def _varies(name: str) -> bool:
     joint, _, key = name.rpartition(".")
-    return not joint or key in _OF_JOINTS[:2]
+    return not joint or key in _OF_JOINTS

@@ -239,16 +239,16 @@ def first_of_each_stamp(time: Array) -> NDArray[np.bool_]:
     return np.append(True, np.diff(time) != 0.0) if time.size else np.zeros(0, dtype=bool)
 
 
-def check_consistency(recording: Recording, *, minimum_travel: float = 0.2) -> Recording:
+def check_consistency(recording: Recording) -> Recording:
     """Return the recording if its velocity is the derivative of its position, else name the likely unit.
 
     The slope of travelled angle against integrated velocity is 1 in consistent units, 57.3 for degrees taken
-    as radians, and so on. Recordings that hardly move (less than ``minimum_travel`` [rad]) are not judged.
+    as radians, and so on. Recordings that hardly move (less than 0.2 rad) are not judged.
 
     Raises:
         DataError: where the slope lies outside 0.5 to 2.
     """
-    if recording.velocity is None or np.ptp(recording.position) < minimum_travel:
+    if recording.velocity is None or np.ptp(recording.position) < 0.2:
         return recording
     step = np.diff(recording.time)
     travel = 0.5 * (recording.velocity[1:] + recording.velocity[:-1]) * step

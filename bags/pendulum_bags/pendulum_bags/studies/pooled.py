@@ -31,7 +31,8 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
     done = {int(record["number"]) for record in records if record["status"] == "done"}
     runs = [(run, folder / "runs" / run.name / "run") for run in study.runs if run.number in done]
     if study.experiment == "thesis":
-        return {"comparisons": [_pool(labels, places) for labels, places in _alike(runs).items()]}
+        alike = _alike(runs).items()
+        return {"comparisons": [{"of": list(filter(None, of)), **compare_folders(at).to_json()} for of, at in alike]}
     rows = []
     for run, place in runs:
         path = place / "identified.json"
@@ -55,10 +56,6 @@ def _alike(runs: Sequence[tuple[StudyRun, Path]]) -> dict[tuple[str, ...], list[
         kind = tuple(str(run.labels[axis]) for axis in ("plant", "controller", "disturbance"))
         groups.setdefault(kind, {}).setdefault(run.labels["seed"], place)
     return {kind: list(places.values()) for kind, places in groups.items()}
-
-
-def _pool(of: tuple[str, ...], places: Sequence[Path]) -> dict[str, Any]:
-    return {"of": [name for name in of if name], **compare_folders(places).to_json()}
 
 
 def print_table(console: Console, result: Mapping[str, Any]) -> None:

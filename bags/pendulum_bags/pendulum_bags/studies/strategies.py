@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -129,27 +130,19 @@ def sentence(rows: Sequence[Mapping[str, Any]]) -> str:
     hardware = [row for row in rows if row["side"] == "hw"]
     if not hardware:
         return "There is no run on the hardware."
-    most, least = max(hardware, key=_damping), min(hardware, key=_damping)
+    most, least = (choose(hardware, key=itemgetter("damping")) for choose in (max, min))
     text = (
         f"The controller sees a damping of {most['damping']:.3g} N m s/rad under {most['plant']} and of "
         f"{least['damping']:.3g} N m s/rad under {least['plant']}: the same machine, the same gains."
     )
     gaps = [row for row in hardware if row.get("paired_rms") is not None]
     if gaps:
-        best, worst = min(gaps, key=_paired), max(gaps, key=_paired)
+        best, worst = (choose(gaps, key=itemgetter("paired_rms")) for choose in (min, max))
         text += (
             f" Under the same noise, {best['plant']} is nearest to the simulation ({best['paired_rms']:.2g} rad rms), "
             f"{worst['plant']} farthest ({worst['paired_rms']:.2g} rad rms)."
         )
     return text
-
-
-def _damping(row: Mapping[str, Any]) -> float:
-    return float(row["damping"])
-
-
-def _paired(row: Mapping[str, Any]) -> float:
-    return float(row["paired_rms"])
 
 
 def _add_gaps(rows: Sequence[dict[str, Any]], motions: Mapping[str, tuple[Array, Array]]) -> None:
