@@ -340,6 +340,10 @@ def test_a_swing_up_that_its_lqr_would_not_hold_at_this_period_is_refused() -> N
     controller = make_joint_controller("nmpc", late, {})
     with pytest.raises(ParameterError, match=refusal):
         controller.check(0.01)
+    # Of a period that differs by less than counts as another it is asked whether it settles at that one.
+    tardy = make_joint_controller("nmpc", delayed_plant("cart_pole", 0.05), {}, 0.05)
+    with pytest.raises(ParameterError, match=r"nmpc asked every 0\.059 s does not settle on plant 'cart_pole'"):
+        tardy.check(0.059)
 
 
 @pytest.mark.timeout(400)

@@ -27,7 +27,6 @@ class JointIlqr(JointSwingUp):
     """
 
     SUMMARY = "swing-up planned by iterative LQR when it starts, followed by TVLQR, then LQR"
-
     NAME = "ilqr"
     DESIGNING = "compiles its model and searches a swing-up, which takes some ten seconds"
 

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pendulum_lqr.controllers.joint_lqr import require_catching
-from pendulum_lqr.interface import JointController
+from pendulum_lqr.controllers.joint_swing_up import CaughtController
 from pendulum_lqr.mechanism_controllers import default_catch, refuse_passive_friction
 from pendulum_lqr.mechanism_mpc import MechanismMpc
-from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
-from pendulum_msgs_py.joints import Vector
+from pendulum_lqr.sampling import ASSUMED_PERIOD
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["JointNmpc"]
 
 
-class JointNmpc(JointController):
+class JointNmpc(CaughtController):
     """Plans by iterative LQR over 1.4 s, every 20 ms, and hands over to the LQR in the region from which it catches.
 
     It is compiled when it is designed, so that its first answer is not late.
@@ -27,15 +25,16 @@ class JointNmpc(JointController):
     """
 
     SUMMARY = "nonlinear MPC by iterative LQR, then LQR; swings up from anywhere"
-
+    NAME = "nmpc"
+    EVERY_STATE = "nmpc plans for answers"
     DESIGNING = "compiles its model, which takes some ten seconds"
 
     def __init__(self, plant: MechanismParameters, period: float) -> None:
-        super().__init__(plant.effort_limits)
-        self.period = period
-        self._inner = MechanismMpc(plant, period, default_catch(plant))
-        self._inner.command(0.0, (0.0,) * (2 * len(plant.joints)))
-        self._inner.reset()
+        inner = MechanismMpc(plant, period, default_catch(plant))
+        super().__init__(inner, period)
+        self._plan = inner.settings.plan
+        inner.command(0.0, (0.0,) * (2 * len(plant.joints)))
+        inner.reset()
 
     @classmethod
     def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointNmpc:
@@ -47,27 +46,9 @@ class JointNmpc(JointController):
         refuse_passive_friction("nmpc", plant)
         return cls(plant, ASSUMED_PERIOD if period is None else period)
 
-    def check(self, period: float) -> None:
-        """Refuse another period than that of the design [s], and one at which its LQR does not settle.
-
-        Raises:
-            ParameterError: as said.
-        """
-        require_period("nmpc plans for answers", self.period, period)
-        require_catching("nmpc", self._inner.catch, self.period)
-
-    def reset(self) -> None:
-        """Forget the plan."""
-        self._inner.reset()
-
-    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
-        """Return m efforts."""
-        return self._inner.command(t, position + velocity)
-
     def describe(self) -> str:
         """Return its horizon, and from where the LQR catches."""
-        plan = self._inner.settings.plan
         return (
-            f"plans of {plan.nodes * plan.step:.3g} s by iterative LQR, then LQR within "
+            f"plans of {self._plan.nodes * self._plan.step:.3g} s by iterative LQR, then LQR within "
             f"{self._inner.catch.region.describe()}"
         )

@@ -10,6 +10,7 @@ from pendulum_lqr.controllers.joint_lqr import require_catching
 from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_catch import MechanismCatch
 from pendulum_lqr.mechanism_controllers import default_catch, stored_trajectory
+from pendulum_lqr.mechanism_mpc import MechanismMpc
 from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
 from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
@@ -17,7 +18,7 @@ from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["JointSwingUp"]
+__all__ = ["CaughtController", "JointSwingUp"]
 
 _FILE = ParameterSpec(
     "trajectory",
@@ -27,7 +28,39 @@ _FILE = ParameterSpec(
 )
 
 
-class JointSwingUp(JointController):
+class CaughtController(JointController):
+    """What answers to whole states, and ends with an LQR that catches; how it does so is said by its class.
+
+    Args:
+        inner: Who answers.
+        period: Period at which states come [s].
+    """
+
+    NAME: ClassVar[str]
+    """What it is called in refusals."""
+    EVERY_STATE: ClassVar[str]
+    """What is done at every state, in refusals."""
+
+    def __init__(self, inner: MechanismTvlqr | MechanismMpc, period: float) -> None:
+        super().__init__(inner.plant.effort_limits)
+        self.period = period
+        self._inner = inner
+
+    def check(self, period: float) -> None:
+        """Refuse another period than that of the design [s], and one at which its LQR does not settle."""
+        require_period(self.EVERY_STATE, self.period, period)
+        require_catching(self.NAME, self._inner.catch, period)
+
+    def reset(self) -> None:
+        """Begin anew, at hanging."""
+        self._inner.reset()
+
+    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return m efforts."""
+        return self._inner.command(t, position + velocity)
+
+
+class JointSwingUp(CaughtController):
     """From hanging along a swing-up; where it is lost, no effort at all.
 
     Args:
@@ -40,18 +73,14 @@ class JointSwingUp(JointController):
     """
 
     SUMMARY = "swing-up along the stored trajectory of a preset, or that of a file, by TVLQR, then LQR"
-
-    NAME: ClassVar[str] = "tvlqr"
-    """What it is called in refusals."""
+    NAME = "tvlqr"
+    EVERY_STATE = "the trajectory is followed"
     DESIGNING = "tries out from where the LQR catches, which takes some seconds"
 
     def __init__(self, catch: MechanismCatch, period: float, trajectory: MechanismTrajectory) -> None:
-        plant = catch.plant
-        super().__init__(plant.effort_limits)
-        self._period = period
         self._duration = trajectory.duration
-        q, r = plant.mechanism.weights
-        self._inner = MechanismTvlqr(plant, period, trajectory, catch, q=q, r=r)
+        q, r = catch.plant.mechanism.weights
+        super().__init__(MechanismTvlqr(catch.plant, period, trajectory, catch, q=q, r=r), period)
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
@@ -68,23 +97,6 @@ class JointSwingUp(JointController):
         given = p["trajectory"]
         trajectory = load_trajectory(Path(given).expanduser()) if given else stored_trajectory(plant)
         return cls(default_catch(plant), ASSUMED_PERIOD if period is None else period, trajectory)
-
-    def check(self, period: float) -> None:
-        """Refuse another period than that of the design [s], and one at which its LQR does not settle.
-
-        Raises:
-            ParameterError: as said.
-        """
-        require_period("the trajectory is followed", self._period, period)
-        require_catching(self.NAME, self._inner.catch, period)
-
-    def reset(self) -> None:
-        """Begin anew, at hanging."""
-        self._inner.reset()
-
-    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
-        """Return m efforts."""
-        return self._inner.command(t, position + velocity)
 
     def describe(self) -> str:
         """Return how long it swings, and from where the LQR catches."""
