@@ -52,11 +52,7 @@ def states_to_hold(policy: Policy, period: float) -> int:
 
 
 def check_policy_period(policy: Policy, period: float) -> None:
-    """Refuse a period of the states that the policy's is no whole multiple of [s].
-
-    Raises:
-        DesignError: as said.
-    """
+    """Refuse a period of the states that the policy's is no whole multiple of [s]."""
     parts = policy.period / period
     if abs(parts / max(1, round(parts)) - 1.0) > _SAME_PERIOD:
         raise DesignError(

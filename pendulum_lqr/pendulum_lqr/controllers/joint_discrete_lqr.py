@@ -62,11 +62,7 @@ class JointDiscreteLqr(JointController):
         return cls(plant, p, ASSUMED_PERIOD if period is None else period)
 
     def check(self, period: float) -> None:
-        """Refuse another period than that of the design [s].
-
-        Raises:
-            ParameterError: as said.
-        """
+        """Refuse another period than that of the design [s]."""
         require_period("the loop is predicted", self.period, period)
 
     def reset(self) -> None:

@@ -97,11 +97,7 @@ class JointEnergySwingUp(JointController):
         return cls(plant, pump, p["energy_margin"], replace(found, region=region, leave=found.leave / share))
 
     def check(self, period: float) -> None:
-        """Refuse a period at which the LQR does not settle [s].
-
-        Raises:
-            ParameterError: as said.
-        """
+        """Refuse a period at which the LQR does not settle [s]."""
         require_catching("energy_swing_up", self.catch, period)
 
     def reset(self) -> None:

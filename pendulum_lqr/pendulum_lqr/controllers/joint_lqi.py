@@ -77,11 +77,7 @@ class JointLqi(JointController):
         return cls(plant, wide, gain, ASSUMED_PERIOD if period is None else period, limits)
 
     def check(self, period: float) -> None:
-        """Refuse another period than that of the design [s], and one at which it does not settle.
-
-        Raises:
-            ParameterError: as said.
-        """
+        """Refuse another period than that of the design [s], and one at which it does not settle."""
         require_period("it is integrated", self.period, period)
         require_settling("lqi", self._plant.name, self._model, self.gain, period, SMALLER_Q)
 

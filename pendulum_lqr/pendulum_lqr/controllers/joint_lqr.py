@@ -121,11 +121,7 @@ class JointLqr(JointController):
         return cls(plant, model, gain, joint_limits(plant, p["effort_limit"]))
 
     def check(self, period: float) -> None:
-        """Refuse a period at which it does not settle [s].
-
-        Raises:
-            ParameterError: as said.
-        """
+        """Refuse a period at which it does not settle [s]."""
         require_settling("lqr", self._plant.name, self._model, self.gain, period, SMALLER_Q)
 
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:

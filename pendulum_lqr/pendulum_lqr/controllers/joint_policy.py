@@ -102,11 +102,7 @@ class JointPolicy(JointController):
         return self._answers.notice
 
     def check(self, period: float) -> None:
-        """Refuse a period that the policy's is no whole multiple of [s].
-
-        Raises:
-            DesignError: as said.
-        """
+        """Refuse a period that the policy's is no whole multiple of [s]."""
         check_policy_period(self.policy, period)
 
     def reset(self) -> None:

@@ -78,11 +78,7 @@ class LearnedPolicy(BaseController):
         return cls(policy, states_to_hold(policy, period), p["effort_limit"], fallback, start_time=p["start_time"])
 
     def check(self, plant: PlantParameters, period: float) -> None:
-        """Refuse a period that the policy's is no whole multiple of, and a fallback that is unstable at it.
-
-        Raises:
-            ParameterError: as said.
-        """
+        """Refuse a period that the policy's is no whole multiple of, and a fallback that is unstable at it."""
         check_policy_period(self.policy, period)
         if self.fallback is not None:
             from pendulum_lqr.loop_check import require_stable
