@@ -17,16 +17,18 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.model import LinearModel, sort_poles
-from pendulum_lqr.sampled_design import DiscreteModel, discretise
+from pendulum_lqr.sampled_design import closed_loop, discretise
 from pendulum_msgs_py.json_values import without_nan
 
 __all__ = [
     "LoopReport",
     "Margins",
     "analyse",
+    "bears_its_delay",
     "closed_loop_poles",
     "delayed_spectral_radius",
     "largest_stable_period",
+    "last_to_hold",
     "loop_margins",
     "loop_transfer",
 ]
@@ -112,7 +114,7 @@ def analyse(model: LinearModel, K: ArrayLike | None) -> LoopReport:
     return LoopReport(
         K=tuple(float(value) for value in gain),
         poles=tuple(complex(pole) for pole in poles),
-        stable=slowest < 0.0 and (K is None or model.delay == 0.0 or _bears_its_delay(model, gain)),
+        stable=slowest < 0.0 and (K is None or model.delay == 0.0 or bears_its_delay(model, gain)),
         time_constant=-1.0 / slowest if slowest < 0.0 else math.inf,
         damping_ratio=float(min(ratios)),
         natural_frequency=float(abs(poles[0])),
@@ -216,10 +218,8 @@ def delayed_spectral_radius(model: LinearModel, K: ArrayLike, period: float, del
         period: Sampling period [s].
         delay: Time from state to torque, beyond the model's own [s].
     """
-    sampled: DiscreteModel = discretise(model, period, delay)
-    feedback = np.zeros(sampled.B.T.shape)
-    feedback[:, : model.A.shape[0]] = _on_state(model, K)
-    return float(np.max(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ feedback))))
+    sampled = discretise(model, period, delay)
+    return float(np.max(np.abs(np.linalg.eigvals(closed_loop(sampled, K)))))
 
 
 def largest_stable_period(model: LinearModel, K: ArrayLike) -> float:
@@ -229,7 +229,35 @@ def largest_stable_period(model: LinearModel, K: ArrayLike) -> float:
         model: Linear model.
         K: Gain, shape (2,) or (n,).
     """
-    return _first_unstable(lambda period: delayed_spectral_radius(model, K, period) < 1.0, model)
+
+    def stable(period: float) -> bool:
+        return delayed_spectral_radius(model, K, period) < 1.0
+
+    fastest = float(np.max(np.abs(model.poles)))
+    # A delay of very many periods makes very many states, and is hardly sampled any more.
+    low = max(1e-3 / max(fastest, 1e-3), model.delay / 40.0)
+    if not stable(low):
+        return 0.0
+    # Periods are tried in steps of 2 %, so that an unstable band is not jumped over, then refined.
+    while low < _PERIOD_LIMIT:
+        if not stable(1.02 * low):
+            return last_to_hold(stable, low, 1.02 * low)[0]
+        low *= 1.02
+    return math.inf
+
+
+def last_to_hold(holds: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
+    """Return two neighbouring numbers, of which the lower one has a property and the higher one has not.
+
+    Args:
+        holds: Tells whether a number has it.
+        low: One that has.
+        high: One that has not.
+    """
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low, high
 
 
 def _on_state(model: LinearModel, K: ArrayLike) -> NDArray[np.float64]:
@@ -238,7 +266,13 @@ def _on_state(model: LinearModel, K: ArrayLike) -> NDArray[np.float64]:
     return gain if gain.shape[1] == model.A.shape[0] else np.asarray(gain @ model.C)
 
 
-def _bears_its_delay(model: LinearModel, K: ArrayLike) -> bool:
+def bears_its_delay(model: LinearModel, K: ArrayLike) -> bool:
+    """Tell whether a loop that is stable without the plant's delay stays so with it.
+
+    Args:
+        model: Linear model.
+        K: Gain, shape (2,) or (n,).
+    """
     return model.delay < loop_margins(replace(model, delay=0.0), K).delay
 
 
@@ -247,32 +281,6 @@ def _last_frequency(model: LinearModel, gain: NDArray[np.float64]) -> float:
     omega = np.logspace(0, 7, 400)
     loud = np.abs(loop_transfer(model, gain[0], omega)) > 0.01
     return float(omega[min(int(np.max(np.nonzero(loud)[0], initial=0)) + 1, omega.size - 1)])
-
-
-def _first_unstable(stable: Any, model: LinearModel) -> float:
-    fastest = float(np.max(np.abs(model.poles)))
-    # A delay of very many periods makes very many states, and is hardly sampled any more.
-    low = max(1e-3 / max(fastest, 1e-3), model.delay / 40.0)
-    if not stable(low):
-        return 0.0
-    # Periods are tried in steps of 2 %, so that an unstable band is not jumped over, then refined.
-    high = low
-    while high < _PERIOD_LIMIT:
-        high = low * 1.02
-        if not stable(high):
-            return _bisect(stable, low, high)
-        low = high
-    return math.inf
-
-
-def _bisect(stable: Any, low: float, high: float) -> float:
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if stable(middle):
-            low = middle
-        else:
-            high = middle
-    return low
 
 
 def _delay_margin(phases: NDArray[np.float64], crossovers: NDArray[np.float64]) -> float:

@@ -28,10 +28,10 @@ from pendulum_lqr.gap_metric import (
 )
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.model import LinearModel
-from pendulum_lqr.sampled_design import DiscreteModel, discretise
+from pendulum_lqr.sampled_design import DiscreteModel, closed_loop, discretise
 from pendulum_lqr.sampled_response import model_response
 
-__all__ = ["Certificate", "Certifier", "GapProfile", "compare_machine", "is_stable", "stabilises"]
+__all__ = ["Certificate", "Certifier", "GapProfile", "compare_machine", "is_stable"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -153,17 +153,6 @@ class Certificate:
         return self.by_gap or self.by_frequency
 
 
-def stabilises(plant: LinearModel, K: ArrayLike, period: float) -> bool:
-    """Tell whether a static gain u = -K [theta, theta_dot] stabilises a model that is sampled and held.
-
-    Args:
-        plant: The model.
-        K: Gain, shape (2,).
-        period: Sampling period [s].
-    """
-    return is_stable(discretise(plant, period), K)
-
-
 def is_stable(sampled: DiscreteModel, K: ArrayLike) -> bool:
     """Tell whether a static gain stabilises a sampled model.
 
@@ -171,9 +160,7 @@ def is_stable(sampled: DiscreteModel, K: ArrayLike) -> bool:
         sampled: The model; its first states are what is measured: angle and velocity, or those of k joints.
         K: Gain, shape (2,), or (2 k,).
     """
-    feedback = np.zeros((1, sampled.A.shape[0]))
-    feedback[0, : np.size(K)] = np.asarray(K, dtype=np.float64)
-    return bool(np.max(np.abs(np.linalg.eigvals(sampled.A - sampled.B @ feedback))) < 1.0)
+    return bool(np.max(np.abs(np.linalg.eigvals(closed_loop(sampled, K)))) < 1.0)
 
 
 class Certifier:

@@ -19,7 +19,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 if TYPE_CHECKING:
     from pendulum_lqr.interface import Controller
 
-__all__ = ["MOST_GROWTH", "growth", "require_stable"]
+__all__ = ["growth", "require_stable", "settles"]
 
 _START = 1e-5
 """Deviation from which the loop is released [rad]; a hundred times as much is still far from every limit."""
@@ -28,7 +28,7 @@ _WINDOW = 100
 _WINDOWS = 100
 _DEAD, _FALLEN = 0.2, 100.0 * _START
 """A spread below this share of the largest one has died out; beyond this deviation [rad] it never will."""
-MOST_GROWTH = 1.05
+_MOST_GROWTH = 1.05
 """Growth up to which a loop counts as one that settles."""
 
 
@@ -78,6 +78,11 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
     return spreads[-1] / spreads[-2]
 
 
+def settles(controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> bool:
+    """Tell whether a balancing controller settles on the linear model of its plant; arguments as of :func:`growth`."""
+    return growth(controller, plant, period, set_point) <= _MOST_GROWTH
+
+
 def require_stable(name: str, controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> None:
     """Refuse a controller whose loop with its own plant is unstable.
 
@@ -91,7 +96,7 @@ def require_stable(name: str, controller: Controller, plant: RigidPlant, period:
     Raises:
         DesignError: The loop grows.
     """
-    if growth(controller, plant, period, set_point) <= MOST_GROWTH:
+    if settles(controller, plant, period, set_point):
         return
     model = linearise(plant, UPRIGHT + set_point)
     late = f", a delay of {model.delay:g} s" if model.delay > 0.0 else ""

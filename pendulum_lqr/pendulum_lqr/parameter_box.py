@@ -14,9 +14,10 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_lqr.analysis import Margins, closed_loop_poles, loop_margins
+from pendulum_lqr.analysis import Margins, bears_its_delay, closed_loop_poles, loop_margins
 from pendulum_lqr.model import linearise
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import without_nan
 from pendulum_msgs_py.parameters import suggestion
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant_file
 
@@ -106,10 +107,7 @@ class WorstCase:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; infinities as None."""
-        plain = asdict(self)
-        if self.margins is not None:
-            plain["margins"] = {n: v if math.isfinite(v) else None for n, v in asdict(self.margins).items()}
-        return plain
+        return without_nan(asdict(self))
 
 
 def worst_case(plants: Sequence[PlantParameters], K: ArrayLike, theta: float, names: Sequence[str]) -> WorstCase:
@@ -127,7 +125,7 @@ def worst_case(plants: Sequence[PlantParameters], K: ArrayLike, theta: float, na
         model = linearise(plant, theta)
         held = float(closed_loop_poles(model, K)[0].real) < 0.0
         margins = loop_margins(model, K) if held else None
-        if margins is None or (model.delay > 0.0 and not _bears(plant, K, theta)):
+        if margins is None or (model.delay > 0.0 and not bears_its_delay(model, K)):
             unstable += 1
             lost = lost or plant
         else:
@@ -231,9 +229,3 @@ def _correlation(path: Path, names: Sequence[str]) -> Array | None:
         return None
     plausible = np.all(np.isfinite(found)) and np.all(np.abs(found) <= 1.0 + 1e-9)
     return found if plausible and np.allclose(found, found.T, atol=1e-9) else None
-
-
-def _bears(plant: PlantParameters, K: ArrayLike, theta: float) -> bool:
-    """Return whether the loop is stable with the plant's delay."""
-    prompt = loop_margins(linearise(plant.with_values(transport_delay=0.0), theta), K)
-    return plant.transport_delay < prompt.delay

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pendulum_lqr.design import DesignError, Gain, Matrix, cost_matrices, no_solution, require_controllable
 from pendulum_lqr.model import LinearModel, sort_poles
 
-__all__ = ["DiscreteModel", "discrete_lqr", "discretise", "sampled_cost"]
+__all__ = ["DiscreteModel", "closed_loop", "discrete_lqr", "discretise", "sampled_cost"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +80,19 @@ def discretise(model: LinearModel, period: float, delay: float = 0.0) -> Discret
     else:
         A[:n, n : n + m] = gamma_new
     return DiscreteModel(A, B, period, delay, pending)
+
+
+def closed_loop(model: DiscreteModel, K: ArrayLike) -> Matrix:
+    """Return A - B K of a gain that acts on the leading states alone, shape (n + p m, n + p m).
+
+    Args:
+        model: Sampled model with m inputs.
+        K: Gain on its first k states, shape (k,) or (m, k): on what is measured, or all but the inputs on their way.
+    """
+    gain = np.atleast_2d(np.asarray(K, dtype=np.float64))
+    feedback = np.zeros(model.B.T.shape)
+    feedback[:, : gain.shape[1]] = gain
+    return np.asarray(model.A - model.B @ feedback)
 
 
 def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float | Matrix, cross: Matrix | None = None) -> Gain:

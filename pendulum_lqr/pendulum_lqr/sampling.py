@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from pendulum_lqr.interface import Controller
-from pendulum_lqr.loop_check import MOST_GROWTH, growth
+from pendulum_lqr.loop_check import settles
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -19,7 +19,6 @@ __all__ = [
     "goes_on",
     "rate_problem",
     "require_period",
-    "settles",
     "uses_period",
 ]
 
@@ -107,18 +106,6 @@ def uses_period(kind: str, velocity: str = "measured") -> bool:
         velocity: Where it takes the velocity from; every estimator depends on it.
     """
     return kind not in _IGNORE_PERIOD or velocity != "measured"
-
-
-def settles(controller: Controller, plant: PlantParameters, period: float, set_point: float = 0.0) -> bool:
-    """Tell whether a balancing controller settles on the linear model of its plant when it is asked at a period.
-
-    Args:
-        controller: The controller; it is reset.
-        plant: The plant that it was designed for.
-        period: Period at which it is asked [s].
-        set_point: Angle to hold, from upright [rad].
-    """
-    return growth(controller, plant, period, set_point) <= MOST_GROWTH
 
 
 def require_period(what: str, designed: float, period: float) -> None:

@@ -15,7 +15,7 @@ from pendulum_lqr.analysis import loop_transfer
 from pendulum_lqr.design import DesignError, output_lqr
 from pendulum_lqr.model import equilibrium_effort, friction_effort, linearise, low_frequency
 from pendulum_lqr.reference import Motion, Reference
-from pendulum_lqr.sampled_design import discretise
+from pendulum_lqr.sampled_design import closed_loop, discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
@@ -171,10 +171,7 @@ def scheduled_margins(
     for angle in map(float, angles):
         model = linearise(plant, UPRIGHT + angle)
         K = np.array(schedule.gain(angle))
-        sampled = discretise(model, period)
-        feedback = np.zeros(sampled.B.T.shape)
-        feedback[:, : model.A.shape[0]] = K @ model.C
-        loops.append(sampled.A - sampled.B @ feedback)
+        loops.append(closed_loop(discretise(model, period), K))
         radii.append(float(np.max(np.abs(np.linalg.eigvals(loops[-1])))))
         if radii[-1] >= 1.0:
             late = f", a delay of {model.delay:g} s" if model.delay > 0.0 else ""

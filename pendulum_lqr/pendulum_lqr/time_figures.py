@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.model import LinearModel, low_frequency
 from pendulum_msgs_py.dynamics.rigid import gravity_torque
+from pendulum_msgs_py.json_values import without_nan
 from pendulum_msgs_py.plants.equilibrium import RigidPlant, drivetrain_of, offset_of
 from pendulum_msgs_py.plants.friction_terms import friction_of_terms
 
@@ -54,7 +55,7 @@ class TimeFigures:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; what is not known as None."""
-        return {name: value if math.isfinite(value) else None for name, value in asdict(self).items()}
+        return without_nan(asdict(self))
 
 
 def time_figures(model: LinearModel, K: ArrayLike, plant: RigidPlant | None = None) -> TimeFigures | None:

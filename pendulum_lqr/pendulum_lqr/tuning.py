@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from pendulum_lqr.analysis import last_to_hold
 from pendulum_lqr.design import DesignError, cost_matrices
 from pendulum_lqr.model import LinearModel, low_frequency
 from pendulum_lqr.sampled_design import discretise
@@ -157,23 +158,20 @@ def ultimate_gain(model: LinearModel, period: float) -> tuple[float, float]:
     def poles(gain: float) -> NDArray[np.complex128]:
         return np.asarray(np.linalg.eigvals(sampled.A - gain * sampled.B @ np.eye(1, size)), dtype=np.complex128)
 
+    def stable(gain: float) -> bool:
+        return bool(np.max(np.abs(poles(gain))) < 1.0)
+
     low = max(-low_frequency(model)[2], 0.0) * 1.001 + 1e-9
-    if np.max(np.abs(poles(low * 1.01))) >= 1.0:
+    if not stable(low * 1.01):
         raise DesignError(
             f"no proportional gain stabilises the loop at a period of {period} s; expected a shorter period"
         )
     high = low * 1.01
-    while np.max(np.abs(poles(high))) < 1.0:
+    while stable(high):
         high *= 1.05
         if high > 1e9:
             raise DesignError("no proportional gain makes the loop oscillate; expected numerical tuning instead")
-    low = high / 1.05
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if np.max(np.abs(poles(middle))) < 1.0:
-            low = middle
-        else:
-            high = middle
+    _, high = last_to_hold(stable, high / 1.05, high)
     angle = abs(float(np.angle(poles(high)[np.argmax(np.abs(poles(high)))])))
     return high, 2.0 * math.pi * period / angle
 

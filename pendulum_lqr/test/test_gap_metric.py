@@ -9,7 +9,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.certificate import Certifier, stabilises
+from pendulum_lqr.certificate import Certifier, is_stable
 from pendulum_lqr.design_cli import main as design
 from pendulum_lqr.gap_metric import (
     Scaling,
@@ -22,6 +22,7 @@ from pendulum_lqr.gap_metric import (
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
 from pendulum_lqr.model import linearise
+from pendulum_lqr.sampled_design import discretise
 from pendulum_lqr.sampled_response import brought_to, model_response
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
@@ -178,8 +179,8 @@ def test_a_design_is_certified_for_a_close_machine_and_not_for_one_that_it_does_
     base = load_plant("dfki")
     near, far = base.with_values(transport_delay=0.004), base.with_values(transport_delay=0.06)
     K = np.array([20.0, 3.0])
-    assert stabilises(linearise(base), K, 0.01)
-    assert not stabilises(linearise(far), K, 0.01)
+    assert is_stable(discretise(linearise(base), 0.01), K)
+    assert not is_stable(discretise(linearise(far), 0.01), K)
     certificates = [Certifier(linearise(base), Machine.of(exact(plant))).gain(K) for plant in (base, near, far)]
     assert [c.certified for c in certificates] == [True, True, False]
     assert certificates[0].distance < certificates[1].distance < 1.0 < certificates[2].distance
@@ -193,8 +194,8 @@ def test_a_gain_that_fails_below_the_lowest_line_is_not_certified():
     # The machine is heavier than the gain can hold; on every measured line its loop looks fine.
     base, heavy = load_plant("dfki"), load_plant("dfki").with_values(gravity=3.5)
     K = np.array([3.3, 8.0])
-    assert stabilises(linearise(base), K, 0.01)
-    assert not stabilises(linearise(heavy), K, 0.01)
+    assert is_stable(discretise(linearise(base), 0.01), K)
+    assert not is_stable(discretise(linearise(heavy), 0.01), K)
     found = Certifier(linearise(base), Machine.of(exact(heavy))).gain(K)
     assert not found.certified
     assert not found.undecided
@@ -232,7 +233,7 @@ def test_no_certified_gain_fails_on_any_of_many_machines():
         certifier = Certifier(linearise(base), Machine.of(exact(plant, lines=28)))
         for _ in range(30):
             K = np.exp([generator.uniform(0.9, 5.0), generator.uniform(-2.0, 2.0)])
-            stable = stabilises(linearise(plant), K, 0.01)
+            stable = is_stable(discretise(linearise(plant), 0.01), K)
             certified = certifier.gain(K).certified
             counts["certified"] += certified
             counts["stable"] += stable

@@ -7,6 +7,7 @@ from typing import Any
 
 from pendulum_lqr.controller import BaseController, make_controller
 from pendulum_lqr.interface import Controller
+from pendulum_lqr.loop_check import require_stable
 from pendulum_lqr.policy import Policy, require_plant
 from pendulum_lqr.policy_answers import (
     START_TIME,
@@ -81,8 +82,6 @@ class LearnedPolicy(BaseController):
         """Refuse a period that the policy's is no whole multiple of, and a fallback that is unstable at it."""
         check_policy_period(self.policy, period)
         if self.fallback is not None:
-            from pendulum_lqr.loop_check import require_stable
-
             require_stable("the fallback", self.fallback, plant, period)
 
     @property
