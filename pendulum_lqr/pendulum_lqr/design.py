@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -29,6 +29,7 @@ __all__ = [
     "output_lqr",
     "require_controllable",
     "require_observable",
+    "riccati_gain",
 ]
 
 Matrix = NDArray[np.float64]
@@ -112,7 +113,8 @@ def continuous_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
         Thesis, section 6.1; Anderson and Moore, Optimal Control, 1990, section 3.2.
     """
     Q, R = cost_matrices(q, r)
-    return _care(model.A, model.B, model.C.T @ Q @ model.C, R)
+    gain = riccati_gain(model.A, model.B, model.C.T @ Q @ model.C, R[0])
+    return replace(gain, K=gain.K[0])
 
 
 def output_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
@@ -165,7 +167,8 @@ def integral_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
     A[n, 0] = 1.0
     B = np.vstack([model.B, [[0.0]]])
     C = scipy.linalg.block_diag(model.C, [[1.0]])
-    full = _care(A, B, C.T @ Q @ C, R)
+    full = riccati_gain(A, B, C.T @ Q @ C, R[0])
+    full = replace(full, K=full.K[0])
     if not model.hidden:
         return full
     lift = scipy.linalg.block_diag(_lift(model), [[1.0]])
@@ -296,17 +299,18 @@ def _without_rate(gain: Matrix) -> Matrix:
     return mask
 
 
-def _care(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Gain:
+def riccati_gain(A: Matrix, B: Matrix, Q: Matrix, costs: Matrix) -> Gain:
+    """Return the gain, its K of shape (m, n), for a cost Q of the states and costs of each input, shape (m,)."""
     require_controllable(A, B)
     try:
-        S = scipy.linalg.solve_continuous_are(A, B, Q, R)
+        S = scipy.linalg.solve_continuous_are(A, B, Q, np.diag(costs))
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(no_solution(Q, float(R[0, 0]), error)) from error
-    K = B.T @ S / R[0, 0]
+        raise DesignError(no_solution(Q, float(costs[0]), error)) from error
+    K = B.T @ S / costs[:, None]
     poles = sort_poles(np.linalg.eigvals(A - B @ K))
     if np.max(poles.real) >= 0.0:
-        raise DesignError(no_solution(Q, float(R[0, 0]), "the closed loop is not stable"))
-    return Gain(K[0], S, poles)
+        raise DesignError(no_solution(Q, float(costs[0]), "the closed loop is not stable"))
+    return Gain(K, S, poles)
 
 
 def no_solution(Q: Matrix, r: float, reason: object) -> str:

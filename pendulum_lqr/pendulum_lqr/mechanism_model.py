@@ -14,11 +14,10 @@ import cmath
 from collections.abc import Sequence
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike
 
-from pendulum_lqr.design import DesignError, Gain, cost_matrices, no_solution, require_controllable
-from pendulum_lqr.model import LinearModel, sort_poles
+from pendulum_lqr.design import DesignError, Gain, cost_matrices, riccati_gain
+from pendulum_lqr.model import LinearModel
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
@@ -121,16 +120,7 @@ def mechanism_lqr(model: LinearModel, q: ArrayLike, r: ArrayLike) -> Gain:
     if costs.shape != (m,) or not (np.isfinite(costs).all() and costs.min() > 0.0):
         raise DesignError(f"r is {np.asarray(r).tolist()}; expected one finite weight > 0, or {m}")
     Q, _ = cost_matrices(q, 1.0, size)
-    require_controllable(model.A, model.B)
-    try:
-        S = scipy.linalg.solve_continuous_are(model.A, model.B, Q, np.diag(costs))
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(no_solution(Q, float(costs[0]), error)) from error
-    K = (model.B.T @ S) / costs[:, None]
-    poles = sort_poles(np.linalg.eigvals(model.A - model.B @ K))
-    if np.max(poles.real) >= 0.0:
-        raise DesignError(no_solution(Q, float(costs[0]), "the closed loop is not stable"))
-    return Gain(K, S, poles)
+    return riccati_gain(model.A, model.B, Q, costs)
 
 
 def _checked_position(plant: MechanismParameters, position: Sequence[float] | None) -> Vector:
