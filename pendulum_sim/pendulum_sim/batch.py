@@ -156,11 +156,10 @@ def simulate_batch(
         values = {name: float(packed[worst, PACKED.index(name)]) for name in ("inertia", "damping", "gravity")}
         # The plant at fault, rebuilt, so that its own check says what is wrong and what would do.
         check_stability(integrator, plants[min(worst, len(plants) - 1)].with_values(**values), dt, substeps, h)
-    limits = np.array([plant.effort_limit for plant in plants])
     delays = np.array([plant.transport_delay for plant in plants])
     smooth = not (delays.any() or packed[:, DRY].any() or packed[:, LAG].any())
 
-    keys = _spread(own_keys, size)
+    keys = np.broadcast_to(own_keys, (size,)).copy()
     record_of = np.empty((steps, 3, size)) if record else np.empty((0, 3, size))
     table = np.zeros((len(ROWS) + coefficients.shape[1], size))
     rows = dict(zip(ROWS, table, strict=False))
@@ -170,17 +169,14 @@ def simulate_batch(
         columns["amplitude"],
     )
     rows["gain_1"][:], rows["gain_2"][:] = gains.T
-    rows["limit"][:] = limits
+    rows["limit"][:] = [plant.effort_limit for plant in plants]
+    rows["delay"][:] = delays
     for name, values in zip(PACKED, packed.T, strict=True):
         rows[name][:] = values
     table[len(ROWS) :] = coefficients.T
     with on_threads(threads):
-        if smooth:
-            run = smooth_kernel(method, coefficients.shape[1])
-            run(table, keys, target, h, steps, hold, substeps, record_of)
-        else:
-            run = general_kernel(method)
-            run(table, _spread(delays, size), keys, target, dt, steps, hold, substeps, record_of)
+        run = smooth_kernel(method, coefficients.shape[1]) if smooth else general_kernel(method)
+        run(table, keys, target, dt, steps, hold, substeps, record_of)
     mean_x, mean_v = rows["sum_x"] / steps, rows["sum_v"] / steps
     return BatchResult(
         theta=rows["x"].copy(),
@@ -280,8 +276,3 @@ def _column(name: str, values: ArrayLike) -> Array:
     if column.ndim != 1 or not np.all(np.isfinite(column)):
         raise ParameterError(f"{name} has shape {column.shape}; expected finite numbers, one or one per pendulum")
     return column
-
-
-def _spread(values: NDArray[np.generic], size: int) -> NDArray[np.generic]:
-    """Return a contiguous copy whose last axis has ``size`` entries."""
-    return np.ascontiguousarray(np.broadcast_to(values, (*values.shape[:-1], size))).copy()

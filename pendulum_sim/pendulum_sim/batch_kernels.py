@@ -14,29 +14,23 @@ import numba
 import numpy as np
 
 from pendulum_msgs_py.contract import noise
-from pendulum_msgs_py.dynamics.steps import actuator_torque
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
 from pendulum_sim.compiling import compile_tree, tuple_loader
-from pendulum_sim.dry_friction import LAG, PACKED, acceleration_with_friction, advance_dry, is_dry
+from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, is_dry
 from pendulum_sim.integrators import get_integrator
+from pendulum_sim.plant import advance_rigid
 
 __all__ = ["BLOCK", "block_loop", "coefficients_kernel", "general_kernel", "smooth_kernel"]
 
 BLOCK = 256
 """Pendulums in a block."""
 
-_PLANT_ROWS = len(PACKED)
 ROWS = (
-    "x", "v", "torque", "noise", "amplitude", "gain_1", "gain_2", "limit", "max", "sum_x", "sum_xx", "sum_v", "sum_vv",
-    "max_x", *PACKED,
+    "x", "v", "torque", "noise", "amplitude", "gain_1", "gain_2", "limit", "delay", "max", "sum_x", "sum_xx", "sum_v",
+    "sum_vv", "max_x", *PACKED,
 )  # fmt: skip
 """Rows of a block's array, the integrator's coefficients below them."""
-(
-    _X, _V, _TORQUE, _NOISE, _AMPLITUDE, _GAIN_1, _GAIN_2, _LIMIT, _MAX, _SUM_X, _SUM_XX, _SUM_V, _SUM_VV,
-    _MAX_X, _PLANT,
-) = (row * BLOCK for row in range(len(ROWS) - _PLANT_ROWS + 1))  # fmt: skip
-_COEFFICIENTS = len(ROWS) * BLOCK
 _scramble = compile_tree(noise.scramble)
 _unit_interval = compile_tree(noise.unit_interval)
 _wrap = compile_tree(vector_math.wrap)
@@ -75,6 +69,44 @@ def block_loop(run_block: Any, lanes: int) -> Any:
     return run
 
 
+def _starts(lanes: int) -> dict[str, int]:
+    """Return where each row begins in a block's array."""
+    return {name: row * lanes for row, name in enumerate((*ROWS, "coefficients"))}
+
+
+def _control(lanes: int) -> Any:
+    """Return the compiled loop that measures, counts, and sets the torques of a block for one step."""
+    s = _starts(lanes)
+    o_v, o_torque, o_noise, o_amplitude, o_limit = (s[key] for key in ("v", "torque", "noise", "amplitude", "limit"))
+    o_gain_1, o_gain_2, o_max, o_max_x = (s[key] for key in ("gain_1", "gain_2", "max", "max_x"))
+    o_sum_x, o_sum_xx, o_sum_v, o_sum_vv = (s[key] for key in ("sum_x", "sum_xx", "sum_v", "sum_vv"))
+
+    @numba.njit(fastmath={"contract"}, error_model="numpy")
+    def control(w: Any, keys: Any, target: float, k: int, hold: int, record: Any) -> None:
+        if k % hold == 0:
+            index = np.uint64(k // hold)
+            for j in range(lanes):
+                w[o_noise + j] = w[o_amplitude + j] * _unit_interval(_scramble(keys[j], index))
+        for j in range(lanes):
+            deviation = _wrap(w[j] - target)
+            v = w[o_v + j]
+            wanted = -(w[o_gain_1 + j] * deviation + w[o_gain_2 + j] * v)
+            w[o_max + j] = max(w[o_max + j], abs(wanted))
+            w[o_max_x + j] = max(w[o_max_x + j], abs(deviation))
+            w[o_sum_x + j] += deviation
+            w[o_sum_xx + j] += deviation * deviation
+            w[o_sum_v + j] += v
+            w[o_sum_vv + j] += v * v
+            limit = w[o_limit + j]
+            w[o_torque + j] = min(limit, max(-limit, wanted + w[o_noise + j]))
+        if record.shape[0] > 0:
+            for row in range(3):
+                for j in range(record.shape[2]):
+                    record[k, row, j] = w[row * lanes + j]
+
+    return control
+
+
 @cache
 def smooth_kernel(method: str, coefficient_rows: int) -> Any:
     """Return the loop for pendulums without dry friction, lag and delay.
@@ -86,48 +118,32 @@ def smooth_kernel(method: str, coefficient_rows: int) -> Any:
     integrator = get_integrator(method)
     step = compile_tree(integrator.step, vector=True)
     acceleration = compile_tree(acceleration_with_friction, vector=True)
-    load_plant = tuple_loader(_PLANT_ROWS, BLOCK)
+    load_plant = tuple_loader(len(PACKED), BLOCK)
     load_coefficients = tuple_loader(coefficient_rows, BLOCK)
+    control = _control(BLOCK)
+    o_v, o_torque, o_plant, o_coefficients = (_starts(BLOCK)[key] for key in ("v", "torque", PACKED[0], "coefficients"))
 
     @numba.njit(fastmath={"contract"}, error_model="numpy")
     def run_block(
-        w: Any, keys: Any, target: float, h: float, steps: int, hold: int, substeps: int, record: Any
+        w: Any, keys: Any, target: float, dt: float, steps: int, hold: int, substeps: int, record: Any
     ) -> None:
+        h = dt / substeps
         for k in range(steps):
-            if k % hold == 0:
-                index = np.uint64(k // hold)
-                for j in range(BLOCK):
-                    w[_NOISE + j] = w[_AMPLITUDE + j] * _unit_interval(_scramble(keys[j], index))
-            for j in range(BLOCK):
-                deviation = _wrap(w[_X + j] - target)
-                v = w[_V + j]
-                control = -(w[_GAIN_1 + j] * deviation + w[_GAIN_2 + j] * v)
-                w[_MAX + j] = max(w[_MAX + j], abs(control))
-                w[_MAX_X + j] = max(w[_MAX_X + j], abs(deviation))
-                w[_SUM_X + j] += deviation
-                w[_SUM_XX + j] += deviation * deviation
-                w[_SUM_V + j] += v
-                w[_SUM_VV + j] += v * v
-                limit = w[_LIMIT + j]
-                w[_TORQUE + j] = min(limit, max(-limit, control + w[_NOISE + j]))
-            for j in range(record.shape[2] if record.shape[0] > 0 else 0):
-                record[k, 0, j] = w[_X + j]
-                record[k, 1, j] = w[_V + j]
-                record[k, 2, j] = w[_TORQUE + j]
+            control(w, keys, target, k, hold, record)
             for _ in range(substeps):
                 for j in range(BLOCK):
-                    torque = w[_TORQUE + j]
-                    w[_X + j], w[_V + j] = step(
+                    torque = w[o_torque + j]
+                    w[j], w[o_v + j] = step(
                         acceleration,
-                        w[_X + j],
-                        w[_V + j],
+                        w[j],
+                        w[o_v + j],
                         torque,
                         torque,
                         torque,
                         0.0,
                         h,
-                        load_coefficients(w, _COEFFICIENTS + j),
-                        load_plant(w, _PLANT + j),
+                        load_coefficients(w, o_coefficients + j),
+                        load_plant(w, o_plant + j),
                     )
 
     return keep_kernel(block_loop(run_block, BLOCK), "smooth_kernel", integrator.step, coefficient_rows)
@@ -154,34 +170,25 @@ def general_kernel(method: str) -> Any:
 
     Args:
         method: Integrator.
-        coefficient_rows: How many numbers its coefficients are.
     """
     integrator = get_integrator(method)
     step = compile_tree(integrator.step, inline=True)
     coefficients_of = compile_tree(integrator.coefficients, inline=True)
     acceleration = compile_tree(acceleration_with_friction, inline=True)
-    advance = compile_tree(advance_dry, inline=True)
-    lagged = compile_tree(actuator_torque, inline=True)
+    advance = compile_tree(advance_rigid, inline=True)
     has_dry_friction = compile_tree(is_dry, inline=True)
-    load_plant = tuple_loader(_PLANT_ROWS, 1)
+    load_plant = tuple_loader(len(PACKED), 1)
+    control = _control(1)
+    o_torque, o_delay, o_plant = (_starts(1)[key] for key in ("torque", "delay", PACKED[0]))
 
     @numba.njit(fastmath={"contract"}, error_model="numpy")
-    def run_one(
-        w: Any,
-        delay: float,
-        key: Any,
-        target: float,
-        dt: float,
-        steps: int,
-        hold: int,
-        substeps: int,
-        record: Any,
+    def run_block(
+        w: Any, keys: Any, target: float, dt: float, steps: int, hold: int, substeps: int, record: Any
     ) -> None:
-        plant = load_plant(w, _PLANT // BLOCK)
+        plant = load_plant(w, o_plant)
         rate = plant[1] / plant[0]
         dry = has_dry_friction(plant)
-        lag = plant[LAG]
-        periods = delay / dt
+        periods = w[o_delay] / dt
         if abs(periods - np.rint(periods)) < 1e-9:
             periods = np.rint(periods)
         whole = int(np.floor(periods))
@@ -196,59 +203,21 @@ def general_kernel(method: str) -> Any:
                 lengths[part] = share * dt / counts[part]
         c_0 = coefficients_of(rate, lengths[0])
         c_1 = coefficients_of(rate, lengths[1])
-        x, v, torque, disturbance = w[0], w[1], 0.0, 0.0
+        torque = 0.0
         for k in range(steps):
-            if k % hold == 0:
-                disturbance = w[_AMPLITUDE // BLOCK] * _unit_interval(_scramble(key, np.uint64(k // hold)))
-            deviation = _wrap(x - target)
-            control = -(w[_GAIN_1 // BLOCK] * deviation + w[_GAIN_2 // BLOCK] * v)
-            w[_MAX // BLOCK] = max(w[_MAX // BLOCK], abs(control))
-            w[_MAX_X // BLOCK] = max(w[_MAX_X // BLOCK], abs(deviation))
-            w[_SUM_X // BLOCK] += deviation
-            w[_SUM_XX // BLOCK] += deviation * deviation
-            w[_SUM_V // BLOCK] += v
-            w[_SUM_VV // BLOCK] += v * v
-            limit = w[_LIMIT // BLOCK]
-            wanted = min(limit, max(-limit, control + disturbance))
-            if record.shape[0] > 0:
-                record[k, 0], record[k, 1], record[k, 2] = x, v, wanted
+            control(w, keys, target, k, hold, record)
             for index in range(whole + 1):
                 line[index] = line[index + 1]
-            line[whole + 1] = wanted
+            line[whole + 1] = w[o_torque]
+            x, v = w[0], w[1]
             for part in range(2):
-                command = line[part]
-                h = lengths[part]
+                command, h = line[part], lengths[part]
                 c = c_0 if part == 0 else c_1
                 for _ in range(counts[part]):
-                    if dry:
-                        x, v = advance(step, coefficients_of, acceleration, x, v, torque, command, 0.0, h, c, plant)
-                        torque = lagged(torque, command, h, lag)
-                    else:
-                        torque_0 = torque if lag > 0.0 else command
-                        torque_mid = lagged(torque, command, 0.5 * h, lag)
-                        torque = lagged(torque, command, h, lag)
-                        x, v = step(acceleration, x, v, torque_0, torque_mid, torque, 0.0, h, c, plant)
-        w[0], w[1] = x, v
+                    x, v, torque = advance(
+                        step, coefficients_of, acceleration, x, v, torque, command, 0.0, h, c, plant, dry
+                    )
+            w[0], w[1] = x, v
 
-    @numba.njit(parallel=True)
-    def run(
-        columns: Any,
-        delays: Any,
-        keys: Any,
-        target: float,
-        dt: float,
-        steps: int,
-        hold: int,
-        substeps: int,
-        record: Any,
-    ) -> None:
-        rows, size = columns.shape
-        for j in numba.prange(size):
-            w = np.empty(rows)
-            for row in range(rows):
-                w[row] = columns[row, j]
-            run_one(w, delays[j], keys[j], target, dt, steps, hold, substeps, record[:, :, j])
-            for row in range(rows):
-                columns[row, j] = w[row]
-
-    return keep_kernel(run, "general_kernel", integrator.step, integrator.coefficients)
+    kernel = block_loop(run_block, 1)
+    return keep_kernel(kernel, "general_kernel", integrator.step, integrator.coefficients)
