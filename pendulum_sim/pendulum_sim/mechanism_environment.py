@@ -151,17 +151,8 @@ class MechanismVectorEnv(PlantVectorEnv):
 
     Plant i, reset with a list of seeds, starts and is disturbed as a single environment reset with seed i.
 
-    Args:
-        num_envs: Plants, >= 1.
-        max_episode_steps: Steps after which an episode is truncated; it restarts with the step after that. None for
-            ``episode_time``.
-        plant: As for :class:`MechanismEnv`.
-        dt: As for :class:`MechanismEnv`.
-        start: As for :class:`MechanismEnv`.
-        disturbance: As for :class:`MechanismEnv`.
-        q: As for :class:`MechanismEnv`.
-        r: As for :class:`MechanismEnv`.
-        episode_time: As for :class:`MechanismEnv`.
+    There are ``num_envs`` of them, >= 1. An episode is truncated after ``max_episode_steps``, or ``episode_time`` where
+    that is None, and restarts with the step after that. All other arguments are those of :class:`MechanismEnv`.
 
     Raises:
         ParameterError: An argument is outside its domain.

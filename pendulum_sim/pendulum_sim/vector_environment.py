@@ -31,20 +31,8 @@ _LANES = 256
 class PendulumVectorEnv(PlantVectorEnv):
     """Many equal pendulums in one compiled step, for learning libraries; rigid plants without dry friction or lag.
 
-    Args:
-        num_envs: Pendulums, >= 1.
-        max_episode_steps: Steps after which an episode is truncated; it restarts with the step after that. None for
-            ``episode_time``.
-        plant: As for :class:`PendulumEnv`.
-        dt: As for :class:`PendulumEnv`.
-        method: As for :class:`PendulumEnv`.
-        substeps: As for :class:`PendulumEnv`.
-        start: As for :class:`PendulumEnv`.
-        disturbance: As for :class:`PendulumEnv`.
-        hold: As for :class:`PendulumEnv`.
-        q: As for :class:`PendulumEnv`.
-        r: As for :class:`PendulumEnv`.
-        episode_time: As for :class:`PendulumEnv`.
+    There are ``num_envs`` of them, >= 1. An episode is truncated after ``max_episode_steps``, or ``episode_time`` where
+    that is None, and restarts with the step after that. All other arguments are those of ``PendulumEnv``.
 
     Raises:
         ParameterError: An argument is outside its domain.
