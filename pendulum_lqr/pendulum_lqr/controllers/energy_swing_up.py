@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.energy_margin import EnergyMargin
 from pendulum_lqr.interface import Controller
@@ -15,20 +17,10 @@ from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["CATCH_SHARE", "EnergySwingUp"]
+__all__ = ["EnergySwingUp"]
 
 _REST = 0.02
 """Velocity below which the pendulum may be held by dry friction [rad/s]."""
-CATCH_SHARE = ParameterSpec(
-    "catch_share",
-    1.0,
-    "-",
-    "Share of the proven region of attraction in which it takes over.",
-    minimum=0.0,
-    maximum=1.0,
-    exclusive_minimum=True,
-)
-"""How much of what it can catch the LQR waits for."""
 
 
 class EnergySwingUp(BaseController):
@@ -61,8 +53,8 @@ class EnergySwingUp(BaseController):
         ParameterSpec(
             "energy_margin", 0.1, "-", "Energy aimed at beyond that of upright, relative.", minimum=-0.5, maximum=1.0
         ),
-        ParameterSpec("catch_q", [30.0, 0.3], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
-        ParameterSpec("catch_r", 1.0, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
+        replace(CATCH_Q, default=[30.0, 0.3]),
+        replace(CATCH_R, default=1.0),
         CATCH_SHARE,
     )
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from pendulum_lqr.controllers.energy_swing_up import CATCH_SHARE
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, require_catching
+from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.energy_margin import EnergyMargin
 from pendulum_lqr.interface import Controller, JointController
@@ -67,8 +67,8 @@ class JointEnergySwingUp(JointController):
             ParameterSpec("servo_damping", gains.damping, "-", "Its damping ratio.", minimum=0.0, maximum=5.0),
             ParameterSpec("reach", gains.reach, joint.unit, f"Farthest that {joint.name} may go from its goal, and the "
                           "LQR with it; 0 for nine tenths of the way to its stops, where it has some.", minimum=0.0),
-            ParameterSpec("catch_q", list(q), "", "Weights of the LQR that catches.", minimum=0.0),
-            ParameterSpec("catch_r", r, "", "Its weight of effort.", minimum=0.0, exclusive_minimum=True),
+            replace(CATCH_Q, default=list(q), unit=""),
+            replace(CATCH_R, default=r, unit="", description="Its weight of effort."),
             replace(CATCH_SHARE, description="Share of the sampled region in which it takes over."),
             JOINT_LIMIT,
         )  # fmt: skip

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.trajectory_optimisation import rigid_dynamics
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -44,8 +45,8 @@ class NonlinearMpc(BaseController):
         ParameterSpec("steps", 40, "-", "Length of the horizon in steps.", minimum=5, maximum=200),
         ParameterSpec("step", 0.05, "s", "Step of the horizon.", minimum=0.0, exclusive_minimum=True, maximum=1.0),
         ParameterSpec("iterations", 60, "-", "Largest number of solver iterations per answer.", minimum=1),
-        ParameterSpec("catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
-        ParameterSpec("catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
+        CATCH_Q,
+        CATCH_R,
     )
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any], catch: Catch) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pendulum_msgs_py.parameters import ParameterSpec
 
-__all__ = ["DELAY", "FEEDFORWARD", "OFFSET_NOISE", "Q", "R"]
+__all__ = ["CATCH_Q", "CATCH_R", "CATCH_SHARE", "DELAY", "FEEDFORWARD", "OFFSET_NOISE", "Q", "R"]
 
 Q = ParameterSpec(
     "q", [100.0, 0.01], "1/rad^2, s^2/rad^2", "Weights of angle and velocity: the diagonal of Q.", minimum=0.0
@@ -26,3 +26,15 @@ OFFSET_NOISE = ParameterSpec(
     "How fast an unknown constant torque may wander; > 0 observes and cancels it, so that no offset stays.",
     minimum=0.0,
 )
+CATCH_Q = ParameterSpec("catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0)
+CATCH_R = ParameterSpec("catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True)
+CATCH_SHARE = ParameterSpec(
+    "catch_share",
+    1.0,
+    "-",
+    "Share of the proven region of attraction in which it takes over.",
+    minimum=0.0,
+    maximum=1.0,
+    exclusive_minimum=True,
+)
+"""How much of what it can catch the LQR waits for."""

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
+from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.minimum_time import SIGN_VELOCITY, TimeToGo, minimum_time
 from pendulum_lqr.model import acceleration_from_upright
@@ -33,17 +35,9 @@ class TimeOptimal(BaseController):
     SUMMARY = "swing-up in minimum time by dynamic programming, caught by LQR"
     PARAMETERS = (
         ParameterSpec("grid", 400, "-", "Grid points in angle and in velocity.", minimum=40, maximum=1000),
-        ParameterSpec("catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
-        ParameterSpec("catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
-        ParameterSpec(
-            "catch_share",
-            0.9,
-            "-",
-            "Share of the proven region of attraction in which it takes over.",
-            minimum=0.0,
-            maximum=1.0,
-            exclusive_minimum=True,
-        ),
+        CATCH_Q,
+        CATCH_R,
+        replace(CATCH_SHARE, default=0.9),
     )
 
     def __init__(

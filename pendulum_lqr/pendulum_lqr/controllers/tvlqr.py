@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.energy_swing_up import EnergySwingUp
+from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R
 from pendulum_lqr.design import cost_matrices
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
@@ -62,8 +63,8 @@ class Tvlqr(BaseController):
             "reserve", 0.1, "-", "Share of the torque limit that is left to the feedback.", minimum=0.0, maximum=0.9
         ),
         ParameterSpec("nodes", 100, "-", "Collocation intervals.", minimum=20, maximum=1000),
-        ParameterSpec("catch_q", [100.0, 1.0], "1/rad^2, s^2/rad^2", "Weights of the LQR that catches.", minimum=0.0),
-        ParameterSpec("catch_r", 0.1, "1/(N m)^2", "Its weight of torque.", minimum=0.0, exclusive_minimum=True),
+        CATCH_Q,
+        CATCH_R,
     )
 
     def __init__(
