@@ -199,7 +199,7 @@ def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike
             raise DesignError(f"{name} noise covariance is {covariance.tolist()}; expected finite, not negative")
     if not float(np.linalg.eigvalsh(V)[0]) > 0.0:
         raise DesignError(f"measurement noise covariance is {V.tolist()}; expected every variance > 0")
-    require_observable(A, C, discrete=True)
+    require_observable(A, C)
     try:
         P = scipy.linalg.solve_discrete_are(A.T, C.T, W, V)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -219,31 +219,30 @@ def require_controllable(A: Matrix, B: Matrix, *, discrete: bool = False) -> Non
     Raises:
         DesignError: Names the mode.
     """
-    pole = _unreached_mode(A, B, discrete)
+    pole = _unreached_mode(A, B, discrete=discrete)
     if pole is not None:
         raise DesignError(f"mode at {_number(pole)} is not controllable: no torque reaches it; expected B = [0, 1/M]")
 
 
-def require_observable(A: Matrix, C: Matrix, *, discrete: bool = False) -> None:
-    """Refuse a system with an unstable mode that the outputs do not show (Hautus test).
+def require_observable(A: Matrix, C: Matrix) -> None:
+    """Refuse a sampled system with an unstable mode that the outputs do not show (Hautus test).
 
     Args:
         A: State matrix, shape (n, n).
         C: Output matrix, shape (m, n).
-        discrete: Whether stability is meant on the z-plane.
 
     Raises:
         DesignError: Names the mode.
     """
     # The dual of controllability: what A' and C' do not reach, A and C do not show.
-    pole = _unreached_mode(A.T, C.T, discrete)
+    pole = _unreached_mode(A.T, C.T, discrete=True)
     if pole is not None:
         raise DesignError(
             f"mode at {_number(pole)} is not observable: no measurement shows it; expected theta among the outputs"
         )
 
 
-def _unreached_mode(A: Matrix, B: Matrix, discrete: bool) -> complex | None:
+def _unreached_mode(A: Matrix, B: Matrix, *, discrete: bool) -> complex | None:
     """Return a mode that neither decays by itself nor is reached by the input, by the rank of [s I - A, B]."""
     for pole in np.linalg.eigvals(A):
         if not _decays(pole, discrete) and _deficient(np.hstack([pole * np.eye(A.shape[0]) - A, B])):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,28 +14,16 @@ from pendulum_lqr.mechanism_search import PlanSearch, PlanSettings
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["MechanismMpc", "MpcSettings"]
+__all__ = ["ITERATIONS", "PATIENCE", "PLAN", "RETRIES", "MechanismMpc"]
 
 Array = NDArray[np.float64]
 _HURRY = IlqrWeights(1.0, 0.0, 0.004, 2e-5, 5e-3, 10.0)
-_PLAN = PlanSettings(_HURRY, step=0.02, nodes=70, guesses=32, iterations=20)
-
-
-@dataclass(frozen=True)
-class MpcSettings:
-    """Settings of the controller.
-
-    Attributes:
-        plan: Of the plans, and of fresh guesses where there is no plan; its step is also the time from plan to plan.
-        iterations: Of iterative LQR from plan to plan.
-        patience: Plans after which some guesses are tried again where the plan does not end upright.
-        retries: How many.
-    """
-
-    plan: PlanSettings = _PLAN
-    iterations: int = 3
-    patience: int = 8
-    retries: int = 2
+PLAN = PlanSettings(_HURRY, step=0.02, nodes=70, guesses=32, iterations=20)
+"""Of the plans, and of fresh guesses where there is no plan; its step is also the time from plan to plan."""
+ITERATIONS = 3
+"""Of iterative LQR from plan to plan."""
+PATIENCE, RETRIES = 8, 2
+"""Plans after which some guesses are tried again where the plan does not end upright, and how many."""
 
 
 class MechanismMpc:
@@ -46,21 +33,11 @@ class MechanismMpc:
         plant: The plant.
         period: Sampling period [s].
         catch: LQR with its region.
-        settings: Horizon, weights, guesses.
-        seed: Of the guesses.
     """
 
-    def __init__(
-        self,
-        plant: MechanismParameters,
-        period: float,
-        catch: MechanismCatch,
-        settings: MpcSettings | None = None,
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, plant: MechanismParameters, period: float, catch: MechanismCatch) -> None:
         self.plant, self.period, self.catch = plant, period, catch
-        self.settings = settings or MpcSettings()
-        self.search = PlanSearch(catch, self.settings.plan, seed)
+        self.search = PlanSearch(catch, PLAN)
         self._limits = plant.effort_limits
         self.reset()
 
@@ -75,20 +52,20 @@ class MechanismMpc:
 
     def command(self, t: float, x: Vector) -> Vector:
         """Return the efforts [N m or N]."""
-        step = self.settings.plan.step
+        step = PLAN.step
         deviation = deviation_of(self.plant.coordinates, x)
         if self.catch.holds(deviation):
             self._plan = None
             self._before = self.catch.command(deviation)
             return self._before
         if self._plan is None:
-            self._plan = self._best(x, None, self.settings.plan.guesses)
+            self._plan = self._best(x, None, PLAN.guesses)
             self._planned, self._age = t, 0
         elif t - self._planned > 2.0 * step:
             # A plan that nobody followed for a while begins elsewhere. In real time that is one whose search took too
             # long for its answer to be applied: it is a better start than none, and another search would be as late.
-            late = self.search.solve(x, self._before, self._plan.efforts, self.settings.plan.iterations)
-            self._plan = self._best(x, late, self.settings.retries)
+            late = self.search.solve(x, self._before, self._plan.efforts, PLAN.iterations)
+            self._plan = self._best(x, late, RETRIES)
             self._planned, self._age = t, 0
         elif t - self._planned >= step - 0.5 * self.period:
             self._plan_again(t, x)
@@ -107,10 +84,10 @@ class MechanismMpc:
         assert self._plan is not None
         self._before = tuple(float(u) for u in self._plan.efforts[0])
         guess, around = _shifted(self._plan)
-        plan = self.search.solve(x, self._before, guess, self.settings.iterations, around)
+        plan = self.search.solve(x, self._before, guess, ITERATIONS, around)
         self._age += 1
-        if self._age % self.settings.patience == 0 and not self.search.arrives(plan):
-            plan = self._best(x, plan, self.settings.retries)
+        if self._age % PATIENCE == 0 and not self.search.arrives(plan):
+            plan = self._best(x, plan, RETRIES)
         if math.isfinite(plan.cost):
             self._plan, self._planned = plan, t
         # Else a single wild state, such as an encoder's glitch: the plan before it is the better one.

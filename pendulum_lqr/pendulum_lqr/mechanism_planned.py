@@ -35,19 +35,13 @@ class PlannedSwingUp:
         period: Sampling period [s].
         catch: LQR with its region.
         settings: Horizon, weights, guesses.
-        seed: Of the guesses.
     """
 
     def __init__(
-        self,
-        plant: MechanismParameters,
-        period: float,
-        catch: MechanismCatch,
-        settings: PlanSettings = _PLAN,
-        seed: int = 0,
+        self, plant: MechanismParameters, period: float, catch: MechanismCatch, settings: PlanSettings = _PLAN
     ) -> None:
         self.plant, self.period, self.catch = plant, period, catch
-        self.search = PlanSearch(catch, settings, seed)
+        self.search = PlanSearch(catch, settings)
         self.reset()
 
     def reset(self) -> None:

@@ -43,17 +43,16 @@ class PlanSearch:
     Args:
         catch: LQR with its region, where a plan should end; the plant is its own.
         settings: Horizon, weights, guesses.
-        seed: Of the guesses.
     """
 
-    def __init__(self, catch: MechanismCatch, settings: PlanSettings, seed: int = 0) -> None:
-        self.catch, self.settings, self.seed = catch, settings, seed
+    def __init__(self, catch: MechanismCatch, settings: PlanSettings) -> None:
+        self.catch, self.settings = catch, settings
         self._problem = IlqrProblem(catch.plant, settings.step, settings.weights, catch.terminal)
         self.reset()
 
     def reset(self) -> None:
         """Draw the same guesses again."""
-        self._rng = np.random.default_rng(self.seed)
+        self._rng = np.random.default_rng(0)
 
     def solve(
         self, x: Vector, before: Vector, guess: Array, iterations: int, around: IlqrPlan | None = None

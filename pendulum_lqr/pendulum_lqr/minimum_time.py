@@ -28,6 +28,10 @@ Array = NDArray[np.float64]
 
 SIGN_VELOCITY = 0.05
 """Velocity over which the model of dry friction changes sign [rad/s]; grid cells are about as large."""
+_STEP = 0.02
+"""Time step [s]; long enough to leave a cell."""
+_TOLERANCE = 1e-5
+"""Largest change of W in the last sweep."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +87,6 @@ def minimum_time(
     centre: float = 0.0,
     angles: int = 240,
     velocities: int = 241,
-    velocity_span: float = 0.0,
-    step: float = 0.02,
-    tolerance: float = 1e-5,
 ) -> TimeToGo:
     """Return the time to go from every state of a grid to an ellipse around a set-point.
 
@@ -96,22 +97,20 @@ def minimum_time(
         centre: Where the set lies, from upright [rad].
         angles: Grid points around the circle.
         velocities: Grid points in velocity, odd so that rest is one of them.
-        velocity_span: Half width in velocity [rad/s]; 0 for 1.3 times the speed of a free fall from upright.
-        step: Time step [s]; long enough to leave a cell.
-        tolerance: Largest change of W in the last sweep.
     """
-    span = velocity_span or 1.3 * math.sqrt(4.0 * max(plant.gravity, 1e-3) / plant.inertia)
+    # 1.3 times the speed of a free fall from upright.
+    span = 1.3 * math.sqrt(4.0 * max(plant.gravity, 1e-3) / plant.inertia)
     theta = np.linspace(-math.pi, math.pi, angles, endpoint=False)
     speed = np.linspace(-span, span, velocities)
     x, v = np.meshgrid(theta, speed, indexing="ij")
     S, level = target
     e = wrap(x - centre)
     inside = S[0, 0] * e * e + 2.0 * S[0, 1] * e * v + S[1, 1] * v * v <= level
-    successors = [_successors(plant, x, v, u, step, span) for u in (-effort_limit, 0.0, effort_limit)]
-    discount = math.exp(-step)
+    successors = [_successors(plant, x, v, u, span) for u in (-effort_limit, 0.0, effort_limit)]
+    discount = math.exp(-_STEP)
     W = np.where(inside, 0.0, 1.0)
     # Information travels one step a sweep: ten seconds of motion are more than any swing-up needs.
-    for _ in range(math.ceil(10.0 / step)):
+    for _ in range(math.ceil(10.0 / _STEP)):
         new = np.ones_like(W)
         padded = W.ravel()
         for corners, weights in successors:
@@ -123,17 +122,17 @@ def minimum_time(
         new[inside] = 0.0
         change = float(np.max(np.abs(new - W)))
         W = new
-        if change < tolerance:
+        if change < _TOLERANCE:
             break
-    return TimeToGo(W, span, step)
+    return TimeToGo(W, span, _STEP)
 
 
 def _successors(
-    plant: PlantParameters, x: Array, v: Array, effort: float, step: float, span: float
+    plant: PlantParameters, x: Array, v: Array, effort: float, span: float
 ) -> tuple[list[NDArray[np.intp]], list[Array]]:
     """Return the four neighbours of each successor, as flat indices, and their weights."""
-    substeps = max(4, math.ceil(step * plant.damping / plant.inertia / 0.5))
-    h = step / substeps
+    substeps = max(4, math.ceil(_STEP * plant.damping / plant.inertia / 0.5))
+    h = _STEP / substeps
     angle, velocity = x.copy(), v.copy()
 
     def acceleration(angle: Array, velocity: Array) -> Array:

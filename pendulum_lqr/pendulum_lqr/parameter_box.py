@@ -48,7 +48,7 @@ class ParameterBox:
     correlation: Array | None = None
     source: str = "given"
 
-    def plants(self, plant: PlantParameters, *, seed: int = 0) -> list[PlantParameters]:
+    def plants(self, plant: PlantParameters) -> list[PlantParameters]:
         """Return the plant itself and others that are possible: corners and inside, or the edge of the ellipsoid.
 
         Without correlation every corner of the box is there. With it, the plants lie on the ellipsoid that holds 95 %
@@ -56,12 +56,11 @@ class ParameterBox:
 
         Args:
             plant: The plant that is believed in.
-            seed: Of the draw.
 
         Source:
             Johnson and Wichern, Applied Multivariate Statistical Analysis, 6th ed., 2007, section 5.4 (ellipsoid).
         """
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         low, high = (np.array([pair[i] for pair in self.bounds.values()]) for i in (0, 1))
         if self.correlation is None:
             corners = np.array(list(itertools.product(*self.bounds.values())))

@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 Rollout = Callable[[Array, Array], tuple[Array, Array]]
 """Batch simulation: start angles (from upright [rad]) and velocities [rad/s], shape (n,), to those at the end."""
 
+_ARRIVED = (0.05, 0.1)
+"""What counts as arrived: |angle| [rad] and |velocity| [rad/s]. An angle a whole turn away has fallen."""
 _SPLITS = 14
 _MOST_CELLS = 400_000
 # Rounding of a dozen operations on doubles is far below this share of the terms summed.
@@ -162,7 +164,6 @@ def region_of_attraction(
     angle_span: float = math.pi,
     velocity_span: float = 10.0,
     points: int = 101,
-    tolerance: tuple[float, float] = (0.05, 0.1),
 ) -> Region:
     """Sample the region of attraction through a batch simulation and prove its inner part.
 
@@ -174,14 +175,13 @@ def region_of_attraction(
         angle_span: Half width of the grid in angle [rad].
         velocity_span: Half width of the grid in velocity [rad/s].
         points: Points along each axis; an odd number has upright among them.
-        tolerance: What counts as arrived: |angle| [rad] and |velocity| [rad/s]. An angle a whole turn away has fallen.
     """
     angles = np.linspace(-angle_span, angle_span, points)
     velocities = np.linspace(-velocity_span, velocity_span, points)
     x, v = np.meshgrid(angles, velocities)
     end_angle, end_velocity = rollout(x.ravel(), v.ravel())
-    arrived = (np.abs(wrap(np.asarray(end_angle, dtype=np.float64))) < tolerance[0]) & (
-        np.abs(end_velocity) < tolerance[1]
+    arrived = (np.abs(wrap(np.asarray(end_angle, dtype=np.float64))) < _ARRIVED[0]) & (
+        np.abs(end_velocity) < _ARRIVED[1]
     )
     level = proven_level(plant, gain, effort_limit)
     return Region(angles, velocities, arrived.reshape(x.shape), level, sublevel_ellipse(gain.S, level), gain.S)

@@ -32,6 +32,9 @@ __all__ = [
     "make_velocity_estimator",
 ]
 
+_WINDOW, _ORDER = 7, 2
+"""Samples to which a polynomial is fitted, and its degree."""
+
 
 class VelocityEstimator(Protocol):
     """A filter from positions (and what else there is) to velocity."""
@@ -96,19 +99,16 @@ class SavitzkyGolay:
 
     Args:
         period: Sampling period [s].
-        window: Number of samples.
-        order: Degree of the polynomial.
 
     Source: Savitzky and Golay, Analytical Chemistry 36(8), 1964; coefficients by scipy.
     """
 
-    def __init__(self, period: float, window: int = 7, order: int = 2) -> None:
+    def __init__(self, period: float) -> None:
         self.period = period
-        self.window = window
         # Here, because it costs every controller 40 MB that few have a use for.
         import scipy.signal
 
-        weights = scipy.signal.savgol_coeffs(window, order, deriv=1, delta=period, pos=window - 1, use="dot")
+        weights = scipy.signal.savgol_coeffs(_WINDOW, _ORDER, deriv=1, delta=period, pos=_WINDOW - 1, use="dot")
         self._weights = [float(weight) for weight in weights]
         self.reset()
 
@@ -125,9 +125,9 @@ class SavitzkyGolay:
             samples.clear()
         samples.append(position if not samples else samples[-1] + wrap(position - samples[-1]))
         self._t = t
-        if len(samples) > self.window:
+        if len(samples) > _WINDOW:
             del samples[0]
-        if len(samples) < self.window:
+        if len(samples) < _WINDOW:
             return velocity
         return sum(weight * sample for weight, sample in zip(self._weights, samples, strict=True))
 

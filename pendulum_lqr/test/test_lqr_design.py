@@ -289,7 +289,7 @@ def test_a_mode_that_no_torque_reaches_is_refused():
 def test_a_mode_that_no_measurement_shows_is_refused():
     integrator = np.array([[1.0, 0.01], [0.0, 1.0]])
     with pytest.raises(DesignError, match="mode at 1 is not observable: no measurement shows it"):
-        require_observable(integrator, np.array([[0.0, 1.0]]), discrete=True)
+        require_observable(integrator, np.array([[0.0, 1.0]]))
     with pytest.raises(DesignError, match="not observable"):
         kalman_gain(integrator, np.array([[0.0, 1.0]]), np.eye(2), [[1.0]])
     with pytest.raises(DesignError, match="expected every variance > 0"):

@@ -22,7 +22,7 @@ from pendulum_lqr.mechanism_controllers import (
 )
 from pendulum_lqr.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.mechanism_mpc import MechanismMpc
+from pendulum_lqr.mechanism_mpc import ITERATIONS, PATIENCE, PLAN, RETRIES, MechanismMpc
 from pendulum_lqr.mechanism_planned import PlannedSwingUp
 from pendulum_lqr.mechanism_search import PlanSettings
 from pendulum_lqr.mechanism_trajectory import (
@@ -179,10 +179,10 @@ def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
     controller.search.solve = lambda *asked: (solved.append(asked), solve(*asked))[1]  # type: ignore[method-assign]
     controller.reset()
     controller.command(0.0, (0.0,) * 4)
-    assert len(solved) == controller.settings.plan.guesses
+    assert len(solved) == PLAN.guesses
     solved.clear()
     late = controller.command(0.1, (0.0,) * 4)
-    assert len(solved) == 1 + controller.settings.retries
+    assert len(solved) == 1 + RETRIES
     assert controller.search.arrives(controller._plan)
     assert late == pytest.approx(efforts[0], abs=0.5)
     # On the graph it is the same, and begins anew with a plant that begins anew, whatever turns were made before.
@@ -372,8 +372,8 @@ def test_mpc_plans_from_the_last_plan_and_searches_where_that_leads_nowhere_or_t
     plant = load_mechanism("cart_pole")
     gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
     controller = MechanismMpc(plant, DT, MechanismCatch(plant, gain, CaughtRegion(0.1, 0)))
-    search, settings = controller.search, controller.settings
-    nodes = round(settings.plan.step / DT)
+    search = controller.search
+    nodes = round(PLAN.step / DT)
     asked: list[tuple[object, ...]] = []
     solve = search.solve
     search.solve = lambda *given: (asked.append(given), solve(*given))[1]  # type: ignore[method-assign]
@@ -388,7 +388,7 @@ def test_mpc_plans_from_the_last_plan_and_searches_where_that_leads_nowhere_or_t
         x = step(plant, x, effort)
         return len(asked)
 
-    assert [counted(k) for k in range(nodes)] == [settings.plan.guesses] + [0] * (nodes - 1)
+    assert [counted(k) for k in range(nodes)] == [PLAN.guesses] + [0] * (nodes - 1)
     # At each node once, from where the plan would be, by its feedback and a few iterations.
     plan = controller._plan
     assert plan is not None
@@ -396,22 +396,22 @@ def test_mpc_plans_from_the_last_plan_and_searches_where_that_leads_nowhere_or_t
     _, before, guess, iterations, around = asked[0]
     assert before == pytest.approx(plan.efforts[0])
     assert np.array(guess) == pytest.approx(np.vstack([plan.efforts[1:], [[0.0]]]))
-    assert iterations == settings.iterations
+    assert iterations == ITERATIONS
     assert isinstance(around, IlqrPlan)
     assert around.gains[0] == pytest.approx(plan.gains[1])
     # Where plans do not arrive, guesses are tried again, once in a while.
     begin = nodes + 1
-    for outcome, tried in ((True, 1), (False, 1 + settings.retries)):
+    for outcome, tried in ((True, 1), (False, 1 + RETRIES)):
         outcomes.append(outcome)
-        planned = [count for count in map(counted, range(begin, begin + settings.patience * nodes)) if count]
-        begin += settings.patience * nodes
-        assert len(planned) == settings.patience
+        planned = [count for count in map(counted, range(begin, begin + PATIENCE * nodes)) if count]
+        begin += PATIENCE * nodes
+        assert len(planned) == PATIENCE
         assert max(planned) == tried
     # Thrown off while the LQR holds it, it searches as at the start: its plan of long ago led elsewhere.
     x = (*plant.coordinates.goal, 0.0, 0.0)
     assert counted(begin) == 0
     x = (0.0,) * 4
-    assert counted(begin + 1) == settings.plan.guesses
+    assert counted(begin + 1) == PLAN.guesses
     x = (*plant.coordinates.goal, 0.0, 0.0)
     assert counted(begin + 2) == 0
     assert controller.catch.active

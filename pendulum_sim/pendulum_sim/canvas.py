@@ -67,15 +67,10 @@ class Picture:
     def clear_trail(self) -> None:
         """Forget where the plant has been."""
 
-    def show_text(self, rows: Sequence[tuple[str, Colour]], note: str = "") -> None:
-        """Draw nothing but text, where a plant cannot be drawn yet.
-
-        Args:
-            rows: Lines at the top.
-            note: Line at the bottom.
-        """
+    def show_text(self, note: str) -> None:
+        """Draw nothing but a line of text, where a plant cannot be drawn yet."""
         self.canvas.fill(BACKGROUND)
-        self.draw_text(rows, note)
+        self.draw_text([], note)
         self.finish()
 
     # --- parts ---------------------------------------------------------------------------------------------

@@ -86,7 +86,7 @@ class MechanismPicture(Picture):
         if self._slides:
             self._draw_rail()
         elif self._in_space:
-            self._draw_circle(self._pixel, 0.5)
+            self._draw_circle(self._pixel)
         else:
             self.draw_dial(self._origin, self._length)
         self.draw_trail([self._pixel(points[-1]) for points in self._trail], 0.045 * self._length)
@@ -120,14 +120,14 @@ class MechanismPicture(Picture):
                 tall = np.array([0.0, 4.0 * thick])
                 line(self.canvas, INK, end - tall, end + tall, max(3, round(1.5 * thick)))
 
-    def _draw_circle(self, pixel: Any, thickness: float) -> None:
+    def _draw_circle(self, pixel: Any) -> None:
         """Draw where the end of an arm may be, and a mark where it points at position 0."""
         arm = self.parameters.value("arm_length")
         ring = [
             pixel((arm * math.cos(turn), arm * math.sin(turn), 0.0)) for turn in np.linspace(0.0, 2.0 * math.pi, 73)
         ]
-        self.pygame.draw.lines(self.canvas, GREY, False, ring, max(2, round(0.02 * thickness * self._length)))
-        self.pygame.draw.circle(self.canvas, GREY, ring[0], 0.03 * thickness * self._length)
+        self.pygame.draw.lines(self.canvas, GREY, False, ring, max(2, round(0.01 * self._length)))
+        self.pygame.draw.circle(self.canvas, GREY, ring[0], 0.015 * self._length)
 
     def _draw_links(self, points: list[NDArray[np.float64]]) -> None:
         draw, length = self.pygame.draw, self._length
@@ -177,7 +177,7 @@ class MechanismPicture(Picture):
         def pixel(point: Any) -> NDArray[np.float64]:
             return middle + scale * np.array([point[0], -point[1]])
 
-        self._draw_circle(pixel, 0.5)
+        self._draw_circle(pixel)
         points = [pixel(point) for point in chain]
         for index, (start, end) in enumerate(pairwise(points)):
             self._draw_link(start, end, _LINKS[index % 2], 0.014 * self._length)

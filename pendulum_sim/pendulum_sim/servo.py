@@ -12,7 +12,6 @@ import math
 
 from pendulum_msgs_py.dynamics import gravity_torque
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping
-from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["PositionServo"]
@@ -24,19 +23,13 @@ class PositionServo:
     Args:
         parameters: The plant.
         dt: Period at which it is asked [s].
-        bandwidth: Slow pole w [1/s]; None for the fastest that the period allows, at most 60 1/s.
-
-    Raises:
-        ParameterError: The bandwidth is not positive.
     """
 
-    def __init__(self, parameters: PlantParameters, dt: float, *, bandwidth: float | None = None) -> None:
-        # A quarter of a radian of phase per period leaves a margin to the held command and the plant's own
-        # delays.
+    def __init__(self, parameters: PlantParameters, dt: float) -> None:
+        # The slow pole is the fastest that the period allows, at most 60 1/s: a quarter of a radian of phase per period
+        # leaves a margin to the held command and the plant's own delays.
         lateness = dt + parameters.transport_delay + parameters.actuator_time_constant
-        omega = min(60.0, 0.25 / lateness) if bandwidth is None else bandwidth
-        if not omega > 0.0:
-            raise ParameterError(f"bandwidth is {omega} 1/s; expected > 0")
+        omega = min(60.0, 0.25 / lateness)
         inertia, damping, gain = parameters.inertia, parameters.damping, 1.0
         drive = parameters.drivetrain
         if drive is not None:

@@ -183,7 +183,7 @@ class ViewerNode(Node):
 
     def _draw(self) -> None:
         if self._plant.missing:
-            self._picture.show_text([], self._plant.missing)
+            self._picture.show_text(self._plant.missing)
         elif self._plant.parameters is not None and self._sample is not None:
             self._draw_mechanism(self._plant.parameters, self._sample)
         else:

@@ -7,7 +7,7 @@ from typing import Any
 
 from pendulum_lqr.controllers.joint_swing_up import CaughtController
 from pendulum_lqr.mechanism_controllers import default_catch, refuse_passive_friction
-from pendulum_lqr.mechanism_mpc import MechanismMpc
+from pendulum_lqr.mechanism_mpc import PLAN, MechanismMpc
 from pendulum_lqr.sampling import ASSUMED_PERIOD
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
@@ -32,7 +32,6 @@ class JointNmpc(CaughtController):
     def __init__(self, plant: MechanismParameters, period: float) -> None:
         inner = MechanismMpc(plant, period, default_catch(plant))
         super().__init__(inner, period)
-        self._plan = inner.settings.plan
         inner.command(0.0, (0.0,) * (2 * len(plant.joints)))
         inner.reset()
 
@@ -48,7 +47,5 @@ class JointNmpc(CaughtController):
 
     def describe(self) -> str:
         """Return its horizon, and from where the LQR catches."""
-        return (
-            f"plans of {self._plan.nodes * self._plan.step:.3g} s by iterative LQR, then LQR within "
-            f"{self._inner.catch.region.describe()}"
-        )
+        length = PLAN.nodes * PLAN.step
+        return f"plans of {length:.3g} s by iterative LQR, then LQR within {self._inner.catch.region.describe()}"
