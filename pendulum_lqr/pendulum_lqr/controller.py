@@ -32,7 +32,6 @@ __all__ = [
     "controller_parameters",
     "make_controller",
     "soft_start",
-    "specs_of",
     "unwrapped",
 ]
 
@@ -325,12 +324,8 @@ def controller_class(name: str) -> type[BaseController]:
 
 
 def controller_parameters(name: str) -> tuple[ParameterSpec, ...]:
-    """Return the specs of a controller, common ones first."""
-    return specs_of(controller_class(name))
-
-
-def specs_of(kind: type[BaseController]) -> tuple[ParameterSpec, ...]:
-    """Return the specs of a class of controllers: common ones first, but for those of which it has its own."""
+    """Return the specs of a controller: common ones first, but for those of which it has its own."""
+    kind = controller_class(name)
     own = {spec.name for spec in kind.PARAMETERS}
     return (*(spec for spec in COMMON_PARAMETERS if spec.name not in own), *kind.PARAMETERS)
 
@@ -358,7 +353,7 @@ def make_controller(
             that is unstable on the linear model of the plant at this period, delay included.
     """
     kind = controller_class(name)
-    p = validate(specs_of(kind), values or {})
+    p = validate(controller_parameters(name), values or {})
     if not (math.isfinite(period) and period > 0.0):
         raise ParameterError(f"period is {period} s; expected a finite value > 0")
     p["effort_limit"] = min(p["effort_limit"], plant.effort_limit) if p["effort_limit"] > 0.0 else plant.effort_limit

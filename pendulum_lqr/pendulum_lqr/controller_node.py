@@ -22,9 +22,8 @@ from pendulum_lqr.compiled_controller import CompiledController
 from pendulum_lqr.controller import (
     CONTROLLERS,
     BaseController,
-    controller_class,
+    controller_parameters,
     make_controller,
-    specs_of,
     unwrapped,
 )
 from pendulum_lqr.interface import Controller, JointController
@@ -32,7 +31,6 @@ from pendulum_lqr.joint_controller import (
     JOINT_CONTROLLER_NAMES,
     JOINT_CONTROLLERS,
     joint_controller_class,
-    joint_parameters,
     make_joint_controller,
 )
 from pendulum_lqr.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
@@ -127,21 +125,20 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._own = {spec.name for spec in NODE_SPECS}
         self._plant: PlantParameters | MechanismParameters
         self._plant = load_mechanism(plant) if is_mechanism(plant) else load_plant(plant)
-        self._coordinates = self._plant.coordinates if isinstance(self._plant, MechanismParameters) else ONE_JOINT
+        self._coordinates, takes_time = ONE_JOINT, ""
+        if isinstance(self._plant, MechanismParameters):
+            several = joint_controller_class(kind, self._plant)
+            self._coordinates, takes_time = self._plant.coordinates, several.DESIGNING
+            own = several.parameters(self._plant)
+        else:
+            own = controller_parameters(kind)
         self._joints, self._driven = self._coordinates.names, self._coordinates.driven_names
-        own = (
-            joint_parameters(kind, self._plant)
-            if isinstance(self._plant, MechanismParameters)
-            else specs_of(controller_class(kind))
-        )
         self._settings = NodeParameters(self, NODE_SPECS + own, self._design, self._swap)
         self._period = self._settings["period"] or ASSUMED_PERIOD
         self._period_measured = False
-        if isinstance(self._plant, MechanismParameters):
-            takes_time = joint_controller_class(kind, self._plant).DESIGNING
-            if takes_time:
-                # Nothing interrupts a compiler: who asks once waits for it, and nothing is commanded.
-                self.get_logger().info(f"{takes_time}; Ctrl-C waits for it, a second one does not")
+        if takes_time:
+            # Nothing interrupts a compiler: who asks once waits for it, and nothing is commanded.
+            self.get_logger().info(f"{takes_time}; Ctrl-C waits for it, a second one does not")
         # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
         self._pending: Controller | JointController | None = self._design(self._settings.values)
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
@@ -467,5 +464,5 @@ def _specs_for_help(arguments: Sequence[str]) -> tuple[ParameterSpec, ...]:
     for argument in arguments:
         name, separator, value = argument.partition(":=")
         if separator and name == "controller" and value in CONTROLLERS:
-            return specs_of(controller_class(value))
-    return specs_of(controller_class("lqr"))
+            return controller_parameters(value)
+    return controller_parameters("lqr")

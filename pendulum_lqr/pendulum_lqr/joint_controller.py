@@ -11,14 +11,13 @@ from typing import Any, cast
 
 from pendulum_lqr.interface import JointController
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import ParameterSpec, validate
+from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = [
     "JOINT_CONTROLLERS",
     "JOINT_CONTROLLER_NAMES",
     "joint_controller_class",
-    "joint_parameters",
     "make_joint_controller",
 ]
 
@@ -58,15 +57,6 @@ def joint_controller_class(name: str, plant: MechanismParameters) -> type[JointC
     return cast(type[JointController], getattr(importlib.import_module(module), class_name))
 
 
-def joint_parameters(name: str, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
-    """Return the specs of what a controller of a plant of several joints takes, its own weights as defaults.
-
-    Raises:
-        ParameterError: No controller for several joints has this name.
-    """
-    return joint_controller_class(name, plant).parameters(plant)
-
-
 def make_joint_controller(
     name: str, plant: MechanismParameters, values: Mapping[str, Any], period: float | None = None
 ) -> JointController:
@@ -75,7 +65,7 @@ def make_joint_controller(
     Args:
         name: One of ``JOINT_CONTROLLERS``.
         plant: The plant.
-        values: Parameters of :func:`joint_parameters` by name; others at their default.
+        values: Parameters of its ``parameters`` by name; others at their default.
         period: Period at which states come [s]; None where it is not known yet.
 
     Raises:

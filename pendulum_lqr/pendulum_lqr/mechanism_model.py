@@ -85,14 +85,12 @@ def linearise_mechanism(plant: MechanismParameters, position: Sequence[float] | 
 
     jacobian = np.array(complex_step(flow, (*q, *still, *coordinates.spread(efforts))))
     names = coordinates.names
-    m = len(coordinates.driven)
     return LinearModel(
         jacobian[:, : 2 * n].copy(),
         jacobian[:, [2 * n + index for index in coordinates.driven]],
         theta=q[-1],
         effort=efforts[0],
         C=np.eye(2 * n),
-        D=np.zeros((2 * n, m)),
         E=jacobian[:, 2 * n :].copy(),
         delay=max(actuator.transport_delay for actuator in plant.actuators),
         states=(*names, *(f"{name}_dot" for name in names)),

@@ -68,10 +68,10 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class LinearModel:
-    """Linear model ``x' = A x + B du(t - delay) + E d``, ``y = C x + D du`` around a fixed point, du = u - effort.
+    """Linear model ``x' = A x + B du(t - delay) + E d``, ``y = C x`` around a fixed point, du = u - effort.
 
     Of one joint the first two states are always [theta - theta*, theta_dot], and they are what is measured:
-    C = [I, 0], D = 0.
+    C = [I, 0].
 
     Attributes:
         A: State matrix, shape (n, n) [1/s and mixed].
@@ -79,7 +79,6 @@ class LinearModel:
         theta: Angle of the fixed point, 0 hanging down [rad].
         effort: Commanded torque that holds the fixed point [N m].
         C: Output matrix, shape (2, n): angle and velocity of the link.
-        D: Feedthrough, shape (2, 1); zeros.
         E: Input matrix of a torque on the link itself, such as a push, shape (n, 1); without delay.
         delay: Time between a command and its first effect [s]; not in A.
         states: Names of the states: theta, theta_dot, then motor_angle and motor_velocity (at the output side of the
@@ -94,7 +93,6 @@ class LinearModel:
     theta: float = UPRIGHT
     effort: float = 0.0
     C: Matrix = field(default=None)  # type: ignore[arg-type]  # filled in below
-    D: Matrix = field(default=None)  # type: ignore[arg-type]
     E: Matrix = field(default=None)  # type: ignore[arg-type]
     delay: float = 0.0
     states: tuple[str, ...] = ("theta", "theta_dot")
@@ -106,8 +104,6 @@ class LinearModel:
         n = self.A.shape[0]
         if self.C is None:
             object.__setattr__(self, "C", np.eye(2, n))  # type: ignore[unreachable]
-        if self.D is None:
-            object.__setattr__(self, "D", np.zeros((2, 1)))  # type: ignore[unreachable]
         if self.E is None:
             object.__setattr__(self, "E", self.B.copy())  # type: ignore[unreachable]
         if len(self.states) != n:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from pendulum_bags.experiments.joint_run import stand_in_for
+from pendulum_lqr.controllers.joint_energy_swing_up import JointEnergySwingUp
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.energy_margin import EnergyMargin
 from pendulum_lqr.interface import JointController
-from pendulum_lqr.joint_controller import joint_parameters, make_joint_controller
+from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_lqr.mechanism_catch import make_mechanism_catch
 from pendulum_lqr.mechanism_pump import EnergyPump, pump_gains
 from pendulum_msgs_py.errors import ParameterError
@@ -163,7 +164,7 @@ def test_no_state_counts_as_caught_that_runs_into_an_end_stop() -> None:
 def test_what_cannot_be_swung_up_so_is_refused_with_what_to_take() -> None:
     for name, motors in (("acrobot_frictionless", "elbow"), ("double_pendulum", "shoulder, elbow")):
         with pytest.raises(DesignError, match=rf"{name}' is a double_pendulum with motors at {motors}; .*ilqr, nmpc"):
-            joint_parameters("energy_swing_up", load_mechanism(name))
+            JointEnergySwingUp.parameters(load_mechanism(name))
     stiff = load_mechanism("furuta").with_values({"arm.coulomb_friction": 0.02})
     with pytest.raises(DesignError, match=r"effort_limit is 0\.01 N m; .* the friction that holds arm, 0\.02 N m"):
         make_joint_controller("energy_swing_up", stiff, {"effort_limit": 0.01}, PERIOD)

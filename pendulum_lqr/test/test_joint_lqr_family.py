@@ -10,9 +10,10 @@ import control
 import numpy as np
 import pytest
 
+from pendulum_lqr.controllers.joint_lqg import JointLqg
 from pendulum_lqr.design import DesignError, kalman_gain
 from pendulum_lqr.interface import JointController
-from pendulum_lqr.joint_controller import joint_parameters, make_joint_controller
+from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.errors import ParameterError
@@ -175,7 +176,7 @@ def test_the_filter_is_that_of_python_control_and_uses_velocities_where_their_no
         _, P, _ = control.dlqe(sampled.A, E, C, 0.09 * np.eye(2), V)
         L = P @ C.T @ np.linalg.inv(C @ P @ C.T + V)
         assert pytest.approx(L, rel=1e-6, abs=1e-9) == controller.filter.L
-    assert {spec.name for spec in joint_parameters("lqg", plant)} >= set(values)
+    assert {spec.name for spec in JointLqg.parameters(plant)} >= set(values)
 
 
 def test_the_filter_follows_its_model_through_delay_and_whole_turns_and_forgets_what_is_beyond_all_bounds() -> None:

@@ -14,7 +14,7 @@ import scipy.optimize
 
 from pendulum_lqr.answering import AnswerLoop
 from pendulum_lqr.controllers.joint_mpc import JointMpc
-from pendulum_lqr.joint_controller import joint_parameters, make_joint_controller
+from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.contract.values import JointSample
@@ -290,7 +290,7 @@ def test_a_state_that_is_not_finite_is_not_answered(bad: float) -> None:
 
 def test_positions_are_limited_where_there_are_end_stops_and_wherever_somebody_says() -> None:
     defaults = {
-        name: next(s.default for s in joint_parameters("mpc", load_mechanism(name)) if s.name == "position_limits")
+        name: next(s.default for s in JointMpc.parameters(load_mechanism(name)) if s.name == "position_limits")
         for name in ("cart_pole", "furuta")
     }
     assert defaults == {"cart_pole": pytest.approx([1.71, 0.0]), "furuta": [0.0, 0.0]}
@@ -298,7 +298,7 @@ def test_positions_are_limited_where_there_are_end_stops_and_wherever_somebody_s
     hinge = load_mechanism("furuta").with_values({"pendulum.lower_stop": 2.5, "pendulum.upper_stop": 4.0})
     track = load_mechanism("cart_pole").with_values({"cart.upper_stop": 1.0})
     for plant, expected in ((hinge, [0.0, 0.95 * (math.pi - 2.5)]), (track, [0.95, 0.0])):
-        widths = next(spec.default for spec in joint_parameters("mpc", plant) if spec.name == "position_limits")
+        widths = next(spec.default for spec in JointMpc.parameters(plant) if spec.name == "position_limits")
         assert widths == pytest.approx(expected)
     with pytest.raises(ParameterError, match=r"position_limits has 1 values; expected 2, for cart, pole"):
         make_joint_controller("mpc", load_mechanism("cart_pole"), {"position_limits": [1.0]}, PERIOD)

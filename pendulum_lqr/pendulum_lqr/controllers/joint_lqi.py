@@ -116,4 +116,4 @@ def _with_integrals(model: LinearModel, driven: tuple[int, ...]) -> LinearModel:
     B = np.vstack([model.B, np.zeros((m, m))])
     E = np.vstack([model.E, np.zeros((m, model.E.shape[1]))])
     names = (*model.states, *(f"integral of {model.states[joint]}" for joint in driven))
-    return replace(model, A=A, B=B, C=np.eye(size + m), D=np.zeros((size + m, m)), E=E, states=names)
+    return replace(model, A=A, B=B, C=np.eye(size + m), E=E, states=names)
