@@ -6,18 +6,22 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
+from pendulum_lqr.controllers.joint_policy import JointPolicy
 from pendulum_lqr.mechanism_catch import MechanismCatch, make_mechanism_catch
 from pendulum_lqr.mechanism_controller import MechanismController
 from pendulum_lqr.mechanism_mpc import MechanismMpc
 from pendulum_lqr.mechanism_planned import PlannedSwingUp
-from pendulum_lqr.mechanism_policy import CATCH_SUFFIX, MechanismPolicy, is_policy_name
 from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
-from pendulum_lqr.mechanism_velocity import DifferencedVelocity
+from pendulum_lqr.policy import require_plant
+from pendulum_lqr.policy_answers import check_policy_period, states_to_hold
+from pendulum_lqr.policy_file import POLICY_SUFFIX, load_policy
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = [
+    "DifferencedVelocity",
     "default_catch",
     "make_mechanism_controller",
     "mechanism_controller_names",
@@ -30,6 +34,78 @@ _CALM = ((1.0, 1.0, 1.0, 1.0), 10.0)
 """Weights of catch and tracking behind a swing-up, for two joints: of gains as low as still catch from far."""
 _TUBE = 10.0
 """Width of the tube about a swing-up: beyond it, planning anew is better than tracking."""
+_CATCH_SUFFIX = "+lqr"
+"""What the name of a policy file ends with where an LQR takes over near upright."""
+
+
+class DifferencedVelocity:
+    """Gives a controller velocities from the last two positions in the place of the measured ones.
+
+    The slope between two positions is the velocity in their middle; half a period of the model's acceleration brings
+    it to the end. That is exact to the period's square, and as good as the positions are: an encoder's steps over the
+    period come through as noise.
+
+    Args:
+        plant: The plant.
+        controller: Who is given them.
+    """
+
+    def __init__(self, plant: MechanismParameters, controller: MechanismController) -> None:
+        self.plant, self.controller = plant, controller
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last position; the first velocity is the measured one."""
+        self.controller.reset()
+        self._last: tuple[float, Vector] | None = None
+        self._effort = (0.0,) * len(self.plant.effort_limits)
+
+    def command(self, t: float, x: Vector) -> Vector:
+        """Return the controller's efforts [N m or N]."""
+        n = len(self.plant.joints)
+        q, v = x[:n], x[n:]
+        if self._last is not None and t > self._last[0]:
+            before, old = self._last
+            h = t - before
+            slope = tuple((new - was) / h for new, was in zip(q, old, strict=True))
+            a = self.plant.acceleration(q, slope, self.plant.coordinates.spread(self._effort))
+            v = tuple(middle + 0.5 * h * each for middle, each in zip(slope, a, strict=True))
+        self._last = (t, q)
+        self._effort = self.controller.command(t, (*q, *v))
+        return self._effort
+
+
+class MechanismPolicy:
+    """What a policy file answers; it has all of its effort from the start.
+
+    Args:
+        plant: The plant.
+        period: Sampling period [s].
+        path: The file.
+        catch: LQR that takes over near upright; None for none.
+
+    Raises:
+        ParameterError: The policy is for another plant.
+        DesignError: The period is no whole part of the policy's.
+        DataError: The file is refused.
+    """
+
+    def __init__(self, plant: MechanismParameters, period: float, path: str, catch: MechanismCatch | None) -> None:
+        policy = load_policy(path)
+        require_plant(policy, plant)
+        check_policy_period(policy, period)
+        self._joints = len(plant.joints)
+        self.inner = JointPolicy(
+            policy, states_to_hold(policy, period), plant.effort_limits, start_time=0.0, catch=catch
+        )
+
+    def reset(self) -> None:
+        """Forget the past, and that it gave up."""
+        self.inner.reset()
+
+    def command(self, t: float, x: Vector) -> Vector:
+        """Return m efforts [N m or N]."""
+        return self.inner.command(t, x[: self._joints], x[self._joints :])
 
 
 def stored_trajectory(plant: MechanismParameters) -> MechanismTrajectory:
@@ -123,9 +199,9 @@ def make_mechanism_controller(name: str, plant: MechanismParameters, period: flo
         ParameterError: No controller has this name, or it does not go with this plant.
         DataError: A policy file is refused.
     """
-    if is_policy_name(name):
-        catch = make_mechanism_catch(plant, *_CALM) if name.endswith(CATCH_SUFFIX) else None
-        return MechanismPolicy(plant, period, name.removesuffix(CATCH_SUFFIX), catch)
+    file = name.removesuffix(_CATCH_SUFFIX)
+    if file.endswith(POLICY_SUFFIX):
+        return MechanismPolicy(plant, period, file, make_mechanism_catch(plant, *_CALM) if file != name else None)
     if name not in _CONTROLLERS:
         raise ParameterError(
             f"controller {name!r} is unknown; expected one of {', '.join(_CONTROLLERS)}, or a policy file (.npz)"

@@ -16,6 +16,7 @@ from pendulum_lqr.design import DesignError
 from pendulum_lqr.joint_controller import make_joint_controller
 from pendulum_lqr.mechanism_catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_lqr.mechanism_controllers import (
+    DifferencedVelocity,
     default_catch,
     make_mechanism_controller,
     stored_trajectory,
@@ -33,7 +34,6 @@ from pendulum_lqr.mechanism_trajectory import (
     write_trajectory,
 )
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
-from pendulum_lqr.mechanism_velocity import DifferencedVelocity
 from pendulum_msgs_py.dynamics.runge_kutta import along_2, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
