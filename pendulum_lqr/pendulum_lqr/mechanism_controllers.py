@@ -143,11 +143,9 @@ def refuse_passive_friction(controller: str, plant: MechanismParameters) -> None
             )
 
 
-def _followed(
-    plant: MechanismParameters, period: float, catch: MechanismCatch, recover: MechanismController | None
-) -> MechanismTvlqr:
+def _followed(period: float, catch: MechanismCatch, recover: MechanismController | None = None) -> MechanismTvlqr:
     q, r = _CALM
-    return MechanismTvlqr(plant, period, stored_trajectory(plant), catch, q=q, r=r, recover=recover, tube=_TUBE)
+    return MechanismTvlqr(period, stored_trajectory(catch.plant), catch, q=q, r=r, recover=recover, tube=_TUBE)
 
 
 def tracked_swing_up(plant: MechanismParameters, period: float) -> MechanismTvlqr:
@@ -156,21 +154,21 @@ def tracked_swing_up(plant: MechanismParameters, period: float) -> MechanismTvlq
     Raises:
         ParameterError: There is none for this plant.
     """
-    return _followed(plant, period, make_mechanism_catch(plant, *_CALM), None)
+    return _followed(period, make_mechanism_catch(plant, *_CALM))
 
 
 def _mpc(plant: MechanismParameters, period: float) -> MechanismController:
-    return DifferencedVelocity(plant, MechanismMpc(plant, period, default_catch(plant)))
+    return DifferencedVelocity(plant, MechanismMpc(period, default_catch(plant)))
 
 
 def _tvlqr_mpc(plant: MechanismParameters, period: float) -> MechanismController:
     catch = make_mechanism_catch(plant, *_CALM)
-    recover = MechanismMpc(plant, period, catch)
-    return DifferencedVelocity(plant, _followed(plant, period, catch, recover))
+    recover = MechanismMpc(period, catch)
+    return DifferencedVelocity(plant, _followed(period, catch, recover))
 
 
 def _ilqr(plant: MechanismParameters, period: float) -> MechanismController:
-    return PlannedSwingUp(plant, period, default_catch(plant))
+    return PlannedSwingUp(period, default_catch(plant))
 
 
 _CONTROLLERS: dict[str, Callable[[MechanismParameters, float], MechanismController]] = {

@@ -12,7 +12,6 @@ from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_ilqr import IlqrPlan, IlqrWeights
 from pendulum_lqr.mechanism_search import PlanSearch, PlanSettings
 from pendulum_msgs_py.joints import Vector
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["ITERATIONS", "PATIENCE", "PLAN", "RETRIES", "MechanismMpc"]
 
@@ -30,15 +29,14 @@ class MechanismMpc:
     """Follows the first interval of a plan, plans anew from where it is, and hands over to the LQR near upright.
 
     Args:
-        plant: The plant.
         period: Sampling period [s].
-        catch: LQR with its region.
+        catch: LQR with its region; the plant is its own.
     """
 
-    def __init__(self, plant: MechanismParameters, period: float, catch: MechanismCatch) -> None:
-        self.plant, self.period, self.catch = plant, period, catch
+    def __init__(self, period: float, catch: MechanismCatch) -> None:
+        self.plant, self.period, self.catch = catch.plant, period, catch
         self.search = PlanSearch(catch, PLAN)
-        self._limits = plant.effort_limits
+        self._limits = self.plant.effort_limits
         self.reset()
 
     def reset(self) -> None:

@@ -12,7 +12,6 @@ from pendulum_lqr.mechanism_search import PlanSearch, PlanSettings
 from pendulum_lqr.mechanism_trajectory import trajectory_of
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr, whole_turns
 from pendulum_msgs_py.joints import Vector
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["PlannedSwingUp"]
 
@@ -31,16 +30,13 @@ class PlannedSwingUp:
     A search takes about a second: simulated time waits for it, a real plant does not.
 
     Args:
-        plant: The plant; plans leave its dry friction out.
         period: Sampling period [s].
-        catch: LQR with its region.
+        catch: LQR with its region; the plant is its own, and plans leave its dry friction out.
         settings: Horizon, weights, guesses.
     """
 
-    def __init__(
-        self, plant: MechanismParameters, period: float, catch: MechanismCatch, settings: PlanSettings = _PLAN
-    ) -> None:
-        self.plant, self.period, self.catch = plant, period, catch
+    def __init__(self, period: float, catch: MechanismCatch, settings: PlanSettings = _PLAN) -> None:
+        self.plant, self.period, self.catch = catch.plant, period, catch
         self.search = PlanSearch(catch, settings)
         self.reset()
 
@@ -81,4 +77,4 @@ class PlannedSwingUp:
     def _follow(self, plan: IlqrPlan) -> MechanismTvlqr:
         trajectory = trajectory_of(self.plant, plan, self.search.settings.step)
         q, r = self.plant.mechanism.weights
-        return MechanismTvlqr(self.plant, self.period, trajectory, self.catch, q=q, r=r, tube=_TUBE)
+        return MechanismTvlqr(self.period, trajectory, self.catch, q=q, r=r, tube=_TUBE)

@@ -101,17 +101,14 @@ class SwingUpSearch:
     iterations: int = 150
 
 
-def search_swing_up(
-    plant: MechanismParameters, catch: MechanismCatch, search: SwingUpSearch, seed: int
-) -> MechanismTrajectory:
+def search_swing_up(catch: MechanismCatch, search: SwingUpSearch, seed: int) -> MechanismTrajectory:
     """Return what one random guess becomes: a locally optimal swing-up.
 
     The guess is a sine of random height, period and phase over a horizon of random length. Iterative LQR brings it
     upright, the LQR holds it there for the rest of the duration, and the whole is optimised again.
 
     Args:
-        plant: The plant.
-        catch: LQR with its caught region, of the same plant.
+        catch: LQR with its caught region; the plant is its own.
         search: Settings.
         seed: Of the guess.
 
@@ -119,6 +116,7 @@ def search_swing_up(
         DesignError: The guess does not end upright, or runs into an end stop on its way.
     """
     rng = np.random.default_rng(seed)
+    plant = catch.plant
     m = len(plant.coordinates.driven)
     n = len(plant.joints)
     still = (0.0,) * n
@@ -132,7 +130,7 @@ def search_swing_up(
     found = problem.solve(still, still, none, found.efforts, search.iterations)
     if not catch.share(deviation_of(plant.coordinates, tuple(found.states[-1][: 2 * n]))) <= _NEAR:
         raise DesignError(f"guess {seed} of {plant.name!r} does not end upright")
-    tail = _held(plant, catch, tuple(found.states[-1]), max(0, round(search.duration / search.step) - len(t)), search)
+    tail = _held(catch, tuple(found.states[-1]), max(0, round(search.duration / search.step) - len(t)), search)
     plan = problem.solve(still, still, none, np.vstack([found.efforts, tail]), 2 * search.iterations)
     lowest, highest = np.array(plant.stops).T
     if np.any((plan.states[:, :n] <= lowest) | (plan.states[:, :n] >= highest)):
@@ -155,13 +153,12 @@ def trajectory_of(
 
 
 def cheapest_swing_up(
-    plant: MechanismParameters, catch: MechanismCatch, search: SwingUpSearch, seeds: Iterable[int]
+    catch: MechanismCatch, search: SwingUpSearch, seeds: Iterable[int]
 ) -> tuple[MechanismTrajectory, int]:
     """Return the cheapest swing-up of several guesses, and how many of them became one.
 
     Args:
-        plant: The plant.
-        catch: LQR with its caught region, of the same plant.
+        catch: LQR with its caught region; the plant is its own.
         search: Settings.
         seeds: Of the guesses.
 
@@ -173,16 +170,17 @@ def cheapest_swing_up(
     for seed in seeds:
         tried += 1
         try:
-            found.append(search_swing_up(plant, catch, search, seed))
+            found.append(search_swing_up(catch, search, seed))
         except DesignError:
             continue
     if not found:
-        raise DesignError(f"none of {tried} guesses of {plant.name!r} ends upright; expected more guesses")
+        raise DesignError(f"none of {tried} guesses of {catch.plant.name!r} ends upright; expected more guesses")
     return min(found, key=lambda each: float(each.how["cost"])), len(found)
 
 
-def _held(plant: MechanismParameters, catch: MechanismCatch, z: Vector, count: int, search: SwingUpSearch) -> Array:
+def _held(catch: MechanismCatch, z: Vector, count: int, search: SwingUpSearch) -> Array:
     """Return the efforts with which the LQR holds the plant from a state on."""
+    plant = catch.plant
     n = len(plant.joints)
     along, spread = along_functions(n), plant.coordinates.spread
     q, v, u = z[:n], z[n : 2 * n], z[2 * n :]

@@ -78,10 +78,9 @@ class MechanismTvlqr:
     by the LQR where that can, and else left to ``recover``.
 
     Args:
-        plant: The plant.
         period: Sampling period [s].
         trajectory: The swing-up.
-        catch: LQR with its region.
+        catch: LQR with its region; the plant is its own.
         q: Weights of the deviation along the trajectory, shape (2n,).
         r: Weight of the efforts' deviation.
         recover: What brings it up from anywhere else; None for no effort at all.
@@ -93,7 +92,6 @@ class MechanismTvlqr:
 
     def __init__(
         self,
-        plant: MechanismParameters,
         period: float,
         trajectory: MechanismTrajectory,
         catch: MechanismCatch,
@@ -103,6 +101,7 @@ class MechanismTvlqr:
         recover: MechanismController | None = None,
         tube: float = 1.0,
     ) -> None:
+        plant = catch.plant
         names = plant.coordinates.names
         m = len(plant.coordinates.driven)
         if trajectory.joints != names or trajectory.efforts.shape[1] != m:

@@ -56,13 +56,12 @@ def swing_up(
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ParameterError(f"{output} cannot be written: {error.strerror}") from error
-    plant = load_mechanism(preset)
-    catch = default_catch(plant)
+    catch = default_catch(load_mechanism(preset))
     search = SwingUpSearch(values, duration=duration)
     console = make_console(highlight=False)
     with counting_bar(console) as bar:
         seeds = bar.track(range(first, first + guesses), description="guesses")
-        best, upright = cheapest_swing_up(plant, catch, search, seeds)
+        best, upright = cheapest_swing_up(catch, search, seeds)
     write_trajectory(output, best)
     console.print(f"{upright} of {guesses} guesses end upright; seed {best.how['seed']} costs {best.how['cost']:.4f}")
     console.print(f"trajectory {output}", soft_wrap=True)

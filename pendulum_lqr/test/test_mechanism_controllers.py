@@ -163,7 +163,7 @@ def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
             plant.mechanism.forward, along_2, tuple(before[:2]), tuple(before[2:4]), *ends, 0.05, plant.packed
         )
         assert (*q, *v) == pytest.approx(tuple(after[:4]), abs=1e-9)
-    controller = MechanismMpc(plant, DT, catch)
+    controller = MechanismMpc(DT, catch)
     x: Vector = (0.0,) * 4
     efforts = []
     for k in range(2500):
@@ -209,7 +209,7 @@ def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
 def test_a_planned_swing_up_is_searched_once_and_anew_only_where_it_is_thrown_off() -> None:
     plant = load_mechanism("cart_pole")
     few = PlanSettings(IlqrWeights(1.0, 0.0, 0.0005, 2e-6, 1e-4, 3.0), step=0.02, nodes=100, guesses=4, iterations=30)
-    controller = PlannedSwingUp(plant, DT, default_catch(plant), few)
+    controller = PlannedSwingUp(DT, default_catch(plant), few)
     searched: list[Vector] = []
     guessed = controller.search.guessed
     controller.search.guessed = lambda x, *asked: (searched.append(x), guessed(x, *asked))[1]  # type: ignore[method-assign]
@@ -289,18 +289,18 @@ def test_a_swing_up_that_runs_into_an_end_stop_is_none() -> None:
     catch = default_catch(plant)
     search = SwingUpSearch(IlqrWeights(1.0, 0.0, 0.02, 1e-4, 5e-3, 10.0))
     with pytest.raises(DesignError, match=r"guess 2 of 'cart_pole' runs into an end stop"):
-        search_swing_up(narrow, catch, search, 2)
-    assert np.max(np.abs(search_swing_up(plant, catch, search, 2).states[:, 0])) < plant.stops[0][1]
+        search_swing_up(replace(catch, plant=narrow), search, 2)
+    assert np.max(np.abs(search_swing_up(catch, search, 2).states[:, 0])) < plant.stops[0][1]
     with pytest.raises(DesignError, match=r"none of 2 guesses of 'cart_pole' ends upright; expected more guesses"):
-        cheapest_swing_up(narrow, catch, search, (2, 3))
-    best, count = cheapest_swing_up(plant, catch, search, (0, 2))
+        cheapest_swing_up(replace(catch, plant=narrow), search, (2, 3))
+    best, count = cheapest_swing_up(catch, search, (0, 2))
     assert (best.how["seed"], count) == (2, 2)
 
 
 def test_tvlqr_follows_the_file_of_a_search_and_refuses_that_of_another_mechanism(tmp_path: Path) -> None:
     plant = load_mechanism("cart_pole")
     trajectory = search_swing_up(
-        plant, default_catch(plant), SwingUpSearch(IlqrWeights(1.0, 0.0, 0.02, 1e-4, 5e-3, 10.0), duration=3.0), 2
+        default_catch(plant), SwingUpSearch(IlqrWeights(1.0, 0.0, 0.02, 1e-4, 5e-3, 10.0), duration=3.0), 2
     )
     path = tmp_path / "cart_pole.json"
     write_trajectory(path, trajectory)
@@ -350,7 +350,7 @@ def test_a_swing_up_that_its_lqr_would_not_hold_at_this_period_is_refused() -> N
 def test_a_wild_state_does_not_cost_a_plan_and_from_wild_states_alone_there_is_none() -> None:
     plant = load_mechanism("cart_pole")
     gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
-    controllers = [MechanismMpc(plant, DT, MechanismCatch(plant, gain, CaughtRegion(0.1, 0))) for _ in range(2)]
+    controllers = [MechanismMpc(DT, MechanismCatch(plant, gain, CaughtRegion(0.1, 0))) for _ in range(2)]
     x: Vector = (0.0,) * 4
     wild = (0.0, 1.0, 1e200, -1e200)
     # In the middle of the swing a state at which it plans again is a glitch of the sensors, for one of them.
@@ -371,7 +371,7 @@ def test_a_wild_state_does_not_cost_a_plan_and_from_wild_states_alone_there_is_n
 def test_mpc_plans_from_the_last_plan_and_searches_where_that_leads_nowhere_or_there_is_none() -> None:
     plant = load_mechanism("cart_pole")
     gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
-    controller = MechanismMpc(plant, DT, MechanismCatch(plant, gain, CaughtRegion(0.1, 0)))
+    controller = MechanismMpc(DT, MechanismCatch(plant, gain, CaughtRegion(0.1, 0)))
     search = controller.search
     nodes = round(PLAN.step / DT)
     asked: list[tuple[object, ...]] = []
@@ -422,7 +422,7 @@ def test_mpc_plans_from_the_last_plan_and_searches_where_that_leads_nowhere_or_t
 def test_nothing_is_planned_from_a_state_that_is_no_number() -> None:
     plant = load_mechanism("cart_pole")
     gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
-    controller = MechanismMpc(plant, DT, MechanismCatch(plant, gain, CaughtRegion(1.0, 0)))
+    controller = MechanismMpc(DT, MechanismCatch(plant, gain, CaughtRegion(1.0, 0)))
     for x in ((0.0, math.nan, 0.0, 0.0), (0.0, 0.0, 0.0, math.inf)):
         with pytest.raises(ParameterError, match=r"plan begins at .*(nan|inf).*; expected finite numbers"):
             controller.command(0.0, x)
@@ -490,6 +490,6 @@ def test_a_trajectory_file_gives_back_what_was_written_and_says_what_is_wrong_wi
     plant = load_mechanism("cart_pole")
     catch = default_catch(plant)
     with pytest.raises(ParameterError, match="has the joints shoulder, elbow and 1 motors; expected cart, pole and 1"):
-        MechanismTvlqr(plant, DT, trajectory, catch, q=Q, r=R)
+        MechanismTvlqr(DT, trajectory, catch, q=Q, r=R)
     with pytest.raises(ParameterError, match="controller 'lqr' is unknown; expected one of tvlqr"):
         make_mechanism_controller("lqr", load_mechanism("acrobot_frictionless"), DT)

@@ -51,5 +51,5 @@ class JointIlqr(JointSwingUp):
         refuse_passive_friction("ilqr", plant)
         catch = make_mechanism_catch(plant, *plant.mechanism.weights, joint_limits(plant, p["effort_limit"]))
         search = SwingUpSearch(_WEIGHTS, duration=p["duration"])
-        trajectory, _ = cheapest_swing_up(catch.plant, catch, search, range(p["guesses"]))
+        trajectory, _ = cheapest_swing_up(catch, search, range(p["guesses"]))
         return cls(catch, ASSUMED_PERIOD if period is None else period, trajectory)

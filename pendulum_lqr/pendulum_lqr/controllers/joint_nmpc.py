@@ -30,7 +30,7 @@ class JointNmpc(CaughtController):
     DESIGNING = "compiles its model, which takes some ten seconds"
 
     def __init__(self, plant: MechanismParameters, period: float) -> None:
-        inner = MechanismMpc(plant, period, default_catch(plant))
+        inner = MechanismMpc(period, default_catch(plant))
         super().__init__(inner, period)
         inner.command(0.0, (0.0,) * (2 * len(plant.joints)))
         inner.reset()

@@ -80,7 +80,7 @@ class JointSwingUp(CaughtController):
     def __init__(self, catch: MechanismCatch, period: float, trajectory: MechanismTrajectory) -> None:
         self._duration = trajectory.duration
         q, r = catch.plant.mechanism.weights
-        super().__init__(MechanismTvlqr(catch.plant, period, trajectory, catch, q=q, r=r), period)
+        super().__init__(MechanismTvlqr(period, trajectory, catch, q=q, r=r), period)
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
