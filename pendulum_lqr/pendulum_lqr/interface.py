@@ -58,13 +58,13 @@ class JointController:
         return ()
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointController:
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointController:
         """Return the controller for a plant.
 
         Args:
             plant: The plant.
             p: Checked values of :meth:`parameters`.
-            period: Period at which states come [s]; None where it is not known yet.
+            period: Period at which states come, or as long as it is not known one that is assumed [s].
 
         Raises:
             ParameterError: The values do not make a controller for this plant at this period.

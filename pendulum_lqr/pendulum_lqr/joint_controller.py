@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, cast
 
 from pendulum_lqr.interface import JointController
+from pendulum_lqr.sampling import ASSUMED_PERIOD
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -73,7 +74,8 @@ def make_joint_controller(
             a loop that is unstable on the linear model at this period, delay included.
     """
     chosen = joint_controller_class(name, plant)
-    controller = chosen.design(plant, validate(chosen.parameters(plant), values), period)
+    own = validate(chosen.parameters(plant), values)
+    controller = chosen.design(plant, own, ASSUMED_PERIOD if period is None else period)
     if period is not None:
         controller.check(period)
     return controller

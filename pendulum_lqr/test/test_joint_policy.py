@@ -17,6 +17,7 @@ from pendulum_lqr.policy_file import dumps_policy, load_policy, loads_policy, wr
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
+from tests.joint_plants import delayed_plant
 from tests.policies import random_policy
 
 CART_POLE = load_mechanism("cart_pole")
@@ -100,6 +101,16 @@ def test_outside_of_the_box_of_any_joint_it_gives_up_for_good_and_names_it(tmp_p
     assert learned.notice in learned.describe()
     learned.reset()
     assert learned.command(0.0, *STILL) != (0.0,)
+
+
+def test_a_fallback_that_does_not_settle_is_refused_as_soon_as_the_period_is_known(tmp_path):
+    late = delayed_plant("cart_pole", 0.3)
+    refusal = r"lqr asked every 0\.01 s does not settle on plant 'cart_pole'"
+    learned = controller(tmp_path, random_policy(late), late, period=None, fallback="lqr")
+    with pytest.raises(ParameterError, match=refusal):
+        learned.check(0.01)
+    with pytest.raises(ParameterError, match=refusal):
+        controller(tmp_path, random_policy(late), late, fallback="lqr")
 
 
 def test_a_chosen_fallback_answers_after_it_gave_up_and_begins_softly(tmp_path):

@@ -14,7 +14,7 @@ from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
-from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
+from pendulum_lqr.sampling import require_period
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -57,9 +57,9 @@ class JointDiscreteLqr(JointController):
         return (*joint_weights(plant), JOINT_LIMIT)
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointDiscreteLqr:
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointDiscreteLqr:
         """Return the controller for the plant linearised at upright."""
-        return cls(plant, p, ASSUMED_PERIOD if period is None else period)
+        return cls(plant, p, period)
 
     def check(self, period: float) -> None:
         """Refuse another period than that of the design [s]."""

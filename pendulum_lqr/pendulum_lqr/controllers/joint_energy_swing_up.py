@@ -74,7 +74,7 @@ class JointEnergySwingUp(JointController):
         )  # fmt: skip
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointEnergySwingUp:
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointEnergySwingUp:
         """Return the controller; its region takes a second to sample.
 
         Raises:

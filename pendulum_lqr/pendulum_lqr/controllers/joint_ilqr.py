@@ -11,7 +11,6 @@ from pendulum_lqr.mechanism_catch import make_mechanism_catch
 from pendulum_lqr.mechanism_controllers import refuse_passive_friction
 from pendulum_lqr.mechanism_ilqr import IlqrWeights
 from pendulum_lqr.mechanism_trajectory import SwingUpSearch, cheapest_swing_up
-from pendulum_lqr.sampling import ASSUMED_PERIOD
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
@@ -42,7 +41,7 @@ class JointIlqr(JointSwingUp):
         )
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointIlqr:
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointIlqr:
         """Return the swing-up for a plant whose passive joints have no dry friction.
 
         Raises:
@@ -52,4 +51,4 @@ class JointIlqr(JointSwingUp):
         catch = make_mechanism_catch(plant, *plant.mechanism.weights, joint_limits(plant, p["effort_limit"]))
         search = SwingUpSearch(_WEIGHTS, duration=p["duration"])
         trajectory, _ = cheapest_swing_up(catch, search, range(p["guesses"]))
-        return cls(catch, ASSUMED_PERIOD if period is None else period, trajectory)
+        return cls(catch, period, trajectory)

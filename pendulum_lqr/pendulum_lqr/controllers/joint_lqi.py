@@ -21,7 +21,7 @@ from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.mechanism_controller import within_limits
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.model import LinearModel
-from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
+from pendulum_lqr.sampling import require_period
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -63,7 +63,7 @@ class JointLqi(JointController):
         return (*joint_weights(plant), integral, JOINT_LIMIT)
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointLqi:
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointLqi:
         """Return the LQI.
 
         Raises:
@@ -74,7 +74,7 @@ class JointLqi(JointController):
         wide = _with_integrals(model, driven)
         gain = mechanism_lqr(wide, [*p["q"], *(p["q_integral"],) * len(driven)], p["r"])
         limits = joint_limits(plant, p["effort_limit"])
-        return cls(plant, wide, gain, ASSUMED_PERIOD if period is None else period, limits)
+        return cls(plant, wide, gain, period, limits)
 
     def check(self, period: float) -> None:
         """Refuse another period than that of the design [s], and one at which it does not settle."""

@@ -110,7 +110,7 @@ class JointLqr(JointController):
         return (*joint_weights(plant), JOINT_LIMIT)
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointLqr:
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointLqr:
         """Return the LQR.
 
         Raises:

@@ -8,7 +8,6 @@ from typing import Any
 from pendulum_lqr.controllers.joint_swing_up import CaughtController
 from pendulum_lqr.mechanism_controllers import default_catch, refuse_passive_friction
 from pendulum_lqr.mechanism_mpc import PLAN, MechanismMpc
-from pendulum_lqr.sampling import ASSUMED_PERIOD
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["JointNmpc"]
@@ -36,14 +35,14 @@ class JointNmpc(CaughtController):
         inner.reset()
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointNmpc:
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointNmpc:
         """Return the controller for a plant whose passive joints have no dry friction.
 
         Raises:
             ParameterError: One has: plans leave it out, and no effort can make up for it there.
         """
         refuse_passive_friction("nmpc", plant)
-        return cls(plant, ASSUMED_PERIOD if period is None else period)
+        return cls(plant, period)
 
     def describe(self) -> str:
         """Return its horizon, and from where the LQR catches."""

@@ -19,7 +19,6 @@ from pendulum_lqr.policy_answers import (
     states_to_hold,
 )
 from pendulum_lqr.policy_file import load_policy
-from pendulum_lqr.sampling import ASSUMED_PERIOD
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -74,7 +73,7 @@ class JointPolicy(JointController):
         return (*policy_specs(_FALLBACKS), catch, JOINT_LIMIT)
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointPolicy:
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointPolicy:
         """Return the controller of the parameter ``policy``.
 
         Raises:
@@ -83,16 +82,14 @@ class JointPolicy(JointController):
         """
         fallback = None
         if p["fallback"] != ZERO:
-            fallback = make_joint_controller(p["fallback"], plant, {"effort_limit": p["effort_limit"]}, period)
+            fallback = make_joint_controller(p["fallback"], plant, {"effort_limit": p["effort_limit"]})
         if not p["policy"]:
             raise ParameterError("policy is empty; expected the path of a policy file (.npz)")
         policy = load_policy(p["policy"])
         require_plant(policy, plant)
-        if period is not None:
-            check_policy_period(policy, period)
         own = joint_limits(plant, p["effort_limit"])
         limits = tuple(min(both) for both in zip(own, policy.effort_limit, strict=True))
-        hold = states_to_hold(policy, ASSUMED_PERIOD if period is None else period)
+        hold = states_to_hold(policy, period)
         catch = make_mechanism_catch(plant, *plant.mechanism.weights, limits) if p["catch"] != ZERO else None
         return cls(policy, hold, limits, fallback, start_time=p["start_time"], catch=catch)
 
@@ -102,8 +99,10 @@ class JointPolicy(JointController):
         return self._answers.notice
 
     def check(self, period: float) -> None:
-        """Refuse a period that the policy's is no whole multiple of [s]."""
+        """Refuse a period that the policy's is no whole multiple of, and at which its fallback does not settle [s]."""
         check_policy_period(self.policy, period)
+        if self.fallback is not None:
+            self.fallback.check(period)
 
     def reset(self) -> None:
         """Forget the past, and that it gave up."""

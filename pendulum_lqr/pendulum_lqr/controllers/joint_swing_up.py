@@ -13,7 +13,7 @@ from pendulum_lqr.mechanism_controllers import default_catch, stored_trajectory
 from pendulum_lqr.mechanism_mpc import MechanismMpc
 from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
-from pendulum_lqr.sampling import ASSUMED_PERIOD, require_period
+from pendulum_lqr.sampling import require_period
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -88,7 +88,7 @@ class JointSwingUp(CaughtController):
         return (_FILE,)
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float | None) -> JointSwingUp:
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointSwingUp:
         """Return the swing-up, which is tracked at one period.
 
         Raises:
@@ -96,7 +96,7 @@ class JointSwingUp(CaughtController):
         """
         given = p["trajectory"]
         trajectory = load_trajectory(Path(given).expanduser()) if given else stored_trajectory(plant)
-        return cls(default_catch(plant), ASSUMED_PERIOD if period is None else period, trajectory)
+        return cls(default_catch(plant), period, trajectory)
 
     def describe(self) -> str:
         """Return how long it swings, and from where the LQR catches."""
