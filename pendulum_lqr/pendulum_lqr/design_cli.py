@@ -19,7 +19,14 @@ from rich.console import Console
 from pendulum_lqr.analysis import LoopReport, analyse
 from pendulum_lqr.certificate_table import certificate_document, certify_rows, print_certificates
 from pendulum_lqr.design import Gain, output_lqr
-from pendulum_lqr.design_tables import RowTable, margin_cells, print_time_figures, print_worst_cases
+from pendulum_lqr.design_tables import (
+    RowTable,
+    margin_cells,
+    pole_cell,
+    print_time_figures,
+    print_worst_cases,
+    time_cell,
+)
 from pendulum_lqr.mechanism_design import design_mechanism
 from pendulum_lqr.model import LinearModel, linearise
 from pendulum_lqr.parameter_box import UNCERTAIN, parse_box, worst_case
@@ -223,8 +230,8 @@ def _print(
         table.add(
             index,
             *cells,
-            _poles(report.poles, 2),
-            _poles(report.poles, 6),
+            pole_cell(report.poles),
+            pole_cell(report.poles, 6),
             ", ".join(f"{value:.6f}" for value in report.K) if index else "\u2013",
             f"{report.time_constant:.4f}" if stable else "unstable",
             f"{report.damping_ratio:.3f}",
@@ -232,7 +239,7 @@ def _print(
         )
         margins = report.margins
         if margins is not None:
-            period = "none" if report.largest_period is None else _period(report.largest_period)
+            period = "none" if report.largest_period is None else time_cell(report.largest_period)
             margins_table.add(index, *margin_cells(margins), period, chosen=chosen)
     console.print(table)
     console.print(margins_table)
@@ -268,20 +275,6 @@ def _plant_lines(name: str, model: LinearModel) -> list[str]:
     if model.delay > 0.0:
         lines.append(f"transport delay {model.delay:g} s: counted in margins and periods, not in the eigenvalues")
     return lines
-
-
-def _poles(poles: Sequence[complex], digits: int) -> str:
-    parts = []
-    for pole in poles:
-        if abs(pole.imag) < 1e-9:
-            parts.append(f"{pole.real:.{digits}f}")
-        elif pole.imag > 0.0:
-            parts.append(f"{pole.real:.{digits}f} \u00b1 {pole.imag:.{digits}f}j")
-    return ", ".join(parts)
-
-
-def _period(period: float) -> str:
-    return "any" if math.isinf(period) else f"{period:.4f} s"
 
 
 def _document(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from rich.console import Console
 
@@ -13,7 +13,7 @@ from pendulum_lqr.time_figures import TimeFigures
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 from pendulum_msgs_py.programs.terminal import WholeTable
 
-__all__ = ["RowTable", "margin_cells", "print_time_figures", "print_worst_cases"]
+__all__ = ["RowTable", "margin_cells", "pole_cell", "print_time_figures", "print_worst_cases", "time_cell"]
 
 _UNITS = {spec.name: spec.unit for spec in PLANT_SPECS}
 
@@ -44,9 +44,23 @@ def margin_cells(margins: Margins) -> list[str]:
         "any" if math.isinf(margins.gain_up) else f"{margins.gain_up:.3f}",
         f"{margins.gain_down:.4f}",
         f"{math.degrees(margins.phase):.2f}\u00b0",
-        f"{margins.delay:.4f} s" if math.isfinite(margins.delay) else "any",
+        time_cell(margins.delay),
         f"{margins.modulus:.3f}",
     ]
+
+
+def time_cell(time: float) -> str:
+    """Return the cell of a time that may be any [s]."""
+    return f"{time:.4f} s" if math.isfinite(time) else "any"
+
+
+def pole_cell(poles: Iterable[complex], digits: int = 2) -> str:
+    """Return the cell of poles, a pair of conjugate ones as one."""
+    return ", ".join(
+        f"{pole.real:.{digits}f}" + (f" \u00b1 {pole.imag:.{digits}f}j" if abs(pole.imag) >= 1e-9 else "")
+        for pole in poles
+        if pole.imag > -1e-9
+    )
 
 
 def print_time_figures(console: Console, found: Sequence[TimeFigures | None], chosen: int, limit: float) -> None:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pendulum_lqr.analysis import LoopReport, analyse
 from pendulum_lqr.design import Gain
-from pendulum_lqr.design_tables import RowTable
+from pendulum_lqr.design_tables import RowTable, pole_cell, time_cell
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.model import LinearModel, sort_poles
+from pendulum_lqr.model import LinearModel
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.programs.terminal import make_console
@@ -70,7 +69,7 @@ def _print(plant: MechanismParameters, model: LinearModel, rows: Sequence[_Row])
         for index, value in zip(plant.coordinates.driven, model.efforts, strict=True)
     )
     console.print(f"plant {plant.name}, a {plant.mechanism.name}, at {held}; held by {driven}")
-    console.print(f"states {', '.join(model.states)}; poles without control {_poles(sort_poles(model.poles))} 1/s")
+    console.print(f"states {', '.join(model.states)}; poles without control {pole_cell(model.poles)} 1/s")
     if plant.has_dry_friction:
         console.print(
             "dry friction has no derivative at rest and is not in the model: simulate the loop to see its cost"
@@ -84,11 +83,11 @@ def _print(plant: MechanismParameters, model: LinearModel, rows: Sequence[_Row])
             count,
             ", ".join(f"{value:g}" for value in row.q),
             f"{row.r:g}",
-            _poles(row.gain.poles),
+            pole_cell(row.gain.poles),
             "\n".join(", ".join(f"{value:.4f}" for value in line) for line in row.gain.K),
             f"{-1.0 / row.gain.poles[0].real:.4f}",
-            "\u2013" if report is None or report.margins is None else _seconds(report.margins.delay),
-            "\u2013" if report is None or report.largest_period is None else _seconds(report.largest_period),
+            "\u2013" if report is None or report.margins is None else time_cell(report.margins.delay),
+            "\u2013" if report is None or report.largest_period is None else time_cell(report.largest_period),
         )
     console.print(table)
 
@@ -128,15 +127,3 @@ def _diagonal(text: str, states: Sequence[str]) -> tuple[float, ...]:
     if len(values) != len(states):
         raise ParameterError(f"--q is {text!r}; expected {len(states)} numbers, for {', '.join(states)}")
     return values
-
-
-def _poles(poles: Iterable[complex]) -> str:
-    return ", ".join(
-        f"{pole.real:.2f}" if abs(pole.imag) < 1e-9 else f"{pole.real:.2f} \u00b1 {pole.imag:.2f}j"
-        for pole in poles
-        if pole.imag > -1e-9
-    )
-
-
-def _seconds(value: float) -> str:
-    return "any" if math.isinf(value) else f"{value:.4f} s"

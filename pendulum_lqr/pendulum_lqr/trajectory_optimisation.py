@@ -15,7 +15,7 @@ from pendulum_lqr.design import DesignError
 from pendulum_lqr.model import acceleration_from_upright
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["OptimisedTrajectory", "rigid_dynamics", "swing_up_trajectory"]
+__all__ = ["OptimisedTrajectory", "rigid_flow", "swing_up_trajectory"]
 
 Array = NDArray[np.float64]
 
@@ -43,16 +43,15 @@ class OptimisedTrajectory:
         return float(self.times[-1])
 
 
-def rigid_dynamics(plant: PlantParameters, angle: Any, velocity: Any, effort: Any) -> Any:
-    """Return the acceleration as a CasADi expression; dry friction with a smooth sign, offsets included [rad/s^2].
+def rigid_flow(plant: PlantParameters, x: Any, effort: Any) -> Any:
+    """Return velocity and acceleration as a CasADi expression; dry friction with a smooth sign, offsets included.
 
     Args:
         plant: Plant parameters.
-        angle: From upright [rad].
-        velocity: [rad/s].
+        x: Angle from upright [rad] and velocity [rad/s].
         effort: [N m].
     """
-    return acceleration_from_upright(plant, angle, velocity, effort, casadi, sign_velocity=_SIGN_VELOCITY)
+    return casadi.vertcat(x[1], acceleration_from_upright(plant, x[0], x[1], effort, casadi, _SIGN_VELOCITY))
 
 
 @lru_cache(maxsize=16)
@@ -81,14 +80,11 @@ def swing_up_trajectory(
     U = opti.variable(nodes + 1)
     h = duration / nodes
 
-    def flow(x: Any, u: Any) -> Any:
-        return casadi.vertcat(x[1], rigid_dynamics(plant, x[0], x[1], u))
-
     for k in range(nodes):
         left, right = X[:, k], X[:, k + 1]
-        slope_left, slope_right = flow(left, U[k]), flow(right, U[k + 1])
+        slope_left, slope_right = rigid_flow(plant, left, U[k]), rigid_flow(plant, right, U[k + 1])
         middle = 0.5 * (left + right) + h / 8.0 * (slope_left - slope_right)
-        slope_middle = flow(middle, 0.5 * (U[k] + U[k + 1]))
+        slope_middle = rigid_flow(plant, middle, 0.5 * (U[k] + U[k + 1]))
         opti.subject_to(right == left + h / 6.0 * (slope_left + 4.0 * slope_middle + slope_right))
     opti.subject_to(opti.bounded(-effort_limit, U, effort_limit))
     # Without a command the pendulum rests where gravity balances the torque offset.

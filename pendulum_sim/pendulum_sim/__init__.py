@@ -1,3 +1,1 @@
 """The plant as mathematics: models, integrators, sensors, batch engine; and the simulator node over them."""
-
-__version__ = "0.1.0"

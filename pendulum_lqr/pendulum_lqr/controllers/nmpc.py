@@ -14,7 +14,7 @@ from pendulum_lqr.catch import Catch, make_catch
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R
 from pendulum_lqr.interface import Controller
-from pendulum_lqr.trajectory_optimisation import rigid_dynamics
+from pendulum_lqr.trajectory_optimisation import rigid_flow
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
@@ -118,18 +118,15 @@ def _problem(plant: PlantParameters, p: Mapping[str, Any], hold: float) -> tuple
     steps, step, limit = int(p["steps"]), float(p["step"]), float(p["effort_limit"])
     x, u = casadi.MX.sym("x", 2), casadi.MX.sym("u")
 
-    def flow(state: Any) -> Any:
-        return casadi.vertcat(state[1], rigid_dynamics(plant, state[0], state[1], u))
-
     # RK4 is stable up to 2.7 times the fastest time constant.
     substeps = max(2, math.ceil(step * plant.damping / plant.inertia))
     h = step / substeps
     end = x
     for _ in range(substeps):
-        k1 = flow(end)
-        k2 = flow(end + h / 2 * k1)
-        k3 = flow(end + h / 2 * k2)
-        k4 = flow(end + h * k3)
+        k1 = rigid_flow(plant, end, u)
+        k2 = rigid_flow(plant, end + h / 2 * k1, u)
+        k3 = rigid_flow(plant, end + h / 2 * k2, u)
+        k4 = rigid_flow(plant, end + h * k3, u)
         end = end + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     advance = casadi.Function("advance", [x, u], [end])
     measured = casadi.MX.sym("measured", 2)
