@@ -19,6 +19,7 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import without_nan
 
 __all__ = [
+    "HOW",
     "Answer",
     "Evidence",
     "Layer",
@@ -196,7 +197,7 @@ class Answer:
         }
 
 
-_HOW = {
+HOW = {
     Layer.SAME_RUN: "make experiment",
     Layer.SAME_PLANT: "python -m pendulum_bags experiment frequency_response",
     Layer.WHICH_CONTROLLERS: "python -m pendulum_bags experiment frequency_response",
@@ -252,7 +253,7 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
 
 
 def _not_measured(layer: Layer) -> LayerResult:
-    how = _HOW[layer]
+    how = HOW[layer]
     return LayerResult(layer, Mark.NOT_MEASURED, f"Not measured yet; to measure it: {how}.", reason=how)
 
 
