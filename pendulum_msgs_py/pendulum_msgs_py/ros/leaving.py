@@ -11,6 +11,8 @@ __all__ = ["leaving_graph"]
 
 _LONGEST = 5.0
 """Time that the middleware may take to leave the graph [s]."""
+_STANDARD_ERROR = 2
+"""Its descriptor: what stands for it in Python may have none, as in a notebook."""
 _lock = threading.Lock()
 _under_way = 0
 
@@ -27,7 +29,7 @@ def leaving_graph() -> Iterator[None]:
     global _under_way  # noqa: PLW0603  # the watchdog is one for the process
     with _lock:
         _under_way += 1
-        faulthandler.dump_traceback_later(_LONGEST, exit=True)
+        faulthandler.dump_traceback_later(_LONGEST, exit=True, file=_STANDARD_ERROR)
     try:
         yield
     finally:
