@@ -6,7 +6,6 @@ from __future__ import annotations
 import pendulum_msgs_py.programs.one_thread  # noqa: F401  # before anything that imports numpy
 # isort: on
 
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -241,7 +240,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the disturbance node and return the exit code."""
     return run_node(
         DisturbanceNode,
-        list(sys.argv[1:] if argv is None else argv),
+        argv,
         program="pendulum_lqr disturbance",
         description="Answers each joint state with a disturbance torque, a pure function of seed and time.",
         specs=DISTURBANCE_SPECS + NODE_SPECS,

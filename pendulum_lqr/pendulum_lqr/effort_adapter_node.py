@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Sequence
 
@@ -140,7 +139,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the adapter and return the exit code."""
     return run_node(
         EffortAdapterNode,
-        list(sys.argv[1:] if argv is None else argv),
+        argv,
         program="pendulum_lqr effort_adapter",
         description="Lets ros2_control, or who commands its effort controllers, drive our plants by torque.",
         specs=NODE_SPECS,

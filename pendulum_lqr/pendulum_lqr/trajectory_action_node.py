@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -207,7 +206,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the action server and return the exit code."""
     return run_node(
         TrajectoryActionNode,
-        list(sys.argv[1:] if argv is None else argv),
+        argv,
         program="pendulum_lqr trajectory_action",
         description="Offers a plant's position control as the action FollowJointTrajectory (needs control_msgs).",
         specs=NODE_SPECS,

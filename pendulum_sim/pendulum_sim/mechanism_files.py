@@ -41,7 +41,7 @@ def mechanism_mjcf(parameters: MechanismParameters) -> str:
     bodies = _checked_bodies(parameters)
     model = ElementTree.Element("mujoco", model=safe_name(parameters.name))
     add(model, "compiler", angle="radian", autolimits="true")
-    add(model, "option", gravity=f"0 0 {number(-_gravity(parameters))}", timestep="0.002", integrator="RK4")
+    add(model, "option", gravity=f"0 0 {number(-parameters.value('gravity'))}", timestep="0.002", integrator="RK4")
     world = add(model, "worldbody")
     add(world, "light", pos="0 -1 1.5", dir="0 0.5 -1")
     size = sum(math.dist(body.tip, (0.0, 0.0, 0.0)) for body in bodies)
@@ -138,11 +138,6 @@ def _checked_bodies(parameters: MechanismParameters) -> tuple[Body, ...]:
                 " expected > 0: its inertia about the joint is less than mass * centre^2, and no file can say that"
             )
     return bodies
-
-
-def _gravity(parameters: MechanismParameters) -> float:
-    names = [spec.name for spec in parameters.mechanism.parameters]
-    return parameters.values[names.index("gravity")]
 
 
 def _urdf_type(joint: Joint, own: JointParameters) -> str:

@@ -34,6 +34,7 @@ _BOB_SHARE = 0.9
 _FLAT_LENGTH = 0.3
 _ROD_RADIUS = 0.008
 _STEEL = 7850.0
+_CASING, _ROD, _BOB = "0.25 0.25 0.28 1", "0.6 0.62 0.66 1", "0.85 0.3 0.2 1"
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
     speed = 100.0 if drive is None else drive.supply_voltage / (drive.back_emf_constant * drive.gear_ratio)
     robot = ElementTree.Element("robot", name=safe_name(parameters.name))
     base = add(robot, "link", name="base_link")
-    _urdf_visual(base, ("box", {"size": "0.06 0.1 0.06"}), f"0 {number(0.06)} 0", "0 0 0", "0.25 0.25 0.28 1")
+    _urdf_visual(base, ("box", {"size": "0.06 0.1 0.06"}), f"0 {number(0.06)} 0", _CASING)
     link = add(robot, "link", name=LINK)
     inertial = add(link, "inertial")
     add(inertial, "origin", xyz=f"0 0 {number(-shape.length)}", rpy="0 0 0")
@@ -97,14 +98,8 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
     i = number(shape.inertia + rotor)
     add(inertial, "inertia", ixx=i, iyy=i, izz=number(0.02 * shape.inertia), ixy="0", ixz="0", iyz="0")
     rod = {"radius": number(_ROD_RADIUS), "length": number(shape.length)}
-    _urdf_visual(link, ("cylinder", rod), f"0 0 {number(-0.5 * shape.length)}", "0 0 0", "0.6 0.62 0.66 1")
-    _urdf_visual(
-        link,
-        ("sphere", {"radius": number(shape.bob_radius)}),
-        f"0 0 {number(-shape.length)}",
-        "0 0 0",
-        "0.85 0.3 0.2 1",
-    )
+    _urdf_visual(link, ("cylinder", rod), f"0 0 {number(-0.5 * shape.length)}", _ROD)
+    _urdf_visual(link, ("sphere", {"radius": number(shape.bob_radius)}), f"0 0 {number(-shape.length)}", _BOB)
     joint = add(robot, "joint", name=JOINT, type="continuous")
     add(joint, "parent", link="base_link")
     add(joint, "child", link=LINK)
@@ -170,7 +165,7 @@ def mjcf(parameters: PlantParameters) -> str:
         type="capsule",
         fromto=f"0 0 0 0 0 {number(-shape.length)}",
         size=number(_ROD_RADIUS),
-        rgba="0.6 0.62 0.66 1",
+        rgba=_ROD,
         attributes=appearance,
     )
     add(
@@ -179,7 +174,7 @@ def mjcf(parameters: PlantParameters) -> str:
         type="sphere",
         pos=f"0 0 {number(-shape.length)}",
         size=number(shape.bob_radius),
-        rgba="0.85 0.3 0.2 1",
+        rgba=_BOB,
         attributes=appearance,
     )
     driven, gain = JOINT, 1.0
@@ -227,12 +222,10 @@ def mjcf(parameters: PlantParameters) -> str:
     return document_text(model)
 
 
-def _urdf_visual(
-    link: ElementTree.Element, geometry: tuple[str, dict[str, str]], xyz: str, rpy: str, rgba: str
-) -> None:
+def _urdf_visual(link: ElementTree.Element, geometry: tuple[str, dict[str, str]], xyz: str, rgba: str) -> None:
     shape, sizes = geometry
     visual = add(link, "visual")
-    add(visual, "origin", xyz=xyz, rpy=rpy)
+    add(visual, "origin", xyz=xyz, rpy="0 0 0")
     add(add(visual, "geometry"), shape, sizes)
     material = add(visual, "material", name=f"{shape}_colour")
     add(material, "color", rgba=rgba)
