@@ -50,7 +50,6 @@ class GapProfile:
         at: Frequency of the limit [Hz].
         winding: Whether the winding number condition holds.
         scaling: Units.
-        beyond: Part of the limit that the roll-off above the highest line needs.
     """
 
     frequency: Array
@@ -61,7 +60,6 @@ class GapProfile:
     at: float
     winding: bool
     scaling: SignalScaling
-    beyond: float
 
 
 def compare_machine(plant: LinearModel, machine: Machine, scaling: SignalScaling = DEFAULT_SCALING) -> GapProfile:
@@ -95,7 +93,6 @@ def compare_machine(plant: LinearModel, machine: Machine, scaling: SignalScaling
         float(machine.frequency[at] if upper[at] >= beyond else machine.frequency[-1]),
         found.winding,
         scaling,
-        beyond,
     )
 
 

@@ -118,7 +118,6 @@ class ControllerNode(LifecycleNode, PollingNode):
     def __init__(self, stop: Callable[[], None]) -> None:
         super().__init__("controller", enable_logger_service=True)
         self.exit_code = 0
-        self._stop = stop
         self._active = False
         self._loop: AnswerLoop | None = None
         kind, plant = self._choose("controller"), self._choose("plant")

@@ -77,7 +77,6 @@ class DisturbanceNode(PollingNode):
 
     def __init__(self, stop: Callable[[], None]) -> None:
         super().__init__("disturbance", enable_logger_service=True)
-        self._stop = stop
         self._settings = NodeParameters(self, DISTURBANCE_SPECS + NODE_SPECS, self._prepare, self._swap)
         self._now = SteadyWallClock()
         self._full_name = self.get_fully_qualified_name()

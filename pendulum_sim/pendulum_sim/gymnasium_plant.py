@@ -164,7 +164,6 @@ class GymnasiumPlant:
             raise self._error("nothing bounds its torque; expected effort_limit")
         self._steps, self._applied = 0, 0.0
         self._theta = self._theta_dot = 0.0
-        self._started = False
         self._read(self._reset_env({}), fresh=True)
         self.remarks: list[str] = [f"period {self.dt * 1e3:g} ms, at most {self._limit:g} N m"]
         self.parameters = self._find_equation()

@@ -133,8 +133,6 @@ class SeriesElasticPlant:
         ParameterError: There is no drivetrain, or an argument is outside its domain.
     """
 
-    method = "semi_implicit"
-
     def __init__(self, parameters: PlantParameters, dt: float, *, substeps: int | None = None) -> None:
         if substeps is None and math.isfinite(dt):
             substeps = max(1, math.ceil(dt / MAX_SUBSTEP - 1e-9))

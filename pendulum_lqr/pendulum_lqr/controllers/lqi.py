@@ -72,8 +72,6 @@ class Lqi(LawController):
     ) -> None:
         super().__init__(lqi_law, effort_limit, set_point, (hold, *gain.K, period), (0.0,))
         self.gain = gain
-        self.period = period
-        self.hold = hold
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Lqi:

@@ -45,7 +45,6 @@ class Lqr(LawController):
     def __init__(self, gain: Gain, effort_limit: float, set_point: float = 0.0, hold: float = 0.0) -> None:
         super().__init__(lqr_law, effort_limit, set_point, (hold, *gain.K))
         self.gain = gain
-        self.hold = hold
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Lqr:

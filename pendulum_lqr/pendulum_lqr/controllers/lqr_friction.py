@@ -90,7 +90,6 @@ class LqrFriction(LawController):
     ) -> None:
         super().__init__(lqr_friction_law, effort_limit, set_point, (hold, *gain.K, friction, width))
         self.gain = gain
-        self.hold = hold
         self.friction = friction
         self.width = width
 

@@ -65,10 +65,8 @@ class LinearMpc(BaseController):
                 f"holding set_point {self.set_point} rad takes {self.hold:.4g} N m; expected less than effort_limit "
                 f"= {self.effort_limit:g} N m"
             )
-        self.failures = 0
         sampled = discretise(model, period, p["delay"])
         cost = sampled_cost(model, p["q"], p["r"], period, p["delay"])
-        self._size = sampled.A.shape[0]
         # Measured states need no filter: what they show is then what counts.
         self._observer: Observer | None = None
         if model.hidden or sampled.pending or p["offset_noise"] > 0.0:
@@ -120,7 +118,6 @@ class LinearMpc(BaseController):
         low, high = np.array([-self.effort_limit - held]), np.array([self.effort_limit - held])
         plan = self._program.first(state, low, high)
         if plan is None:
-            self.failures += 1
             return -float(self.gain.K @ state)
         return float(plan[0])
 

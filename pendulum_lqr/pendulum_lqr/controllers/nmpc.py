@@ -55,7 +55,6 @@ class NonlinearMpc(BaseController):
         self.period = period
         self.step = float(p["step"])
         self.steps = int(p["steps"])
-        self.failures = 0
         self._solver, self._lower, self._upper = _problem(plant, p, catch.hold)
         self._plan: Array | None = None
 
@@ -82,7 +81,6 @@ class NonlinearMpc(BaseController):
             self._plan = plan
         else:
             # The last plan, shifted to now, is a better answer than none.
-            self.failures += 1
             self._plan = guess
         return self.clamp(float(self._plan[2]))
 

@@ -89,7 +89,6 @@ class Pid(LawController):
         numbers = (gains.kp, gains.ki, gains.kd, period, pole, (1.0 - pole) / period, period / tracking_time)
         super().__init__(pid_law, effort_limit, set_point, numbers, _NOTHING_YET)
         self.gains = gains
-        self.period = period
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Pid:
