@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pendulum_msgs_py.contract.rules import NEVER
-
 __all__ = [
     "DUPLICATE",
     "FROM_FUTURE",
     "LONGEST",
-    "NEVER",
     "NEW",
     "OUT_OF_ORDER",
     "STALE",

@@ -13,7 +13,6 @@ from pendulum_lqr.answer_rules import (
     DUPLICATE,
     FROM_FUTURE,
     LONGEST,
-    NEVER,
     NEW,
     OUT_OF_ORDER,
     STALE,
@@ -22,6 +21,7 @@ from pendulum_lqr.answer_rules import (
 )
 from pendulum_lqr.interface import Controller, JointController
 from pendulum_msgs_py.contract.angles import deviation_from_upright
+from pendulum_msgs_py.contract.rules import NEVER
 from pendulum_msgs_py.contract.timing import RingOfTimes
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample, Vector, written
 

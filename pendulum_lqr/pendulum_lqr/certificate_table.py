@@ -78,9 +78,7 @@ def certificate_document(certifier: Certifier, found: Sequence[Certificate]) -> 
         "nu_gap": profile.value,
         "nu_gap_upper": profile.value_upper,
         "at_hz": profile.at,
-        "scaling": {
-            **profile.scaling.to_json(),
-        },
+        "scaling": profile.scaling.to_json(),
         "rows": [
             {
                 "combination": index,
