@@ -41,14 +41,7 @@ def certify_rows(path: Path, model: LinearModel, gains: Sequence[Gain]) -> tuple
 
 
 def print_certificates(console: Console, certifier: Certifier, found: Sequence[Certificate], chosen: int) -> None:
-    """Print one line a row, and what the certificate means.
-
-    Args:
-        console: Where.
-        certifier: Of the machine.
-        found: One for each row, from row 1.
-        chosen: Row that is marked.
-    """
+    """Print one line a row, from row 1, the chosen one marked, and what the certificates mean."""
     profile, machine = certifier.profile, certifier.machine
     headings = ("#", "margin b", "loop distance", "modulus there", "certified")
     table = RowTable("Certified for this machine", headings)

@@ -294,11 +294,7 @@ class SoftStart(BaseController):
 
 
 def unwrapped(controller: Controller) -> Controller:
-    """Return the controller itself, without what gives it its velocity and what lets its torque rise.
-
-    Args:
-        controller: A controller, wrapped or not.
-    """
+    """Return the controller itself, without what gives it its velocity and what lets its torque rise."""
     while isinstance(controller, (EstimatedVelocity, SoftStart)):
         controller = controller.inner
     return controller

@@ -40,9 +40,6 @@ _FALLEN = 0.5
 def require_time_invariant(name: str) -> None:
     """Refuse a controller that answers by the clock, and so has no frequency response.
 
-    Args:
-        name: Controller.
-
     Raises:
         ParameterError: It follows a reference that moves, or plays torques.
     """

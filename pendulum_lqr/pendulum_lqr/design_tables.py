@@ -109,14 +109,7 @@ def print_time_figures(console: Console, found: Sequence[TimeFigures | None], ch
 
 
 def print_worst_cases(console: Console, box: ParameterBox, found: Sequence[WorstCase], chosen: int) -> None:
-    """Print one line a row: the worst of each margin over all plants, and which plant is the worst.
-
-    Args:
-        console: Where.
-        box: Of the plants.
-        found: One for each row, from row 1.
-        chosen: Row that is marked.
-    """
+    """Print one line a row, from row 1: the worst of each margin over all plants, and which plant is the worst."""
     headings = ("#", "not held", "gain up", "gain down", "phase margin", "delay margin", "modulus", "worst at")
     table = RowTable(f"Worst case over {found[0].plants} plants ({box.source})", headings, left={"worst at"})
     for index, one in enumerate(found, start=1):

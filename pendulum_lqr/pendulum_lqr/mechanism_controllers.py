@@ -44,10 +44,6 @@ class DifferencedVelocity:
     The slope between two positions is the velocity in their middle; half a period of the model's acceleration brings
     it to the end. That is exact to the period's square, and as good as the positions are: an encoder's steps over the
     period come through as noise.
-
-    Args:
-        plant: The plant.
-        controller: Who is given them.
     """
 
     def __init__(self, plant: MechanismParameters, controller: MechanismController) -> None:

@@ -54,9 +54,6 @@ class ParameterBox:
         Without correlation every corner of the box is there. With it, the plants lie on the ellipsoid that holds 95 %
         of all outcomes of such an identification, all parameters together.
 
-        Args:
-            plant: The plant that is believed in.
-
         Source:
             Johnson and Wichern, Applied Multivariate Statistical Analysis, 6th ed., 2007, section 5.4 (ellipsoid).
         """

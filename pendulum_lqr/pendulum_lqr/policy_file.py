@@ -121,10 +121,7 @@ def named_controller(text: str) -> tuple[str, dict[str, str]]:
 
 
 def policy_record(parameters: Mapping[str, Any]) -> dict[str, str]:
-    """Return what the record of a run says of a policy file beside its path: the file may be another one tomorrow.
-
-    Args:
-        parameters: Of the controller.
+    """Return what a run's record says of a controller's policy file beside its path: it may be another one tomorrow.
 
     Returns:
         The digest of the file under ``policy_sha256``; nothing where no policy answers or its file cannot be read.

@@ -66,12 +66,6 @@ _KNOWN = (
 def policy_of_actor(actor: Actor, told: Told, *, name: str, provenance: Mapping[str, Any]) -> Policy:
     """Return the policy that answers as an actor does.
 
-    Args:
-        actor: The actor.
-        told: What it sees and asks for.
-        name: Name of the policy.
-        provenance: Where it comes from.
-
     Raises:
         ParameterError: What was told and what the actor says of its spaces do not go together, or too little was told.
         DataError: The parts do not make a policy.

@@ -51,10 +51,7 @@ class _Tensor(NamedTuple):
 
 
 def read_state(content: bytes) -> dict[str, NDArray[np.float32]]:
-    """Return the tensors of a ``state_dict`` by name.
-
-    Args:
-        content: What ``torch.save`` wrote.
+    """Return the tensors by name of a ``state_dict`` that ``torch.save`` wrote.
 
     Raises:
         DataError: It is no such file, damaged, too large, or holds more than named tensors of finite numbers.

@@ -57,13 +57,7 @@ def design_tracking(
 
 
 def print_tracking(console: Console, controller: LqrTracking, chosen: int) -> None:
-    """Print gain and frozen margins over the angle, and what the whole reference takes.
-
-    Args:
-        console: Where.
-        controller: The controller, checked.
-        chosen: Row of the table whose weights it has.
-    """
+    """Print gain and frozen margins of a checked controller over the angle, and what the whole reference takes."""
     document = tracking_document(controller)
     table = WholeTable(title="Gain along the reference (lqr_tracking)", title_justify="left", header_style="bold")
     for heading in ("angle \\[rad]", "K", "largest pole, sampled", "modulus"):
@@ -80,11 +74,7 @@ def print_tracking(console: Console, controller: LqrTracking, chosen: int) -> No
 
 
 def tracking_document(controller: LqrTracking) -> dict[str, Any]:
-    """Return the same as plain values for JSON.
-
-    Args:
-        controller: The controller, checked.
-    """
+    """Return the same as plain values for JSON."""
     margins, reference = controller.margins, controller.reference
     assert margins is not None
     return {

@@ -109,12 +109,7 @@ def _control(lanes: int) -> Any:
 
 @cache
 def smooth_kernel(method: str, coefficient_rows: int) -> Any:
-    """Return the loop for pendulums without dry friction, lag and delay.
-
-    Args:
-        method: Integrator.
-        coefficient_rows: How many numbers its coefficients are.
-    """
+    """Return the loop for pendulums without dry friction, lag and delay, by an integrator with so many coefficients."""
     integrator = get_integrator(method)
     step = compile_tree(integrator.step, vector=True)
     acceleration = compile_tree(acceleration_with_friction, vector=True)
@@ -166,11 +161,7 @@ def coefficients_kernel(method: str) -> Any:
 
 @cache
 def general_kernel(method: str) -> Any:
-    """Return the loop for pendulums with dry friction, actuator lag or transport delay, one after another.
-
-    Args:
-        method: Integrator.
-    """
+    """Return the loop for pendulums with dry friction, actuator lag or transport delay, one after another."""
     integrator = get_integrator(method)
     step = compile_tree(integrator.step, inline=True)
     coefficients_of = compile_tree(integrator.coefficients, inline=True)

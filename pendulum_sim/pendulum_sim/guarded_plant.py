@@ -22,12 +22,7 @@ _MEMORY = 0.02
 
 
 class GuardedPlant:
-    """A plant of which no exception and no value that is not a number gets out.
-
-    Args:
-        plant: The simulation.
-        name: What to call it.
-    """
+    """A plant of which no exception and no value that is not a number gets out."""
 
     def __init__(self, plant: Plant, name: str) -> None:
         self._plant = plant

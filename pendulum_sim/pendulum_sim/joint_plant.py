@@ -50,11 +50,7 @@ class JointPlant(Protocol):
 
 
 class OneJoint:
-    """A plant of one joint, its numbers as tuples.
-
-    Args:
-        plant: The plant.
-    """
+    """A plant of one joint, its numbers as tuples."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant

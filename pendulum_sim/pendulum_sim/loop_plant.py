@@ -42,11 +42,7 @@ LAYOUT = np.dtype(
 
 
 class LoopPlant:
-    """A rigid plant that a compiled loop can step.
-
-    Args:
-        plant: The plant.
-    """
+    """A rigid plant that a compiled loop can step."""
 
     def __init__(self, plant: RigidPlant) -> None:
         self.plant = plant

@@ -31,9 +31,6 @@ def mechanism_mjcf(parameters: MechanismParameters) -> str:
     What MuJoCo has no word for is left out: Stribeck's curve and transport delay. Its dry friction is regularised: it
     creeps where ours sticks; its end stops are springs.
 
-    Args:
-        parameters: The plant.
-
     Raises:
         ParameterError: A body has no positive inertia about its own centre of mass, which MuJoCo refuses.
     """
@@ -82,9 +79,6 @@ def mechanism_mjcf(parameters: MechanismParameters) -> str:
 
 def mechanism_urdf(parameters: MechanismParameters) -> str:
     """Return the URDF of a plant, for RViz and Gazebo; it has no word for rotors, which are left out.
-
-    Args:
-        parameters: The plant.
 
     Raises:
         ParameterError: A body has no positive inertia about its own centre of mass.

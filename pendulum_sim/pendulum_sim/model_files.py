@@ -55,11 +55,7 @@ class LinkShape:
 
 
 def link_shape(parameters: PlantParameters) -> LinkShape:
-    """Return mass, length and inertia of the link that is drawn.
-
-    Args:
-        parameters: The plant.
-    """
+    """Return mass, length and inertia of the link that is drawn."""
     at_bob = _BOB_SHARE * parameters.inertia
     if parameters.gravity > 0.0:
         # m l^2 = at_bob and m g l = G
