@@ -17,7 +17,9 @@ from pendulum_lqr.controller import (
     controller_class,
     controller_parameters,
     make_controller,
+    unwrapped,
 )
+from pendulum_lqr.controllers.nmpc import NonlinearMpc
 from pendulum_lqr.controllers.playback import Playback
 from pendulum_lqr.disturbance import make_disturbance
 from pendulum_lqr.policy_file import write_policy
@@ -166,6 +168,22 @@ def test_unlimited_mpc_is_the_discrete_lqr_and_limited_mpc_keeps_the_limit():
         assert abs(far.command(0.0, strong)) <= dfki.effort_limit
     tight = make_controller("mpc", THESIS, 0.01, {"effort_limit": 2.0})
     assert tight.command(0.0, (0.3, 0.0)) == pytest.approx(-2.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("name", "answered"), [("mpc", "the LQR"), ("nmpc", "the last plan")])
+def test_where_a_solver_finds_no_plan_the_user_is_told(
+    name: str, answered: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = make_controller(name, DFKI, 0.01)
+    controller = unwrapped(told)
+    assert told.notice == ""
+    if isinstance(controller, NonlinearMpc):
+        monkeypatch.setattr(controller, "_solver", lambda **given: {"x": np.full_like(given["x0"], np.nan)})
+    else:
+        monkeypatch.setattr(controller._program, "first", lambda *_: None)
+    for _ in range(2):
+        assert abs(told.command(0.0, (0.3, 0.0))) <= DFKI.effort_limit
+    assert told.notice == f"no plan for 2 states: {answered} answered"
 
 
 def test_mpc_keeps_the_angle_within_its_soft_limit_where_lqr_does_not(simulate):

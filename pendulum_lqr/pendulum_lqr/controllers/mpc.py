@@ -59,6 +59,7 @@ class LinearMpc(BaseController):
 
     def __init__(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(p["effort_limit"], p["set_point"])
+        self._failures = 0
         self.hold = model.effort if p["feedforward"] else 0.0
         if abs(self.hold) >= self.effort_limit:
             raise DesignError(
@@ -118,6 +119,8 @@ class LinearMpc(BaseController):
         low, high = np.array([-self.effort_limit - held]), np.array([self.effort_limit - held])
         plan = self._program.first(state, low, high)
         if plan is None:
+            self._failures += 1
+            self.notice = f"no plan for {self._failures} states: the LQR answered"
             return -float(self.gain.K @ state)
         return float(plan[0])
 

@@ -57,6 +57,7 @@ class NonlinearMpc(BaseController):
         self.steps = int(p["steps"])
         self._solver, self._lower, self._upper = _problem(plant, p, catch.hold)
         self._plan: Array | None = None
+        self._failures = 0
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> NonlinearMpc:
@@ -81,6 +82,8 @@ class NonlinearMpc(BaseController):
             self._plan = plan
         else:
             # The last plan, shifted to now, is a better answer than none.
+            self._failures += 1
+            self.notice = f"no plan for {self._failures} states: the last plan answered"
             self._plan = guess
         return self.clamp(float(self._plan[2]))
 
