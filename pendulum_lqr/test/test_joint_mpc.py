@@ -174,7 +174,7 @@ def test_a_pole_that_may_not_lean_far_leans_less_far() -> None:
 def test_an_effort_that_holds_upright_is_within_the_limits_and_not_on_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
     plant = delayed_plant("acrobot_frictionless", PERIOD)
     weighted = replace(linearise_mechanism(plant), efforts=(2.0,))
-    monkeypatch.setattr("pendulum_lqr.controllers.joint_discrete_lqr.linearise_mechanism", lambda _: weighted)
+    monkeypatch.setattr("pendulum_lqr.controllers.joint_lqr.linearise_mechanism", lambda _: weighted)
     controller = make_joint_controller("mpc", plant, {}, PERIOD)
     for _ in range(3):
         assert controller.command(0.0, plant.coordinates.goal, (0.0, 0.0)) == pytest.approx((2.0,), abs=1e-4)

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, gain_text, joint_limits, joint_weights
+from pendulum_lqr.controllers.joint_lqr import UprightController, gain_text
 from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.mechanism_controller import within_limits
-from pendulum_lqr.mechanism_model import linearise_mechanism
 from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_lqr.sampling import require_period
 from pendulum_msgs_py.joints import Vector
-from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["JointDiscreteLqr"]
@@ -24,42 +22,22 @@ __all__ = ["JointDiscreteLqr"]
 Array = NDArray[np.float64]
 
 
-class JointDiscreteLqr(JointController):
+class JointDiscreteLqr(UprightController):
     """u = u* - K [q - q*, v, efforts on their way, oldest first] about upright, held over each period.
 
     What is on its way is what it sent itself, limits included.
-
-    Args:
-        plant: The plant.
-        p: Checked parameters.
-        period: Sampling period [s].
     """
 
     SUMMARY = "discrete LQR for zero-order hold, with compensation of the plant's delay"
 
     def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
-        super().__init__(joint_limits(plant, p["effort_limit"]))
-        model = linearise_mechanism(plant)
-        self.model = discretise(model, period)
-        self.cost = sampled_cost(model, p["q"], p["r"], period)
+        super().__init__(plant, p, period)
+        self.model = discretise(self._linear, period)
+        self.cost = sampled_cost(self._linear, p["q"], p["r"], period)
         self.gain = discrete_lqr(self.model, *self.cost)
-        self.period = period
         self._K = np.atleast_2d(self.gain.K)
-        self._hold = np.array(model.efforts)
-        self._deviation = plant.coordinates.deviation
-        self._linear = model
         self._none = (0.0,) * len(self._hold)
         self._on_their_way: deque[Vector] = deque([self._none] * self.model.pending, self.model.pending)
-
-    @classmethod
-    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
-        """Return weights and limit."""
-        return (*joint_weights(plant), JOINT_LIMIT)
-
-    @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointDiscreteLqr:
-        """Return the controller for the plant linearised at upright."""
-        return cls(plant, p, period)
 
     def check(self, period: float) -> None:
         """Refuse another period than that of the design [s]."""

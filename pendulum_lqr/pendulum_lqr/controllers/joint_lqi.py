@@ -11,15 +11,14 @@ import numpy as np
 from pendulum_lqr.controllers.joint_lqr import (
     JOINT_LIMIT,
     SMALLER_Q,
+    UprightController,
     gain_text,
-    joint_limits,
     joint_weights,
     require_settling,
 )
-from pendulum_lqr.design import Gain
 from pendulum_lqr.interface import Controller, JointController
 from pendulum_lqr.mechanism_controller import within_limits
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.mechanism_model import mechanism_lqr
 from pendulum_lqr.model import LinearModel
 from pendulum_lqr.sampling import require_period
 from pendulum_msgs_py.joints import Vector
@@ -29,30 +28,20 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 __all__ = ["JointLqi"]
 
 
-class JointLqi(JointController):
+class JointLqi(UprightController):
     """u = u* - K [q - q*, v, integrals of the driven joints' q - q*] about upright.
 
     As many outputs as there are efforts can be brought to where they belong, whatever constant effort disturbs: those
     of the driven joints. All integrals stand still while an effort is at its limit, so that they do not wind up.
-
-    Args:
-        plant: The plant.
-        model: Its linear model about upright, with integrals.
-        gain: Gain, K of shape (m, 2n + m).
-        period: Sampling period [s].
-        effort_limits: Largest effort of each driven joint [N m or N].
     """
 
     SUMMARY = "LQR with integrals of the driven joints: no offset of theirs under a constant effort"
 
-    def __init__(
-        self, plant: MechanismParameters, model: LinearModel, gain: Gain, period: float, effort_limits: Vector
-    ) -> None:
-        super().__init__(effort_limits)
-        self.gain, self.period = gain, period
-        self._plant, self._model = plant, model
-        self._coordinates = plant.coordinates
-        self._hold = np.array(model.efforts)
+    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
+        super().__init__(plant, p, period)
+        self._driven = plant.coordinates.driven
+        self._model = _with_integrals(self._linear, self._driven)
+        self.gain = mechanism_lqr(self._model, [*p["q"], *(p["q_integral"],) * len(self._driven)], p["r"])
         self._integral = np.zeros(len(self._hold))
 
     @classmethod
@@ -61,20 +50,6 @@ class JointLqi(JointController):
         meaning = "Weight of the integral of each driven joint's deviation."
         integral = ParameterSpec("q_integral", 10.0, "", meaning, minimum=0.0, exclusive_minimum=True)
         return (*joint_weights(plant), integral, JOINT_LIMIT)
-
-    @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointLqi:
-        """Return the LQI.
-
-        Raises:
-            ParameterError: There is none for these weights.
-        """
-        model = linearise_mechanism(plant)
-        driven = plant.coordinates.driven
-        wide = _with_integrals(model, driven)
-        gain = mechanism_lqr(wide, [*p["q"], *(p["q_integral"],) * len(driven)], p["r"])
-        limits = joint_limits(plant, p["effort_limit"])
-        return cls(plant, wide, gain, period, limits)
 
     def check(self, period: float) -> None:
         """Refuse another period than that of the design [s], and one at which it does not settle."""
@@ -87,8 +62,8 @@ class JointLqi(JointController):
 
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts [N m or N]."""
-        deviation = self._coordinates.deviation(position)
-        integral = self._integral + self.period * np.array([deviation[joint] for joint in self._coordinates.driven])
+        deviation = self._deviation(position)
+        integral = self._integral + self.period * np.array([deviation[joint] for joint in self._driven])
         wanted = self._hold - self.gain.K @ np.array([*deviation, *velocity, *integral])
         efforts = within_limits(wanted, self.effort_limits)
         if all(abs(effort) <= limit for effort, limit in zip(wanted, self.effort_limits, strict=True)):

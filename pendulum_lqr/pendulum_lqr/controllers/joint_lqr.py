@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
 from pendulum_lqr.analysis import delayed_spectral_radius
 from pendulum_lqr.design import Gain
 from pendulum_lqr.interface import JointController
@@ -22,6 +24,7 @@ __all__ = [
     "JOINT_LIMIT",
     "SMALLER_Q",
     "JointLqr",
+    "UprightController",
     "gain_text",
     "joint_limits",
     "joint_weights",
@@ -82,27 +85,25 @@ def gain_text(rows: Iterable[Iterable[float]]) -> str:
     return "; ".join(", ".join(f"{value:.6g}" for value in row) for row in rows)
 
 
-class JointLqr(JointController):
-    """Continuous LQR of n joints, sampled.
+class UprightController(JointController):
+    """Feedback of all deviations about upright, by the linear model there.
 
     Args:
         plant: The plant.
-        model: Its linear model about upright.
-        gain: Gain, K of shape (m, 2n).
-        effort_limits: Largest effort of each driven joint [N m or N].
+        p: Checked parameters.
+        period: Sampling period [s].
+
+    Raises:
+        ParameterError: There is no such feedback for these weights.
     """
 
-    SUMMARY = "continuous LQR, sampled"
-    SAMPLED = False
-
-    def __init__(self, plant: MechanismParameters, model: LinearModel, gain: Gain, effort_limits: Vector) -> None:
-        super().__init__(effort_limits)
-        self.gain = gain
-        self._plant, self._model = plant, model
+    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
+        super().__init__(joint_limits(plant, p["effort_limit"]))
+        self.period = period
+        self._plant = plant
+        self._linear = linearise_mechanism(plant)
+        self._hold = np.array(self._linear.efforts)
         self._deviation = plant.coordinates.deviation
-        # Plain floats: indexing an array on every state costs more than the law itself.
-        self._rows = tuple(tuple(float(value) for value in row) for row in gain.K)
-        self._hold = model.efforts
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
@@ -110,26 +111,33 @@ class JointLqr(JointController):
         return (*joint_weights(plant), JOINT_LIMIT)
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointLqr:
-        """Return the LQR.
+    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> UprightController:
+        """Return the controller for the plant linearised at upright."""
+        return cls(plant, p, period)
 
-        Raises:
-            ParameterError: There is none for these weights.
-        """
-        model = linearise_mechanism(plant)
-        gain = mechanism_lqr(model, p["q"], p["r"])
-        return cls(plant, model, gain, joint_limits(plant, p["effort_limit"]))
+
+class JointLqr(UprightController):
+    """Continuous LQR of n joints, sampled."""
+
+    SUMMARY = "continuous LQR, sampled"
+    SAMPLED = False
+
+    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
+        super().__init__(plant, p, period)
+        self.gain = mechanism_lqr(self._linear, p["q"], p["r"])
+        # Plain floats: indexing an array on every state costs more than the law itself.
+        self._rows = tuple(tuple(float(value) for value in row) for row in self.gain.K)
 
     def check(self, period: float) -> None:
         """Refuse a period at which it does not settle [s]."""
-        require_settling("lqr", self._plant.name, self._model, self.gain, period, SMALLER_Q)
+        require_settling("lqr", self._plant.name, self._linear, self.gain, period, SMALLER_Q)
 
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts."""
         x = self._deviation(position) + velocity
         wanted = (
             hold - sum(k * value for k, value in zip(row, x, strict=True))
-            for row, hold in zip(self._rows, self._hold, strict=True)
+            for row, hold in zip(self._rows, self._linear.efforts, strict=True)
         )
         return within_limits(wanted, self.effort_limits)
 
