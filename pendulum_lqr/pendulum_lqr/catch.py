@@ -4,62 +4,58 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
+from pendulum_lqr.controller import BaseController
 from pendulum_lqr.design import DesignError, Gain, continuous_lqr
+from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
 from pendulum_lqr.roa import proven_level
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["Catch", "make_catch"]
+__all__ = ["Catch", "CatchingController", "make_catch"]
 
 _LET_GO = 2.0
 
 
+@dataclass
 class Catch:
     """LQR at the set-point with hysteresis: takes over inside x' S x <= level, lets go beyond twice the proven level.
 
-    Args:
+    Attributes:
         gain: Gain and Riccati solution.
         level: Level at which it takes over.
         release: Level at which it lets go, larger.
         effort_limit: Largest torque [N m].
         set_point: Angle from upright [rad].
         hold: Torque that holds it [N m].
+        active: Whether it is in charge.
     """
 
-    def __init__(
-        self,
-        gain: Gain,
-        level: float,
-        release: float,
-        effort_limit: float,
-        set_point: float = 0.0,
-        hold: float = 0.0,
-    ) -> None:
-        self.gain = gain
-        self.level = level
-        self.release = release
-        self.effort_limit = effort_limit
-        self.set_point = set_point
-        self.hold = hold
-        self.active = False
-        self._k0, self._k1 = (float(value) for value in gain.K)
-        self._s00, self._s01, self._s11 = (float(gain.S[0, 0]), float(gain.S[0, 1]), float(gain.S[1, 1]))
+    gain: Gain
+    level: float
+    release: float
+    effort_limit: float
+    set_point: float
+    hold: float
+    active: bool = False
+
+    def __post_init__(self) -> None:
+        """Take plain floats out of arrays: indexing these on every state costs more than the law itself."""
+        self._k0, self._k1 = (float(value) for value in self.gain.K)
+        self._s00, self._s01, self._s11 = (float(self.gain.S[row]) for row in ((0, 0), (0, 1), (1, 1)))
 
     def reset(self) -> None:
         """Let go."""
         self.active = False
 
-    def value(self, angle: float, velocity: float) -> float:
-        """Return x' S x of a deviation from the set-point."""
-        return self._s00 * angle * angle + 2.0 * self._s01 * angle * velocity + self._s11 * velocity * velocity
-
     def holds(self, angle: float, velocity: float) -> bool:
         """Tell whether the LQR is in charge at a state, and remember it."""
         angle = wrap(angle - self.set_point)
-        self.active = self.value(angle, velocity) <= (self.release if self.active else self.level)
+        cost = self._s00 * angle * angle + 2.0 * self._s01 * angle * velocity + self._s11 * velocity * velocity
+        self.active = cost <= (self.release if self.active else self.level)
         return self.active
 
     def command(self, angle: float, velocity: float) -> float:
@@ -71,6 +67,29 @@ class Catch:
         """Return gain and level."""
         reach = math.sqrt(self.level * self._s11 / (self._s00 * self._s11 - self._s01**2))
         return f"K = [{self._k0:.4f}, {self._k1:.4f}] within {reach:.3f} rad"
+
+
+class CatchingController(BaseController):
+    """Brings a rigid pendulum to where an LQR catches it; how it does so is said by its class.
+
+    Args:
+        catch: LQR with hysteresis; set-point and torque limit are its own.
+    """
+
+    SERIES_ELASTIC = False
+
+    def __init__(self, catch: Catch) -> None:
+        super().__init__(catch.effort_limit, catch.set_point)
+        self.catch = catch
+
+    def reset(self) -> None:
+        """Let go."""
+        self.catch.reset()
+
+    def take_over(self, previous: Controller) -> None:
+        """Take over whether the LQR is in charge."""
+        if isinstance(previous, type(self)):
+            self.catch.active = previous.catch.active
 
 
 def make_catch(

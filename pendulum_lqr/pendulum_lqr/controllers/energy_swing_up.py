@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.catch import Catch, CatchingController, make_catch
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.energy_margin import EnergyMargin
@@ -23,7 +22,7 @@ _REST = 0.02
 """Velocity below which the pendulum may be held by dry friction [rad/s]."""
 
 
-class EnergySwingUp(BaseController):
+class EnergySwingUp(CatchingController):
     """Pumps energy until the set-point is within reach, then hands over to an LQR.
 
     Pumping torque: u = clamp(k (E* (1 + margin) - E) theta_dot + b theta_dot + tau_C sgn(theta_dot) - tau_0), with
@@ -36,7 +35,6 @@ class EnergySwingUp(BaseController):
         gain: k [s/rad].
         margin: Energy beyond that of upright, as a share of E* [-].
         catch: LQR with hysteresis, at its set-point.
-        effort_limit: Largest torque [N m].
 
     Raises:
         DesignError: Dry friction holds more than the torque limit.
@@ -44,7 +42,6 @@ class EnergySwingUp(BaseController):
     Source: Astrom and Furuta, Swinging up a pendulum by energy control, Automatica 36(2), 2000, eq. 7.
     """
 
-    SERIES_ELASTIC = False
     SUMMARY = "swing-up by energy shaping, caught by LQR with hysteresis"
     PARAMETERS = (
         ParameterSpec(
@@ -58,21 +55,15 @@ class EnergySwingUp(BaseController):
         CATCH_SHARE,
     )
 
-    def __init__(self, plant: PlantParameters, gain: float, margin: float, catch: Catch, effort_limit: float) -> None:
-        super().__init__(effort_limit, catch.set_point)
-        if effort_limit <= plant.static_friction + abs(plant.torque_offset):
+    def __init__(self, plant: PlantParameters, gain: float, margin: float, catch: Catch) -> None:
+        super().__init__(catch)
+        if self.effort_limit <= plant.static_friction + abs(plant.torque_offset):
             raise DesignError(
-                f"effort_limit is {effort_limit:g} N m; expected more than static friction and torque offset, "
+                f"effort_limit is {self.effort_limit:g} N m; expected more than static friction and torque offset, "
                 f"{plant.static_friction + abs(plant.torque_offset):g} N m, or the pendulum may never move"
             )
         self.gain = gain
-        self.catch = catch
-        self._inertia = plant.inertia
-        self._gravity = plant.gravity
-        self._damping = plant.damping
-        self._coulomb = plant.coulomb_friction
-        self._angle_offset = plant.angle_offset
-        self._torque_offset = plant.torque_offset
+        self._plant = plant
         self._target = plant.gravity * (1.0 + math.cos(catch.set_point - plant.angle_offset))
         self._margin = EnergyMargin(margin)
         self.reset()
@@ -81,11 +72,11 @@ class EnergySwingUp(BaseController):
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> EnergySwingUp:
         """Return the swing-up controller with its catch designed under the torque limit."""
         catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"], p["set_point"])
-        return cls(plant, p["gain"], p["energy_margin"], catch, p["effort_limit"])
+        return cls(plant, p["gain"], p["energy_margin"], catch)
 
     def reset(self) -> None:
         """Start in the swing-up phase."""
-        self.catch.reset()
+        super().reset()
         self._margin.reset()
 
     def command(self, t: float, x: Sequence[float]) -> float:
@@ -97,20 +88,21 @@ class EnergySwingUp(BaseController):
 
     def pump(self, angle: float, velocity: float) -> float:
         """Return the torque that brings the energy to its target, before the limit [N m]."""
-        angle -= self._angle_offset
+        plant = self._plant
+        angle -= plant.angle_offset
         if abs(velocity) < _REST:
             # Where gravity pulls neither way, at the bottom, either side will do.
-            pull = self._gravity * math.sin(angle) + self._torque_offset
+            pull = plant.gravity * math.sin(angle) + plant.torque_offset
             return math.copysign(self.effort_limit, pull)
-        energy = 0.5 * self._inertia * velocity * velocity + self._gravity * (1.0 + math.cos(angle))
-        friction = self._damping * velocity + math.copysign(self._coulomb, velocity) - self._torque_offset
+        energy = 0.5 * plant.inertia * velocity * velocity + plant.gravity * (1.0 + math.cos(angle))
+        friction = plant.damping * velocity + math.copysign(plant.coulomb_friction, velocity) - plant.torque_offset
         return self.gain * (self._target * (1.0 + self._margin.value) - energy) * velocity + friction
 
     def take_over(self, previous: Controller) -> None:
         """Take over what was learnt, and whether the LQR is in charge."""
+        super().take_over(previous)
         if isinstance(previous, EnergySwingUp):
             self._margin.take_over(previous._margin)
-            self.catch.active = previous.catch.active
 
     def describe(self) -> str:
         """Return gains of both phases."""

@@ -10,10 +10,8 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.catch import Catch, CatchingController, make_catch
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R
-from pendulum_lqr.interface import Controller
 from pendulum_lqr.trajectory_optimisation import rigid_flow
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -23,7 +21,7 @@ __all__ = ["NonlinearMpc"]
 Array = NDArray[np.float64]
 
 
-class NonlinearMpc(BaseController):
+class NonlinearMpc(CatchingController):
     """Multiple shooting with RK4 over N steps, warm-started from the last plan; LQR takes over near upright.
 
     Minimises the sum of h (q0 2 (1 - cos e) + q1 theta_dot^2 + r (u - u*)^2) and a terminal cost of the same form;
@@ -36,7 +34,6 @@ class NonlinearMpc(BaseController):
         catch: LQR with hysteresis.
     """
 
-    SERIES_ELASTIC = False
     SUMMARY = "nonlinear MPC by multiple shooting, swings up and balances"
     PARAMETERS = (
         ParameterSpec("q", [10.0, 0.1], "1/rad^2, s^2/rad^2", "Weights of angle and velocity.", minimum=0.0),
@@ -50,8 +47,7 @@ class NonlinearMpc(BaseController):
     )
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any], catch: Catch) -> None:
-        super().__init__(p["effort_limit"], catch.set_point)
-        self.catch = catch
+        super().__init__(catch)
         self.period = period
         self.step = float(p["step"])
         self.steps = int(p["steps"])
@@ -67,7 +63,7 @@ class NonlinearMpc(BaseController):
 
     def reset(self) -> None:
         """Forget the plan."""
-        self.catch.reset()
+        super().reset()
         self._plan = None
 
     def command(self, t: float, x: Sequence[float]) -> float:
@@ -86,11 +82,6 @@ class NonlinearMpc(BaseController):
             self.notice = f"no plan for {self._failures} states: the last plan answered"
             self._plan = guess
         return self.clamp(float(self._plan[2]))
-
-    def take_over(self, previous: Controller) -> None:
-        """Take over whether the LQR is in charge."""
-        if isinstance(previous, NonlinearMpc):
-            self.catch.active = previous.catch.active
 
     def describe(self) -> str:
         """Return horizon and catch."""

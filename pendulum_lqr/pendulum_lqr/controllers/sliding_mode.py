@@ -63,9 +63,7 @@ class SlidingMode(BaseController):
         self.rate = rate
         self.gain = gain
         self.layer = layer
-        self._gravity = plant.gravity
-        self._angle_offset = plant.angle_offset
-        self._torque_offset = plant.torque_offset
+        self._plant = plant
         self._proportional = plant.damping * rate
         self._derivative = plant.inertia * rate
 
@@ -80,8 +78,8 @@ class SlidingMode(BaseController):
         sliding = (x[1] + self.rate * error) / self.layer
         switch = 1.0 if sliding > 1.0 else (max(sliding, -1.0))
         return self.clamp(
-            -self._gravity * math.sin(x[0] - self._angle_offset)
-            - self._torque_offset
+            -self._plant.gravity * math.sin(x[0] - self._plant.angle_offset)
+            - self._plant.torque_offset
             - self._proportional * error
             - self._derivative * x[1]
             - self.gain * switch

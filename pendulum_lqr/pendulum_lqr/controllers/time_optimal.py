@@ -8,10 +8,8 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
-from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.catch import Catch, CatchingController, make_catch
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
-from pendulum_lqr.interface import Controller
 from pendulum_lqr.minimum_time import SIGN_VELOCITY, TimeToGo, minimum_time
 from pendulum_lqr.model import acceleration_from_upright
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -20,18 +18,16 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["TimeOptimal"]
 
 
-class TimeOptimal(BaseController):
+class TimeOptimal(CatchingController):
     """Picks the torque whose successor has the least time to go to the catch's region; a feedback from every state.
 
     Args:
         plant: Plant parameters.
         table: Time to go.
         catch: LQR with hysteresis.
-        effort_limit: Largest torque [N m].
         horizon: How far a candidate torque looks ahead [s].
     """
 
-    SERIES_ELASTIC = False
     SUMMARY = "swing-up in minimum time by dynamic programming, caught by LQR"
     PARAMETERS = (
         ParameterSpec("grid", 400, "-", "Grid points in angle and in velocity.", minimum=40, maximum=1000),
@@ -40,12 +36,9 @@ class TimeOptimal(BaseController):
         replace(CATCH_SHARE, default=0.9),
     )
 
-    def __init__(
-        self, plant: PlantParameters, table: TimeToGo, catch: Catch, effort_limit: float, horizon: float
-    ) -> None:
-        super().__init__(effort_limit, catch.set_point)
+    def __init__(self, plant: PlantParameters, table: TimeToGo, catch: Catch, horizon: float) -> None:
+        super().__init__(catch)
         self.table = table
-        self.catch = catch
         self.horizon = horizon
         self._plant = plant
         self._substeps = max(2, math.ceil(horizon * plant.damping / plant.inertia / 0.5))
@@ -57,11 +50,7 @@ class TimeOptimal(BaseController):
         table = _table(
             plant, p["effort_limit"], tuple(p["catch_q"]), p["catch_r"], p["catch_share"], p["set_point"], p["grid"]
         )
-        return cls(plant, table, catch, p["effort_limit"], max(period, table.step))
-
-    def reset(self) -> None:
-        """Let go."""
-        self.catch.reset()
+        return cls(plant, table, catch, max(period, table.step))
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m]."""
@@ -82,11 +71,6 @@ class TimeOptimal(BaseController):
             angle += h * (velocity + 0.5 * h * acceleration)
             velocity += h * acceleration
         return angle, velocity
-
-    def take_over(self, previous: Controller) -> None:
-        """Take over whether the LQR is in charge."""
-        if isinstance(previous, TimeOptimal):
-            self.catch.active = previous.catch.active
 
     def describe(self) -> str:
         """Return the time from hanging at rest, and the catch."""

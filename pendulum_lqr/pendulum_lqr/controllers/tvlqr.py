@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.catch import Catch, make_catch
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.catch import Catch, CatchingController, make_catch
 from pendulum_lqr.controllers.energy_swing_up import EnergySwingUp
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R
 from pendulum_lqr.design import cost_matrices
@@ -33,7 +32,7 @@ _MOST_LOSSES = 2
 _ANGLE_SCALE, _VELOCITY_SCALE = 0.5, 2.0
 
 
-class Tvlqr(BaseController):
+class Tvlqr(CatchingController):
     """u = u0(t) - K(t) (x - x0(t)) along an optimised swing-up, then LQR.
 
     The trajectory and, for a plant without offsets, its mirror image are tracked from wherever the state is
@@ -47,12 +46,10 @@ class Tvlqr(BaseController):
         gains: K at each sample, shape (n, 2).
         catch: LQR with hysteresis.
         pump: What swings it up where no trajectory is near.
-        effort_limit: Largest torque [N m].
 
     Source: Tedrake, Underactuated Robotics, section 8.2 (finite-horizon LQR along a trajectory).
     """
 
-    SERIES_ELASTIC = False
     SUMMARY = "swing-up along a trajectory by direct collocation, tracked by time-varying LQR"
     PARAMETERS = (
         ParameterSpec(
@@ -76,15 +73,13 @@ class Tvlqr(BaseController):
         r: float,
         catch: Catch,
         pump: EnergySwingUp,
-        effort_limit: float,
     ) -> None:
-        super().__init__(effort_limit, catch.set_point)
+        super().__init__(catch)
         # Gravity knows no left and right; a torque offset, or a set-point beside the top, does.
         alike = plant.torque_offset == 0.0 and catch.set_point == plant.angle_offset
         self._signs = (1.0, -1.0) if alike else (1.0,)
         self._centre = plant.angle_offset
         self.trajectory = trajectory
-        self.catch = catch
         self.pump = pump
         self.period = period
         samples = math.ceil(trajectory.duration / period)
@@ -107,12 +102,12 @@ class Tvlqr(BaseController):
         catch = make_catch(plant, p["catch_q"], p["catch_r"], limit, set_point=set_point)
         trajectory = swing_up_trajectory(plant, limit * (1.0 - p["reserve"]), p["nodes"], set_point)
         pump_catch = make_catch(plant, (30.0, 0.3), 1.0, limit, 1.0, set_point)
-        pump = EnergySwingUp(plant, 50.0, 0.1, pump_catch, limit)
-        return cls(plant, period, trajectory, p["q"], p["r"], catch, pump, limit)
+        pump = EnergySwingUp(plant, 50.0, 0.1, pump_catch)
+        return cls(plant, period, trajectory, p["q"], p["r"], catch, pump)
 
     def reset(self) -> None:
         """Forget where on the trajectory it was."""
-        self.catch.reset()
+        super().reset()
         self.pump.reset()
         self._index: int | None = None
         self._joined = (0.0, 0)
@@ -146,8 +141,8 @@ class Tvlqr(BaseController):
 
     def take_over(self, previous: Controller) -> None:
         """Take over whether the LQR is in charge; a trajectory of its own has to be joined anew."""
+        super().take_over(previous)
         if isinstance(previous, Tvlqr):
-            self.catch.active = previous.catch.active
             self.pump.take_over(previous.pump)
 
     def describe(self) -> str:
