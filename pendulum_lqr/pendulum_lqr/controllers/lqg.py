@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, OFFSET_NOISE, Q, R
-from pendulum_lqr.design import Gain
+from pendulum_lqr.design import Gain, Matrix
 from pendulum_lqr.interface import Controller
-from pendulum_lqr.model import linearise
+from pendulum_lqr.model import LinearModel, linearise
 from pendulum_lqr.observer import Observer
 from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -23,10 +25,12 @@ class Lqg(BaseController):
     """Stationary LQG regulator for the whole linear model: motor, spring, lag and torques on their way are estimated.
 
     Args:
+        model: Linear model at the set-point.
+        period: Sampling period [s].
+        p: Checked parameters.
+
+    Attributes:
         gain: LQR gain on [x; torques on their way].
-        observer: Kalman filter, with the constant torque if that is observed.
-        effort_limit: Largest torque [N m].
-        set_point: Angle from upright [rad].
         hold: Torque that is fed forward at the set-point [N m].
     """
 
@@ -46,21 +50,22 @@ class Lqg(BaseController):
         FEEDFORWARD,
     )  # fmt: skip
 
-    def __init__(
-        self, gain: Gain, observer: Observer, effort_limit: float, set_point: float = 0.0, hold: float = 0.0
-    ) -> None:
-        super().__init__(effort_limit, set_point)
-        self.gain = gain
-        self.observer = observer
-        self.hold = hold
+    def __init__(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(p["effort_limit"], p["set_point"])
+        self.hold = model.effort if p["feedforward"] else 0.0
+        self._sampled = discretise(model, period, p["delay"])
+        self._cost = sampled_cost(model, p["q"], p["r"], period, p["delay"])
+        self.gain: Gain = discrete_lqr(self._sampled, *self._cost)
+        self._observer = self._make_observer(model, period, p)
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Lqg:
-        """Return the LQG regulator for the plant linearised at the set-point."""
-        model = linearise(plant, UPRIGHT + p["set_point"])
-        sampled = discretise(model, period, p["delay"])
-        gain = discrete_lqr(sampled, *sampled_cost(model, p["q"], p["r"], period, p["delay"]))
-        observer = Observer(
+        """Return the regulator for the plant linearised at the set-point."""
+        return cls(linearise(plant, UPRIGHT + p["set_point"]), period, p)
+
+    def _make_observer(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> Observer | None:
+        """Return the Kalman filter, with the constant torque if that is observed; None where none is needed."""
+        return Observer(
             model,
             period,
             angle_noise=p["angle_noise"],
@@ -69,25 +74,34 @@ class Lqg(BaseController):
             offset_noise=p["offset_noise"],
             delay=p["delay"],
         )
-        hold = model.effort if p["feedforward"] else 0.0
-        return cls(gain, observer, p["effort_limit"], p["set_point"], hold)
 
     def reset(self) -> None:
         """Forget the estimate."""
-        self.observer.reset()
+        if self._observer is not None:
+            self._observer.reset()
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque for what is measured [N m]."""
-        state = self.observer.correct(self.error(x[0]), x[1])
-        effort = self.clamp(self.hold - self.observer.offset - float(self.gain.K @ state))
-        self.observer.predict(effort)
+        state, offset = np.array([self.error(x[0]), x[1]]), 0.0
+        if self._observer is not None:
+            state = self._observer.correct(float(state[0]), float(state[1]))
+            offset = self._observer.offset
+        held = self.hold - offset
+        effort = self.clamp(held + self._beyond(state, held))
+        if self._observer is not None:
+            self._observer.predict(effort)
         return effort
+
+    def _beyond(self, state: Matrix, held: float) -> float:
+        """Return the torque beyond what holds, for a state of the sampled model [N m]."""
+        return -float(self.gain.K @ state)
 
     def describe(self) -> str:
         """Return both gains."""
-        return f"K = [{', '.join(f'{value:.6f}' for value in self.gain.K)}], {self.observer.describe()}"
+        filtered = "" if self._observer is None else f", {self._observer.describe()}"
+        return f"K = [{', '.join(f'{value:.6f}' for value in self.gain.K)}]{filtered}"
 
     def take_over(self, previous: Controller) -> None:
         """Take over the estimate, moved to the new set-point."""
-        if isinstance(previous, Lqg):
-            self.observer.carry_over(previous.observer, self.set_point - previous.set_point)
+        if isinstance(previous, Lqg) and self._observer is not None and previous._observer is not None:
+            self._observer.carry_over(previous._observer, self.set_point - previous.set_point)
