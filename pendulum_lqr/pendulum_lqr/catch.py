@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 from pendulum_lqr.controller import BaseController
 from pendulum_lqr.design import DesignError, Gain, continuous_lqr
@@ -18,6 +19,8 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["Catch", "CatchingController", "make_catch"]
 
 _LET_GO = 2.0
+_SHARE = 0.9
+"""Share of the proven level in which it takes over, where that is no parameter."""
 
 
 @dataclass
@@ -72,15 +75,16 @@ class Catch:
 class CatchingController(BaseController):
     """Brings a rigid pendulum to where an LQR catches it; how it does so is said by its class.
 
-    Args:
-        catch: LQR with hysteresis; set-point and torque limit are its own.
+    Attributes:
+        catch: LQR with hysteresis at the set-point.
     """
 
     SERIES_ELASTIC = False
 
-    def __init__(self, catch: Catch) -> None:
-        super().__init__(catch.effort_limit, catch.set_point)
-        self.catch = catch
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(p["effort_limit"], p["set_point"])
+        share = p.get("catch_share", _SHARE)
+        self.catch = make_catch(plant, p["catch_q"], p["catch_r"], self.effort_limit, share, self.set_point)
 
     def reset(self) -> None:
         """Let go."""
@@ -97,8 +101,8 @@ def make_catch(
     q: Sequence[float],
     r: float,
     effort_limit: float,
-    share: float = 0.9,
-    set_point: float = 0.0,
+    share: float,
+    set_point: float,
 ) -> Catch:
     """Return the catch for a plant under a torque limit; lag and delay are not in its proof.
 

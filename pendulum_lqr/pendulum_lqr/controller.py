@@ -123,7 +123,7 @@ class BaseController:
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> BaseController:
-        """Return the controller for a plant.
+        """Return the controller for a plant; by default what the class makes of these three.
 
         Args:
             plant: Plant parameters.
@@ -133,7 +133,9 @@ class BaseController:
         Raises:
             ParameterError: The values do not make a controller for this plant.
         """
-        raise NotImplementedError(f"{cls.__name__}.design")
+        make: Any = cls
+        designed: BaseController = make(plant, period, p)
+        return designed
 
     @classmethod
     def judged_at(cls, p: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:

@@ -9,15 +9,17 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pendulum_lqr.answer_rules import NEVER, judge_state
+from pendulum_lqr.answer_rules import judge_state
 from pendulum_lqr.compiled_controller import law_of
-from pendulum_lqr.controller import EstimatedVelocity, SoftStart, make_controller
+from pendulum_lqr.controller import EstimatedVelocity, SoftStart, controller_parameters, make_controller
 from pendulum_lqr.controllers.lqr import Lqr
 from pendulum_lqr.law import MOST_MEMORY, MOST_NUMBERS
 from pendulum_lqr.sampling import PeriodWatch, goes_on
 from pendulum_msgs_py.contract.angles import deviation_from_upright, from_upright
+from pendulum_msgs_py.contract.rules import NEVER
 from pendulum_msgs_py.contract.timing import RingOfTimes
 from pendulum_msgs_py.loops.trees import compile_tree
+from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 LAWS = ("lqr", "lqr_friction", "lqi", "discrete_lqr", "pid", "pd_gravity")
@@ -75,7 +77,7 @@ def test_what_stands_around_a_law_keeps_it_from_being_compiled():
         def command(self, t, x):
             return 0.0
 
-    assert law_of(Other(lqr.gain, 1.0)) is None
+    assert law_of(Other.design(plant, 0.002, validate(controller_parameters("lqr"), {"effort_limit": 1.0}))) is None
 
 
 @given(before=st.lists(st.integers(1, 9), max_size=9), more=st.lists(st.integers(1, 9), max_size=9))

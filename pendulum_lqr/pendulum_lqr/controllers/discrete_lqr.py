@@ -13,7 +13,7 @@ from pendulum_lqr.design import DesignError, Gain
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.model import linearise
-from pendulum_lqr.sampled_design import DiscreteModel, discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -58,16 +58,7 @@ def discrete_lqr_law(
 
 
 class DiscreteLqr(LawController):
-    """Discrete LQR with delay compensation: u = u* - K [x - x*; lagged torque; torques on their way, oldest first].
-
-    Args:
-        model: Sampled model.
-        gain: Gain on its state.
-        equilibrium: Torque that holds the set-point, u* [N m].
-        effort_limit: Largest torque [N m].
-        set_point: Angle from upright [rad].
-        feedforward: Whether u* is added.
-    """
+    """Discrete LQR with delay compensation: u = u* - K [x - x*; lagged torque; torques on their way, oldest first]."""
 
     PREDICTS = True
     SUMMARY = "discrete LQR for zero-order hold, with compensation of a known delay"
@@ -85,48 +76,30 @@ class DiscreteLqr(LawController):
         FEEDFORWARD,
     )
 
-    def __init__(
-        self,
-        model: DiscreteModel,
-        gain: Gain,
-        equilibrium: float,
-        effort_limit: float,
-        set_point: float = 0.0,
-        *,
-        feedforward: bool = True,
-    ) -> None:
-        hold = equilibrium if feedforward else 0.0
-        pending = model.pending
-        lags = model.A.shape[0] - pending > 2
-        lag_gain, lag_share, sent_share = (gain.K[2], model.A[2, 2], model.B[2, 0]) if lags else (0.0, 0.0, 0.0)
-        unused = [0.0] * (_MOST_PENDING - pending)
-        shares = model.A[2, 3:] if lags else np.zeros(pending)
-        numbers = (hold, equilibrium, gain.K[0], gain.K[1], lags, lag_gain, lag_share, sent_share, pending)
-        weights = (*gain.K[len(gain.K) - pending :], *unused, *shares, *unused)
-        # No torque in the lag and none on its way.
-        at_first = [-equilibrium] * (1 + pending)
-        super().__init__(discrete_lqr_law, effort_limit, set_point, (*numbers, *weights), at_first)
-        self.gain = gain
-        self.hold = hold
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> DiscreteLqr:
-        """Return the discrete LQR for the plant linearised at the set-point, held and delayed."""
-        model = linearise(plant, UPRIGHT + p["set_point"])
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        linear = linearise(plant, UPRIGHT + p["set_point"])
         if plant.drivetrain is not None:
             raise DesignError(
-                f"plant {plant.name!r} is series elastic, and {' and '.join(model.hidden)} not measured; expected a "
+                f"plant {plant.name!r} is series elastic, and {' and '.join(linear.hidden)} not measured; expected a "
                 "rigid plant: use lqg, which estimates them, or lqr, whose gain does without"
             )
         delay = p["delay"] + plant.transport_delay
         if delay > _MOST_PENDING * period:
             raise DesignError(f"delay is {delay} s at a period of {period} s; expected at most {_MOST_PENDING} periods")
-        sampled = discretise(model, period, p["delay"])
-        if p["cost"] == "sum":
-            gain = discrete_lqr(sampled, p["q"], p["r"])
-        else:
-            gain = discrete_lqr(sampled, *sampled_cost(model, p["q"], p["r"], period, p["delay"]))
-        return cls(sampled, gain, model.effort, p["effort_limit"], p["set_point"], feedforward=p["feedforward"])
+        model = discretise(linear, period, p["delay"])
+        cost = sampled_cost(linear, p["q"], p["r"], period, p["delay"])
+        self.gain: Gain = discrete_lqr(model, *((p["q"], p["r"]) if p["cost"] == "sum" else cost))
+        K, pending = self.gain.K, model.pending
+        self.hold = linear.effort if p["feedforward"] else 0.0
+        lags = model.A.shape[0] - pending > 2
+        lag_gain, lag_share, sent_share = (K[2], model.A[2, 2], model.B[2, 0]) if lags else (0.0, 0.0, 0.0)
+        unused = [0.0] * (_MOST_PENDING - pending)
+        shares = model.A[2, 3:] if lags else np.zeros(pending)
+        numbers = (self.hold, linear.effort, K[0], K[1], lags, lag_gain, lag_share, sent_share, pending)
+        weights = (*K[len(K) - pending :], *unused, *shares, *unused)
+        # No torque in the lag and none on its way.
+        at_first = [-linear.effort] * (1 + pending)
+        super().__init__(discrete_lqr_law, p["effort_limit"], p["set_point"], (*numbers, *weights), at_first)
 
     def describe(self) -> str:
         """Return the gain."""

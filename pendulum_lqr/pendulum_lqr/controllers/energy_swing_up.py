@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from pendulum_lqr.catch import Catch, CatchingController, make_catch
+from pendulum_lqr.catch import CatchingController
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
 from pendulum_lqr.design import DesignError
 from pendulum_lqr.energy_margin import EnergyMargin
@@ -30,12 +30,6 @@ class EnergySwingUp(CatchingController):
     plant's offsets. Its first part is passive; the other two put back what friction takes. At rest, where no velocity
     says where to push and dry friction holds more than it takes in motion, it pushes at the limit where gravity pulls.
 
-    Args:
-        plant: Plant parameters.
-        gain: k [s/rad].
-        margin: Energy beyond that of upright, as a share of E* [-].
-        catch: LQR with hysteresis, at its set-point.
-
     Raises:
         DesignError: Dry friction holds more than the torque limit.
 
@@ -55,24 +49,18 @@ class EnergySwingUp(CatchingController):
         CATCH_SHARE,
     )
 
-    def __init__(self, plant: PlantParameters, gain: float, margin: float, catch: Catch) -> None:
-        super().__init__(catch)
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
         if self.effort_limit <= plant.static_friction + abs(plant.torque_offset):
             raise DesignError(
                 f"effort_limit is {self.effort_limit:g} N m; expected more than static friction and torque offset, "
                 f"{plant.static_friction + abs(plant.torque_offset):g} N m, or the pendulum may never move"
             )
-        self.gain = gain
+        self.gain = p["gain"]
         self._plant = plant
-        self._target = plant.gravity * (1.0 + math.cos(catch.set_point - plant.angle_offset))
-        self._margin = EnergyMargin(margin)
+        self._target = plant.gravity * (1.0 + math.cos(self.set_point - plant.angle_offset))
+        self._margin = EnergyMargin(p["energy_margin"])
         self.reset()
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> EnergySwingUp:
-        """Return the swing-up controller with its catch designed under the torque limit."""
-        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"], p["set_point"])
-        return cls(plant, p["gain"], p["energy_margin"], catch)
 
     def reset(self) -> None:
         """Start in the swing-up phase."""

@@ -24,11 +24,6 @@ __all__ = ["Lqg"]
 class Lqg(BaseController):
     """Stationary LQG regulator for the whole linear model: motor, spring, lag and torques on their way are estimated.
 
-    Args:
-        model: Linear model at the set-point.
-        period: Sampling period [s].
-        p: Checked parameters.
-
     Attributes:
         gain: LQR gain on [x; torques on their way].
         hold: Torque that is fed forward at the set-point [N m].
@@ -50,18 +45,14 @@ class Lqg(BaseController):
         FEEDFORWARD,
     )  # fmt: skip
 
-    def __init__(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        model = linearise(plant, UPRIGHT + p["set_point"])
         super().__init__(p["effort_limit"], p["set_point"])
         self.hold = model.effort if p["feedforward"] else 0.0
         self._sampled = discretise(model, period, p["delay"])
         self._cost = sampled_cost(model, p["q"], p["r"], period, p["delay"])
         self.gain: Gain = discrete_lqr(self._sampled, *self._cost)
         self._observer = self._make_observer(model, period, p)
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Lqg:
-        """Return the regulator for the plant linearised at the set-point."""
-        return cls(linearise(plant, UPRIGHT + p["set_point"]), period, p)
 
     def _make_observer(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> Observer | None:
         """Return the Kalman filter, with the constant torque if that is observed; None where none is needed."""

@@ -43,13 +43,6 @@ class Lqi(LawController):
 
     The integral stands still while the torque is at its limit and integrating would drive it further (conditional
     integration), so that it does not wind up.
-
-    Args:
-        gain: Gain on the three states.
-        period: Sampling period [s].
-        effort_limit: Largest torque [N m].
-        set_point: Angle from upright [rad].
-        hold: Torque at the set-point [N m].
     """
 
     SUMMARY = "LQR with an integral state: no offset under a constant torque"
@@ -67,19 +60,11 @@ class Lqi(LawController):
         FEEDFORWARD,
     )
 
-    def __init__(
-        self, gain: Gain, period: float, effort_limit: float, set_point: float = 0.0, hold: float = 0.0
-    ) -> None:
-        super().__init__(lqi_law, effort_limit, set_point, (hold, *gain.K, period), (0.0,))
-        self.gain = gain
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Lqi:
-        """Return the LQI for the plant linearised at the set-point."""
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         model = linearise(plant, UPRIGHT + p["set_point"])
+        self.gain: Gain = integral_lqr(model, [*p["q"], p["q_integral"]], p["r"])
         hold = model.effort if p["feedforward"] else 0.0
-        weights = [*p["q"], p["q_integral"]]
-        return cls(integral_lqr(model, weights, p["r"]), period, p["effort_limit"], p["set_point"], hold)
+        super().__init__(lqi_law, p["effort_limit"], p["set_point"], (hold, *self.gain.K, period), (0.0,))
 
     def describe(self) -> str:
         """Return the gain."""

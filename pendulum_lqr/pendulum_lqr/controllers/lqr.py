@@ -31,27 +31,16 @@ class Lqr(LawController):
     """Continuous LQR, sampled: the controller of the thesis.
 
     Where the plant has states that are not measured, K is the best gain on angle and velocity.
-
-    Args:
-        gain: Gain and Riccati solution.
-        effort_limit: Largest torque [N m].
-        set_point: Angle from upright [rad].
-        hold: Torque at the set-point, u* [N m].
     """
 
     SUMMARY = "linear quadratic regulator of the thesis, u = u* - K (x - x*)"
     PARAMETERS: ClassVar[tuple[ParameterSpec, ...]] = (Q, R, FEEDFORWARD)
 
-    def __init__(self, gain: Gain, effort_limit: float, set_point: float = 0.0, hold: float = 0.0) -> None:
-        super().__init__(lqr_law, effort_limit, set_point, (hold, *gain.K))
-        self.gain = gain
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Lqr:
-        """Return the LQR for the plant linearised at the set-point."""
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         model = linearise(plant, UPRIGHT + p["set_point"])
+        self.gain: Gain = output_lqr(model, p["q"], p["r"])
         hold = model.effort if p["feedforward"] else 0.0
-        return cls(output_lqr(model, p["q"], p["r"]), p["effort_limit"], p["set_point"], hold)
+        super().__init__(lqr_law, p["effort_limit"], p["set_point"], (hold, *self.gain.K))
 
     def describe(self) -> str:
         """Return gain and poles."""

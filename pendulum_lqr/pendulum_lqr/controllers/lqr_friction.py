@@ -49,13 +49,9 @@ class LqrFriction(LawController):
     one at the rate at which it runs, friction or no friction, so that less friction than was identified cannot make it
     hunt (sector condition for a static nonlinearity, by describing function).
 
-    Args:
-        gain: Gain and Riccati solution.
+    Attributes:
         friction: c, torque fed forward far from the set-point [N m].
         width: w, deviation over which it changes its sign [rad].
-        effort_limit: Largest torque [N m].
-        set_point: Angle from upright [rad].
-        hold: Torque at the set-point, u* [N m].
 
     Source:
         Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994, section 5.4 (compensation of friction, and
@@ -79,34 +75,21 @@ class LqrFriction(LawController):
         ),
     )
 
-    def __init__(
-        self,
-        gain: Gain,
-        friction: float,
-        width: float,
-        effort_limit: float,
-        set_point: float = 0.0,
-        hold: float = 0.0,
-    ) -> None:
-        super().__init__(lqr_friction_law, effort_limit, set_point, (hold, *gain.K, friction, width))
-        self.gain = gain
-        self.friction = friction
-        self.width = width
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LqrFriction:
-        """Return the controller for the plant linearised at the set-point."""
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         model = linearise(plant, UPRIGHT + p["set_point"])
-        gain = output_lqr(model, p["q"], p["r"])
-        friction = p["share"] * friction_effort(plant, model.theta)
-        if friction > _LARGEST * p["effort_limit"]:
+        self.gain: Gain = output_lqr(model, p["q"], p["r"])
+        self.friction = p["share"] * friction_effort(plant, model.theta)
+        if self.friction > _LARGEST * p["effort_limit"]:
             raise DesignError(
-                f"friction to compensate is {friction:.3g} N m, more than half of the effort_limit of "
+                f"friction to compensate is {self.friction:.3g} N m, more than half of the effort_limit of "
                 f"{p['effort_limit']:g} N m; expected a smaller share, or a plant with less friction"
             )
-        width = _width(model, gain, friction, period, p["width"]) if friction > 0.0 else math.inf
+        self.width = math.inf
+        if self.friction > 0.0:
+            self.width = _width(model, self.gain, self.friction, period, p["width"])
         hold = model.effort if p["feedforward"] else 0.0
-        return cls(gain, friction, width, p["effort_limit"], p["set_point"], hold)
+        numbers = (hold, *self.gain.K, self.friction, self.width)
+        super().__init__(lqr_friction_law, p["effort_limit"], p["set_point"], numbers)
 
     def describe(self) -> str:
         """Return gain, what is compensated, and what to watch for."""

@@ -35,15 +35,11 @@ class LqrTracking(BaseController):
     ``max_error``; a change of parameters goes on from the reference before it. The time of the reference is that of
     the states' stamps.
 
-    Args:
-        plant: Plant parameters.
-        period: Sampling period [s].
+    Attributes:
         reference: What it follows.
         schedule: Gain and feedforward over the angle.
-        approach_time: Shortest time in which it is joined [s]; 0 for at once.
-        max_error: Error of the angle beyond which it is joined anew [rad].
-        reserve: Share of the limit that is left to the feedback.
-        effort_limit: Largest torque [N m].
+        margins: How stable it is; None before it was checked.
+        needed: Largest torque that the reference takes [N m].
 
     Source:
         Rugh, Shamma, Automatica 36(10), 2000 (gain scheduling, frozen parameters); Spong, Hutchinson, Vidyasagar,
@@ -74,49 +70,30 @@ class LqrTracking(BaseController):
         R,
     )  # fmt: skip
 
-    def __init__(
-        self,
-        plant: PlantParameters,
-        period: float,
-        reference: Reference,
-        schedule: Schedule,
-        approach_time: float,
-        max_error: float,
-        reserve: float,
-        effort_limit: float,
-    ) -> None:
-        super().__init__(effort_limit, reference.centre)
-        self.reference = reference
-        self.schedule = schedule
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(p["effort_limit"], p["set_point"])
+        self.reference = Reference(p["reference"], p["set_point"], p["amplitude"], p["frequency"], p["move_time"])
+        if self.reference.shape == "steps" and self.reference.move_time > 0.5 * self.reference.period:
+            raise ParameterError(
+                f"move_time is {self.reference.move_time:g} s; expected at most half a period of the reference, "
+                f"{0.5 * self.reference.period:g} s"
+            )
+        self.schedule = Schedule.design(plant, p["q"], p["r"], p["share"], self.reference.fastest)
         self.margins: ScheduledMargins | None = None
-        self._approach_time = approach_time
-        self._max_error = max_error
-        self._within = (1.0 - reserve) * effort_limit
+        self._approach_time = p["approach_time"]
+        self._max_error = p["max_error"]
+        self._within = (1.0 - p["reserve"]) * self.effort_limit
         # A torque acts after the delay and is held for a period: it does best as that of the middle of its interval.
         self._lead = plant.transport_delay + 0.5 * period
-        self.needed, self._needed_at = self._most_torque()
-        self.reset()
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LqrTracking:
-        """Return the controller, if the plant's torque suffices for the reference."""
-        reference = Reference(p["reference"], p["set_point"], p["amplitude"], p["frequency"], p["move_time"])
-        if reference.shape == "steps" and reference.move_time > 0.5 * reference.period:
-            raise ParameterError(
-                f"move_time is {reference.move_time:g} s; expected at most half a period of the reference, "
-                f"{0.5 * reference.period:g} s"
-            )
-        schedule = Schedule.design(plant, p["q"], p["r"], p["share"], reference.fastest)
-        limit, reserve = p["effort_limit"], p["reserve"]
-        made = cls(plant, period, reference, schedule, p["approach_time"], p["max_error"], reserve, limit)
-        if made.needed > made._within:
+        self.needed, at = self._most_torque()
+        if self.needed > self._within:
             raise DesignError(
-                f"following the reference takes up to {made.needed:.4g} N m (at {made._needed_at:.3g} rad from "
-                f"upright), and effort_limit {limit:g} N m less a reserve of {100.0 * reserve:g} % leaves "
-                f"{made._within:.4g} N m; expected a smaller amplitude or frequency, a longer move_time, a set_point "
+                f"following the reference takes up to {self.needed:.4g} N m (at {at:.3g} rad from upright), and "
+                f"effort_limit {self.effort_limit:g} N m less a reserve of {100.0 * p['reserve']:g} % leaves "
+                f"{self._within:.4g} N m; expected a smaller amplitude or frequency, a longer move_time, a set_point "
                 "that takes less, or a smaller reserve"
             )
-        return made
+        self.reset()
 
     @classmethod
     def judged_at(cls, p: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:

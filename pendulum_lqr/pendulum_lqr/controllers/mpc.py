@@ -14,6 +14,7 @@ from pendulum_lqr.design import DesignError, Matrix
 from pendulum_lqr.model import LinearModel
 from pendulum_lqr.observer import Observer
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["LinearMpc"]
 
@@ -44,8 +45,8 @@ class LinearMpc(Lqg):
         FEEDFORWARD,
     )
 
-    def __init__(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> None:
-        super().__init__(model, period, p)
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
         self._failures = 0
         if abs(self.hold) >= self.effort_limit:
             raise DesignError(

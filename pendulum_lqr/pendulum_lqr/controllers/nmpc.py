@@ -10,7 +10,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.catch import Catch, CatchingController, make_catch
+from pendulum_lqr.catch import CatchingController
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R
 from pendulum_lqr.trajectory_optimisation import rigid_flow
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -26,12 +26,6 @@ class NonlinearMpc(CatchingController):
 
     Minimises the sum of h (q0 2 (1 - cos e) + q1 theta_dot^2 + r (u - u*)^2) and a terminal cost of the same form;
     2 (1 - cos e) is e^2 near upright and knows no difference between turns.
-
-    Args:
-        plant: Plant parameters.
-        period: Sampling period [s].
-        p: Checked parameters.
-        catch: LQR with hysteresis.
     """
 
     SUMMARY = "nonlinear MPC by multiple shooting, swings up and balances"
@@ -46,20 +40,14 @@ class NonlinearMpc(CatchingController):
         CATCH_R,
     )
 
-    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any], catch: Catch) -> None:
-        super().__init__(catch)
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
         self.period = period
         self.step = float(p["step"])
         self.steps = int(p["steps"])
-        self._solver, self._lower, self._upper = _problem(plant, p, catch.hold)
+        self._solver, self._lower, self._upper = _problem(plant, p, self.catch.hold)
         self._plan: Array | None = None
         self._failures = 0
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> NonlinearMpc:
-        """Build the problem; the catch holds the set-point."""
-        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], set_point=p["set_point"])
-        return cls(plant, period, p, catch)
 
     def reset(self) -> None:
         """Forget the plan."""

@@ -31,13 +31,6 @@ class PdGravity(LawController):
     """u = (G_c sin(theta - angle_offset) - torque_offset) / gain - k_p (theta - theta*) - k_d theta_dot.
 
     Holds any angle, upright or not; gain is what the actuator gives per torque asked for, 1 for a rigid plant.
-
-    Args:
-        plant: Plant parameters.
-        kp: Proportional gain [N m/rad].
-        kd: Derivative gain [N m s/rad].
-        effort_limit: Largest torque [N m].
-        set_point: Angle from upright [rad].
     """
 
     SUMMARY = "PD with gravity compensation: holds any angle"
@@ -54,27 +47,17 @@ class PdGravity(LawController):
         ParameterSpec("kd", 0.0, "N m s/rad", "Derivative gain; 0 for that of the bandwidth.", minimum=0.0),
     )
 
-    def __init__(
-        self, plant: PlantParameters, kp: float, kd: float, effort_limit: float, set_point: float = 0.0
-    ) -> None:
-        gain = torque_gain(plant)
-        numbers = (kp, kd, plant.gravity / gain, plant.angle_offset, plant.torque_offset / gain)
-        super().__init__(pd_gravity_law, effort_limit, set_point, numbers)
-        self.kp = kp
-        self.kd = kd
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> PdGravity:
-        """Place the slowest pole of M s^2 + (b + k_d) s + k_p at -bandwidth, critically damped if b allows.
-
-        M and b are those of slow motion, motor and gears included.
-        """
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        # The slowest pole of M s^2 + (b + k_d) s + k_p is placed at -bandwidth, critically damped if b allows; M and b
+        # are those of slow motion, motor and gears included.
         w = p["bandwidth"]
         inertia, damping, _ = low_frequency(linearise(plant.with_values(gravity=0.0)))
-        kd = p["kd"] if p["kd"] > 0.0 else max(0.0, 2.0 * inertia * w - damping)
+        self.kd = p["kd"] if p["kd"] > 0.0 else max(0.0, 2.0 * inertia * w - damping)
         # M w^2 - (b + k_d) w + k_p = 0; where damping is ample the other pole is faster.
-        kp = p["kp"] if p["kp"] > 0.0 else w * (damping + kd) - inertia * w * w
-        return cls(plant, kp, kd, p["effort_limit"], p["set_point"])
+        self.kp = p["kp"] if p["kp"] > 0.0 else w * (damping + self.kd) - inertia * w * w
+        gain = torque_gain(plant)
+        numbers = (self.kp, self.kd, plant.gravity / gain, plant.angle_offset, plant.torque_offset / gain)
+        super().__init__(pd_gravity_law, p["effort_limit"], p["set_point"], numbers)
 
     def describe(self) -> str:
         """Return the gains."""

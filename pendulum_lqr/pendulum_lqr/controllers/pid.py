@@ -52,13 +52,6 @@ class Pid(LawController):
     The derivative is that of the angle, not of the error, so that a step of the set-point does not kick. Beyond the
     limit the integral is led back with the time constant sqrt(T_i T_d).
 
-    Args:
-        gains: The three gains.
-        period: Sampling period [s].
-        filter_time: Time constant of the derivative's filter [s].
-        effort_limit: Largest torque [N m].
-        set_point: Angle from upright [rad].
-
     Source: Astrom and Hagglund, Advanced PID Control, 2006, sections 3.3 to 3.5.
     """
 
@@ -79,25 +72,19 @@ class Pid(LawController):
         R,
     )
 
-    def __init__(
-        self, gains: PidGains, period: float, filter_time: float, effort_limit: float, set_point: float = 0.0
-    ) -> None:
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        filter_time = p["derivative_filter"]
+        if p["tuning"] == "manual":
+            gains = PidGains(p["kp"], p["ki"], p["kd"])
+        else:
+            gains = _tune(plant, period, p["set_point"], p["tuning"], filter_time, tuple(p["q"]), p["r"])
         pole = math.exp(-period / filter_time)
         integral_time = gains.kp / gains.ki if gains.ki > 0.0 else math.inf
         derivative_time = gains.kd / gains.kp if gains.kp > 0.0 else 0.0
         tracking_time = max(math.sqrt(integral_time * derivative_time), period) if gains.ki > 0.0 else math.inf
         numbers = (gains.kp, gains.ki, gains.kd, period, pole, (1.0 - pole) / period, period / tracking_time)
-        super().__init__(pid_law, effort_limit, set_point, numbers, _NOTHING_YET)
+        super().__init__(pid_law, p["effort_limit"], p["set_point"], numbers, _NOTHING_YET)
         self.gains = gains
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Pid:
-        """Return the PID tuned for the plant linearised at the set-point."""
-        if p["tuning"] == "manual":
-            gains = PidGains(p["kp"], p["ki"], p["kd"])
-        else:
-            gains = _tune(plant, period, p["set_point"], p["tuning"], p["derivative_filter"], tuple(p["q"]), p["r"])
-        return cls(gains, period, p["derivative_filter"], p["effort_limit"], p["set_point"])
 
     def describe(self) -> str:
         """Return the gains."""

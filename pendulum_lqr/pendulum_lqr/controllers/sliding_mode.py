@@ -24,14 +24,6 @@ class SlidingMode(BaseController):
     The switching is smooth inside the layer, so that it does not chatter; the price is that a constant torque d below
     b phi + k is not rejected but leaves e = d / (lambda (b + k / phi)), which may be more than a plain LQR leaves.
 
-    Args:
-        plant: Plant parameters.
-        rate: lambda [1/s].
-        gain: k [N m].
-        layer: phi [rad/s].
-        effort_limit: Largest torque [N m].
-        set_point: Angle from upright [rad].
-
     Source: Slotine and Li, Applied Nonlinear Control, 1991, section 7.2.
     """
 
@@ -50,27 +42,12 @@ class SlidingMode(BaseController):
         ),
     )
 
-    def __init__(
-        self,
-        plant: PlantParameters,
-        rate: float,
-        gain: float,
-        layer: float,
-        effort_limit: float,
-        set_point: float = 0.0,
-    ) -> None:
-        super().__init__(effort_limit, set_point)
-        self.rate = rate
-        self.gain = gain
-        self.layer = layer
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(p["effort_limit"], p["set_point"])
+        self.rate, self.gain, self.layer = p["rate"], p["gain"], p["layer"]
         self._plant = plant
-        self._proportional = plant.damping * rate
-        self._derivative = plant.inertia * rate
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> SlidingMode:
-        """Return the controller; gains follow from the plant's inertia, damping and gravity."""
-        return cls(plant, p["rate"], p["gain"], p["layer"], p["effort_limit"], p["set_point"])
+        self._proportional = plant.damping * self.rate
+        self._derivative = plant.inertia * self.rate
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m]."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
-from pendulum_lqr.catch import Catch, CatchingController, make_catch
+from pendulum_lqr.catch import CatchingController, make_catch
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
 from pendulum_lqr.minimum_time import SIGN_VELOCITY, TimeToGo, minimum_time
 from pendulum_lqr.model import acceleration_from_upright
@@ -19,14 +19,7 @@ __all__ = ["TimeOptimal"]
 
 
 class TimeOptimal(CatchingController):
-    """Picks the torque whose successor has the least time to go to the catch's region; a feedback from every state.
-
-    Args:
-        plant: Plant parameters.
-        table: Time to go.
-        catch: LQR with hysteresis.
-        horizon: How far a candidate torque looks ahead [s].
-    """
+    """Picks the torque whose successor has the least time to go to the catch's region; a feedback from every state."""
 
     SUMMARY = "swing-up in minimum time by dynamic programming, caught by LQR"
     PARAMETERS = (
@@ -36,21 +29,16 @@ class TimeOptimal(CatchingController):
         replace(CATCH_SHARE, default=0.9),
     )
 
-    def __init__(self, plant: PlantParameters, table: TimeToGo, catch: Catch, horizon: float) -> None:
-        super().__init__(catch)
-        self.table = table
-        self.horizon = horizon
-        self._plant = plant
-        self._substeps = max(2, math.ceil(horizon * plant.damping / plant.inertia / 0.5))
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> TimeOptimal:
-        """Return the controller; the table takes a second or two and is kept for the next design."""
-        catch = make_catch(plant, p["catch_q"], p["catch_r"], p["effort_limit"], p["catch_share"], p["set_point"])
-        table = _table(
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        # The table takes a second or two and is kept for the next design.
+        super().__init__(plant, period, p)
+        self.table = _table(
             plant, p["effort_limit"], tuple(p["catch_q"]), p["catch_r"], p["catch_share"], p["set_point"], p["grid"]
         )
-        return cls(plant, table, catch, max(period, table.step))
+        # How far a candidate torque looks ahead [s].
+        self.horizon = max(period, self.table.step)
+        self._plant = plant
+        self._substeps = max(2, math.ceil(self.horizon * plant.damping / plant.inertia / 0.5))
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m]."""

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.catch import Catch, CatchingController, make_catch
+from pendulum_lqr.catch import CatchingController
 from pendulum_lqr.controllers.energy_swing_up import EnergySwingUp
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R
 from pendulum_lqr.design import cost_matrices
 from pendulum_lqr.interface import Controller
 from pendulum_lqr.model import linearise
 from pendulum_lqr.sampled_design import discretise
-from pendulum_lqr.trajectory_optimisation import OptimisedTrajectory, swing_up_trajectory
+from pendulum_lqr.trajectory_optimisation import swing_up_trajectory
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -39,12 +39,9 @@ class Tvlqr(CatchingController):
     close to one of them; far from both the
     pendulum is pumped by energy until it is close again, so that a wrong start or a push does not end the swing-up.
 
-    Args:
-        plant: Plant parameters.
-        period: Sampling period [s].
+    Attributes:
         trajectory: The swing-up.
         gains: K at each sample, shape (n, 2).
-        catch: LQR with hysteresis.
         pump: What swings it up where no trajectory is near.
 
     Source: Tedrake, Underactuated Robotics, section 8.2 (finite-horizon LQR along a trajectory).
@@ -64,23 +61,16 @@ class Tvlqr(CatchingController):
         CATCH_R,
     )
 
-    def __init__(
-        self,
-        plant: PlantParameters,
-        period: float,
-        trajectory: OptimisedTrajectory,
-        q: Sequence[float],
-        r: float,
-        catch: Catch,
-        pump: EnergySwingUp,
-    ) -> None:
-        super().__init__(catch)
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
+        limit, set_point, catch = self.effort_limit, self.set_point, self.catch
         # Gravity knows no left and right; a torque offset, or a set-point beside the top, does.
-        alike = plant.torque_offset == 0.0 and catch.set_point == plant.angle_offset
+        alike = plant.torque_offset == 0.0 and set_point == plant.angle_offset
         self._signs = (1.0, -1.0) if alike else (1.0,)
         self._centre = plant.angle_offset
-        self.trajectory = trajectory
-        self.pump = pump
+        self.trajectory = trajectory = swing_up_trajectory(plant, limit * (1.0 - p["reserve"]), p["nodes"], set_point)
+        pumping = {"gain": 50.0, "energy_margin": 0.1, "catch_q": (30.0, 0.3), "catch_r": 1.0, "catch_share": 1.0}
+        self.pump = EnergySwingUp(plant, period, {**p, **pumping})
         self.period = period
         samples = math.ceil(trajectory.duration / period)
         times = period * np.arange(samples + 1)
@@ -90,20 +80,10 @@ class Tvlqr(CatchingController):
         # A held sample does best with the torque of the middle of its interval.
         self.efforts = np.interp(times + 0.5 * period, trajectory.times, trajectory.efforts)
         self.efforts[times >= trajectory.duration] = catch.hold
-        self.gains = _gains(plant, period, self.states, q, r, catch.gain.S)
+        self.gains = _gains(plant, period, self.states, p["q"], p["r"], catch.gain.S)
         self.states[:, 0] -= self._centre
         self._scaled = self.states / np.array([_ANGLE_SCALE, _VELOCITY_SCALE])
         self.reset()
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> Tvlqr:
-        """Optimise the trajectory (a second or so) and its gains."""
-        limit, set_point = p["effort_limit"], p["set_point"]
-        catch = make_catch(plant, p["catch_q"], p["catch_r"], limit, set_point=set_point)
-        trajectory = swing_up_trajectory(plant, limit * (1.0 - p["reserve"]), p["nodes"], set_point)
-        pump_catch = make_catch(plant, (30.0, 0.3), 1.0, limit, 1.0, set_point)
-        pump = EnergySwingUp(plant, 50.0, 0.1, pump_catch)
-        return cls(plant, period, trajectory, p["q"], p["r"], catch, pump)
 
     def reset(self) -> None:
         """Forget where on the trajectory it was."""
