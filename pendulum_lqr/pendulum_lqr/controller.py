@@ -15,7 +15,7 @@ from pendulum_lqr.interface import Controller
 from pendulum_lqr.joint_controller import JOINT_CONTROLLERS
 from pendulum_lqr.law import Law, clamped, deviation
 from pendulum_lqr.loop_check import require_stable
-from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator, make_velocity_estimator
+from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, VelocityEstimator
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, suggestion, validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -64,7 +64,9 @@ COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
         "Largest torque of the controller; 0 for the plant's own limit.",
         minimum=0.0,
     ),
-    ParameterSpec("velocity", "measured", "", "Where the velocity comes from.", choices=tuple(VELOCITY_ESTIMATORS)),
+    ParameterSpec(
+        "velocity", "measured", "", "Where the velocity comes from.", choices=("measured", *VELOCITY_ESTIMATORS)
+    ),
     ParameterSpec(
         "start_time",
         0.0,
@@ -367,7 +369,7 @@ def make_controller(
     if p["start_time"] > 0.0 and not kind.STARTS_SOFTLY:
         controller = SoftStart(controller, p["start_time"])
     if p["velocity"] != "measured":
-        controller = EstimatedVelocity(controller, make_velocity_estimator(p["velocity"], plant, period))
+        controller = EstimatedVelocity(controller, VELOCITY_ESTIMATORS[p["velocity"]](plant, period))
     if checked and kind.FEEDBACK and p.get("tuning") != "manual":
         for changed in kind.judged_at(p):
             judged, at = controller, {**p, **changed}

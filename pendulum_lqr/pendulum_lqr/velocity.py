@@ -19,17 +19,14 @@ from pendulum_lqr.model import LinearModel, linearise
 from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.dynamics.series_elastic import spring_deflection
-from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "VELOCITY_ESTIMATORS",
     "FilteredDifference",
     "KalmanVelocity",
-    "MeasuredVelocity",
     "SavitzkyGolay",
     "VelocityEstimator",
-    "make_velocity_estimator",
 ]
 
 _WINDOW, _ORDER = 7, 2
@@ -51,17 +48,6 @@ class VelocityEstimator(Protocol):
             velocity: Measured velocity [rad/s].
             effort: Torque commanded since the last sample [N m].
         """
-
-
-class MeasuredVelocity:
-    """The velocity as the sensor gives it."""
-
-    def reset(self) -> None:
-        """Nothing to forget."""
-
-    def update(self, t: float, position: float, velocity: float, effort: float) -> float:
-        """Return the measured velocity [rad/s]."""
-        return velocity
 
 
 class FilteredDifference:
@@ -196,20 +182,8 @@ class KalmanVelocity:
 
 
 VELOCITY_ESTIMATORS: dict[str, Callable[[PlantParameters, float], VelocityEstimator]] = {
-    "measured": lambda plant, period: MeasuredVelocity(),
     "filtered_difference": lambda plant, period: FilteredDifference(2.0 * period),
     "savitzky_golay": lambda plant, period: SavitzkyGolay(period),
     "kalman": KalmanVelocity,
 }
 """Name -> maker from plant and sampling period."""
-
-
-def make_velocity_estimator(name: str, plant: PlantParameters, period: float) -> VelocityEstimator:
-    """Return the estimator behind a name of ``VELOCITY_ESTIMATORS``.
-
-    Raises:
-        ParameterError: No such estimator.
-    """
-    if name not in VELOCITY_ESTIMATORS:
-        raise ParameterError(f"velocity is {name!r}; expected one of {', '.join(VELOCITY_ESTIMATORS)}")
-    return VELOCITY_ESTIMATORS[name](plant, period)

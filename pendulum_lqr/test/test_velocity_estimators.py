@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pendulum_lqr.controller import make_controller
-from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, KalmanVelocity, SavitzkyGolay, make_velocity_estimator
+from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, KalmanVelocity, SavitzkyGolay
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -21,14 +21,14 @@ DFKI = load_plant("dfki")
 def test_a_steady_turn_across_the_wrap_gives_its_velocity(name):
     if name == "kalman":
         pytest.skip("its model knows gravity, and a steady turn is no motion of a free pendulum")
-    estimator = make_velocity_estimator(name, THESIS, 0.01)
+    estimator = VELOCITY_ESTIMATORS[name](THESIS, 0.01)
     estimates = [estimator.update(0.01 * k, wrap(0.02 * k), 2.0, 0.0) for k in range(400)]
     np.testing.assert_allclose(estimates[50:], 2.0, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", [name for name in VELOCITY_ESTIMATORS if name != "measured"])
+@pytest.mark.parametrize("name", VELOCITY_ESTIMATORS)
 def test_no_estimator_looks_at_the_measured_velocity_once_it_runs(name):
-    estimator = make_velocity_estimator(name, THESIS, 0.01)
+    estimator = VELOCITY_ESTIMATORS[name](THESIS, 0.01)
     for k in range(100):
         estimate = estimator.update(0.01 * k, 0.1, 0.0 if k == 0 else 77.0, -THESIS.gravity * math.sin(0.1))
     assert abs(estimate) < 0.05
@@ -40,7 +40,7 @@ def test_kalman_follows_a_swinging_pendulum_better_than_a_difference():
     errors = {}
     for name, estimator in {
         "kalman": KalmanVelocity(plant, 0.01, position_noise=2e-3, torque_noise=0.1),
-        "filtered_difference": make_velocity_estimator("filtered_difference", plant, 0.01),
+        "filtered_difference": VELOCITY_ESTIMATORS["filtered_difference"](plant, 0.01),
     }.items():
         simulated = make_plant(plant, 0.01)
         state = simulated.reset(0.5)
@@ -67,13 +67,13 @@ def test_savitzky_golay_is_exact_for_a_parabola_and_starts_anew_after_a_hole():
 
 def test_a_reset_forgets():
     for name in VELOCITY_ESTIMATORS:
-        estimator = make_velocity_estimator(name, THESIS, 0.01)
+        estimator = VELOCITY_ESTIMATORS[name](THESIS, 0.01)
         first = [estimator.update(0.01 * k, 0.01 * k, 1.0, 0.0) for k in range(20)]
         estimator.reset()
         assert [estimator.update(0.01 * k, 0.01 * k, 1.0, 0.0) for k in range(20)] == first
 
 
-@pytest.mark.parametrize("name", VELOCITY_ESTIMATORS)
+@pytest.mark.parametrize("name", ["measured", *VELOCITY_ESTIMATORS])
 def test_lqr_balances_on_every_estimator(name, simulate):
     controller = make_controller("lqr", THESIS, 0.01, {"velocity": name})
     run = simulate(THESIS, controller, theta=math.pi + 0.2)
@@ -111,4 +111,4 @@ def test_kalman_gives_the_velocity_of_every_plant_in_a_free_fall_under_torque(na
 
 def test_an_unknown_estimator_is_refused():
     with pytest.raises(ParameterError, match="velocity is 'magic'; expected one of measured, filtered_difference"):
-        make_velocity_estimator("magic", THESIS, 0.01)
+        make_controller("lqr", THESIS, 0.01, {"velocity": "magic"})
