@@ -59,7 +59,7 @@ class JointController:
 
     @classmethod
     def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointController:
-        """Return the controller for a plant.
+        """Return the controller for a plant; by default what the class makes of these three.
 
         Args:
             plant: The plant.
@@ -69,7 +69,9 @@ class JointController:
         Raises:
             ParameterError: The values do not make a controller for this plant at this period.
         """
-        raise NotImplementedError(f"{cls.__name__}.design")
+        make: Any = cls
+        designed: JointController = make(plant, p, period)
+        return designed
 
     @property
     def notice(self) -> str:

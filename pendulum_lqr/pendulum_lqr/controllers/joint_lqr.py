@@ -110,11 +110,6 @@ class UprightController(JointController):
         """Return weights and limit."""
         return (*joint_weights(plant), JOINT_LIMIT)
 
-    @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> UprightController:
-        """Return the controller for the plant linearised at upright."""
-        return cls(plant, p, period)
-
 
 class JointLqr(UprightController):
     """Continuous LQR of n joints, sampled."""

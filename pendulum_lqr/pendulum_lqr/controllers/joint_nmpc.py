@@ -18,9 +18,8 @@ class JointNmpc(CaughtController):
 
     It is compiled when it is designed, so that its first answer is not late.
 
-    Args:
-        plant: The plant.
-        period: Sampling period [s].
+    Raises:
+        ParameterError: A passive joint has dry friction: plans leave it out, and no effort can make up for it there.
     """
 
     SUMMARY = "nonlinear MPC by iterative LQR, then LQR; swings up from anywhere"
@@ -28,21 +27,12 @@ class JointNmpc(CaughtController):
     EVERY_STATE = "nmpc plans for answers"
     DESIGNING = "compiles its model, which takes some ten seconds"
 
-    def __init__(self, plant: MechanismParameters, period: float) -> None:
+    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
+        refuse_passive_friction("nmpc", plant)
         inner = MechanismMpc(period, default_catch(plant))
         super().__init__(inner, period)
         inner.command(0.0, (0.0,) * (2 * len(plant.joints)))
         inner.reset()
-
-    @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointNmpc:
-        """Return the controller for a plant whose passive joints have no dry friction.
-
-        Raises:
-            ParameterError: One has: plans leave it out, and no effort can make up for it there.
-        """
-        refuse_passive_friction("nmpc", plant)
-        return cls(plant, period)
 
     def describe(self) -> str:
         """Return its horizon, and from where the LQR catches."""
