@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -120,7 +119,3 @@ def _import(source: Path, out: Path, told: Told) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the conversion and return the exit code."""
     return cli_main(app, argv, name="python -m pendulum_lqr convert_policy")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -110,15 +110,7 @@ def design(
     """
     chosen_plant = str(plant) if plant is not None else preset
     if is_mechanism(chosen_plant):
-        if (
-            figures is not None
-            or machine is not None
-            or theta != UPRIGHT
-            or effort_limit
-            or row
-            or uncertainty
-            or tracking
-        ):
+        if any((figures, machine, theta != UPRIGHT, effort_limit, row, uncertainty, tracking)):
             raise ParameterError(
                 f"plant {chosen_plant!r} has several joints; expected --q, --r and --json alone: figures, --machine, "
                 "--uncertainty, --tracking, --theta, --effort-limit and --row are for one joint"

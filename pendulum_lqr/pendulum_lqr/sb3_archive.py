@@ -16,7 +16,7 @@ import json
 import re
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,7 @@ class _Kind:
     others: tuple[str, ...]
 
 
+_SAC = _Kind("SAC", "relu", "tanh", "actor.latent_pi", "actor.mu", ("actor.log_std.", "critic.", "critic_target."))
 _KINDS = {
     "stable_baselines3.common.policies": _Kind(
         "PPO or A2C",
@@ -58,12 +59,8 @@ _KINDS = {
         "action_net",
         ("log_std", "mlp_extractor.value_net.", "value_net."),
     ),
-    "stable_baselines3.sac.policies": _Kind(
-        "SAC", "relu", "tanh", "actor.latent_pi", "actor.mu", ("actor.log_std.", "critic.", "critic_target.")
-    ),
-    "sb3_contrib.tqc.policies": _Kind(
-        "TQC", "relu", "tanh", "actor.latent_pi", "actor.mu", ("actor.log_std.", "critic.", "critic_target.")
-    ),
+    "stable_baselines3.sac.policies": _SAC,
+    "sb3_contrib.tqc.policies": replace(_SAC, algorithm="TQC"),
 }
 """Module of the class of policies -> its actor."""
 _ACTIVATIONS = {

@@ -6,7 +6,6 @@ from __future__ import annotations
 import pendulum_msgs_py.programs.one_thread  # noqa: F401  # before anything that imports numpy
 # isort: on
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -70,7 +69,3 @@ def swing_up(
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the search and return the exit code."""
     return cli_main(app, argv, name="python -m pendulum_lqr swing_up")
-
-
-if __name__ == "__main__":
-    sys.exit(main())
