@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -16,7 +16,7 @@ from pendulum_lqr.roa import proven_level
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["Catch", "CatchingController", "make_catch"]
+__all__ = ["Catch", "CatchingController"]
 
 _LET_GO = 2.0
 _SHARE = 0.9
@@ -83,8 +83,9 @@ class CatchingController(BaseController):
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(p["effort_limit"], p["set_point"])
+        gain, level, hold = _proven(plant, tuple(p["catch_q"]), p["catch_r"], self.effort_limit, self.set_point)
         share = p.get("catch_share", _SHARE)
-        self.catch = make_catch(plant, p["catch_q"], p["catch_r"], self.effort_limit, share, self.set_point)
+        self.catch = Catch(gain, share * level, _LET_GO * level, self.effort_limit, self.set_point, hold)
 
     def reset(self) -> None:
         """Let go."""
@@ -96,35 +97,15 @@ class CatchingController(BaseController):
             self.catch.active = previous.catch.active
 
 
-def make_catch(
-    plant: PlantParameters,
-    q: Sequence[float],
-    r: float,
-    effort_limit: float,
-    share: float,
-    set_point: float,
-) -> Catch:
-    """Return the catch for a plant under a torque limit; lag and delay are not in its proof.
-
-    Args:
-        plant: Plant parameters.
-        q: Weights of angle and velocity.
-        r: Weight of torque.
-        effort_limit: Largest torque [N m].
-        share: Share of the proven level in which it takes over.
-        set_point: Angle from upright [rad].
-
-    Raises:
-        DesignError: The set-point takes more torque than there is, or no region around it can be proven.
-    """
-    gain, level, hold = _proven(plant, tuple(q), r, effort_limit, set_point)
-    return Catch(gain, share * level, _LET_GO * level, effort_limit, set_point, hold)
-
-
 @lru_cache(maxsize=32)
 def _proven(
     plant: PlantParameters, q: tuple[float, ...], r: float, effort_limit: float, set_point: float
 ) -> tuple[Gain, float, float]:
+    """Return gain, proven level and holding torque of an LQR under a torque limit; lag and delay are not in the proof.
+
+    Raises:
+        DesignError: The set-point takes more torque than there is, or no region around it can be proven.
+    """
     prompt = plant.with_values(actuator_time_constant=0.0, transport_delay=0.0)
     model = linearise(prompt, UPRIGHT + set_point)
     gain = continuous_lqr(model, q, r)

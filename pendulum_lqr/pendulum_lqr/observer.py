@@ -9,7 +9,9 @@ a constant torque d adds to the command and is modelled as a random walk (distur
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,42 +32,30 @@ class Observer:
     Args:
         model: Linear model at the fixed point.
         period: Sampling period [s].
-        angle_noise: Standard deviation of a measured angle [rad].
-        velocity_noise: Standard deviation of a measured velocity [rad/s]; 0 where velocities are not used.
-        torque_noise: Standard deviation of the unknown torque, held for a period [N m].
-        offset_noise: How fast the constant torque may wander [N m/s^0.5]; 0 for no such torque.
-        delay: Delay of commands beyond the model's own [s].
+        p: Checked parameters: standard deviations ``angle_noise`` [rad], ``velocity_noise`` [rad/s], 0 where velocities
+            are not used, and ``torque_noise`` of the unknown torque, held for a period [N m]; ``offset_noise``, how
+            fast the constant torque may wander, 0 for no such torque [N m/s^0.5]; ``delay`` beyond the model's own [s].
     """
 
-    def __init__(
-        self,
-        model: LinearModel,
-        period: float,
-        *,
-        angle_noise: float,
-        velocity_noise: float,
-        torque_noise: float,
-        offset_noise: float = 0.0,
-        delay: float = 0.0,
-    ) -> None:
-        sampled = discretise(model, period, delay)
+    def __init__(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> None:
+        sampled = discretise(model, period, p["delay"])
         n = model.A.shape[0]
         self.model = model
         self.pending = sampled.pending
         self._n = n
         self._hold = model.effort
-        wide = n + (1 if offset_noise > 0.0 else 0)
+        wide = n + (1 if p["offset_noise"] > 0.0 else 0)
         drive = discretise(replace(model, delay=0.0), period).B[:, 0]
         A = np.eye(wide)
         A[:n, :n] = sampled.A[:n, :n]
         noise = np.zeros((wide, wide))
-        noise[:n, :n] = torque_noise**2 * np.outer(drive, drive)
+        noise[:n, :n] = p["torque_noise"] ** 2 * np.outer(drive, drive)
         if wide > n:
             A[:n, n] = drive
-            noise[n, n] = offset_noise**2 * period
-        rows = 1 if velocity_noise == 0.0 else 2
+            noise[n, n] = p["offset_noise"] ** 2 * period
+        rows = 1 if p["velocity_noise"] == 0.0 else 2
         C = np.eye(rows, wide)
-        variances = np.diag([angle_noise**2, velocity_noise**2][:rows])
+        variances = np.diag([p["angle_noise"] ** 2, p["velocity_noise"] ** 2][:rows])
         self.gain = kalman_gain(A, C, noise, variances)
         self._A = A
         self._on_their_way = sampled.A[:n, n:]

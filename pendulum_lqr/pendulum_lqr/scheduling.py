@@ -41,35 +41,21 @@ class Schedule:
 
     Args:
         plant: Plant parameters.
-        table: K_1 [N m/rad], K_2 [N m s/rad], b [N m s/rad] and M [kg m^2] at the edges of the cells from -pi to pi
-            from upright, shape (cells + 1, 4).
+        q: Diagonal of Q [1/rad^2, s^2/rad^2].
+        r: R [1/(N m)^2].
         share: Share of the Coulomb friction that is fed forward.
-        smooth: Velocity over which that changes its sign [rad/s].
+        fastest: Largest velocity of the reference [rad/s].
+
+    Raises:
+        DesignError: An angle has no stabilising gain; the message names it.
     """
 
-    def __init__(self, plant: PlantParameters, table: NDArray[np.float64], share: float, smooth: float) -> None:
+    def __init__(self, plant: PlantParameters, q: Sequence[float], r: float, share: float, fastest: float) -> None:
         self._plant = plant
-        self._table: list[list[float]] = table.tolist()
-        self._cell = 2.0 * math.pi / (len(table) - 1)
+        self._table: list[list[float]] = _table(plant, tuple(map(float, q)), float(r)).tolist()
+        self._cell = 2.0 * math.pi / _CELLS
         self._share = share
-        self._smooth = smooth
-
-    @classmethod
-    def design(cls, plant: PlantParameters, q: Sequence[float], r: float, share: float, fastest: float) -> Schedule:
-        """Solve the Riccati equation on a grid of angles and interpolate by a periodic spline.
-
-        Args:
-            plant: Plant parameters.
-            q: Diagonal of Q [1/rad^2, s^2/rad^2].
-            r: R [1/(N m)^2].
-            share: Share of the Coulomb friction that is fed forward.
-            fastest: Largest velocity of the reference [rad/s].
-
-        Raises:
-            DesignError: An angle has no stabilising gain; the message names it.
-        """
-        table = _table(plant, tuple(map(float, q)), float(r))
-        return cls(plant, table, share, max(_SMOOTH * fastest, 1e-3))
+        self._smooth = max(_SMOOTH * fastest, 1e-3)
 
     def gain(self, angle: float) -> tuple[float, float]:
         """Return K [N m/rad, N m s/rad] at an angle from upright [rad]."""
@@ -99,7 +85,11 @@ class Schedule:
 
 @lru_cache(maxsize=8)
 def _table(plant: PlantParameters, q: tuple[float, ...], r: float) -> NDArray[np.float64]:
-    """Return K, b and M at the edges of the cells; kept, so that another reference needs no other Riccati solutions."""
+    """Return K_1 [N m/rad], K_2 and b [N m s/rad] and M [kg m^2] at the edges of the cells, shape (cells + 1, 4).
+
+    The Riccati equation is solved on a grid of angles, between which lies a periodic spline. What comes out is kept, so
+    that another reference needs no other solutions.
+    """
     angles = np.linspace(-math.pi, math.pi, _KNOTS + 1)
     rows = []
     for angle in angles[:-1]:

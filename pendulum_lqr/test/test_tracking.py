@@ -107,7 +107,7 @@ def test_it_follows_far_better_than_lqr_whose_set_point_is_moved(plant, simulate
 
 @pytest.mark.parametrize("plant", [THESIS, OFFSETS, LAGGING], ids=["thesis", "offsets", "lag"])
 def test_at_every_angle_the_gain_is_that_of_the_lqr_there(plant):
-    schedule = Schedule.design(plant, (50.0, 0.5), 0.2, 0.0, 1.0)
+    schedule = Schedule(plant, (50.0, 0.5), 0.2, 0.0, 1.0)
     for angle in (-math.pi, -2.0, -0.71, 0.0, 0.33, 1.5, 3.1, 4.0):
         expected = output_lqr(linearise(plant, UPRIGHT + angle), (50.0, 0.5), 0.2).K
         assert schedule.gain(angle) == pytest.approx(tuple(expected), rel=1e-4)

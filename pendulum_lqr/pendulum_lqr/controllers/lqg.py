@@ -56,15 +56,7 @@ class Lqg(BaseController):
 
     def _make_observer(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> Observer | None:
         """Return the Kalman filter, with the constant torque if that is observed; None where none is needed."""
-        return Observer(
-            model,
-            period,
-            angle_noise=p["angle_noise"],
-            velocity_noise=p["velocity_noise"],
-            torque_noise=p["torque_noise"],
-            offset_noise=p["offset_noise"],
-            delay=p["delay"],
-        )
+        return Observer(model, period, p)
 
     def reset(self) -> None:
         """Forget the estimate."""

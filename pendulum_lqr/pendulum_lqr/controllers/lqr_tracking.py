@@ -78,7 +78,7 @@ class LqrTracking(BaseController):
                 f"move_time is {self.reference.move_time:g} s; expected at most half a period of the reference, "
                 f"{0.5 * self.reference.period:g} s"
             )
-        self.schedule = Schedule.design(plant, p["q"], p["r"], p["share"], self.reference.fastest)
+        self.schedule = Schedule(plant, p["q"], p["r"], p["share"], self.reference.fastest)
         self.margins: ScheduledMargins | None = None
         self._approach_time = p["approach_time"]
         self._max_error = p["max_error"]

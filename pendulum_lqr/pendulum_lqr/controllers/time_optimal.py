@@ -8,7 +8,9 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
-from pendulum_lqr.catch import CatchingController, make_catch
+import numpy as np
+
+from pendulum_lqr.catch import CatchingController
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
 from pendulum_lqr.minimum_time import SIGN_VELOCITY, TimeToGo, minimum_time
 from pendulum_lqr.model import acceleration_from_upright
@@ -32,9 +34,8 @@ class TimeOptimal(CatchingController):
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         # The table takes a second or two and is kept for the next design.
         super().__init__(plant, period, p)
-        self.table = _table(
-            plant, p["effort_limit"], tuple(p["catch_q"]), p["catch_r"], p["catch_share"], p["set_point"], p["grid"]
-        )
+        S = tuple(map(tuple, self.catch.gain.S.tolist()))
+        self.table = _table(plant, self.effort_limit, S, self.catch.level, self.set_point, p["grid"])
         # How far a candidate torque looks ahead [s].
         self.horizon = max(period, self.table.step)
         self._plant = plant
@@ -70,17 +71,15 @@ class TimeOptimal(CatchingController):
 def _table(
     plant: PlantParameters,
     limit: float,
-    q: tuple[float, ...],
-    r: float,
-    share: float,
+    S: tuple[tuple[float, ...], ...],
+    level: float,
     set_point: float,
     grid: int,
 ) -> TimeToGo:
-    catch = make_catch(plant, q, r, limit, share, set_point)
     return minimum_time(
         plant,
         limit,
-        (catch.gain.S, catch.level),
+        (np.array(S), level),
         centre=set_point,
         angles=grid,
         velocities=grid + 1 - grid % 2,
