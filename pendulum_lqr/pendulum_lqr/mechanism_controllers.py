@@ -7,6 +7,7 @@ from importlib import resources
 from pathlib import Path
 
 from pendulum_lqr.controllers.joint_policy import JointPolicy
+from pendulum_lqr.interface import JointController
 from pendulum_lqr.mechanism_catch import MechanismCatch, make_mechanism_catch
 from pendulum_lqr.mechanism_controller import MechanismController
 from pendulum_lqr.mechanism_mpc import MechanismMpc
@@ -71,37 +72,19 @@ class DifferencedVelocity:
         return self._effort
 
 
-class MechanismPolicy:
-    """What a policy file answers; it has all of its effort from the start.
+class _WholeStates:
+    """A controller of the graph as one that is asked for whole states."""
 
-    Args:
-        plant: The plant.
-        period: Sampling period [s].
-        path: The file.
-        catch: LQR that takes over near upright; None for none.
-
-    Raises:
-        ParameterError: The policy is for another plant.
-        DesignError: The period is no whole part of the policy's.
-        DataError: The file is refused.
-    """
-
-    def __init__(self, plant: MechanismParameters, period: float, path: str, catch: MechanismCatch | None) -> None:
-        policy = load_policy(path)
-        require_plant(policy, plant)
-        check_policy_period(policy, period)
-        self._joints = len(plant.joints)
-        self.inner = JointPolicy(
-            policy, states_to_hold(policy, period), plant.effort_limits, start_time=0.0, catch=catch
-        )
+    def __init__(self, inner: JointController, joints: int) -> None:
+        self._inner, self._joints = inner, joints
 
     def reset(self) -> None:
-        """Forget the past, and that it gave up."""
-        self.inner.reset()
+        """Forget the past."""
+        self._inner.reset()
 
     def command(self, t: float, x: Vector) -> Vector:
         """Return m efforts [N m or N]."""
-        return self.inner.command(t, x[: self._joints], x[self._joints :])
+        return self._inner.command(t, x[: self._joints], x[self._joints :])
 
 
 def stored_trajectory(plant: MechanismParameters) -> MechanismTrajectory:
@@ -153,24 +136,16 @@ def tracked_swing_up(plant: MechanismParameters, period: float) -> MechanismTvlq
     return _followed(period, make_mechanism_catch(plant, *_CALM))
 
 
-def _mpc(plant: MechanismParameters, period: float) -> MechanismController:
-    return DifferencedVelocity(plant, MechanismMpc(period, default_catch(plant)))
-
-
 def _tvlqr_mpc(plant: MechanismParameters, period: float) -> MechanismController:
     catch = make_mechanism_catch(plant, *_CALM)
     recover = MechanismMpc(period, catch)
     return DifferencedVelocity(plant, _followed(period, catch, recover))
 
 
-def _ilqr(plant: MechanismParameters, period: float) -> MechanismController:
-    return PlannedSwingUp(period, default_catch(plant))
-
-
 _CONTROLLERS: dict[str, Callable[[MechanismParameters, float], MechanismController]] = {
     "tvlqr": tracked_swing_up,
-    "ilqr": _ilqr,
-    "mpc": _mpc,
+    "ilqr": lambda plant, period: PlannedSwingUp(period, default_catch(plant)),
+    "mpc": lambda plant, period: DifferencedVelocity(plant, MechanismMpc(period, default_catch(plant))),
     "tvlqr_mpc": _tvlqr_mpc,
 }
 
@@ -195,7 +170,14 @@ def make_mechanism_controller(name: str, plant: MechanismParameters, period: flo
     """
     file = name.removesuffix(_CATCH_SUFFIX)
     if file.endswith(POLICY_SUFFIX):
-        return MechanismPolicy(plant, period, file, make_mechanism_catch(plant, *_CALM) if file != name else None)
+        policy = load_policy(file)
+        require_plant(policy, plant)
+        check_policy_period(policy, period)
+        catch = make_mechanism_catch(plant, *_CALM) if file != name else None
+        hold = states_to_hold(policy, period)
+        # It has all of its effort from the start.
+        inner = JointPolicy(policy, hold, plant.effort_limits, start_time=0.0, catch=catch)
+        return _WholeStates(inner, len(plant.joints))
     if name not in _CONTROLLERS:
         raise ParameterError(
             f"controller {name!r} is unknown; expected one of {', '.join(_CONTROLLERS)}, or a policy file (.npz)"
