@@ -59,7 +59,7 @@ class Machine:
     radius: Array
     period: float
     lowest: float
-    confidence: float
+    confidence: float = 0.95
 
     @property
     def up_to_nyquist(self) -> bool:
@@ -67,14 +67,9 @@ class Machine:
         return 2.0 * self.period * float(self.frequency[-1]) >= _NEAR_NYQUIST
 
     @classmethod
-    def of(cls, measured: MeasuredResponse, confidence: float = 0.95) -> Machine:
-        """Return the machine of a measurement.
-
-        Args:
-            measured: The measurement.
-            confidence: Probability with which all discs hold the true response.
-        """
-        radius = measured.radius(confidence)
+    def of(cls, measured: MeasuredResponse) -> Machine:
+        """Return the machine of a measurement."""
+        radius = measured.radius()
         lines = measured.frequency
         inside, response, discs = _between(measured, radius)
         low = lines[0] * _BELOW
@@ -93,20 +88,19 @@ class Machine:
             # At low frequency the measured velocity is the derivative of the angle, but for the hold.
             response = np.hstack([np.vstack([angle, 1j * omega * angle]), response])
             discs = np.hstack([np.vstack([disc, omega * (disc + hold)]), discs])
-        return cls(inside, response, discs, measured.period, float(lines[0]), confidence)
+        return cls(inside, response, discs, measured.period, float(lines[0]))
 
     @classmethod
-    def beside(cls, measured: MeasuredResponse, model: LinearModel, confidence: float = 0.95) -> Machine:
+    def beside(cls, measured: MeasuredResponse, model: LinearModel) -> Machine:
         """Return the machine of a measurement of several joints, interpolated beside a model.
 
         Args:
             measured: The measurement.
             model: A model of the plant, with the same outputs.
-            confidence: Probability with which all discs hold the true response.
         """
         lines, period = measured.frequency, measured.period
         own = model_response(model, lines, period)
-        ratio, spread = measured.response / own, measured.radius(confidence) / np.abs(own)
+        ratio, spread = measured.response / own, measured.radius() / np.abs(own)
         below = lines[0] * np.concatenate([[_NEARLY_ZERO], _BELOW[1:]])
         whole = np.concatenate([below, _grid(lines)])
         on_line = np.isin(whole, lines)
@@ -125,9 +119,7 @@ class Machine:
             rows.append(values)
             discs.append(disc)
         on_grid = model_response(model, whole, period)
-        return cls(
-            whole, np.array(rows) * on_grid, np.array(discs) * np.abs(on_grid), period, float(lines[0]), confidence
-        )
+        return cls(whole, np.array(rows) * on_grid, np.array(discs) * np.abs(on_grid), period, float(lines[0]))
 
 
 def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex, Array]:
