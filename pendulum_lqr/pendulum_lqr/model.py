@@ -33,34 +33,24 @@ from pendulum_msgs_py.dynamics.series_elastic import (
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.equilibrium import (
-    FixedPoint,
     RigidPlant,
     command_pwm,
     drivetrain_of,
     equilibrium_effort,
-    fixed_points,
-    friction_effort,
     held_torque,
     offset_of,
-    overdamped_velocity,
     resistance_of,
-    torque_gain,
 )
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, SeriesElasticParameters
 
 __all__ = [
-    "FixedPoint",
     "LinearModel",
     "RigidPlant",
     "acceleration_from_upright",
     "equilibrium_effort",
-    "fixed_points",
-    "friction_effort",
     "linearise",
     "low_frequency",
-    "overdamped_velocity",
     "state_derivative",
-    "torque_gain",
 ]
 
 Matrix = NDArray[np.float64]

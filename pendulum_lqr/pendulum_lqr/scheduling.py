@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.analysis import loop_transfer
 from pendulum_lqr.design import DesignError, output_lqr
-from pendulum_lqr.model import equilibrium_effort, friction_effort, linearise, low_frequency
+from pendulum_lqr.model import linearise, low_frequency
 from pendulum_lqr.reference import Motion, Reference
 from pendulum_lqr.sampled_design import closed_loop, discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_msgs_py.plants.equilibrium import equilibrium_effort, friction_effort
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Schedule", "ScheduledMargins", "scheduled_margins"]

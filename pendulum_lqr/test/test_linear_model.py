@@ -11,15 +11,13 @@ from hypothesis import strategies as st
 from pendulum_lqr.model import (
     LinearModel,
     equilibrium_effort,
-    fixed_points,
     linearise,
-    overdamped_velocity,
     state_derivative,
-    torque_gain,
 )
 from pendulum_lqr.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.equilibrium import fixed_points, overdamped_velocity, torque_gain
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.plants import make_plant
 

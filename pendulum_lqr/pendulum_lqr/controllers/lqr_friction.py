@@ -13,9 +13,10 @@ from pendulum_lqr.controller import LawController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.design import DesignError, Gain, output_lqr
 from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
-from pendulum_lqr.model import LinearModel, friction_effort, linearise
+from pendulum_lqr.model import LinearModel, linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.equilibrium import friction_effort
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["LqrFriction", "lqr_friction_law"]

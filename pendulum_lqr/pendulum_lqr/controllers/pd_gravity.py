@@ -8,8 +8,9 @@ from typing import Any
 
 from pendulum_lqr.controller import LawController
 from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
-from pendulum_lqr.model import linearise, low_frequency, torque_gain
+from pendulum_lqr.model import linearise, low_frequency
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.equilibrium import torque_gain
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["PdGravity", "pd_gravity_law"]
