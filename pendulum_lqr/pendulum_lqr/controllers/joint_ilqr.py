@@ -7,10 +7,10 @@ from typing import Any
 
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits
 from pendulum_lqr.controllers.joint_swing_up import JointSwingUp
-from pendulum_lqr.mechanism_catch import make_mechanism_catch
+from pendulum_lqr.mechanism_catch import MechanismCatch, make_mechanism_catch
 from pendulum_lqr.mechanism_controllers import refuse_passive_friction
 from pendulum_lqr.mechanism_ilqr import IlqrWeights
-from pendulum_lqr.mechanism_trajectory import SwingUpSearch, cheapest_swing_up
+from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, SwingUpSearch, cheapest_swing_up
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
@@ -23,6 +23,10 @@ class JointIlqr(JointSwingUp):
     """From hanging along the cheapest swing-up that iterative LQR makes of some random guesses.
 
     It is searched once, while the controller is designed: nothing is planned while the plant moves.
+
+    Raises:
+        ParameterError: A passive joint has dry friction, or no guess ends upright under the limits and between the end
+            stops.
     """
 
     SUMMARY = "swing-up planned by iterative LQR when it starts, followed by TVLQR, then LQR"
@@ -40,15 +44,8 @@ class JointIlqr(JointSwingUp):
             JOINT_LIMIT,
         )
 
-    @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointIlqr:
-        """Return the swing-up for a plant whose passive joints have no dry friction.
-
-        Raises:
-            ParameterError: One has, or no guess ends upright under the limits and between the end stops.
-        """
+    def _find(self, plant: MechanismParameters, p: Mapping[str, Any]) -> tuple[MechanismCatch, MechanismTrajectory]:
         refuse_passive_friction("ilqr", plant)
         catch = make_mechanism_catch(plant, *plant.mechanism.weights, joint_limits(plant, p["effort_limit"]))
         search = SwingUpSearch(_WEIGHTS, duration=p["duration"])
-        trajectory, _ = cheapest_swing_up(catch, search, range(p["guesses"]))
-        return cls(catch, period, trajectory)
+        return catch, cheapest_swing_up(catch, search, range(p["guesses"]))[0]

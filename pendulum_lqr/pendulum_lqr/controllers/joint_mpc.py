@@ -38,7 +38,12 @@ class JointMpc(JointDiscreteLqr):
     def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
         super().__init__(plant, p, period)
         self.failures = 0
-        self._position_limits = _position_limits(plant, p["position_limits"])
+        self._position_limits = p["position_limits"]
+        if len(self._position_limits) != len(plant.joints):
+            raise ParameterError(
+                f"position_limits has {len(self._position_limits)} values; expected {len(plant.joints)}, for "
+                f"{', '.join(plant.coordinates.names)}"
+            )
         limits = {joint: width for joint, width in enumerate(self._position_limits) if width}
         self._program = CondensedMpc(
             self.model, self.gain, self.cost[1], int(p["horizon"]), limits, self.effort_limits, _DEAR * max(p["q"])
@@ -100,12 +105,3 @@ def _within_stops(plant: MechanismParameters) -> list[float]:
         ways = [abs(stop - goal) for stop in (joint.lower_stop, joint.upper_stop) if stop is not None]
         widths.append(_KEPT_CLEAR * min(ways) if ways else 0.0)
     return widths
-
-
-def _position_limits(plant: MechanismParameters, given: list[float]) -> list[float]:
-    if len(given) != len(plant.joints):
-        raise ParameterError(
-            f"position_limits has {len(given)} values; expected {len(plant.joints)}, for "
-            f"{', '.join(plant.coordinates.names)}"
-        )
-    return given

@@ -63,13 +63,9 @@ class CaughtController(JointController):
 class JointSwingUp(CaughtController):
     """From hanging along a swing-up; where it is lost, no effort at all.
 
-    Args:
-        catch: LQR with its region; the plant is its own.
-        period: Period at which states come [s].
-        trajectory: The swing-up.
-
     Raises:
-        ParameterError: The trajectory is that of another mechanism.
+        ParameterError: No swing-up is stored for this plant and none is given, its file is refused, or it is that of
+            another mechanism.
     """
 
     SUMMARY = "swing-up along the stored trajectory of a preset, or that of a file, by TVLQR, then LQR"
@@ -77,9 +73,10 @@ class JointSwingUp(CaughtController):
     EVERY_STATE = "the trajectory is followed"
     DESIGNING = "tries out from where the LQR catches, which takes some seconds"
 
-    def __init__(self, catch: MechanismCatch, period: float, trajectory: MechanismTrajectory) -> None:
+    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
+        catch, trajectory = self._find(plant, p)
         self._duration = trajectory.duration
-        q, r = catch.plant.mechanism.weights
+        q, r = plant.mechanism.weights
         super().__init__(MechanismTvlqr(period, trajectory, catch, q=q, r=r), period)
 
     @classmethod
@@ -87,16 +84,11 @@ class JointSwingUp(CaughtController):
         """Return the file."""
         return (_FILE,)
 
-    @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointSwingUp:
-        """Return the swing-up, which is tracked at one period.
-
-        Raises:
-            ParameterError: No swing-up is stored for this plant and none is given, or its file is refused.
-        """
+    def _find(self, plant: MechanismParameters, p: Mapping[str, Any]) -> tuple[MechanismCatch, MechanismTrajectory]:
+        """Return the LQR that catches, and the swing-up that leads to it."""
         given = p["trajectory"]
         trajectory = load_trajectory(Path(given).expanduser()) if given else stored_trajectory(plant)
-        return cls(default_catch(plant), period, trajectory)
+        return default_catch(plant), trajectory
 
     def describe(self) -> str:
         """Return how long it swings, and from where the LQR catches."""
