@@ -235,6 +235,4 @@ def _number(value: float | None, form: str) -> str:
     return "–" if value is None else format(value, form)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    return cli_main(app, argv, name="python -m pendulum_bags compare")
+main = partial(cli_main, app, name="python -m pendulum_bags compare")

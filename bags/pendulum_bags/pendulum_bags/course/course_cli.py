@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -224,6 +224,4 @@ def _told(judgement: Judgement, *, as_json: bool) -> int:
     return 0 if judgement.right else 1
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    return cli_main(app, argv, name="python -m pendulum_bags course")
+main = partial(cli_main, app, name="python -m pendulum_bags course")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -146,10 +146,4 @@ def excite(
     typer.echo(f"played and recorded; next\n  python -m pendulum_bags identify {target}", err=as_json)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code."""
-    return cli_main(app, argv, name="python -m pendulum_bags excite")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+main = partial(cli_main, app, name="python -m pendulum_bags excite")

@@ -7,7 +7,6 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -418,6 +417,4 @@ def _cell(value: Any, form: str) -> str:
     return format(int(value) if form == "d" else float(value), form)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    return cli_main(app, argv, name="python -m pendulum_bags experiment")
+main = partial(cli_main, app, name="python -m pendulum_bags experiment")

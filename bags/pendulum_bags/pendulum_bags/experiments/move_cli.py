@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -134,6 +134,4 @@ def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: b
         print(f"{space}: upright; held under position control", flush=True)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the program."""
-    return cli_main(app, argv, name="python -m pendulum_bags move")
+main = partial(cli_main, app, name="python -m pendulum_bags move")

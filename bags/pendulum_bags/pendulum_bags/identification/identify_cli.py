@@ -347,7 +347,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     # The matrices are small: threads of the linear algebra would only wait for one another.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     return cli_main(app, argv, name="python -m pendulum_bags identify")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -189,6 +190,4 @@ def _sentence(measured: Mapping[str, Any]) -> str:
     return f"{told}; {gave_up} left the states that training visited" if gave_up else told
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    return cli_main(app, argv, name="python -m pendulum_bags train")
+main = partial(cli_main, app, name="python -m pendulum_bags train")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,6 +55,4 @@ def foxglove(
     return run_node(make, list(context.obj), program="pendulum_bags foxglove", description="Live in Foxglove.")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the server; arguments from ``--ros-args`` on belong to ROS."""
-    return cli_main(app, argv, name="python -m pendulum_bags foxglove", takes_ros_arguments=True)
+main = partial(cli_main, app, name="python -m pendulum_bags foxglove", takes_ros_arguments=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -65,6 +65,4 @@ def ranking(
         console.print(f"\npage    {page}", soft_wrap=True)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    return cli_main(app, argv, name="python -m pendulum_bags ranking")
+main = partial(cli_main, app, name="python -m pendulum_bags ranking")

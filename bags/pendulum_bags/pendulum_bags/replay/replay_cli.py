@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -121,6 +121,4 @@ def _print(result: InputReplay | ControllerReplay, content: dict[str, Any], *, c
     console.print(result.sentence(), highlight=False)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    return cli_main(app, argv, name="python -m pendulum_bags replay")
+main = partial(cli_main, app, name="python -m pendulum_bags replay")

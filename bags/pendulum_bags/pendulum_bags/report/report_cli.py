@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -135,6 +134,4 @@ def _summary(folder: Path) -> dict[str, object] | None:
     return {key: content[key] for key in kept if key in content} if isinstance(content, dict) else None
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    return cli_main(app, argv, name="python -m pendulum_bags report")
+main = partial(cli_main, app, name="python -m pendulum_bags report")
