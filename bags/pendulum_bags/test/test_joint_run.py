@@ -268,3 +268,18 @@ def test_a_plant_that_falls_under_the_multisine_alone_has_its_first_layer(
     assert compared == [[tmp_path / "run"]]
     said = " ".join(capsys.readouterr().out.split())
     assert "The frequencies were not measured: both sides failed: the simulation fell after 3.2 s" in said
+
+
+def test_a_run_of_several_joints_that_records_nothing_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from pendulum_bags.experiments.experiment_cli import main
+
+    def ends(folder: Path, *_: Any, **__: Any) -> None:
+        assert (folder / "machine.yaml").is_file()
+        raise FaultError("sim_plant ended with code 2")
+
+    monkeypatch.setattr(joint_run, "record_joints", ends)
+    assert main(["joints", "--plant", "pendubot", "--out", str(tmp_path / "run")]) == 2
+    assert "error: sim_plant ended with code 2" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -19,6 +19,7 @@ from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.experiments.domain import check_domain
 from pendulum_bags.experiments.graph_plant import PREFIX as GRAPH_PREFIX
 from pendulum_bags.experiments.joints_cli import joints
+from pendulum_bags.experiments.new_run import new_run
 from pendulum_bags.experiments.operator import ask_for_running, confirmed
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import SIDES
@@ -31,15 +32,15 @@ from pendulum_bags.experiments.settings import (
 )
 from pendulum_bags.experiments.trials_cli import add_commands as add_trial_commands
 from pendulum_bags.frequency_response.frequency_response_cli import experiment as frequency_response
-from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty, versions, write_json
+from pendulum_bags.runs.run_folder import versions, write_json
 from pendulum_bags.studies.leaderboard_cli import leaderboard
 from pendulum_bags.studies.mechanism_benchmark_cli import benchmark
 from pendulum_bags.studies.monte_carlo_cli import monte_carlo
 from pendulum_bags.studies.region_cli import region_of_attraction
 from pendulum_bags.studies.study_cli import add_commands as add_study_commands
-from pendulum_msgs_py.errors import ParameterError, PendulumError
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main, typed_options
+from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Domain, Json, Lab, Storage, Yes, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
@@ -194,35 +195,29 @@ def thesis(
     console = make_console(stderr=json_output, highlight=False)
     running = _running(settings, domain, plant)
     ask_for_running(running, domain or 0, _plan(settings), yes=yes)
-    with confirmed(settings.machine, settings.bridge_program(), _plan(settings), yes=yes):
-        folder = create_run_folder(out, "thesis")
+    with (
+        confirmed(settings.machine, settings.bridge_program(), _plan(settings), yes=yes),
+        new_run(out, "thesis", console) as folder,
+    ):
         if (foreign := settings.foreign) is not None:
             equation = foreign.write_equation(folder)
             settings = settings if plant else replace(settings, plant=str(equation))
         started = time.monotonic()
-        try:
-            with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
-                run_undisturbed(
-                    partial(
-                        run_thesis,
-                        folder,
-                        settings,
-                        domain,
-                        progress,
-                        repeat=hardware == "emulator" and settings.can_repeat and budget > 0.0,
-                    ),
+        with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
+            run_undisturbed(
+                partial(
+                    run_thesis,
                     folder,
-                    emulated=settings.is_emulated,
-                    tell=progress.start_again,
-                )
-                comparison, answer, summary = _analyse(folder, settings, margins, budget, progress)
-        except KeyboardInterrupt:
-            kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
-            console.print(f"interrupted: all programs have ended; {kept}")
-            raise typer.Exit(EXIT_INTERRUPTED) from None
-        except PendulumError:
-            discard_if_empty(folder)
-            raise
+                    settings,
+                    domain,
+                    progress,
+                    repeat=hardware == "emulator" and settings.can_repeat and budget > 0.0,
+                ),
+                folder,
+                emulated=settings.is_emulated,
+                tell=progress.start_again,
+            )
+            comparison, answer, summary = _analyse(folder, settings, margins, budget, progress)
     if json_output:
         print(json.dumps(summary, indent=2))
     else:

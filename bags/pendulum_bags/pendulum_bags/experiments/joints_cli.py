@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
+from pendulum_bags.experiments.new_run import new_run
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_msgs_py.errors import DataError, FaultError, ParameterError
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
 from pendulum_msgs_py.programs.options import Json, Storage, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -111,7 +111,6 @@ def joints(
     from pendulum_bags.ranking.joint_choice import COST, DURATION, rank_joints, rankable
     from pendulum_bags.ranking.joint_choice import FOLDER as RANKING
     from pendulum_bags.ranking.present import Words, same_choice, write_ranking
-    from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
     from pendulum_bags.verdict import write_layer
     from pendulum_lqr.mechanism_model import linearise_mechanism
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
@@ -132,9 +131,8 @@ def joints(
     designs = joint_designs(design or (), on, linearise_mechanism(on)) if design or rank_seeds else ()
     ranked = rankable(designs) if rank_seeds else ()
     console = make_console(stderr=json_output, highlight=False)
-    folder = create_run_folder(out, "joints")
     started = time.monotonic()
-    try:
+    with new_run(out, "joints", console) as folder:
         made = write_mechanism(folder / "machine.yaml", drawn, provenance={"stands_in_for": f"the machine of {plant}"})
         expected = _STARTING + _PACE * duration
         multisine = JointMultisine(settings, periods)
@@ -184,10 +182,6 @@ def joints(
                 words = Words("--rank-seeds 10", f"experiment joints --plant {plant} --periods 40", COST)
                 write_ranking(folder / RANKING, found, words=words)
                 write_layer(folder, same_choice(found, words=words))
-    except KeyboardInterrupt:
-        kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
-        console.print(f"interrupted: all programs have ended; {kept}")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
     if analysis is not None and not json_output:
         console.print(designs_table(analysis.designs))
     compare([folder], margin=margin, margins_file=margins_file, out=folder, json_output=json_output)

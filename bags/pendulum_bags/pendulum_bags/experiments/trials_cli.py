@@ -10,11 +10,10 @@ import typer
 from rich.console import Console
 
 from pendulum_bags.experiments.domain import check_domain
+from pendulum_bags.experiments.new_run import new_run
 from pendulum_bags.experiments.operator import confirmed
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED
 from pendulum_msgs_py.programs.options import Domain, Json, Lab, Storage, Yes, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -98,20 +97,14 @@ def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_out
     name = settings.kind.name
     console = make_console(stderr=json_output, highlight=False)
     program, plan = settings.plant_program(1), _plan(settings)
-    with confirmed(settings.machine, program, plan, yes=yes, flat=settings.kind.flat):
-        folder = create_run_folder(out, name)
+    ended = "the drive is off, all programs have ended"
+    with (
+        confirmed(settings.machine, program, plan, yes=yes, flat=settings.kind.flat),
+        new_run(out, name, console, ended=ended, recorded="what was recorded until then") as folder,
+    ):
         started = time.monotonic()
-        try:
-            with PhaseProgress(settings.trials * settings.expected_wall_time, console) as progress:
-                bags = run_trials(folder, settings, domain, progress, ask=lambda sentence: _ask(console, sentence))
-        except KeyboardInterrupt:
-            nothing = discard_if_empty(folder)
-            kept = "nothing was recorded" if nothing else f"what was recorded until then is in {folder}"
-            console.print(f"interrupted: the drive is off, all programs have ended; {kept}")
-            raise typer.Exit(EXIT_INTERRUPTED) from None
-        except PendulumError:
-            discard_if_empty(folder)
-            raise
+        with PhaseProgress(settings.trials * settings.expected_wall_time, console) as progress:
+            bags = run_trials(folder, settings, domain, progress, ask=lambda sentence: _ask(console, sentence))
     elapsed = time.monotonic() - started
     arguments = ["--method", "thesis", "--experiment", name, "--out", str(folder / "identified.json")]
     code = identify_cli.main([*map(str, bags), *arguments, *(["--json"] if json_output else [])])

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main, typed_options
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Domain, Json, Storage, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -118,10 +118,10 @@ def experiment(
     from pendulum_bags.experiments.domain import check_domain
     from pendulum_bags.experiments.host_pool import HostPool
     from pendulum_bags.experiments.lockstep import record_run
+    from pendulum_bags.experiments.new_run import new_run
     from pendulum_bags.experiments.progress import PhaseProgress
     from pendulum_bags.experiments.run_spec import RunSpec
     from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
-    from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty
     from pendulum_lqr.controller_response import require_time_invariant
     from pendulum_lqr.gap_metric import Scaling
     from pendulum_lqr.policy_file import named_controller
@@ -158,26 +158,21 @@ def experiment(
         )
         for side in ("sim", "hw")
     ]
-    folder = create_run_folder(out, "frequency_response")
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
     shares = (1.0, 1.0) if realtime else (0.35, 0.15)
     expected = [6.0 + share * spec.duration for spec, share in zip(specs, shares, strict=True)]
-    try:
-        with HostPool() as hosts, PhaseProgress(sum(expected) + 12.0, console) as progress:
-            for spec, length in zip(specs, expected, strict=True):
-                progress.phase("simulation" if spec.side == "sim" else "hardware", length)
-                record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh, hosts=hosts)
-            progress.phase("analysing", 12.0)
-            responses, told, ran = read_responses([folder])
-            analysis = analyse_responses(responses, told, design or ran, scaling=scaling, margin=gap_margin)
-    except KeyboardInterrupt:
-        kept = "nothing was recorded" if discard_if_empty(folder) else f"what was recorded is in {folder}"
-        console.print(f"interrupted: all programs have ended; {kept}")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    except PendulumError:
-        discard_if_empty(folder)
-        raise
+    with (
+        new_run(out, "frequency_response", console) as folder,
+        HostPool() as hosts,
+        PhaseProgress(sum(expected) + 12.0, console) as progress,
+    ):
+        for spec, length in zip(specs, expected, strict=True):
+            progress.phase("simulation" if spec.side == "sim" else "hardware", length)
+            record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh, hosts=hosts)
+        progress.phase("analysing", 12.0)
+        responses, told, ran = read_responses([folder])
+        analysis = analyse_responses(responses, told, design or ran, scaling=scaling, margin=gap_margin)
     _tell(console, analysis, folder, json_output=json_output)
     console.print(f"bags    {folder / 'sim'}, {folder / 'hw'}\n({time.monotonic() - started:.0f} s)", soft_wrap=True)
 
