@@ -8,9 +8,9 @@ import pytest
 import scipy
 
 from pendulum_bags.identification import identify_cli
-from pendulum_bags.identification.figures import thesis_figures
 from pendulum_bags.identification.page import write_thesis_page
 from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping, static_holds
+from pendulum_bags.identification.thesis_figures import TrialSet, thesis_figures
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 
@@ -178,8 +178,8 @@ def test_holds_follow_the_events_of_a_bag_where_there_are_any():
 
 def test_the_figures_of_the_thesis_are_drawn(tmp_path):
     trials = [hand_trial(seed) for seed in range(6)]
-    first = thesis_figures(fit_inertia_damping(trials), trials)
-    assert set(first) == {"effort_over_velocity", "effort_over_acceleration", "trials"}
+    first = thesis_figures(TrialSet(fit_inertia_damping(trials), trials))
+    assert {figure.name for figure in first} == {"effort_over_velocity", "effort_over_acceleration", "trials"}
     stairs = [staircase(0)]
     page = write_thesis_page(fit_gravity(stairs), stairs, tmp_path)
     assert {p.stem for p in (tmp_path / "figures").iterdir()} == {

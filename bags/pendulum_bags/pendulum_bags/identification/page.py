@@ -8,9 +8,12 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pendulum_bags.identification.figures import fit_figures, save, thesis_figures
+from pendulum_bags.figures.figure import Figure
+from pendulum_bags.figures.render_files import write_figures
+from pendulum_bags.identification.figures import fit_figures, save
 from pendulum_bags.identification.model import UNITS
-from pendulum_bags.identification.thesis import ThesisResult
+from pendulum_bags.identification.thesis import ThesisResult, trial_part
+from pendulum_bags.identification.thesis_figures import TrialSet, thesis_figures
 from pendulum_bags.runs.datasets import Recording
 
 if TYPE_CHECKING:
@@ -63,7 +66,9 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
 def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], folder: str | Path) -> Path:
     """Write figures and ``index.html`` of the two regressions into a folder and return the page's path."""
     target = Path(folder)
-    figures = save(thesis_figures(result, recordings), target / "figures")
+    trials = TrialSet(result, list(map(trial_part, recordings)), [one.trial for one in result.trials])
+    drawn = thesis_figures(trials)
+    figures = write_figures([one for one in drawn if isinstance(one, Figure)], target / "figures", ("png",))
     rows = [
         (name, f"{value:.5g}", f"{result.intervals[name][0]:.5g} to {result.intervals[name][1]:.5g}")
         for name, value in result.average.items()
@@ -72,6 +77,7 @@ def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], fol
         _sentences(result.sentences),
         _table("Average over trials", ("coefficient", "value", "95 % interval"), rows),
         *(f"<h2>{escape(r.trial)}</h2><pre>{escape(r.summary)}</pre>" for r in result.trials),
+        *(f"<p>No figure: {escape(one)}.</p>" for one in drawn if isinstance(one, str)),
         *map(_image, figures),
     ]
     return _write(target, f"Regression: {result.kind.replace('_', ' and ')}", body)

@@ -9,8 +9,8 @@ from typing import Any
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.frequency_response.result import Analysis
+from pendulum_bags.identification.thesis_figures import TrialSet
 from pendulum_bags.replay.result import InputReplay
-from pendulum_bags.report.trials import TrialSet
 from pendulum_bags.runs.run_data import OpenBag
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Answer

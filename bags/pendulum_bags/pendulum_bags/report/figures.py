@@ -10,9 +10,10 @@ from pendulum_bags.comparison import Comparison
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.frequency_response.figures import certified_gains_figure, certified_weights_figure, gap_figure
 from pendulum_bags.frequency_response.result import Analysis
-from pendulum_bags.report import analysis_figures, model_figures, motion_figures, trial_figures
+from pendulum_bags.identification import thesis_figures
+from pendulum_bags.identification.thesis_figures import TrialSet
+from pendulum_bags.report import analysis_figures, model_figures, motion_figures
 from pendulum_bags.report.data import ReportData
-from pendulum_bags.report.trials import TrialSet
 from pendulum_lqr.certificate import Certifier
 
 __all__ = ["FIGURES", "comparison_figures", "make_figures"]
@@ -67,12 +68,12 @@ FIGURES: tuple[tuple[str, Maker], ...] = (
     ("Difference over time", motion_figures.unpaired_difference),
     ("Ramps up and down", motion_figures.ramps),
     ("Torque over sin θ", model_figures.gravity_fit),
-    ("Effort over velocity", _of_experiment(1, trial_figures.effort_over_velocity)),
-    ("Effort over acceleration", _of_experiment(1, trial_figures.effort_over_acceleration)),
-    ("Trials by hand", _of_experiment(1, trial_figures.effort_over_time)),
-    ("Dynamic phase", _of_experiment(2, trial_figures.dynamic_phase)),
-    ("Static phase", _of_experiment(2, trial_figures.static_phase)),
-    ("Effort over sin θ, static", _of_experiment(2, trial_figures.effort_over_sine)),
+    ("Effort over velocity", _of_experiment(1, thesis_figures.effort_over_velocity)),
+    ("Effort over acceleration", _of_experiment(1, thesis_figures.effort_over_acceleration)),
+    ("Trials by hand", _of_experiment(1, thesis_figures.effort_over_time)),
+    ("Dynamic phase", _of_experiment(2, thesis_figures.dynamic_phase)),
+    ("Static phase", _of_experiment(2, thesis_figures.static_phase)),
+    ("Effort over sin θ, static", _of_experiment(2, thesis_figures.effort_over_sine)),
     ("Timing of the states", analysis_figures.timing),
     ("Overdamped phase plot", model_figures.overdamped_phase),
     ("Replay of a real pendulum", model_figures.replay),

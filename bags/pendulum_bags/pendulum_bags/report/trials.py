@@ -3,37 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from pendulum_bags.identification.thesis import (
-    ThesisResult,
     fit_gravity,
     fit_inertia_damping,
     static_holds,
     trial_part,
 )
+from pendulum_bags.identification.thesis_figures import TrialSet
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["TrialSet", "read_trials"]
-
-
-@dataclass(frozen=True)
-class TrialSet:
-    """The trials of one experiment and their regression.
-
-    Args:
-        result: Regressions and average.
-        recordings: One for each trial, cut to the trial.
-    """
-
-    result: ThesisResult
-    recordings: Sequence[Recording]
+__all__ = ["read_trials"]
 
 
 def read_trials(folder: str | os.PathLike[str]) -> TrialSet:

@@ -1,21 +1,29 @@
-"""Figures and tables of the thesis's two identification experiments, where their trials were recorded."""
+"""Figures of the thesis's two identification experiments: trials by hand, and staircases against gravity."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from pendulum_bags.figures.figure import Figure, Panel, Trace, thinned
 from pendulum_bags.figures.numbers import quantity
-from pendulum_bags.identification.thesis import static_holds
-from pendulum_bags.report.trials import TrialSet
+from pendulum_bags.identification.thesis import ThesisResult, static_holds
+from pendulum_bags.runs.datasets import Recording
 
 __all__ = [
+    "GRAVITY",
+    "INERTIA",
+    "UNITS",
+    "TrialSet",
     "dynamic_phase",
     "effort_over_acceleration",
     "effort_over_sine",
     "effort_over_time",
     "effort_over_velocity",
     "static_phase",
+    "thesis_figures",
 ]
 
 INERTIA = "Experiment 1: inertia and damping"
@@ -23,6 +31,32 @@ GRAVITY = "Experiment 2: gravity"
 UNITS = {"inertia": "kg m²", "damping": "N m s/rad", "gravity": "N m"}
 ROLES = 6
 """Looks there are for trials; a seventh looks like the first."""
+
+
+@dataclass(frozen=True)
+class TrialSet:
+    """The trials of one experiment and their regression.
+
+    Args:
+        result: Regressions and average.
+        recordings: One for each trial, cut to the trial.
+        names: One for each trial; by default they are counted.
+    """
+
+    result: ThesisResult
+    recordings: Sequence[Recording]
+    names: Sequence[str] = ()
+
+    def named(self, word: str) -> Sequence[str]:
+        """Return the name of each trial, or the word and its number."""
+        return self.names or [f"{word} {number}" for number in range(1, len(self.recordings) + 1)]
+
+
+def thesis_figures(trials: TrialSet) -> list[Figure | str]:
+    """Return the figures of either experiment, and in words why there is none."""
+    if trials.result.kind == "inertia_damping":
+        return [effort_over_velocity(trials), effort_over_acceleration(trials), effort_over_time(trials)]
+    return [dynamic_phase(trials), static_phase(trials), effort_over_sine(trials)]
 
 
 def _found(trials: TrialSet) -> str:
@@ -37,7 +71,7 @@ def _found(trials: TrialSet) -> str:
 
 def _cloud(trials: TrialSet, column: int, label: str, name: str, title: str) -> Figure:
     panels = []
-    for number, trial in enumerate(trials.result.trials, start=1):
+    for title_of_trial, trial in zip(trials.named("Trial"), trials.result.trials, strict=True):
         x = trial.regressors[:, column]
         step = max(1, x.size // 600)
         ends = np.array([x.min(), x.max()])
@@ -48,7 +82,7 @@ def _cloud(trials: TrialSet, column: int, label: str, name: str, title: str) -> 
                 label,
                 "effort [N m]",
                 [points, Trace(ends, fit, "its part of the fit", "fit")],
-                title=f"Trial {number}",
+                title=title_of_trial,
             )
         )
     return Figure(
@@ -75,13 +109,13 @@ def effort_over_acceleration(trials: TrialSet) -> Figure:
 def effort_over_time(trials: TrialSet) -> Figure:
     """Return measured and fitted effort over time, trial by trial."""
     panels = []
-    for number, (trial, recording) in enumerate(zip(trials.result.trials, trials.recordings, strict=True), start=1):
+    for title, trial, recording in zip(trials.named("Trial"), trials.result.trials, trials.recordings, strict=True):
         t = recording.time - recording.time[0]
         traces = [
             Trace(*thinned(t, trial.response, 1000), "measured", "hw"),
             Trace(*thinned(t, trial.regressors @ trial.values, 1000), "fitted", "fit"),
         ]
-        panels.append(Panel("time [s]", "effort [N m]", traces, title=f"Trial {number}"))
+        panels.append(Panel("time [s]", "effort [N m]", traces, title=title))
     lowest = min(trial.r_squared for trial in trials.result.trials)
     sentence = f"The fit explains at least {100.0 * lowest:.2f} % of the squared effort of each trial."
     return Figure("trials", "Trials by hand", sentence, panels, stacked=False, section=INERTIA, panel_height=180)
@@ -90,8 +124,8 @@ def effort_over_time(trials: TrialSet) -> Figure:
 def dynamic_phase(trials: TrialSet) -> Figure:
     """Return position, velocity and effort of the staircases over time."""
     rows: dict[str, list[Trace]] = {"θ [rad]": [], "θ′ [rad/s]": [], "effort [N m]": []}
-    for i, recording in enumerate(trials.recordings):
-        start, label, role = float(recording.time[0]), f"trial {i + 1}", f"trial {i % ROLES + 1}"
+    for i, (label, recording) in enumerate(zip(trials.named("trial"), trials.recordings, strict=True)):
+        start, role = float(recording.time[0]), f"trial {i % ROLES + 1}"
         rows["θ [rad]"].append(Trace(recording.time - start, recording.position, label, role))
         if recording.velocity is not None:
             rows["θ′ [rad/s]"].append(Trace(recording.time - start, recording.velocity, label, role))
@@ -109,7 +143,7 @@ def static_phase(trials: TrialSet) -> Figure | str:
     panels = []
     for degrees in (10.0, 90.0, -10.0):
         traces = []
-        for i, recording in enumerate(trials.recordings):
+        for i, (name, recording) in enumerate(zip(trials.named("trial"), trials.recordings, strict=True)):
             holds = static_holds(recording)
             nearest = sorted(holds, key=lambda hold: abs(np.degrees(hold.position) - degrees))[:2]
             for hold in (hold for hold in nearest if abs(np.degrees(hold.position) - degrees) < 5.0):
@@ -120,7 +154,7 @@ def static_phase(trials: TrialSet) -> Figure | str:
                     Trace(
                         t,
                         recording.input[inside],
-                        f"trial {i + 1}, going up" if hold.upward else "coming down",
+                        f"{name}, going up" if hold.upward else "coming down",
                         role,
                     )
                 )
@@ -136,8 +170,8 @@ def static_phase(trials: TrialSet) -> Figure | str:
 def effort_over_sine(trials: TrialSet) -> Figure:
     """Return the mean effort of each hold over the sine of its angle, with the fit."""
     traces = [
-        Trace(trial.regressors[:, 0], trial.response, f"trial {i + 1}", f"trial {i % ROLES + 1}", "points")
-        for i, trial in enumerate(trials.result.trials)
+        Trace(trial.regressors[:, 0], trial.response, name, f"trial {i % ROLES + 1}", "points")
+        for i, (name, trial) in enumerate(zip(trials.named("trial"), trials.result.trials, strict=True))
     ]
     ends = np.array([-1.0, 1.0])
     gravity = trials.result.sign * trials.result.average["gravity"]
