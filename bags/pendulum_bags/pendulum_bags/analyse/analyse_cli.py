@@ -13,10 +13,11 @@ from rich.console import Console
 from rich.markup import escape
 
 from pendulum_bags.analyse.questions import QUESTIONS
+from pendulum_bags.figures.terminal_table import number_table
 from pendulum_msgs_py.programs.counted_progress import counted_progress
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
-from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.analyse.bag_table import Table as BagTable
@@ -88,14 +89,11 @@ def _print(console: Console, found: BagTable, out: Path, elapsed: float) -> None
         if not rows:
             continue
         names = [name for name in _SHOWN if any(row.get(name) is not None for row in rows)]
-        table = WholeTable(title=title, title_justify="left")
-        for heading in ("bag", "plant") if file == "bags" else ("run",):
-            table.add_column(heading, justify="left")
-        for name in names:
-            table.add_column(escape(_SHOWN[name]), justify="right")
+        first = ("bag", "plant") if file == "bags" else ("run",)
+        table = number_table(title, *first, *(escape(_SHOWN[name]) for name in names), left=len(first))
         for row in rows[:_MOST_ROWS]:
-            first = [row["bag"], row["plant"]] if file == "bags" else [row["bag"]]
-            table.add_row(*first, *(_cell(row.get(name)) for name in names))
+            whose = [row["bag"], row["plant"]] if file == "bags" else [row["bag"]]
+            table.add_row(*whose, *(_cell(row.get(name)) for name in names))
         console.print(table)
         if len(rows) > _MOST_ROWS:
             console.print(f"... and {len(rows) - _MOST_ROWS} more")

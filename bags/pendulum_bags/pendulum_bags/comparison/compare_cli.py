@@ -177,18 +177,15 @@ def _write(out: Path, results: Mapping[str, Comparison], content: dict[str, Any]
 
 
 def _print(console: Console, result: Comparison, content: dict[str, Any]) -> None:
+    from pendulum_bags.figures.terminal_table import number_table, plants_table
     from pendulum_bags.runs.run_data import timing_warning
     from pendulum_bags.verdict.terminal import print_tests
-    from pendulum_msgs_py.programs.terminal import WholeTable
 
     motion = result.pairs[0].simulation.window
     unit, what = motion.unit, "x" if motion.slides else "theta"
     plants = content["plants"]
     pooled = f", all samples of {len(result.pairs)} runs" if len(result.pairs) > 1 else ""
-    table = WholeTable(title=f"Plants during the noise{pooled}", title_justify="left")
-    for heading in ("", *plants):
-        table.add_column(heading, justify="left" if not heading else "right")
-    for label, key, form in (
+    rows = [
         ("noise recorded \\[s]", "duration_s", ".1f"),
         ("rate \\[Hz]", "rate_hz", ".1f"),
         ("missed deadlines", "missed_deadlines", ".0f"),
@@ -196,19 +193,14 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
         (f"std of {what} \\[{unit}]", "std_theta", ".5f"),
         (f"std of {what}' \\[{unit}/s]", "std_theta_dot", ".5f"),
         (f"max |u| \\[{motion.effort_unit}]", "max_abs_u", ".4f"),
-    ):
-        table.add_row(label, *(_number(plant.get(key), form) for plant in plants.values()))
+    ]
     if any("rms_tracking_error" in plant for plant in plants.values()):
-        errors = (_number(plant.get("rms_tracking_error"), ".5f") for plant in plants.values())
-        table.add_row("rms of tracking error \\[rad]", *errors)
-    console.print(table)
+        rows.append(("rms of tracking error \\[rad]", "rms_tracking_error", ".5f"))
+    console.print(plants_table(f"Plants during the noise{pooled}", list(plants), list(plants.values()), rows))
     blocks = [("paired", content["paired"])] if "position" in content["paired"] else []
     blocks.append(("unpaired", content["unpaired"]))
-    statistics = WholeTable(title="Hardware minus simulation", title_justify="left")
-    statistics.add_column("")
-    for title, _ in blocks:
-        statistics.add_column(f"{title} \\[{unit}]", justify="right")
-        statistics.add_column(f"{title} \\[{unit}/s]", justify="right")
+    headings = (f"{title} \\[{of}]" for title, _ in blocks for of in (unit, f"{unit}/s"))
+    statistics = number_table("Hardware minus simulation", "", *headings)
     for name in content["unpaired"]["position"]:
         cells = [f"{block[key][name]:.4g}" for _, block in blocks for key in ("position", "velocity")]
         statistics.add_row(name, *cells)
@@ -229,10 +221,6 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
     for note in result.left_out:
         console.print(note, style="yellow", highlight=False, markup=False)
     print_tests(console, result)
-
-
-def _number(value: float | None, form: str) -> str:
-    return "–" if value is None else format(value, form)
 
 
 main = partial(cli_main, app, name="python -m pendulum_bags compare")

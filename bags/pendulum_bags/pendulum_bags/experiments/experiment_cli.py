@@ -35,14 +35,14 @@ from pendulum_bags.frequency_response.frequency_response_cli import experiment a
 from pendulum_bags.runs.run_folder import versions, write_json
 from pendulum_bags.studies.leaderboard_cli import leaderboard
 from pendulum_bags.studies.mechanism_benchmark_cli import benchmark
-from pendulum_bags.studies.monte_carlo_cli import monte_carlo
+from pendulum_bags.studies.monte_carlo_cli import Q, R, monte_carlo
 from pendulum_bags.studies.region_cli import region_of_attraction
 from pendulum_bags.studies.study_cli import add_commands as add_study_commands
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Domain, Json, Lab, Storage, Yes, out_option
-from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.comparison import Comparison, Margins
@@ -80,8 +80,6 @@ Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
 Duration = Annotated[float, typer.Option(help="Length of the noise [s].")]
 Controller = Annotated[str, typer.Option(help="Kind of controller, or a policy file (.npz).")]
-Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
-R = Annotated[float, typer.Option(help="R.")]
 Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
 
 
@@ -374,42 +372,31 @@ def _summary(settings: RegulationSettings, comparison: Comparison, answer: Answe
 
 
 def _print_summary(console: Console, summary: dict[str, Any]) -> None:
+    from pendulum_bags.figures.terminal_table import plants_table
     from pendulum_bags.runs.run_data import timing_warning
 
     emulated = summary["emulated"]
     title = f"Simulation and {'emulated hardware' if emulated else 'hardware'} under the same noise"
     if summary["runs"] > 1:
         title += f", all samples of {summary['runs']} runs"
-    table = WholeTable(title=title, title_justify="left")
-    table.add_column("")
     plants = summary["plants"]
-    for name in plants:
-        stands_in = "emulator" if summary["hardware"] in HARDWARE else "a simulation"
-        table.add_column(f"hw ({stands_in})" if name == "hw" and emulated else name, justify="right")
+    stands_in = "emulator" if summary["hardware"] in HARDWARE else "a simulation"
+    headings = [f"hw ({stands_in})" if name == "hw" and emulated else name for name in plants]
     rows = (
-        ("noise recorded", "duration_s", "s", ".1f"),
-        ("rate", "rate_hz", "Hz", ".1f"),
-        ("missed deadlines", "missed_deadlines", "", "d"),
-        ("std of theta", "std_theta", "rad", ".5f"),
-        ("std of theta'", "std_theta_dot", "rad/s", ".5f"),
-        ("max |u|", "max_abs_u", "N m", ".3f"),
+        (r"noise recorded \[s]", "duration_s", ".1f"),
+        (r"rate \[Hz]", "rate_hz", ".1f"),
+        ("missed deadlines", "missed_deadlines", ".0f"),
+        (r"std of theta \[rad]", "std_theta", ".5f"),
+        (r"std of theta' \[rad/s]", "std_theta_dot", ".5f"),
+        (r"max |u| \[N m]", "max_abs_u", ".3f"),
     )
-    for label, key, unit, form in rows:
-        cells = [_cell(plants[name].get(key), form) for name in plants]
-        table.add_row(f"{label} [{unit}]".replace("[", r"\[") if unit else label, *cells)
-    console.print(table)
+    console.print(plants_table(title, headings, list(plants.values()), rows))
     if "sim_500hz" in plants:
         console.print("(sim_500hz: simulation by the thesis's own protocol, with new noise every 2 ms)")
     if warning := timing_warning(plants):
         console.print(warning, style="bold red")
     for note in summary["left_out"]:
         console.print(note, style="yellow", markup=False)
-
-
-def _cell(value: Any, form: str) -> str:
-    if value is None:
-        return "–"
-    return format(int(value) if form == "d" else float(value), form)
 
 
 main = partial(cli_main, app, name="python -m pendulum_bags experiment")

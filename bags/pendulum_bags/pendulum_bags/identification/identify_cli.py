@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main"]
 
+Hold = Annotated[
+    str | None,
+    typer.Option(help="Input of a CSV between its samples: zero (a held command) or linear (measured)."),
+]
 _FOR_SEVERAL_JOINTS = frozenset({"plant", "mapping", "window", "held_out", "out", "name", "as_json"})
 _FOR_REGRESSION = frozenset({"method", "mapping", "hold", "experiment", "skew", "out", "page", "as_json", "verbose"})
 _FOR_REGRESSION_ALONE = frozenset({"experiment", "skew", "verbose"})
@@ -46,10 +50,7 @@ def identify(
             "or once for each."
         ),
     ] = None,
-    hold: Annotated[
-        str | None,
-        typer.Option(help="Input of a CSV between its samples: zero (a held command) or linear (measured)."),
-    ] = None,
+    hold: Hold = None,
     effort: Annotated[str, typer.Option(help="Of a bag: applied (what the plant received) or measured.")] = "applied",
     experiment: Annotated[
         str, typer.Option(help="With --method thesis: inertia_damping or gravity; auto asks the recording.")

@@ -24,9 +24,9 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 
 from pendulum_bags.distributions import mean_interval, student_quantile
+from pendulum_bags.figures.terminal_table import number_table
 from pendulum_bags.ranking.contender import Contender, Interval
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.programs.terminal import WholeTable
 
 __all__ = ["Narrowed", "narrow", "narrow_all", "print_narrowed"]
 
@@ -125,9 +125,8 @@ def print_narrowed(console: Console, found: dict[str, Narrowed]) -> None:
             style="yellow",
         )
         return
-    table = WholeTable(title="Cost on hardware with 95 % intervals, narrowed by simulated runs", title_justify="left")
-    for i, heading in enumerate(("controller", "hardware alone", "with simulated runs", "pairs + more", "worth runs")):
-        table.add_column(heading, justify="right" if i else "left")
+    headings = ("controller", "hardware alone", "with simulated runs", "pairs + more", "worth runs")
+    table = number_table("Cost on hardware with 95 % intervals, narrowed by simulated runs", *headings)
     for name, one in found.items():
         cells = [f"{part.value:.4g} ({part.low:.4g} to {part.high:.4g})" for part in (one.alone, one.together)]
         table.add_row(name, *cells, f"{one.pairs} + {one.further}", f"{one.worth:.3g}")

@@ -12,11 +12,11 @@ from rich.console import Console
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.figures.table import Table
+from pendulum_bags.figures.terminal_table import number_table
 from pendulum_bags.ranking.ranking import Ranking
 from pendulum_bags.report.layer_page import write_layer_page
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
-from pendulum_msgs_py.programs.terminal import WholeTable
 
 __all__ = ["REGRET_MARGIN", "Words", "print_ranking", "same_choice", "write_ranking"]
 
@@ -218,9 +218,7 @@ def write_ranking(
 
 def print_ranking(console: Console, ranking: Ranking) -> None:
     """Print contenders, wrong pairs and the layer's sentence."""
-    table = WholeTable(title="Costs on both sides", title_justify="left")
-    for i, heading in enumerate(_HEAD):
-        table.add_column(heading, justify="right" if i else "left")
+    table = number_table("Costs on both sides", *_HEAD)
     for row in ranking_rows(ranking):
         table.add_row(*row)
     console.print(table)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pendulum_bags.identification.identify_cli import Hold
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
@@ -43,10 +44,7 @@ def replay(
     start: Annotated[float | None, typer.Option(help="Leave out what comes before [s].")] = None,
     stop: Annotated[float | None, typer.Option(help="Leave out what comes after [s].")] = None,
     mapping: Annotated[str, typer.Option(help="Mapping file of a CSV with other columns or units.")] = "",
-    hold: Annotated[
-        str | None,
-        typer.Option(help="Input of a CSV between its samples: zero (a held command) or linear (measured)."),
-    ] = None,
+    hold: Hold = None,
     effort: Annotated[str, typer.Option(help="Torque of a bag: applied (said by the plant) or measured.")] = "applied",
     prefix: Annotated[str, typer.Option(help="Namespace of a bag's topics, where it holds several plants: /sim.")] = "",
     out: Annotated[Path | None, out_option("Folder for figure and replay.json.")] = None,
@@ -96,13 +94,13 @@ def replay(
 
 
 def _print(result: InputReplay | ControllerReplay, content: dict[str, Any], *, chosen: bool) -> None:
-    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+    from pendulum_bags.figures.terminal_table import number_table
+    from pendulum_msgs_py.programs.terminal import make_console
 
     console = make_console()
     if "horizons" in content:
-        table = WholeTable(title="Error of predictions from measured states, by horizon", title_justify="left")
-        for heading in ("samples", r"time \[s]", r"rms \[rad]", "predictions"):
-            table.add_column(heading, justify="right")
+        headings = ("samples", r"time \[s]", r"rms \[rad]", "predictions")
+        table = number_table("Error of predictions from measured states, by horizon", *headings, left=0)
         for row in content["horizons"]:
             table.add_row(str(row["steps"]), f"{row['time_s']:.4g}", f"{row['rms_rad']:.3g}", str(row["starts"]))
         console.print(table)

@@ -10,10 +10,11 @@ from typing import Annotated
 
 import typer
 
+from pendulum_bags.figures.terminal_table import number_table
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import results_at_once
 from pendulum_msgs_py.programs.options import Json, out_option
-from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import make_console
 
 __all__ = ["leaderboard"]
 
@@ -81,9 +82,8 @@ def leaderboard(
     if json_output:
         print(json.dumps(to_json(entries), indent=2))
         return
-    table = WholeTable(title="Leaderboard", title_justify="left")
-    for heading in ("plant", "controller", "up", "v1", "v2", "v3", "time \\[s]", "robustness \\[%]"):
-        table.add_column(heading, justify="left" if heading in {"plant", "controller"} else "right")
+    headings = ("plant", "controller", "up", "v1", "v2", "v3", "time \\[s]", "robustness \\[%]")
+    table = number_table("Leaderboard", *headings, left=2)
     for entry in sorted(entries, key=lambda one: (machines.index(one.plant), -one.scores.get("v2", -1.0))):
         held = list(entry.robustness.values())
         table.add_row(

@@ -13,9 +13,10 @@ import typer
 from rich.console import Console
 from rich.table import Column
 
+from pendulum_bags.figures.terminal_table import number_table
 from pendulum_msgs_py.programs.counted_progress import results_at_once
 from pendulum_msgs_py.programs.options import Json, out_option
-from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.studies.mechanism_benchmark import Published
@@ -82,18 +83,12 @@ def benchmark(
     console.print(f"({time.monotonic() - started:.0f} s)")
 
 
-def _table(title: str, *figures: str) -> WholeTable:
-    """Return a table with a line a controller."""
-    columns = (Column(heading, justify="right") for heading in figures)
-    return WholeTable("controller", *columns, title=title, title_justify="left")
-
-
 def _print(console: Console, plant: str, rows: Sequence[Row], published: Sequence[Published]) -> None:
     from pendulum_bags.studies.mechanism_benchmark import CRITERIA
     from pendulum_bags.studies.mechanism_benchmark_runs import KINDS
 
-    board = _table(f"Double-pendulum benchmark, {plant}", "score v2", "robustness v2", "score v3")
-    board.add_column("")
+    scores = ("score v2", "robustness v2", "score v3", Column(""))
+    board = number_table(f"Double-pendulum benchmark, {plant}", "controller", *scores)
 
     def number(value: float | None) -> str:
         return "–" if value is None else f"{value:.3f}"
@@ -108,12 +103,12 @@ def _print(console: Console, plant: str, rows: Sequence[Row], published: Sequenc
     for _, *cells in sorted(lines, key=lambda line: -line[0]):
         board.add_row(*cells)
     console.print(board)
-    costs = _table("What the swing-ups cost", *(f"{one.title} \\[{one.unit}]" for one in CRITERIA))
+    costs = number_table("What the swing-ups cost", "controller", *(f"{one.title} \\[{one.unit}]" for one in CRITERIA))
     for row in rows:
         costs.add_row(row.controller, *(f"{row.criteria[one.name]:.4g}" for one in CRITERIA))
     console.print(costs)
     if any(row.shares for row in rows):
-        held = _table("Robustness: levels held \\[%]", *KINDS.values())
+        held = number_table("Robustness: levels held \\[%]", "controller", *KINDS.values())
         for row in rows:
             held.add_row(row.controller, *(f"{100.0 * row.shares[kind]:.1f}" for kind in KINDS))
         console.print(held)

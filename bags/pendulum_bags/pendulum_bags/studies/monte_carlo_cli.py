@@ -4,26 +4,39 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Column
 
+from pendulum_bags.figures.terminal_table import number_table
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counted_progress
 from pendulum_msgs_py.programs.executables import typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
-from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo
     from pendulum_bags.studies.monte_carlo import MonteCarlo
 
 __all__ = ["monte_carlo", "options_of_several"]
+
+Plant = Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")]
+Uncertain = Annotated[
+    str,
+    typer.Option(
+        help="identified (covariance of the plant file), or shares: inertia=0.3,damping=0.05. Of several joints "
+        "also one share for all; default 0.05."
+    ),
+]
+Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
+R = Annotated[float, typer.Option(help="R.")]
+Scheduler = Annotated[str, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")]
+Workers = Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)]
 
 _OF_ONE_JOINT = {"q", "r", "sobol"}
 """Options that plants of several joints do not have."""
@@ -35,14 +48,8 @@ def monte_carlo(
         Path | None,
         out_option("Folder; an interrupted one is gone on with, more runs are added. Default: bags/runs/monte_carlo."),
     ] = None,
-    plant: Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")] = "thesis",
-    uncertainty: Annotated[
-        str,
-        typer.Option(
-            help="identified (covariance of the plant file), or shares: inertia=0.3,damping=0.05. Of several joints "
-            "also one share for all; default 0.05."
-        ),
-    ] = "inertia=0.3,damping=0.05,gravity=0.05",
+    plant: Plant = "thesis",
+    uncertainty: Uncertain = "inertia=0.3,damping=0.05,gravity=0.05",
     runs: Annotated[
         int, typer.Option(help="Number of closed-loop runs; of several joints by default 100000.", min=1)
     ] = 1_000_000,
@@ -56,11 +63,11 @@ def monte_carlo(
     ] = 2.5,
     hold_time: Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")] = 0.01,
     duration: Annotated[float, typer.Option(help="Length of each run [s].")] = 5.0,
-    q: Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")] = (100.0, 0.01),
-    r: Annotated[float, typer.Option(help="R.")] = 0.1,
+    q: Q = (100.0, 0.01),
+    r: R = 0.1,
     sobol: Annotated[int, typer.Option(help="Base sample of Sobol indices, a power of two; 0 for none.", min=0)] = 1024,
-    scheduler: Annotated[str, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")] = "",
-    workers: Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)] = 0,
+    scheduler: Scheduler = "",
+    workers: Workers = 0,
     replay: Annotated[int, typer.Option(help="Only replay this run, and write its motion as CSV.")] = -1,
     json_output: Json = False,
 ) -> None:
@@ -191,15 +198,10 @@ def _print_result(
     told = ", ".join(f"{name} {100.0 * share:.2g} %" for name, share in shares.items()) or "nothing"
     console.print(f"uncertain: {told}{source}")
     quantiles = result["quantiles"]
-    table = _right("Quantiles", ("", *next(iter(quantiles.values()))))
+    table = number_table("Quantiles", "", *next(iter(quantiles.values())), left=0)
     for name, values in quantiles.items():
         table.add_row(_with_unit(name, units), *(f"{value:.5g}" for value in values.values()))
     console.print(table)
-
-
-def _right(title: str, headings: Sequence[str]) -> WholeTable:
-    """Return a table with all columns at the right."""
-    return WholeTable(*(Column(heading, justify="right") for heading in headings), title=title, title_justify="left")
 
 
 def _with_unit(name: str, units: Mapping[str, str]) -> str:
@@ -212,7 +214,7 @@ def _print_several(console: Console, result: dict[str, Any]) -> None:
     stays = f"{' and '.join(result['joints'])} stay within {settings['bound']:g} rad or m"
     _print_result(console, result, stays, settings["shares"], "", units)
     names = [f"max_{joint}" for joint in result["joints"]]
-    table = _right("Worst runs", ("run", "noise seed", *(_with_unit(name, units) for name in names)))
+    table = number_table("Worst runs", "run", "noise seed", *(_with_unit(name, units) for name in names), left=0)
     for row in result["worst"][:5]:
         table.add_row(str(row["run"]), f"{row['noise_seed']:.0f}", *(f"{row[name]:.5f}" for name in names))
     console.print(table)
@@ -228,7 +230,7 @@ def _print_one(console: Console, result: dict[str, Any]) -> None:
     stays = f"theta stays within {settings['bound']:g} rad"
     _print_result(console, result, stays, uncertain["shares"], source, units)
     headings = ("run", *(_with_unit(name, units) for name in names), "noise seed", "max theta \\[rad]")
-    table = _right("Worst runs", headings)
+    table = number_table("Worst runs", *headings, left=0)
     for row in result["worst"][:5]:
         table.add_row(
             str(row["run"]),
@@ -238,7 +240,7 @@ def _print_one(console: Console, result: dict[str, Any]) -> None:
         )
     console.print(table)
     if "sobol" in result:
-        table = _right(f"Sobol indices of {result['sobol']['output']}", ("factor", "first order", "total"))
+        table = number_table(f"Sobol indices of {result['sobol']['output']}", "factor", "first order", "total", left=0)
         for entry in result["sobol"]["indices"]:
             table.add_row(
                 entry["factor"],

@@ -15,9 +15,9 @@ from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
 from pendulum_bags.distributions import mean_interval
 from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.figures.render_files import write_figures
+from pendulum_bags.figures.terminal_table import number_table
 from pendulum_bags.studies.results import episode_of_run, group_runs
 from pendulum_bags.studies.study_file import Study
-from pendulum_msgs_py.programs.terminal import WholeTable
 
 __all__ = ["COMPARED", "analyse", "print_table"]
 
@@ -65,10 +65,8 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
 def print_table(console: Console, result: Mapping[str, Any]) -> None:
     """Print the table."""
     rows = result["rows"]
-    table = WholeTable(title="PID and LQR: mean over seeds, 95 % interval, worst seed", title_justify="left")
-    table.add_column("")
-    for row in rows:
-        table.add_column(f"{row['plant']} {row['controller']}\n{row['runs']} runs", justify="right")
+    headings = (f"{row['plant']} {row['controller']}\n{row['runs']} runs" for row in rows)
+    table = number_table("PID and LQR: mean over seeds, 95 % interval, worst seed", "", *headings)
     units = {metric.name: metric.unit for metric in METRICS}
     for name in (*OF_THE_MEAN, *COMPARED):
         cells = []

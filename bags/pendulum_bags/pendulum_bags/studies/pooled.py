@@ -11,13 +11,12 @@ from rich.console import Console
 
 from pendulum_bags.comparison import compare_folders
 from pendulum_bags.distributions import mean_interval
+from pendulum_bags.figures.terminal_table import number_table
+from pendulum_bags.identification.model import UNITS
 from pendulum_bags.studies.study_file import Study, StudyRun
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.programs.terminal import WholeTable
 
 __all__ = ["analyse", "print_table"]
-
-UNITS = {"inertia": "kg m^2", "damping": "N m s/rad", "gravity": "N m"}
 
 
 def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -66,10 +65,8 @@ def print_table(console: Console, result: Mapping[str, Any]) -> None:
             told = ", ".join(content["of"])
             console.print(f"{told}: {pooled}: {content['verdict']['sentence']}", markup=False, highlight=False)
         return
-    table = WholeTable(title="Identified, 95 % interval over trials", title_justify="left")
-    table.add_column("seed", justify="right")
-    for name in result["pooled"]:
-        table.add_column(f"{name} \\[{UNITS.get(name, '')}]", justify="right")
+    names = (f"{name} \\[{UNITS.get(name, '')}]" for name in result["pooled"])
+    table = number_table("Identified, 95 % interval over trials", "seed", *names, left=0)
     for row in result["identified"]:
         cells = [
             f"{row['values'][name]:.4g} ({row['intervals'][name][0]:.4g} to {row['intervals'][name][1]:.4g})"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pendulum_bags.studies.monte_carlo_cli import options_of_several
+from pendulum_bags.studies.monte_carlo_cli import Plant, Q, R, Scheduler, Uncertain, Workers, options_of_several
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counted_progress
 from pendulum_msgs_py.programs.executables import typed_options
@@ -32,14 +32,8 @@ def region_of_attraction(
         Path | None,
         out_option("Folder; an interrupted map is gone on with. Default: bags/runs/region_of_attraction."),
     ] = None,
-    plant: Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")] = "thesis",
-    uncertainty: Annotated[
-        str,
-        typer.Option(
-            help="identified (covariance of the plant file), or shares: inertia=0.3,damping=0.05. Of several joints "
-            "also one share for all; default 0.05."
-        ),
-    ] = "inertia=0.3,damping=0.05,gravity=0.05",
+    plant: Plant = "thesis",
+    uncertainty: Uncertain = "inertia=0.3,damping=0.05,gravity=0.05",
     plants: Annotated[
         int, typer.Option(help="Plants tried at each start; 1 for the believed one; of several joints 10.", min=1)
     ] = 100,
@@ -50,8 +44,8 @@ def region_of_attraction(
     angle_span: Annotated[float, typer.Option(help="Half width of the grid about upright [rad].")] = 3.141592653589793,
     velocity_span: Annotated[float, typer.Option(help="Half width of the grid in velocity [rad/s].")] = 10.0,
     duration: Annotated[float, typer.Option(help="Length of each run [s].")] = 8.0,
-    q: Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")] = (100.0, 0.01),
-    r: Annotated[float, typer.Option(help="R.")] = 0.1,
+    q: Q = (100.0, 0.01),
+    r: R = 0.1,
     axes: Annotated[
         str,
         typer.Option(help="Of several joints: both axes, as cart,pole or pole,pole_dot; default the first two joints."),
@@ -60,8 +54,8 @@ def region_of_attraction(
         tuple[float, float], typer.Option(help="Of several joints: half widths of the grid [rad, m, rad/s or m/s].")
     ] = (1.0, 1.0),
     seed: Annotated[int, typer.Option(help="Seed of the plants.", min=0)] = 1,
-    scheduler: Annotated[str, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")] = "",
-    workers: Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)] = 0,
+    scheduler: Scheduler = "",
+    workers: Workers = 0,
     json_output: Json = False,
 ) -> None:
     """Map the starts from which the LQR reaches upright under a torque limit, over everything not known of the plant.

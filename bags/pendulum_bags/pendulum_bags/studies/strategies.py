@@ -15,12 +15,12 @@ from rich.console import Console
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.figures.render_files import write_figures
+from pendulum_bags.figures.terminal_table import number_table
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.studies.study_file import Study
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_msgs_py.programs.terminal import WholeTable
 from pendulum_rosbag.reader import read_bag
 
 __all__ = ["analyse", "apparent_plant", "commanded_recording", "print_table"]
@@ -105,11 +105,8 @@ def apparent_plant(recording: Recording) -> dict[str, Any]:
 
 def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print the table."""
-    table = WholeTable(title="The plant that the controller sees, by strategy", title_justify="left")
-    headings = ("damping\nN m s/rad", "inertia\nkg m^2", "std theta\nrad", "std ratio\nto sim", "paired rms\nrad")
-    table.add_column("")
-    for heading in headings:
-        table.add_column(heading, justify="right")
+    headings = ("", "damping\nN m s/rad", "inertia\nkg m^2", "std theta\nrad", "std ratio\nto sim", "paired rms\nrad")
+    table = number_table("The plant that the controller sees, by strategy", *headings)
     for row in rows:
         low, high = row["damping_interval"] or (math.nan, math.nan)
         inertia_low, inertia_high = row["inertia_interval"] or (math.nan, math.nan)

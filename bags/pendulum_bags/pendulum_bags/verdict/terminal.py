@@ -7,9 +7,11 @@ import textwrap
 
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Column
 from rich.text import Text
 
 from pendulum_bags.comparison import Comparison, Verdict
+from pendulum_bags.figures.terminal_table import number_table
 from pendulum_bags.verdict.layers import Answer, Mark, name_hardware
 from pendulum_bags.verdict.same_run import seen_note
 from pendulum_msgs_py.programs.terminal import WholeTable
@@ -48,9 +50,7 @@ def tests_table(verdict: Verdict, *, emulated: bool) -> WholeTable:
     """Return the table of the tests of the first layer."""
     title = verdict.tests[0].interval.title if verdict.tests else "interval"
     what = name_hardware("Tests of the same run: hardware against simulation", emulated=emulated)
-    table = WholeTable(title=what, title_justify="left")
-    for heading in ("quantity", "estimate", title, "margin", "result"):
-        table.add_column(heading, justify="left" if heading in {"quantity", "result"} else "right")
+    table = number_table(what, "quantity", "estimate", title, "margin", Column("result"))
     for test in verdict.tests:
         interval = test.interval
         unit = "" if test.unit == "-" else f" \\[{test.unit}]"
