@@ -54,7 +54,7 @@ HOLD_TIME = 1.0
 """Time that a run must have been up at its end [s]: longer than falling through the region takes."""
 
 PATIENCE = 8.0
-"""Wall time of the plain run beyond which the perturbations, 25 more runs, are left out [s]."""
+"""Wall time of the plain run beyond which the perturbations, 25 more runs, are left out; the board shows a dash [s]."""
 
 Array = NDArray[np.float64]
 
@@ -242,7 +242,6 @@ def evaluate(
     parameters: Mapping[str, Any] | None = None,
     duration: float = 10.0,
     robustness: bool = True,
-    patience: float = PATIENCE,
 ) -> Entry:
     """Return the line of a controller: from hanging down to upright, on the plant that it was designed for.
 
@@ -252,7 +251,6 @@ def evaluate(
         parameters: Of the controller; by default those that it comes with.
         duration: Length of each run [s].
         robustness: Whether to try the perturbations.
-        patience: Wall time of the plain run beyond which no perturbation is tried [s]; the board then shows a dash.
     """
     true = load_plant(plant)
     # Hanging exactly down is an equilibrium that no torque of an energy controller leaves.
@@ -274,7 +272,7 @@ def evaluate(
                 runs.append(partial(simulate_plant, RunSpec(**{**spec, "disturbance": disturbance}), changed, sensors))
             yield kind, runs
 
-    return entry_of(plant, controller, lambda: simulate_plant(RunSpec(**spec), true), perturbed(), patience)
+    return entry_of(plant, controller, lambda: simulate_plant(RunSpec(**spec), true), perturbed(), PATIENCE)
 
 
 def motion_of(arrays: RunArrays) -> Array:

@@ -17,14 +17,11 @@ __all__ = ["region_sentence", "write_region_figure"]
 
 @dataclass(frozen=True)
 class _Picture:
-    """What a map of starts shows.
+    """What a picture of a map of starts shows besides its shares.
 
     Attributes:
         x, y: Deviations from upright along both axes, shape (n,) each.
         labels: Of both axes.
-        share: Share of the plants, shape (n, n).
-        believed: Whether the plant that is believed in reaches upright, same shape.
-        plants: How many plants there were.
         curve: Edge of a region that something else tells, shape (k, 2).
         told: What that is, for the legend.
         title: Above all.
@@ -33,24 +30,17 @@ class _Picture:
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     labels: tuple[str, str]
-    share: NDArray[np.float64]
-    believed: NDArray[np.bool_]
-    plants: int
     curve: NDArray[np.float64]
     told: str
     title: str
 
 
 def _picture(result: RegionResult | JointRegionResult) -> _Picture:
-    settings = result.settings
     if isinstance(result, RegionResult):
         return _Picture(
             result.theta - UPRIGHT,
             result.theta_dot,
             ("theta - pi at the start [rad]", "theta' at the start [rad/s]"),
-            result.share,
-            result.believed,
-            settings.plants,
             result.ellipse,
             f"proven: $x^T S x \\leq$ {result.level:.3g}",
             f"Starts from which LQR at {result.limit:g} N m reaches upright",
@@ -59,12 +49,9 @@ def _picture(result: RegionResult | JointRegionResult) -> _Picture:
     return _Picture(
         *result.settings.starts(),
         (first, second),
-        result.share,
-        result.believed,
-        settings.plants,
         result.section,
         "" if result.caught is None else f"sampled, without dry friction: $x^T S x \\leq$ {result.caught.level:.3g}",
-        f"Starts from which the LQR of {settings.plant} reaches upright",
+        f"Starts from which the LQR of {result.settings.plant} reaches upright",
     )
 
 
@@ -83,16 +70,16 @@ def write_region_figure(path: Path, result: RegionResult | JointRegionResult) ->
     ax = figure.subplots()
     picture = _picture(result)
     x, y = picture.x, picture.y
-    shades = ax.pcolormesh(x, y, 100.0 * picture.share, cmap="Greys", vmin=0.0, vmax=100.0, shading="nearest")
+    shades = ax.pcolormesh(x, y, 100.0 * result.share, cmap="Greys", vmin=0.0, vmax=100.0, shading="nearest")
     # Full black would hide the curves.
     shades.set_clim(0.0, 150.0)
     bar = figure.colorbar(shades, ax=ax, boundaries=np.linspace(0.0, 100.0, 101), ticks=[0, 25, 50, 75, 100])
-    plants = picture.plants
+    plants = result.settings.plants
     bar.set_label("plants that reach upright [%]" if plants > 1 else "reaches upright [%]")
     halo = [patheffects.withStroke(linewidth=3.5, foreground="white")]
     legend = []
-    if picture.believed.any() and not picture.believed.all():
-        edge = picture.believed.astype(float)
+    if result.believed.any() and not result.believed.all():
+        edge = result.believed.astype(float)
         ax.contour(x, y, edge, levels=[0.5], colors="black", linestyles="dashed", linewidths=1.4)
         legend.append(Line2D([], [], color="black", ls="--", lw=1.4, label="edge for the believed plant"))
     if picture.told:
