@@ -23,7 +23,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pendulum_bags.ranking.contender import Interval
+from pendulum_bags.distributions import Interval
 from pendulum_bags.ranking.ranking import mmrv
 from pendulum_msgs_py.errors import DataError
 

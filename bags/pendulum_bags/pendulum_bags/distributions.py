@@ -7,6 +7,7 @@ times as long to call.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ import scipy.special
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "Interval",
     "MeanInterval",
     "chi_square_tail",
     "f_quantile",
@@ -28,6 +30,15 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
 
 
 class MeanInterval(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_bags.distributions import f_quantile, f_tail
+from pendulum_bags.distributions import Interval, f_quantile, f_tail
 from pendulum_bags.runs.series import Array
 from pendulum_lqr.gap_metric import DEFAULT_SCALING, SignalScaling, chordal_distance, nu_gap
 from pendulum_lqr.machine_response import Machine
@@ -17,7 +17,7 @@ from pendulum_lqr.model import LinearModel
 from pendulum_lqr.sampled_response import brought_to
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["SMALLEST", "Difference", "Estimate", "compare_responses", "continuous"]
+__all__ = ["SMALLEST", "Difference", "compare_responses", "continuous"]
 
 Complex = NDArray[np.complex128]
 
@@ -28,15 +28,6 @@ other motion."""
 _LEAST_LINES = 5
 _ERROR = 0.05
 """Probability of an error over all lines together."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -65,10 +56,10 @@ class Difference:
     probability: Array
     gap: Array
     gap_high: Array
-    nu_gap: Estimate
+    nu_gap: Interval
     gap_at: float
-    delay: Estimate
-    gain: Estimate
+    delay: Interval
+    gain: Interval
     scaling: SignalScaling
 
     @property
@@ -131,7 +122,7 @@ def compare_responses(
     gap, low, high = _gaps(moved, two, quantile * spread_one, quantile * spread_two, scaling)
     found = nu_gap(scaling.plant(moved), scaling.plant(two))
     at = int(np.argmax(gap))
-    whole = Estimate(found.value, float(low.max()), float(high.max())) if found.winding else Estimate(1.0, 1.0, 1.0)
+    whole = Interval(found.value, float(low.max()), float(high.max())) if found.winding else Interval(1.0, 1.0, 1.0)
     return Difference(
         lines, moved, two, ratio, np.asarray(probability, dtype=np.float64), gap, high, whole,
         float(lines[at]), _delay(lines, ratio, relative), _gain(ratio, relative), scaling,
@@ -180,17 +171,17 @@ def _gaps(first: Complex, second: Complex, a: Array, b: Array, scaling: SignalSc
     return gap, np.sin(low), np.sin(high)
 
 
-def _delay(lines: Array, ratio: Complex, relative: Array) -> Estimate:
+def _delay(lines: Array, ratio: Complex, relative: Array) -> Interval:
     found = _slope(2.0 * np.pi * lines, np.unwrap(np.angle(ratio)), relative)
-    return Estimate(-found.value, -found.high, -found.low)
+    return Interval(-found.value, -found.high, -found.low)
 
 
-def _gain(ratio: Complex, relative: Array) -> Estimate:
+def _gain(ratio: Complex, relative: Array) -> Interval:
     found = _slope(np.ones(ratio.size), np.log(np.abs(ratio)), relative)
-    return Estimate(float(np.exp(found.value)), float(np.exp(found.low)), float(np.exp(found.high)))
+    return Interval(float(np.exp(found.value)), float(np.exp(found.low)), float(np.exp(found.high)))
 
 
-def _slope(x: Array, y: Array, deviation: Array) -> Estimate:
+def _slope(x: Array, y: Array, deviation: Array) -> Interval:
     """Return the weighted slope of y over x through 0; differences of dynamics, which it has not, widen its interval.
 
     Args:
@@ -202,4 +193,4 @@ def _slope(x: Array, y: Array, deviation: Array) -> Estimate:
     slope = float(np.sum(weight * x * y) / np.sum(weight * x**2))
     misfit = max(1.0, float(np.sum(weight * (y - slope * x) ** 2)) / max(1, x.size - 1))
     half = 1.96 * np.sqrt(misfit / float(np.sum(weight * x**2)))
-    return Estimate(slope, slope - half, slope + half)
+    return Interval(slope, slope - half, slope + half)

@@ -10,7 +10,7 @@ import numpy as np
 from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["PARTS", "Contender", "Interval", "compared_runs", "contenders_of", "refuse_no_number"]
+__all__ = ["PARTS", "Contender", "compared_runs", "contenders_of", "refuse_no_number"]
 
 PARTS = ("angle", "velocity", "torque")
 """Parts of the cost: q11 e^2, q22 v^2 and r u^2, each a mean over the run."""
@@ -52,15 +52,6 @@ class Contender:
         rows, seeds = (self.sim, self.sim_seeds) if side == "sim" else (self.hw, self.hw_seeds)
         costs = rows.sum(axis=1)
         return {seed: float(np.mean(costs[np.array(seeds) == seed])) for seed in sorted(set(seeds))}
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A number with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
 
 
 def contenders_of(

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from rich.console import Console
 
-from pendulum_bags.distributions import mean_interval, student_quantile
+from pendulum_bags.distributions import Interval, mean_interval, student_quantile
 from pendulum_bags.figures.terminal_table import number_table
-from pendulum_bags.ranking.contender import Contender, Interval
+from pendulum_bags.ranking.contender import Contender
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Narrowed", "narrow", "narrow_all", "print_narrowed"]

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pendulum_bags.distributions import student_quantile
-from pendulum_bags.ranking.contender import Contender, Interval, compared_runs
+from pendulum_bags.distributions import Interval, student_quantile
+from pendulum_bags.ranking.contender import Contender, compared_runs
 
 __all__ = ["regret_share"]
 
