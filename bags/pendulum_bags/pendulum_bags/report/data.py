@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.frequency_response.result import Analysis
+from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping, static_holds, trial_part
 from pendulum_bags.identification.thesis_figures import TrialSet
 from pendulum_bags.replay.result import InputReplay
+from pendulum_bags.runs.datasets import Recording
+from pendulum_bags.runs.read_recording import read_recording
 from pendulum_bags.runs.run_data import OpenBag
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Answer
 from pendulum_bags.verdict.answer import answer_of
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_rosbag.reader import read_bag
 
-__all__ = ["ReportData"]
+__all__ = ["ReportData", "read_trials"]
 
 
 @dataclass(frozen=True)
@@ -64,3 +71,27 @@ class ReportData:
         except ParameterError:
             # The file that the run was made with is gone: figures of the model are left out, and say so.
             return None
+
+
+def read_trials(folder: str | os.PathLike[str]) -> TrialSet:
+    """Read the bags ``trial_1``, ``trial_2``, ... of a folder and regress them as the thesis does.
+
+    Staircases are told from motions by hand by their holds.
+
+    Raises:
+        BagError: A bag cannot be read.
+        DataError: There is no trial, or one lacks what the regression needs.
+    """
+    bags = sorted(Path(folder).glob("trial_*"), key=lambda bag: (len(bag.name), bag.name))
+    if not bags:
+        raise DataError(f"{folder} has no bags trial_1, trial_2, ...; expected the trials of one experiment")
+    recordings = [_cut(read_recording(bag, effort="measured")) for bag in bags]
+    staircase = all(len(static_holds(recording)) >= 4 for recording in recordings)
+    result = (fit_gravity if staircase else fit_inertia_damping)(recordings)
+    return TrialSet(result, recordings)
+
+
+def _cut(recording: Recording) -> Recording:
+    """Return the trial alone, with the measured effort at the stamps of the states, where it was measured."""
+    part = trial_part(recording)
+    return replace(part, input=np.interp(part.time, part.input_stamps, part.input), input_time=None)

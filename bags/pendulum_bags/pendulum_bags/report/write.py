@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pendulum_bags.figures.render_files import write_figures
-from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.data import ReportData, read_trials
 from pendulum_bags.report.figures import make_figures
 from pendulum_bags.report.joint_page import joint_page
 from pendulum_bags.report.page import Page, page_of, render_page
 from pendulum_bags.report.tables import make_tables
-from pendulum_bags.report.trials import read_trials
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import BagError, PendulumError
