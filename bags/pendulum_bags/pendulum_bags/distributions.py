@@ -12,7 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.special
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from pendulum_bags.arrays import Array
 
 __all__ = [
     "Interval",
@@ -28,8 +30,6 @@ __all__ = [
     "student_quantile",
     "student_tail",
 ]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

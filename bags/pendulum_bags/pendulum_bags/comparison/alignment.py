@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pendulum_bags.runs.series import Array, Series, Signal, uniform_times
+from pendulum_bags.arrays import Array
+from pendulum_bags.runs.series import Series, Signal, uniform_times
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Alignment", "align_motion", "align_signals", "cross_correlation"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from pendulum_bags.runs.series import Array, Series, uniform_times
+from pendulum_bags.arrays import Array
+from pendulum_bags.runs.series import Series, uniform_times
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["BandLimited", "SlowClock", "common_band"]

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.statistics import rms
-from pendulum_bags.runs.series import Array, Series
+from pendulum_bags.runs.series import Series
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.json_values import without_nan
 

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.alignment import Alignment, align_motion
 from pendulum_bags.comparison.same_signal import AMPLITUDE, SharedSignal, compare_signals
 from pendulum_bags.comparison.spectra import Spectra, spectra_of
 from pendulum_bags.comparison.statistics import describe, kolmogorov_smirnov, rms
 from pendulum_bags.runs.run_data import RunData, noise_hold_time
-from pendulum_bags.runs.series import Array, Series, shared_span
+from pendulum_bags.runs.series import Series, shared_span
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import DataError
 

@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.band import BandLimited, SlowClock, common_band
 from pendulum_bags.comparison.equivalence import EquivalenceTest, Outcome, equivalence_test
 from pendulum_bags.comparison.margins import Margin, Margins
 from pendulum_bags.comparison.statistics import Interval, Resampled, bootstrap_interval, resample
-from pendulum_bags.runs.series import Array, Series
+from pendulum_bags.runs.series import Series
 from pendulum_msgs_py.errors import ParameterError
 
 __all__ = ["Looks", "paired_tests", "unpaired_tests"]

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from pendulum_bags.runs.series import Array, Series, shared_span, uniform_times
+from pendulum_bags.arrays import Array
+from pendulum_bags.runs.series import Series, shared_span, uniform_times
 
 __all__ = ["Spectra", "spectra_of"]
 

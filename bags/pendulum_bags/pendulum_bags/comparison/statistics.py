@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import kolmogorov_tail, normal_quantile, student_quantile
 from pendulum_bags.runs.correlation import autocorrelation, effective_size
-from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [

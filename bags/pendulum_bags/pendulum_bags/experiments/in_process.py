@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_lqr.answering import AnswerLoop
 from pendulum_lqr.controller import make_controller
@@ -24,8 +25,6 @@ from pendulum_sim.plants import make_plant
 from pendulum_sim.sensors import Sensors
 
 __all__ = ["RunArrays", "simulate", "simulate_plant"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

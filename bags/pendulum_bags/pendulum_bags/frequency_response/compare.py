@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array, Complex
 from pendulum_bags.distributions import Interval, f_quantile, f_tail
-from pendulum_bags.runs.series import Array
 from pendulum_lqr.gap_metric import DEFAULT_SCALING, SignalScaling, chordal_distance, nu_gap
 from pendulum_lqr.machine_response import Machine
 from pendulum_lqr.measured_response import MeasuredResponse
@@ -18,8 +17,6 @@ from pendulum_lqr.sampled_response import brought_to
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["SMALLEST", "Difference", "compare_responses", "continuous"]
-
-Complex = NDArray[np.complex128]
 
 SMALLEST = 0.1
 """Difference that counts, as a share of the response: 0.9 dB, where a sound design has 6 dB of gain margin. Smaller

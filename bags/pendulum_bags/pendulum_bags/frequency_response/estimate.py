@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array, Complex
 from pendulum_bags.frequency_response.record import Record
-from pendulum_bags.runs.series import Array
 from pendulum_lqr.disturbance import DISTURBANCE_SPECS
 from pendulum_lqr.measured_response import MeasuredResponse
 from pendulum_lqr.multisine import multisine_harmonics
@@ -32,8 +32,6 @@ from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import validate
 
 __all__ = ["estimate", "periodic_lines"]
-
-Complex = NDArray[np.complex128]
 
 TRANSIENT = 1.0
 """Time at the beginning that is left out at least; whole periods of a periodic excitation [s]."""

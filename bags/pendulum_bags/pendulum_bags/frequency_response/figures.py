@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array, Complex
 from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.frequency_response.compare import SMALLEST, Difference, continuous
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_bags.frequency_response.result import Analysis
-from pendulum_bags.runs.series import Array
 from pendulum_lqr.certificate import Certifier
 from pendulum_lqr.design import DesignError, output_lqr
 from pendulum_lqr.gap_metric import JointScaling, SignalScaling
@@ -21,8 +21,6 @@ from pendulum_lqr.model import LinearModel
 from pendulum_lqr.sampled_response import model_response
 
 __all__ = ["certified_gains_figure", "certified_weights_figure", "gap_figure", "response_figures"]
-
-Complex = NDArray[np.complex128]
 
 SECTION = "Frequency response"
 _NAMES = {"sim": "simulation", "hw": "hardware"}

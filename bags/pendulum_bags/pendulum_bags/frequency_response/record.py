@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.in_process import RunArrays
 from pendulum_bags.runs.run_record import run_record
-from pendulum_bags.runs.series import Array, Signal, unwrap_near_upright
+from pendulum_bags.runs.series import Signal, unwrap_near_upright
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
 

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from pendulum_bags.arrays import Array
 
 __all__ = ["eliminate", "find_states"]
-
-Array = NDArray[np.float64]
 
 
 @njit(cache=True)

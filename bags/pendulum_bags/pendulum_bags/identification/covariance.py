@@ -6,15 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import INDEX, FitModel
 from pendulum_bags.identification.problem import Piece, longest_step, projected_sensitivities, simulate
 from pendulum_bags.identification.selection import Candidate, at_bounds
 
 __all__ = ["FREQUENCY", "Errors", "candidate_errors", "least_scale"]
-
-Array = NDArray[np.float64]
 
 FREQUENCY = "natural_frequency"
 """Name of w0 = sqrt(G / J) among the parameters."""

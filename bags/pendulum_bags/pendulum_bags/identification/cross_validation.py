@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.problem import Piece, simulate
 from pendulum_bags.identification.solver import Solution, robust_cost, solve
 from pendulum_bags.identification.window_score import fit_states
 
 __all__ = ["COARSE", "CrossValidation", "cross_validate", "folds"]
-
-Array = NDArray[np.float64]
 
 COARSE = 3.0
 """Factor on the integration step while searching; the chosen model is fitted to the end without it."""

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import BOUNDS, INDEX, from_plant
 from pendulum_bags.identification.problem import prepare, projected_sensitivities, simulate
 from pendulum_bags.runs.datasets import Recording
@@ -23,8 +23,6 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["KINDS", "Excitation", "Limits", "design_excitation"]
-
-Array = NDArray[np.float64]
 
 KINDS = ("multisine", "chirp", "prbs")
 NUISANCE = ("angle_offset", "transport_delay")

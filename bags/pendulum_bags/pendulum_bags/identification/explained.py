@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE, errors_by_window
@@ -20,8 +20,6 @@ from pendulum_bags.identification.residual_tests import INCOMPLETE
 from pendulum_bags.identification.solver import residuals
 
 __all__ = ["REFUSED", "Explained", "explained"]
-
-Array = NDArray[np.float64]
 
 REFUSED = "REFUSED"
 """How the sentence begins that a fit is no model of the recorded motion."""

@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.runs.csv_mapping import read_csv
 from pendulum_bags.runs.datasets import Recording, check_consistency, unwrap
 from pendulum_bags.runs.run_data import find_prefix
@@ -36,8 +36,6 @@ from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mappi
 from pendulum_rosbag.reader import read_bag
 
 __all__ = ["FORMAT", "JointRecording", "read_joints"]
-
-Array = NDArray[np.float64]
 
 FORMAT = "pendulum_joint_columns/1"
 

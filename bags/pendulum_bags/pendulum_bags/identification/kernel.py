@@ -28,16 +28,14 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.plants import friction_terms
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_friction
 from pendulum_msgs_py.programs.kept_kernels import drop_stale_code
 
 __all__ = ["PARAMETER_NAMES", "cumulative_input", "normal_blocks", "simulate_windows"]
-
-Array = NDArray[np.float64]
 
 PARAMETER_NAMES = (
     "inertia",

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.mechanism_fit import MechanismFit, Windows, fit
 from pendulum_bags.identification.mechanism_model import MechanismModel
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["EXTRAS", "choose"]
-
-Array = NDArray[np.float64]
 
 EXTRAS: Mapping[str, Mapping[str, bool]] = {
     "friction": {},

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_fit import MechanismFit, Windows, fit, line_errors, rms_by_joint
@@ -18,8 +18,6 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["Score", "refusal", "unit_hint"]
-
-Array = NDArray[np.float64]
 
 _BETTER = 0.5
 """Another reading of the recording explains better where it misses less than this share of what the fit misses."""

@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_model import MechanismModel, step_functions
 from pendulum_bags.identification.problem import cut_windows
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Blocks", "MechanismFit", "Windows", "fit", "line_errors", "prepare_windows", "rms_by_joint", "scores"]
-
-Array = NDArray[np.float64]
 
 
 _LONGEST = 0.006

@@ -17,14 +17,12 @@ from typing import Any
 
 import casadi
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["DELAY", "MechanismModel", "tellable"]
-
-Array = NDArray[np.float64]
 
 DELAY = "delay"
 """Time from the recorded effort to its effect, negative where the effort is recorded late [s]."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pendulum_bags.distributions import student_quantile
@@ -33,8 +32,6 @@ from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, write_mechanism
 
 __all__ = ["MechanismResult", "Score", "identify_mechanism"]
-
-Array = NDArray[np.float64]
 
 FORMAT = "pendulum_mechanism_identification/1"
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.starts import bumps
 
 __all__ = ["missing_torques"]
-
-Array = NDArray[np.float64]
 
 _LEVEL = 0.01
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
@@ -26,8 +26,6 @@ __all__ = [
     "from_plant",
     "to_plant",
 ]
-
-Array = NDArray[np.float64]
 
 INDEX: Mapping[str, int] = {name: i for i, name in enumerate(PARAMETER_NAMES)}
 """Position of each parameter in the vector."""

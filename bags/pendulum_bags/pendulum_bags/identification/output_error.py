@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.cross_validation import COARSE, cross_validate
 from pendulum_bags.identification.model import FRICTION_MODELS, FURTHER_TERMS, SERVO_ONLY, FitModel
 from pendulum_bags.identification.options import DEFAULTS, Geometry, Options, default_window
@@ -21,8 +21,6 @@ from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["DEFAULTS", "OFFSETS", "Geometry", "Options", "OutputErrorFit", "fit_output_error"]
-
-Array = NDArray[np.float64]
 
 OFFSETS = ("angle_offset", "torque_offset")
 """What may be left out: zero errors of the angle and of the torque."""

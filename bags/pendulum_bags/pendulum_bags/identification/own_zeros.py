@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.problem import Piece, prepare
 from pendulum_bags.identification.selection import effective_samples
@@ -15,8 +15,6 @@ from pendulum_bags.identification.solver import Solution, residuals, solve
 from pendulum_bags.runs.datasets import Recording
 
 __all__ = ["OwnZeros", "align"]
-
-Array = NDArray[np.float64]
 
 ROUNDS = 10
 """Zeros and parameters are found in turn, at most so often."""

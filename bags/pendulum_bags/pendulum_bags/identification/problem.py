@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification import kernel
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.runs.datasets import Recording, gaps
@@ -23,8 +24,6 @@ __all__ = [
     "projected_sensitivities",
     "simulate",
 ]
-
-Array = NDArray[np.float64]
 _NOTHING = np.zeros((0, 0))
 
 

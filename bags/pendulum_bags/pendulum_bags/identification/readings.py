@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.problem import Piece, prepare
 from pendulum_bags.identification.solver import Solution, residuals, solve
@@ -17,8 +17,6 @@ from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["DOUBTFUL_SHARE", "errors_by_window", "other_reading"]
-
-Array = NDArray[np.float64]
 
 DOUBTFUL_SHARE = 0.1
 """From here on the fit misses what can be seen with the eye, and other readings of the angle are tried."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import chi_square_tail, student_quantile
 from pendulum_bags.identification.missing import missing_torques
 from pendulum_bags.identification.output_error import OutputErrorFit
@@ -17,8 +17,6 @@ from pendulum_bags.identification.solver import residuals
 from pendulum_bags.runs.datasets import distinct_names
 
 __all__ = ["INCOMPLETE", "ResidualTests", "residual_tests"]
-
-Array = NDArray[np.float64]
 
 INCOMPLETE = "MODEL INCOMPLETE"
 """How the sentence begins that no interval covers what the model lacks."""

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.cross_validation import CrossValidation
 from pendulum_bags.identification.model import BOUNDS
 from pendulum_bags.identification.problem import Piece
@@ -23,8 +23,6 @@ __all__ = [
     "implausible_rival",
     "is_plausible",
 ]
-
-Array = NDArray[np.float64]
 
 _CLEARLY = 20.0
 """Lead in the information criterion (a weight of e^-10 for the other) that noise and luck do not explain."""

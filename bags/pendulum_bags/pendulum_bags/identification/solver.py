@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification import kernel
 from pendulum_bags.identification.arrowhead import eliminate, find_states
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
@@ -22,8 +23,6 @@ from pendulum_bags.identification.model import BOUNDS, INDEX, FitModel
 from pendulum_bags.identification.problem import Piece, longest_step, simulate
 
 __all__ = ["Solution", "refine", "residuals", "robust_cost", "solve"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

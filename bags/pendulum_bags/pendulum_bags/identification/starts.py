@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.solver import Solution, solve
@@ -19,8 +19,6 @@ from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["bumps", "equation_error", "first_models", "rank"]
-
-Array = NDArray[np.float64]
 
 
 def equation_error(recording: Recording, *, window: float = 0.2) -> Array:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile, student_tail
 from pendulum_bags.runs.correlation import effective_size
 from pendulum_bags.runs.datasets import Recording
@@ -31,8 +31,6 @@ __all__ = [
     "static_holds",
     "trial_part",
 ]
-
-Array = NDArray[np.float64]
 
 
 RECORD_SKEW = 0.5e-3

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.covariance import FREQUENCY, Errors, candidate_errors, least_scale
 from pendulum_bags.identification.model import BOUNDS, INDEX, FitModel
@@ -21,8 +21,6 @@ __all__ = ["Uncertainty", "assess", "profile_interval", "unresolved_offset"]
 
 RIVAL = 0.02
 """Share of the kept offset's Akaike weight from which on the other one counts as its equal (a difference of 8)."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import FitModel, from_plant
 from pendulum_bags.identification.problem import Piece, prepare, simulate
 from pendulum_bags.identification.solver import solve
@@ -17,8 +18,6 @@ from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["WindowScore", "fit_states", "free_run", "window_score"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import BOUNDS, UNITS
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.selection import at_bounds
 
 __all__ = ["Interval", "plain_sentences"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.learning.task import VARIED
 from pendulum_lqr.policy import coordinates_of
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
@@ -44,8 +45,6 @@ from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import pack
 
 __all__ = ["Body", "body_of", "can_exist", "kicks_of", "start_spread", "travel_of", "velocity_scales"]
-
-Array = NDArray[np.float64]
 
 _GROWTH = 0.8
 """Largest product of the damping rate and the step, far inside of where Runge-Kutta is stable [-]."""

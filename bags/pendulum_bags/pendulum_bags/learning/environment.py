@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array, Floats
 from pendulum_bags.learning.body import body_of, start_spread, travel_of, velocity_scales
 from pendulum_bags.learning.task import SwingUpTask
 from pendulum_lqr.policy import default_signals, sample_layout
@@ -18,9 +19,6 @@ from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 
 __all__ = ["SwingUp"]
-
-Floats = NDArray[np.float32]
-Array = NDArray[np.float64]
 
 _KICK_TIME = 0.05
 _EDGE, _END = 0.55, 0.7

@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Adam", "Mlp"]
+from pendulum_bags.arrays import Floats
 
-Floats = NDArray[np.float32]
+__all__ = ["Adam", "Mlp"]
 
 
 class Mlp:

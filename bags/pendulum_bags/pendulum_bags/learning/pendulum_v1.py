@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Floats
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["EPISODE", "PLANT", "STEP", "PendulumV1"]
-
-Floats = NDArray[np.float32]
 
 STEP = 0.05
 """Period [s]."""

@@ -18,12 +18,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Floats
 from pendulum_bags.learning.network import Adam, Mlp
 from pendulum_msgs_py.errors import FaultError
 
 __all__ = ["BatchEnvironment", "Ppo", "PpoSettings", "finite_or_diverged"]
-
-Floats = NDArray[np.float32]
 
 
 class BatchEnvironment(Protocol):

@@ -13,13 +13,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_lqr.mechanism_controllers import tracked_swing_up
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["Teacher", "TeacherAnswers"]
-
-Array = NDArray[np.float64]
 
 
 class TeacherAnswers(NamedTuple):

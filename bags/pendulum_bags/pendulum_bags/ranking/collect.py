@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.metrics import episode_of, metrics_of
 from pendulum_bags.ranking.contender import Contender, contenders_of
 from pendulum_bags.runs.find_bags import bags_below
 from pendulum_bags.runs.run_data import is_emulated, read_run
 from pendulum_bags.runs.run_record import run_record
-from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
 from pendulum_rosbag.reader import read_bag
 

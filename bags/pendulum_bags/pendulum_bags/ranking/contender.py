@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pendulum_bags.runs.series import Array
+from pendulum_bags.arrays import Array
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["PARTS", "Contender", "compared_runs", "contenders_of", "refuse_no_number"]

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.joint_run import JointRun, JointSettings, design_file, fall_time
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.frequency_response.joint_designs import JointDesign
 from pendulum_bags.ranking.contender import contenders_of
 from pendulum_bags.ranking.ranking import Ranking, rank
-from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.contract.names import EFFORT_COMMAND, JOINT_STATES
 from pendulum_msgs_py.errors import ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism

@@ -21,10 +21,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import Interval
 from pendulum_bags.ranking.contender import PARTS, Contender, compared_runs, refuse_no_number
 from pendulum_bags.ranking.regret import regret_share
-from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import without_nan
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.runs.run_data import find_prefix
 from pendulum_bags.runs.run_record import run_record
-from pendulum_bags.runs.series import Array
 from pendulum_lqr.controller import controller_parameters, make_controller
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import from_upright

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import FitModel, from_plant, to_plant
 from pendulum_bags.identification.problem import Piece, prepare, simulate
 from pendulum_bags.identification.result import load_fit_model
 from pendulum_bags.identification.window_score import free_run, window_score
 from pendulum_bags.replay.result import HorizonError, InputReplay, horizon_errors
 from pendulum_bags.runs.datasets import INPUT_KINDS, Recording
-from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 

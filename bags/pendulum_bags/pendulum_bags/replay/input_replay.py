@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import scipy
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.replay.fit_replay import replay_fit
 from pendulum_bags.replay.result import InputReplay, horizon_errors
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.read_recording import read_recording
-from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.plant import Plant

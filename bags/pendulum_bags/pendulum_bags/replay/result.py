@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.figures.figure import Figure, Panel, Trace
-from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["HorizonError", "InputReplay", "fit_percent", "horizon_errors"]

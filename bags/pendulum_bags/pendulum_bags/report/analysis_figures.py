@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.alignment import Alignment
 from pendulum_bags.comparison.equivalence import EquivalenceTest, Verdict
 from pendulum_bags.comparison.spectra import Spectra
@@ -15,7 +16,7 @@ from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.runs.correlation import effective_size
-from pendulum_bags.runs.series import Array, Series
+from pendulum_bags.runs.series import Series
 
 __all__ = [
     "alignment",

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.report.data import ReportData
-from pendulum_bags.runs.series import Array, uniform_times
+from pendulum_bags.runs.series import uniform_times
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.mechanism_drawing import seen_from_the_side

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.runs.run_record import run_record
-from pendulum_bags.runs.series import Array
 from pendulum_msgs_py.plants.equilibrium import overdamped_velocity
 
 __all__ = ["gravity_fit", "overdamped_phase", "replay"]

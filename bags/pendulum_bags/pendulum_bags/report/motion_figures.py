@@ -7,13 +7,14 @@ from operator import attrgetter
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.pairs import Difference
 from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.figures.figure import Figure, Kind, Panel, Trace
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.runs.run_data import RunData, noise_hold_time
-from pendulum_bags.runs.series import Array, Series
+from pendulum_bags.runs.series import Series
 
 __all__ = [
     "both_panel",

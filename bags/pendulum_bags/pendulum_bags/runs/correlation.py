@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pendulum_bags.runs.series import Array
+from pendulum_bags.arrays import Array
 
 __all__ = ["autocorrelation", "effective_size"]
 

@@ -28,7 +28,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from pendulum_bags.runs.datasets import Array, Recording, first_of_each_stamp
+from pendulum_bags.arrays import Array
+from pendulum_bags.runs.datasets import Recording, first_of_each_stamp
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.parameters import load_yaml, suggestion
 

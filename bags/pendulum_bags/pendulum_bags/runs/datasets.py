@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [
@@ -26,8 +27,6 @@ __all__ = [
     "gaps",
     "unwrap",
 ]
-
-Array = NDArray[np.float64]
 
 INPUT_KINDS: Mapping[str, str] = {"effort": "N m", "voltage": "V", "position_goal": "rad", "none": "-"}
 """What drives the pendulum, and its unit. ``position_goal`` is the set point of a servo's own position loop."""

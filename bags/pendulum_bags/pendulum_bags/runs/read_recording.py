@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.runs.bag_recordings import read_bag_recording
 from pendulum_bags.runs.bridge_programs import last_words, run_bridge_program
 from pendulum_bags.runs.csv_mapping import read_csv
-from pendulum_bags.runs.datasets import Array, Recording, check_consistency, first_of_each_stamp, unwrap
+from pendulum_bags.runs.datasets import Recording, check_consistency, first_of_each_stamp, unwrap
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["read_recording", "read_servo_log"]

@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pendulum_bags.arrays import Array
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["Array", "Series", "Signal", "shared_span", "uniform_times", "unwrap_near_upright"]
-
-Array = NDArray[np.float64]
+__all__ = ["Series", "Signal", "shared_span", "uniform_times", "unwrap_near_upright"]
 
 
 def _as_columns(name: str, t: ArrayLike, columns: dict[str, ArrayLike], least: int) -> dict[str, Array]:

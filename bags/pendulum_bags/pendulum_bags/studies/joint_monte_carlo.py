@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.joint_run import LIMIT_PER_NOISE, design_for, identified_names
-from pendulum_bags.studies.random_runs import Array, Columns, RandomRuns, figures_of_runs, replay
+from pendulum_bags.studies.random_runs import Columns, RandomRuns, figures_of_runs, replay
 from pendulum_bags.studies.uncertain import share_of_interval
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_msgs_py.errors import ParameterError

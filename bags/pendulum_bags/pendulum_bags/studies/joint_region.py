@@ -15,10 +15,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.joint_run import design_for
 from pendulum_bags.studies.chunks import chunk_path, read_columns
 from pendulum_bags.studies.joint_monte_carlo import scatter
-from pendulum_bags.studies.random_runs import Array, Columns
+from pendulum_bags.studies.random_runs import Columns
 from pendulum_bags.studies.start_grid import StartGrid, inside_ellipse, share_inside
 from pendulum_lqr.design import DesignError, Gain
 from pendulum_lqr.mechanism_catch import CaughtRegion, sample_caught_region

@@ -13,8 +13,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.in_process import RunArrays, simulate_plant
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_lqr.controller import CONTROLLERS
@@ -55,8 +55,6 @@ HOLD_TIME = 1.0
 
 PATIENCE = 8.0
 """Wall time of the plain run beyond which the perturbations, 25 more runs, are left out; the board shows a dash [s]."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

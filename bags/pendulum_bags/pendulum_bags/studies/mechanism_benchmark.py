@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
@@ -39,8 +40,6 @@ __all__ = [
     "score_v2",
     "time_above_line",
 ]
-
-Array = NDArray[np.float64]
 
 BENCHMARK_PLANTS = ("acrobot", "pendubot")
 """The robots of the benchmark: a motor of 6 N m at the elbow, or at the shoulder."""

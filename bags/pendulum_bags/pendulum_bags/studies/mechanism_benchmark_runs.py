@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.studies.mechanism_benchmark import criteria_of, score_v2, time_above_line
 from pendulum_lqr.mechanism_controller import MechanismController
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
@@ -42,8 +42,6 @@ __all__ = [
     "swing_up",
     "try_once",
 ]
-
-Array = NDArray[np.float64]
 
 DT = 0.002
 """Period of control and step of the integrator [s]."""

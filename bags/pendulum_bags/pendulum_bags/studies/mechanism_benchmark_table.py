@@ -8,7 +8,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_bags.studies.mechanism_benchmark import benchmark_plant
 from pendulum_bags.studies.mechanism_benchmark_runs import (
@@ -28,8 +27,6 @@ from pendulum_lqr.mechanism_controllers import make_mechanism_controller
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["Bench", "Job", "Row", "document", "prepare", "run_job", "score_rows"]
-
-Array = NDArray[np.float64]
 Job = tuple[str, str, int]
 """What is run (swing_up, uptime or trial), by which controller, with which seed or as which trial."""
 

@@ -14,7 +14,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pendulum_bags.studies.random_runs import Array, Columns, RandomRuns, figures_of_runs, replay
+from pendulum_bags.arrays import Array
+from pendulum_bags.studies.random_runs import Columns, RandomRuns, figures_of_runs, replay
 from pendulum_bags.studies.uncertain import THESIS_UNCERTAINTY, VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import output_lqr
 from pendulum_lqr.model import linearise

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
 from pendulum_bags.distributions import mean_interval
 from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
@@ -26,8 +26,6 @@ COMPARED = ("ise", "itae", "effort_energy", "smoothness", "max_effort")
 OF_THE_MEAN = ("overshoot", "settling_time", "rise_time")
 """Metrics of the response to the step, taken from the mean over seeds, in which the noise has averaged out."""
 _RESAMPLES = 500
-
-Array = NDArray[np.float64]
 
 
 def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

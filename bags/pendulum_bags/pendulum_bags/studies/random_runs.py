@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import share_interval
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.chunks import (
@@ -29,8 +30,6 @@ from pendulum_bags.studies.chunks import (
 from pendulum_msgs_py.errors import BagError, ParameterError
 
 __all__ = ["Columns", "RandomRuns", "draw_chunk", "figures_of_runs", "replay", "run_chunk", "run_monte_carlo"]
-
-Array = NDArray[np.float64]
 Columns = dict[str, NDArray[Any]]
 """Columns of a table by name, shape (n,) each; SI units."""
 

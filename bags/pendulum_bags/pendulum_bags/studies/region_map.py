@@ -15,8 +15,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.studies.chunks import chunk_path, read_columns
-from pendulum_bags.studies.random_runs import Array, Columns
+from pendulum_bags.studies.random_runs import Columns
 from pendulum_bags.studies.start_grid import StartGrid, inside_ellipse, share_inside
 from pendulum_bags.studies.uncertain import THESIS_UNCERTAINTY, VARIED, Uncertainty, batch_variations
 from pendulum_lqr.design import Gain, output_lqr

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
 from pendulum_bags.distributions import mean_interval, share_interval
 from pendulum_bags.experiments.run_spec import RunSpec
@@ -38,8 +38,6 @@ SUCCESS_ERROR = 0.1
 SHARES = frozenset({"success"})
 """Metrics that are 1 or 0 in each run: their mean is a share, and more is better."""
 _LEAST_STEP = 1e-6
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.chunks import Connect, open_results, run_chunks, write_columns
-from pendulum_bags.studies.random_runs import Array, Columns
+from pendulum_bags.studies.random_runs import Columns
 from pendulum_msgs_py.errors import ParameterError
 
 __all__ = ["StartGrid", "inside_ellipse", "run_map", "share_inside"]

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.figures.render_files import write_figures
@@ -24,8 +24,6 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag
 
 __all__ = ["analyse", "apparent_plant", "commanded_recording", "print_table"]
-
-Array = NDArray[np.float64]
 
 _SETTLED = 0.5
 """Start of a run that is left out of its spread [s]."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.arrays import Array
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import load_yaml
 from pendulum_msgs_py.plants.plant_parameters import PRESETS, PlantParameters
@@ -30,8 +31,6 @@ VARIED = ("inertia", "damping", "gravity", "coulomb_friction")
 """Parameters that may be uncertain."""
 
 _NORMAL_95 = 1.959963984540054
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

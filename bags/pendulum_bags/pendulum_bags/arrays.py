@@ -1,0 +1,12 @@
+"""Types of the arrays that all rooms hand each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Array", "Complex", "Floats"]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Floats = NDArray[np.float32]
