@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array, Complex
 from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
@@ -113,7 +112,7 @@ def difference_sentence(difference: Difference) -> str:
     )
 
 
-def _phase(values: NDArray[np.complex128]) -> Array:
+def _phase(values: Complex) -> Array:
     phase = np.degrees(np.unwrap(np.angle(values)))
     # Torque lifts an upright pendulum away from it at first: the phase of its angle starts near -180 degrees.
     return np.asarray(phase - 360.0 * round((phase[0] + 120.0) / 360.0), dtype=np.float64)
