@@ -18,16 +18,15 @@ from pendulum_msgs_py.dynamics import friction_magnitude, gravity_torque
 from pendulum_msgs_py.dynamics.series_elastic import (
     dahl_step,
     dry_friction_step,
-    feedforward_pwm,
     link_acceleration,
     motor_acceleration,
     spring_deflection,
     spring_torque,
     winding_current,
-    winding_resistance_at,
 )
 from pendulum_msgs_py.dynamics.steps import actuator_torque
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.equilibrium import command_pwm, resistance_of
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_friction, terms_of, without_terms
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.plant import DelayLine, PlantState, check_start, check_step, command_within, period_segments
@@ -55,14 +54,11 @@ def pack_series_elastic(parameters: PlantParameters) -> SeriesElasticTuple:
     drive = parameters.drivetrain
     if drive is None:
         raise ParameterError(f"plant {parameters.name!r} has no drivetrain; expected a series-elastic plant")
-    resistance = winding_resistance_at(
-        drive.winding_temperature, drive.winding_resistance, drive.resistance_temperature_coefficient
-    )
     return (
         parameters.inertia, parameters.damping, parameters.gravity,
         parameters.coulomb_friction, parameters.static_friction, parameters.stribeck_velocity,
         parameters.angle_offset,
-        drive.gear_ratio, drive.torque_constant, drive.back_emf_constant, resistance, drive.supply_voltage,
+        drive.gear_ratio, drive.torque_constant, drive.back_emf_constant, resistance_of(drive), drive.supply_voltage,
         drive.reflected_inertia, drive.motor_damping,
         drive.motor_coulomb_friction, drive.motor_static_friction, drive.motor_stribeck_velocity,
         drive.stiffness, drive.stiffness_hardening, drive.hysteresis_torque, drive.hysteresis_deflection,
@@ -145,14 +141,7 @@ class SeriesElasticPlant:
         self._delay = DelayLine(parameters.transport_delay, dt)
         self._segments = period_segments(dt, self._delay.fraction, substeps or 1)
         self._check_stability(substeps or 1)
-        self._pwm_per_effort = feedforward_pwm(
-            1.0,
-            drive.supply_voltage,
-            drive.torque_constant,
-            drive.gear_ratio,
-            drive.efficiency,
-            drive.winding_resistance,
-        )
+        self._pwm_per_effort = command_pwm(1.0, drive)
         self._spring = (drive.stiffness, drive.stiffness_hardening)
         self._steps = 0
         self._torque = 0.0
