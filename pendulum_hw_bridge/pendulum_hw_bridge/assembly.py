@@ -24,7 +24,7 @@ from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.contract.plant_specs import in_units_of
-from pendulum_msgs_py.contract.values import NANOSECONDS, Vector
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -212,7 +212,7 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
         return _group(values, plant, limits, lockstep=lockstep)
     hardware, gains = QuasiDirectDrive(), DEFAULT_GAINS[TORQUE_LOOP]
     period_ns = round(NANOSECONDS / values["feedback_rate"])
-    start = _start(values, plant)
+    start = plant.coordinates.for_each("initial_positions", values["initial_positions"])
     delay = common_delay(plant)
     slowest = max(actuator.time_constant for actuator in plant.actuators)
     for name, value in (("transport_delay", delay), ("time_constant", slowest)):
@@ -299,13 +299,3 @@ def _safety(values: Mapping[str, Any], effort: float) -> SafetyLimits:
         measured_effort=values["measured_effort_limit"] or _MEASURED_SHARE * effort,
         position_disagreement=_DISAGREEMENT,
     )
-
-
-def _start(values: Mapping[str, Any], plant: MechanismParameters) -> Vector:
-    given, joints = values["initial_positions"], plant.coordinates.joints
-    if len(given) not in {1, len(joints)}:
-        raise ParameterError(
-            f"initial_positions has {len(given)} values; expected {len(joints)}, for "
-            f"{', '.join(f'{joint.name} [{joint.unit}]' for joint in joints)}, or one for all"
-        )
-    return tuple(given) if len(given) == len(joints) else (given[0],) * len(joints)

@@ -126,7 +126,6 @@ def _checked_position(plant: MechanismParameters, position: Sequence[float] | No
     q = coordinates.goal if position is None else tuple(float(value) for value in position)
     if len(q) != len(coordinates.joints) or not np.isfinite(q).all():
         raise ParameterError(
-            f"position is {list(q)}; expected {len(coordinates.joints)} finite numbers, for "
-            f"{', '.join(f'{joint.name} [{joint.unit}]' for joint in coordinates.joints)}"
+            f"position is {list(q)}; expected {len(coordinates.joints)} finite numbers, for {coordinates.with_units}"
         )
     return q

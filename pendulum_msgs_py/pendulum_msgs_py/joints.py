@@ -70,6 +70,11 @@ class Coordinates:
         return tuple(joint.name for joint in self.joints)
 
     @property
+    def with_units(self) -> str:
+        """Names of all joints, each with the unit of its position, for messages."""
+        return ", ".join(f"{joint.name} [{joint.unit}]" for joint in self.joints)
+
+    @property
     def driven_names(self) -> tuple[str, ...]:
         """Names of the driven joints, as in ``effort_command``."""
         return tuple(self.joints[index].name for index in self.driven)
@@ -107,6 +112,19 @@ class Coordinates:
         return tuple(
             wrap(q - g) if joint.turns else q - g for joint, q, g in zip(self.joints, position, wanted, strict=True)
         )
+
+    def for_each(self, name: str, values: Sequence[float]) -> Vector:
+        """Return a value for each joint of a parameter that has n, or one for all.
+
+        Raises:
+            ParameterError: It has another number of them.
+        """
+        n = len(self.joints)
+        if len(values) not in {1, n}:
+            raise ParameterError(
+                f"{name} has {len(values)} values; expected {n}, for {self.with_units}, or one for all"
+            )
+        return tuple(values) if len(values) == n else (values[0],) * n
 
     def spread(self, effort: Sequence[float]) -> Vector:
         """Return m efforts of the driven joints as n, zero at passive joints [N m or N].

@@ -26,7 +26,6 @@ __all__ = [
     "MechanismState",
     "check_decay",
     "check_stable_step",
-    "check_start_state",
     "is_smooth_mechanism",
 ]
 
@@ -118,7 +117,7 @@ class MechanismPlant:
         Raises:
             ParameterError: They have another length, are not finite, or lie beyond an end stop.
         """
-        self._position = check_start_state(self.parameters, self._still if position is None else position)
+        self._position = self.parameters.check_start(self._still if position is None else position)
         velocity = self._still if velocity is None else tuple(float(value) for value in velocity)
         if len(velocity) != len(self._still) or not all(math.isfinite(value) for value in velocity):
             raise ParameterError(f"initial velocity is {list(velocity)}; expected {len(self._still)} finite numbers")
@@ -179,27 +178,6 @@ class MechanismPlant:
 def is_smooth_mechanism(parameters: MechanismParameters) -> bool:
     """Tell whether a plant is free of dry friction, end stops, lag and delay."""
     return not _has_events(parameters) and not any(actuator.transport_delay for actuator in parameters.actuators)
-
-
-def check_start_state(parameters: MechanismParameters, position: Vector) -> Vector:
-    """Return a start position as numbers.
-
-    Raises:
-        ParameterError: It has another length, is not finite, or lies beyond an end stop.
-    """
-    values = tuple(float(value) for value in position)
-    joints = parameters.mechanism.joints
-    if len(values) != len(joints) or not all(math.isfinite(value) for value in values):
-        raise ParameterError(
-            f"initial position is {list(values)}; expected {len(joints)} finite numbers, for "
-            f"{', '.join(f'{joint.name} [{joint.unit}]' for joint in joints)}"
-        )
-    for joint, (low, high), value in zip(joints, parameters.stops, values, strict=True):
-        if not low <= value <= high:
-            raise ParameterError(
-                f"initial {joint.name} is {value} {joint.unit}; expected {low} to {high}, between its stops"
-            )
-    return values
 
 
 def check_stable_step(parameters: MechanismParameters, h: float) -> None:

@@ -19,7 +19,7 @@ from pendulum_sim.environment_arguments import (
     check_weights,
     episode_steps,
 )
-from pendulum_sim.mechanism_plant import check_stable_step, check_start_state
+from pendulum_sim.mechanism_plant import check_stable_step
 from pendulum_sim.plant import check_step
 
 __all__ = ["MechanismTask"]
@@ -56,7 +56,7 @@ class MechanismTask:
         self.limits = np.array(parameters.effort_limits)
         self.goal = np.array(parameters.coordinates.goal)
         if start != "random":
-            check_start_state(parameters, tuple(self.goal) if start == "top" else (0.0,) * n)
+            parameters.check_start(tuple(self.goal) if start == "top" else (0.0,) * n)
         self.turns = np.array([joint.turns for joint in parameters.mechanism.joints])
         high = np.full(2 * n, np.inf)
         high[:n][self.turns] = np.pi

@@ -296,13 +296,7 @@ class SimulatorNode(PollingNode):
         return self._given("initial_position", values), self._given("initial_velocity", values)
 
     def _given(self, name: str, values: Mapping[str, Any]) -> Vector:
-        given, joints = values.get(name, _ONE_FOR_ALL), self._coordinates.joints
-        if len(given) not in {1, len(joints)}:
-            raise ParameterError(
-                f"{name} has {len(given)} values; expected {len(joints)}, for "
-                f"{', '.join(f'{joint.name} [{joint.unit}]' for joint in joints)}, or one for all"
-            )
-        return tuple(given) if len(given) == len(joints) else (given[0],) * len(joints)
+        return self._coordinates.for_each(name, values.get(name, _ONE_FOR_ALL))
 
     def _check_start(self, values: Mapping[str, Any]) -> None:
         for name in ("initial_theta", "initial_theta_dot"):

@@ -99,7 +99,7 @@ class EmulatedMachine:
             own.constants(joints[index], limit)
             for index, limit in zip(self.coordinates.driven, plant.effort_limits, strict=True)
         )
-        self._position = self._checked(still if position is None else position)
+        self._position = self.plant.check_start(still if position is None else position)
         self._velocity = self._effort = still
         table = pack_joints(plant)
         lags = (
@@ -223,20 +223,6 @@ class EmulatedMachine:
             self._flow(time_ns)
 
     # --- inside ---------------------------------------------------------------------------------------------
-
-    def _checked(self, position: Vector) -> Vector:
-        joints = self.coordinates.joints
-        if len(position) != len(joints) or not all(map(math.isfinite, position)):
-            raise ParameterError(
-                f"initial position is {list(position)}; expected {len(joints)} finite numbers, for "
-                f"{', '.join(f'{joint.name} [{joint.unit}]' for joint in joints)}"
-            )
-        for joint, (low, high), value in zip(joints, self.plant.stops, position, strict=True):
-            if not low <= value <= high:
-                raise ParameterError(
-                    f"initial {joint.name} is {value} {joint.unit}; expected {low} to {high}, between its stops"
-                )
-        return tuple(float(value) for value in position)
 
     def _skip(self, late_ns: int) -> None:
         """Let a time pass in which the mechanism stands still [ns]; a command's lifetime goes by all the same."""

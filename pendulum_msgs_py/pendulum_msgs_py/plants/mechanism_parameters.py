@@ -214,6 +214,25 @@ class MechanismParameters:
         joints = tuple(replace(joint, damping=0.0, coulomb_friction=0.0, static_friction=None) for joint in self.joints)
         return replace(self, joints=joints)
 
+    def check_start(self, position: Sequence[float]) -> Vector:
+        """Return a start position as numbers.
+
+        Raises:
+            ParameterError: It has another length, is not finite, or lies beyond an end stop.
+        """
+        values = tuple(float(value) for value in position)
+        if len(values) != len(self.joints) or not all(map(math.isfinite, values)):
+            raise ParameterError(
+                f"initial position is {list(values)}; expected {len(self.joints)} finite numbers, for "
+                f"{self.coordinates.with_units}"
+            )
+        for joint, (low, high), value in zip(self.mechanism.joints, self.stops, values, strict=True):
+            if not low <= value <= high:
+                raise ParameterError(
+                    f"initial {joint.name} is {value} {joint.unit}; expected {low} to {high}, between its stops"
+                )
+        return values
+
     def acceleration(self, position: Vector, velocity: Vector, torque: Vector) -> Vector:
         """Return q'' under generalised forces at all n joints, dry friction apart [rad/s^2 or m/s^2].
 
