@@ -10,14 +10,13 @@ import yaml
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import (
-    MECHANISM_PRESETS,
     MechanismParameters,
     load_mechanism,
     load_mechanism_file,
     mechanism_from_pendulum,
     write_mechanism,
 )
-from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, PRESETS, load_plant, resolve_plant
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PLANT_SPECS, PRESETS, load_plant, resolve_plant
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import numpy as np
 
-from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Vector
+from pendulum_msgs_py.joints import ONE_JOINT, Vector
 from pendulum_sim.mechanism_plant import MechanismPlant, MechanismState
 from pendulum_sim.plant import Plant, PlantState
 
@@ -15,38 +14,6 @@ __all__ = ["JointPlant", "OneJoint", "joint_plant", "random_start"]
 
 _SLIDE = 0.1
 """Largest distance from the middle at which a joint that slides starts at random [m]."""
-
-
-class JointPlant(Protocol):
-    """A plant whose states and efforts are tuples in the order of its joints."""
-
-    dt: float
-
-    @property
-    def name(self) -> str:
-        """Name of the plant."""
-
-    @property
-    def coordinates(self) -> Coordinates:
-        """Its joints, and which of them are driven."""
-
-    @property
-    def stops(self) -> tuple[tuple[float, float], ...]:
-        """Lowest and highest position of each joint, infinite where nothing stops it [rad or m]."""
-
-    @property
-    def effort_limits(self) -> Vector:
-        """Largest effort of each driven joint [N m or N]."""
-
-    @property
-    def state(self) -> MechanismState:
-        """The present state."""
-
-    def reset(self, position: Vector, velocity: Vector) -> MechanismState:
-        """Start anew at n positions [rad or m] and n velocities."""
-
-    def step(self, effort: Vector, push: Vector) -> MechanismState:
-        """Advance by one period under m commanded efforts and n efforts on the joints themselves [N m or N]."""
 
 
 class OneJoint:
@@ -74,6 +41,10 @@ class OneJoint:
         """Advance by one period under a commanded torque and a torque on the link [N m]."""
         time, theta, theta_dot, torque = self._step(effort[0], push[0])
         return MechanismState(time, (theta,), (theta_dot,), (torque,))
+
+
+JointPlant = MechanismPlant | OneJoint
+"""A plant whose states and efforts are tuples in the order of its joints."""
 
 
 def joint_plant(plant: Plant | MechanismPlant) -> JointPlant:

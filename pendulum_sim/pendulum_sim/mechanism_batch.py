@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.joint_steps import COULOMB, JOINT_ROWS, LOWER, STATIC, UPPER
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.joint_table import pack_joints
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
 from pendulum_sim.batch import batch_size, check_counts, noise_keys, on_threads
 from pendulum_sim.mechanism_plant import check_decay, check_stable_step, is_smooth_mechanism
 from pendulum_sim.plant import check_step

@@ -17,8 +17,7 @@ from pendulum_msgs_py.dynamics.joint_steps import LAG, advance_joints, joint_fun
 from pendulum_msgs_py.dynamics.runge_kutta import rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Coordinates, Vector
-from pendulum_msgs_py.plants.joint_table import pack_joints
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
 from pendulum_sim.plant import DelayLine, check_step, period_segments
 
 __all__ = [

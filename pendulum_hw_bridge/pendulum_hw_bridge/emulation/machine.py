@@ -21,8 +21,7 @@ from pendulum_msgs_py.dynamics.joint_steps import LAG, advance_joints, joint_fun
 from pendulum_msgs_py.dynamics.series_elastic import winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
-from pendulum_msgs_py.plants.joint_table import pack_joints
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
 
 __all__ = ["EmulatedMachine"]
 

@@ -26,6 +26,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from pendulum_msgs_py.dynamics.joint_steps import FAR, JointTable
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Vector
 from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
@@ -41,7 +42,6 @@ from pendulum_msgs_py.plants.joint_parameters import (
 from pendulum_msgs_py.plants.plant_parameters import (
     FORMAT,
     MECHANISM_FORMAT,
-    MECHANISM_PRESETS,
     PLANT_SPECS,
     PlantParameters,
     read_plant_document,
@@ -57,13 +57,12 @@ from pendulum_msgs_py.plants.quantities import (
 )
 
 __all__ = [
-    "MECHANISM_FORMAT",
-    "MECHANISM_PRESETS",
     "MechanismParameters",
     "common_delay",
     "load_mechanism",
     "load_mechanism_file",
     "mechanism_from_pendulum",
+    "pack_joints",
     "write_mechanism",
 ]
 
@@ -403,6 +402,19 @@ def _positive_definite(rows: Sequence[Sequence[float]]) -> bool:
             for j in range(k, len(row)):
                 row[j] -= factor * pivot_row[j]
     return True
+
+
+def pack_joints(parameters: MechanismParameters) -> JointTable:
+    """Return friction, stops and lags of the joints, as the dynamics take them: in the order of ``JOINT_ROWS``."""
+    joints = parameters.joints
+    return (
+        tuple(joint.coulomb_friction for joint in joints),
+        tuple(joint.breakaway for joint in joints),
+        tuple(joint.stribeck_velocity for joint in joints),
+        tuple(-FAR if joint.lower_stop is None else joint.lower_stop for joint in joints),
+        tuple(FAR if joint.upper_stop is None else joint.upper_stop for joint in joints),
+        tuple(0.0 if joint.actuator is None else joint.actuator.time_constant for joint in joints),
+    )
 
 
 def common_delay(parameters: MechanismParameters) -> float:

@@ -34,8 +34,7 @@ from pendulum_msgs_py.dynamics.steps import actuator_torque
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Coordinates
 from pendulum_msgs_py.mechanisms import Mechanism
-from pendulum_msgs_py.plants.joint_table import pack_joints
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.compiling import compile_tree, tuple_loader
