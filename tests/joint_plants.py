@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 
-__all__ = ["delayed_plant", "near_upright"]
+__all__ = ["delayed_plant", "near_upright", "without_friction"]
 
 
 def delayed_plant(name: str, delay: float) -> MechanismParameters:
@@ -17,3 +19,9 @@ def delayed_plant(name: str, delay: float) -> MechanismParameters:
 def near_upright(plant: MechanismParameters, *off: float) -> Vector:
     """Return positions that are off upright by so much [rad or m]."""
     return tuple(goal + each for goal, each in zip(plant.coordinates.goal, off, strict=True))
+
+
+def without_friction(plant: MechanismParameters) -> MechanismParameters:
+    """Return the same plant without damping and dry friction."""
+    joints = tuple(replace(joint, damping=0.0, coulomb_friction=0.0, static_friction=None) for joint in plant.joints)
+    return replace(plant, joints=joints)

@@ -16,6 +16,7 @@ from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from tests.joint_plants import without_friction
 
 MILLISECOND = 1_000_000
 SECOND = 1_000_000_000
@@ -36,7 +37,7 @@ def started(plant: str, hardware: QuasiDirectDrive | None = None, *, position: V
 
 @pytest.mark.parametrize("plant", ["acrobot_frictionless", "pendubot_frictionless", "double_pendulum_frictionless"])
 def test_energy_stays_where_nothing_rubs_and_nobody_drives(plant: str) -> None:
-    parameters = load_mechanism(plant).without_friction()
+    parameters = without_friction(load_mechanism(plant))
     machine = EmulatedMachine(parameters, position=(2.5, -1.0))
     begin = parameters.energy(*machine.state[:2])
     machine.advance_to(2 * SECOND, wholly=True)

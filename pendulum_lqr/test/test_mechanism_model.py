@@ -17,6 +17,7 @@ from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
+from tests.joint_plants import without_friction
 
 _PLANTS = ("cart_pole", "acrobot", "pendubot", "double_pendulum", "furuta")
 
@@ -53,7 +54,7 @@ def test_the_linear_model_has_the_slopes_of_the_equations(name: str) -> None:
 
 @pytest.mark.parametrize("name", _PLANTS)
 def test_the_lqr_brings_the_whole_plant_back_to_upright(name: str) -> None:
-    plant = load_mechanism(name).without_friction()
+    plant = without_friction(load_mechanism(name))
     model = linearise_mechanism(plant)
     gain = mechanism_lqr(model, *plant.mechanism.weights)
     assert gain.K.shape == (len(plant.coordinates.driven), 2 * len(plant.joints))

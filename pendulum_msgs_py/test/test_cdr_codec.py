@@ -13,9 +13,10 @@ from pendulum_msgs_py.contract import cdr
 from pendulum_msgs_py.contract.cdr import MAX_SECONDS, decode_joint_state, encode_clock, encode_joint_state
 from pendulum_msgs_py.contract.cdr_trajectory import decode_joint_trajectory
 from pendulum_msgs_py.contract.names import JOINT
-from pendulum_msgs_py.contract.trajectory import MAX_TRAJECTORY_POINTS, from_points, thesis_ramp
+from pendulum_msgs_py.contract.trajectory import MAX_TRAJECTORY_POINTS, thesis_ramp
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
+from tests.trajectories import from_points
 
 serialization = pytest.importorskip("rclpy.serialization")
 JointState = pytest.importorskip("sensor_msgs.msg").JointState

@@ -18,6 +18,7 @@ from pendulum_msgs_py.plants.mechanism_parameters import (
 )
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PLANT_SPECS, PRESETS, load_plant, resolve_plant
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
+from tests.joint_plants import without_friction
 
 
 def _changed(tmp_path: Path, old: str, new: str, preset: str = "acrobot") -> Path:
@@ -61,7 +62,7 @@ def test_the_benchmarks_plants_come_with_and_without_friction() -> None:
     assert not plain.has_dry_friction
     assert plain.value("rotor_inertia") == 0.0
     assert (rough.value("shoulder.coulomb_friction"), rough.value("elbow.coulomb_friction")) == (0.16, 0.12)
-    assert rough.without_friction().with_values({"rotor_inertia": 0.0}) == plain
+    assert without_friction(rough).with_values({"rotor_inertia": 0.0}) == plain
 
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if load_plant(name).drivetrain is None])

@@ -11,9 +11,10 @@ import pytest
 
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits, PlantSupervisor
-from pendulum_msgs_py.contract.trajectory import Trajectory, from_points
+from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
+from tests.trajectories import from_points
 
 _MS = 1_000_000
 

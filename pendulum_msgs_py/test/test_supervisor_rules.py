@@ -20,9 +20,10 @@ from pendulum_msgs_py.contract.supervisor import (
     PlantLimits,
     PlantSupervisor,
 )
-from pendulum_msgs_py.contract.trajectory import Trajectory, from_points
+from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
+from tests.trajectories import from_points
 
 _MS = 1_000_000
 _PERIOD_NS = 10 * _MS

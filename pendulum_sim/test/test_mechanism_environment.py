@@ -16,6 +16,7 @@ from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_sim.mechanism_drawing import MechanismPicture
 from pendulum_sim.mechanism_environment import IDS, MechanismEnv, MechanismVectorEnv
 from pendulum_sim.mechanism_plant import MechanismPlant
+from tests.joint_plants import without_friction
 
 
 @pytest.mark.parametrize("name", IDS)
@@ -31,7 +32,7 @@ def test_gymnasium_checks_pass_for_every_plant(name: str) -> None:
 @pytest.mark.parametrize("name", IDS)
 def test_a_vector_of_them_moves_as_the_single_ones_do(name: str) -> None:
     # Of plants without friction all in one step of arrays, of others one after another.
-    for plant in (load_mechanism(IDS[name]), load_mechanism(IDS[name]).without_friction()):
+    for plant in (load_mechanism(IDS[name]), without_friction(load_mechanism(IDS[name]))):
         seeds = [3, 4, 5]
         vector = gymnasium.make_vec(
             name, num_envs=3, vectorization_mode="vector_entry_point", plant=plant, start="random", disturbance=0.01

@@ -14,12 +14,13 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.mechanism_files import mechanism_mjcf
 from pendulum_sim.mechanism_plant import MechanismPlant
 from pendulum_sim.plant import RigidPlant
+from tests.joint_plants import without_friction
 
 _PLANTS = ("cart_pole", "acrobot", "furuta")
 
 
 def _free(name: str):
-    plant = load_mechanism(name).without_friction()
+    plant = without_friction(load_mechanism(name))
     return plant if name != "cart_pole" else plant.with_values({"cart.lower_stop": -1e3, "cart.upper_stop": 1e3})
 
 
@@ -139,7 +140,7 @@ def test_a_cart_stops_at_the_end_of_its_track_and_its_pole_swings_on() -> None:
 
 
 def test_an_impact_keeps_the_momentum_that_the_stop_does_not_take() -> None:
-    parameters = load_mechanism("cart_pole").without_friction().with_values({"gravity": 0.0})
+    parameters = without_friction(load_mechanism("cart_pole")).with_values({"gravity": 0.0})
     plant = MechanismPlant(parameters, 1e-3)
     plant.reset((1.79, 0.3), (1.0, 0.5))
     before = plant.state

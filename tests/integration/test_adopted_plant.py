@@ -12,12 +12,12 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.contract.trajectory import from_points
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message, trajectory_to_message
 from tests.integration.adopting import EFFORTS, adopt, start_robot
 from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
+from tests.trajectories import from_points
 
 
 class Peer(PlantPeer):

@@ -21,13 +21,13 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract.names import JOINT
-from pendulum_msgs_py.contract.trajectory import from_points
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message, stamp_to_message, trajectory_to_message
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from tests.fixtures import PROJECT, own_domain
 from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup, RunningProgram
+from tests.trajectories import from_points
 
 PERIODS_TO_ZERO = 15
 """Periods, 10 ms or 5, counted by the plant, in which torque may last: a command counts for 50 ms, and is on its way

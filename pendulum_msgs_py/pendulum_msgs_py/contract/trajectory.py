@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from pendulum_msgs_py.errors import ParameterError
@@ -18,7 +17,6 @@ __all__ = [
     "RAMP_PERIOD",
     "Trajectory",
     "TrajectoryPoint",
-    "from_points",
     "thesis_ramp",
 ]
 
@@ -205,13 +203,3 @@ def thesis_ramp(
             for index in range(steps + 1)
         )
     )
-
-
-def from_points(times: Sequence[float], positions: Sequence[float], velocities: Sequence[float]) -> Trajectory:
-    """Return a trajectory from sequences of one length: times [s], positions [rad], velocities [rad/s]."""
-    if not len(times) == len(positions) == len(velocities):
-        raise ParameterError(
-            f"trajectory has {len(times)} times, {len(positions)} positions and "
-            f"{len(velocities)} velocities; expected as many of each"
-        )
-    return Trajectory(tuple(map(TrajectoryPoint, times, positions, velocities)))

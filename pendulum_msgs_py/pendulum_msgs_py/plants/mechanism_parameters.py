@@ -208,11 +208,6 @@ class MechanismParameters:
             joints[index] = replace(own, **change)
         return replace(self, values=tuple(values), joints=tuple(joints))
 
-    def without_friction(self) -> MechanismParameters:
-        """Return the same plant without damping and dry friction."""
-        joints = tuple(replace(joint, damping=0.0, coulomb_friction=0.0, static_friction=None) for joint in self.joints)
-        return replace(self, joints=joints)
-
     def check_start(self, position: Sequence[float]) -> Vector:
         """Return a start position as numbers.
 
