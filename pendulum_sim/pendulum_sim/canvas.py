@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -36,6 +37,7 @@ class Picture:
 
     Args:
         size: Width and height [px].
+        trail: Positions that the trail remembers.
         lines: Lines of text that fill its height.
 
     Raises:
@@ -47,7 +49,7 @@ class Picture:
         surface: The picture.
     """
 
-    def __init__(self, size: tuple[int, int], *, lines: int = 20) -> None:
+    def __init__(self, size: tuple[int, int], *, trail: int, lines: int = 20) -> None:
         import pygame
 
         if len(size) != 2 or not all(_MIN_SIZE <= int(side) <= _MAX_SIZE for side in size):
@@ -57,6 +59,7 @@ class Picture:
         pygame.font.init()
         self.canvas = pygame.Surface((self.size[0] * OVERSAMPLING, self.size[1] * OVERSAMPLING))
         self.surface = pygame.Surface(self.size)
+        self._trail: deque[Any] = deque(maxlen=trail)
         self._font = pygame.font.Font(None, max(400 // lines, min(self.size) // lines) * OVERSAMPLING)
 
     def array(self) -> NDArray[np.uint8]:
@@ -66,6 +69,7 @@ class Picture:
 
     def clear_trail(self) -> None:
         """Forget where the plant has been."""
+        self._trail.clear()
 
     def show_text(self, note: str) -> None:
         """Draw nothing but a line of text, where a plant cannot be drawn yet."""

@@ -10,7 +10,6 @@ with the link hanging along -y in its own frame, and the screen's y axis pointin
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -48,9 +47,8 @@ class PendulumPicture(Picture):
     """
 
     def __init__(self, size: tuple[int, int], effort_limit: float, *, trail: int = 60) -> None:
-        super().__init__(size)
+        super().__init__(size, trail=trail)
         self._limit = effort_limit
-        self._trail: deque[float] = deque(maxlen=trail)
 
     def draw(
         self,
@@ -89,10 +87,6 @@ class PendulumPicture(Picture):
             self.draw_arrow(self._to_screen(bob, theta, origin)[0], along, disturbance / self._limit, length)
         self._draw_numbers(theta, theta_dot, effort, disturbance, time, note)
         self.finish()
-
-    def clear_trail(self) -> None:
-        """Forget where the bob has been."""
-        self._trail.clear()
 
     # --- parts ---------------------------------------------------------------------------------------------
 

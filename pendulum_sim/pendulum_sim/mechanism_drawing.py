@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
@@ -41,12 +40,11 @@ class MechanismPicture(Picture):
     """
 
     def __init__(self, parameters: MechanismParameters, size: tuple[int, int] = (600, 600), *, trail: int = 60) -> None:
-        super().__init__(size, lines=_LINES)
+        super().__init__(size, trail=trail, lines=_LINES)
         self.parameters = parameters
         self._joints = parameters.mechanism.joints
         self._slides = self._joints[0].unit == "m"
         self._in_space = parameters.mechanism.name == "furuta"
-        self._trail: deque[tuple[Point, ...]] = deque(maxlen=trail)
         still = (0.0,) * len(self._joints)
         points = parameters.mechanism.chain(still, parameters.packed)
         reach = sum(math.dist(first, second) for first, second in pairwise(points))
@@ -103,10 +101,6 @@ class MechanismPicture(Picture):
         rows = rows if time is None else [(f"{time:.3f} s", INK), *rows]
         self.draw_text(rows, self.parameters.name if note is None else note)
         self.finish()
-
-    def clear_trail(self) -> None:
-        """Forget where the tip has been."""
-        self._trail.clear()
 
     # --- parts ---------------------------------------------------------------------------------------------
 
