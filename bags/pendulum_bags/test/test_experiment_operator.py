@@ -1,5 +1,6 @@
 """A real machine moves only after its checklist and an operator's yes."""
 
+import importlib.util
 from pathlib import Path
 
 import pytest
@@ -91,6 +92,17 @@ def test_a_backend_that_nobody_knows_is_a_real_machine_whatever_its_name(
 def test_a_real_machine_needs_its_lab_file(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert experiment_cli.main([name, "--hardware", "hebi", "--out", str(tmp_path / "run")]) == 2
     assert "without a lab file; expected --lab FILE" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["gravity", "inertia_damping"])
+def test_trials_that_could_not_be_evaluated_are_not_recorded(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda module: None if module == "statsmodels" else found(module))
+    assert experiment_cli.main([name, "--out", str(tmp_path / "run")]) == 2
+    assert "statsmodels is not installed, which this needs; install it with make extras" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

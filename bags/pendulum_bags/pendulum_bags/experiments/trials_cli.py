@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -93,6 +94,9 @@ def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_out
     from pendulum_bags.experiments.trials import run_trials
     from pendulum_bags.identification import identify_cli
 
+    # A minute of somebody's machine is not spent on what could not be evaluated afterwards.
+    if importlib.util.find_spec("statsmodels") is None:
+        raise ModuleNotFoundError("No module named 'statsmodels'", name="statsmodels")
     check_domain(domain)
     name = settings.kind.name
     console = make_console(stderr=json_output, highlight=False)
