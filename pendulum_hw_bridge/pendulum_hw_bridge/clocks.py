@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import threading
+import time
 from typing import Protocol
 
 from pendulum_msgs_py.contract.timing import SteadyWallClock
@@ -25,7 +25,6 @@ class WallClock:
 
     def __init__(self) -> None:
         self._clock = SteadyWallClock()
-        self._never = threading.Event()
 
     def now_ns(self) -> int:
         """Return the time since the epoch [ns]."""
@@ -35,7 +34,7 @@ class WallClock:
         """Sleep until a time [ns]."""
         remaining = time_ns - self.now_ns()
         if remaining > 0:
-            self._never.wait(remaining * 1e-9)
+            time.sleep(remaining * 1e-9)
 
 
 class SteppedClock:

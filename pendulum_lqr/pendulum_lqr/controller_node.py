@@ -59,6 +59,7 @@ from pendulum_msgs_py.ros.convert import (
 )
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.first_answer import FirstAnswer
+from pendulum_msgs_py.ros.leaving import wait_until_heard
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.polled import PollingNode
@@ -223,7 +224,7 @@ class ControllerNode(LifecycleNode, PollingNode):
     def close(self) -> None:
         """Send zero torque while the context is still valid, and give it time to be heard."""
         self._send_zero()
-        self._command_publisher.wait_for_all_acked(qos.LAST_WORDS)
+        wait_until_heard(self._command_publisher)
         self._publish_diagnostics()
 
     def _may_lend(self) -> AnswerLoop | None:

@@ -33,6 +33,7 @@ from pendulum_msgs_py.ros.compiled_answers import AnsweredInput
 from pendulum_msgs_py.ros.convert import event_message, stamp_of_state
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.first_answer import FirstAnswer
+from pendulum_msgs_py.ros.leaving import wait_until_heard
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
@@ -125,7 +126,7 @@ class DisturbanceNode(PollingNode):
             stamp = after if self._simulated_time else max(after, self._now())
             nothing = (0.0,) * len(self._joints)
             self._torque_publisher.publish(encode_joints(stamp, self._full_name, self._joints, (), (), nothing))
-            self._torque_publisher.wait_for_all_acked(qos.LAST_WORDS)
+            wait_until_heard(self._torque_publisher)
         for loop in self._loops:
             loop.stop()
         self._publish_diagnostics()

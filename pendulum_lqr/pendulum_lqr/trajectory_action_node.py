@@ -23,6 +23,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import sample_from_bytes, trajectory_to_message
+from pendulum_msgs_py.ros.leaving import wait_until_heard
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.ros.timers import create_wall_timer
@@ -79,7 +80,7 @@ class TrajectoryActionNode(Node):
         """Leave no plant on its way without somebody who watches it."""
         if self._plant.active:
             self._hold()
-            self._publisher.wait_for_all_acked(qos.LAST_WORDS)
+            wait_until_heard(self._publisher)
         if self._server is not None:
             self._server.destroy()
 

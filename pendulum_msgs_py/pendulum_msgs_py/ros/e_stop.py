@@ -14,9 +14,9 @@ from collections.abc import Callable
 from typing import Any
 
 import rclpy
-from rclpy._rclpy_pybind11 import InvalidHandle, NodeNameNonExistentError, RCLError
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
+from rclpy.node import Node, NodeNameNonExistentError
 from std_srvs.srv import Trigger
 
 from pendulum_msgs_py.contract import names
@@ -101,7 +101,7 @@ class EStopThread:
                 seen_by.get_service_names_and_types_by_node(*owner),
             ]
         # Not discovered yet, or destroyed or shut down already.
-        except (NodeNameNonExistentError, InvalidHandle, RCLError):
+        except (NodeNameNonExistentError, implementation.InvalidHandle, implementation.RCLError):
             return []
 
     def _run(self) -> None:

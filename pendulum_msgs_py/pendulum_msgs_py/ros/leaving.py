@@ -1,13 +1,22 @@
-"""Leaving the ROS graph, in which the middleware can hang for good."""
+"""Leaving the ROS graph: last words that are heard, and an end in which the middleware can hang for good."""
 
 from __future__ import annotations
 
 import faulthandler
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["leaving_graph"]
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+
+__all__ = ["leaving_graph", "wait_until_heard"]
+
+_LAST_WORDS = 0.2
+"""Time that a node gives its last words to be heard before it ends [s]."""
+_LOOK = 0.001
+"""Time between two looks whether all have heard [s]."""
 
 _LONGEST = 5.0
 """Time that the middleware may take to leave the graph [s]."""
@@ -15,6 +24,17 @@ _STANDARD_ERROR = 2
 """Its descriptor: what stands for it in Python may have none, as in a notebook."""
 _lock = threading.Lock()
 _under_way = 0
+
+
+def wait_until_heard(publisher: Publisher) -> None:
+    """Wait until all reliable subscribers have heard the last message, for a time at most.
+
+    Looked at again and again, since rclpy keeps Python's lock while it waits itself, 0.15 s with any subscriber: for as
+    long neither an actuator's thread could end its torque nor the e-stop be served.
+    """
+    ends = time.monotonic() + _LAST_WORDS
+    while not publisher.wait_for_all_acked(Duration()) and time.monotonic() < ends:
+        time.sleep(_LOOK)
 
 
 @contextmanager

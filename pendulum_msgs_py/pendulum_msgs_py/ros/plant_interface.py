@@ -12,8 +12,6 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.duration import Duration
-from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -39,6 +37,7 @@ from pendulum_msgs_py.ros.convert import (
 )
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.e_stop import EStopServer
+from pendulum_msgs_py.ros.leaving import wait_until_heard
 from pendulum_msgs_py.ros.polled import REST_AFTER_READING, PolledInput, PollingNode
 from pendulum_msgs_py.ros.timers import create_wall_timer
 
@@ -48,8 +47,6 @@ _LEAST_BETWEEN_LINES = 1.0
 """Time between two lines of the log about one mode [s]."""
 _WAITED_NS = 10 * NANOSECONDS
 """Longest time for which a message may wait while a plant arms [ns]; more is a system clock that was set back."""
-_LOOK_FOR_WORD = 0.001
-"""Time between two looks whether all have heard [s]."""
 _LOOK = 0.02
 """Time between two looks for a press or a trajectory [s]; of trajectories without pause the newest is read then."""
 TRAJECTORY_AGE_LIMIT = 1.0
@@ -209,7 +206,7 @@ class PlantInterface:
             self.applied_publisher.publish(encode_joints(stamp_ns, "", self._driven, (), (), effort))
         # Only the last words are waited for: a torque that was under way meanwhile is still to be ended.
         if self._stopping and not any(effort):
-            _wait_until_heard(self.applied_publisher)
+            wait_until_heard(self.applied_publisher)
 
     def publish_event(self, name: str, **details: object) -> None:
         """Publish an event at the plant's time."""
@@ -237,7 +234,7 @@ class PlantInterface:
         """Disarm, say so in diagnostics; the plant then applies zero torque and publishes that, to be heard too."""
         self.supervisor.disarm(self.clock(), reason)
         self.publish_diagnostics()
-        _wait_until_heard(self._diagnostics.publisher)
+        wait_until_heard(self._diagnostics.publisher)
         self._stopping = True
 
     def close(self) -> None:
@@ -429,14 +426,3 @@ class PlantInterface:
         conflict = bool(self.supervisor.commander_conflict)
         warn = starved or conflict or self._second_commander
         return DiagnosticStatus.WARN if warn else DiagnosticStatus.OK
-
-
-def _wait_until_heard(publisher: Publisher) -> None:
-    """Wait until all reliable subscribers have heard the last message, for a time at most.
-
-    Looked at again and again, since rclpy keeps Python's lock while it waits itself, 0.15 s with any subscriber: for as
-    long neither an actuator's thread could end its torque nor the e-stop be served.
-    """
-    ends = time.monotonic() + qos.LAST_WORDS.nanoseconds / NANOSECONDS
-    while not publisher.wait_for_all_acked(Duration()) and time.monotonic() < ends:
-        time.sleep(_LOOK_FOR_WORD)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 __all__ = [
@@ -11,7 +10,6 @@ __all__ = [
     "COMMAND_INPUT",
     "DIAGNOSTICS",
     "EVENTS",
-    "LAST_WORDS",
     "NEWEST_STATE",
     "STATE",
     "TRAJECTORY",
@@ -43,8 +41,6 @@ TRAJECTORY = _profile(1)
 EVENTS = _profile(100, DurabilityPolicy.TRANSIENT_LOCAL)
 """Phase changes of an experiment; late recorders get the earlier ones too."""
 DIAGNOSTICS = _profile(100)
-LAST_WORDS = Duration(seconds=0.2)
-"""Longest wait of a node that ends for its reliable subscribers to have heard its last message."""
 NEWEST_STATE = _profile(1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """The subscription of controllers and viewers to states: only the newest is worth an answer, or a look.
 

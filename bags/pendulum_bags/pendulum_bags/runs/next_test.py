@@ -35,18 +35,14 @@ def next_test_of(records: Sequence[Mapping[str, Any]], plant: str) -> str:
 
 def plant_file_of(records: Sequence[Mapping[str, Any]]) -> str:
     """Return the plant file that the recorded experiment simulated, as its command names it; empty for a preset."""
-    commands = [_words(record) for record in records]
-    named = [value for words in commands for name, value in pairwise(words) if name == "--plant"]
-    named += [word.partition("=")[2] for words in commands for word in words if word.startswith("--plant=")]
+    named = (name for record in records for name in _values_of("--plant", _words(record)))
     return next((name for name in named if Path(name).suffix in _PLANT_FILES), "")
 
 
 def question_of(command: str) -> str:
     """Return the sentence to set behind a command that may move a machine; empty behind one that moves an emulator."""
-    words = shlex.split(command)
-    hardware = [value for name, value in pairwise(words) if name == "--hardware"]
-    hardware += [word.partition("=")[2] for word in words if word.startswith("--hardware=")]
-    return " Where that moves a machine, it asks first." if set(hardware) - {"emulator"} else ""
+    hardware = set(_values_of("--hardware", shlex.split(command)))
+    return " Where that moves a machine, it asks first." if hardware - {"emulator"} else ""
 
 
 def _again(record: Mapping[str, Any], plant: str, seen: Set[str]) -> str:
@@ -65,6 +61,12 @@ def _again(record: Mapping[str, Any], plant: str, seen: Set[str]) -> str:
     first = int(seed) + 1 if seed.isdecimal() else 2
     unseen = next(number for number in count(first) if str(number) not in seen)
     return shlex.join([*kept, "--plant", plant, "--seed", str(unseen)])
+
+
+def _values_of(option: str, words: Sequence[str]) -> list[str]:
+    """Return the values that an option of a command has, behind it or attached to it."""
+    attached = [word.partition("=")[2] for word in words if word.startswith(f"{option}=")]
+    return [value for name, value in pairwise(words) if name == option] + attached
 
 
 def _words(record: Mapping[str, Any]) -> list[str]:
