@@ -28,6 +28,15 @@ _SIMULATOR = """
 from pendulum_sim.simulator_node import main
 sys.exit(main([]))
 """
+_NESTED = """
+import ctypes
+from pendulum_msgs_py.ros.leaving import leaving_graph
+with leaving_graph():
+    with leaving_graph():
+        pass
+    print("hangs", flush=True)
+    ctypes.PyDLL(None).sleep(600)
+"""
 _CONDUCTOR = """
 from pendulum_bags.experiments.conductor_node import Conductor
 with Conductor({domain}):
@@ -52,6 +61,13 @@ def test_an_experiment_that_cannot_leave_the_graph_ends_all_the_same(domain_id: 
     conductor = _start(_HANGING.format(name="conductor") + _CONDUCTOR.format(domain=domain_id), processes)
     assert conductor.wait(DEADLINE) == 1
     assert "hangs" in conductor.output
+
+
+def test_the_end_of_one_leaving_does_not_end_the_watch_over_another(processes: ProcessGroup) -> None:
+    # A context that shuts down closes an e-stop whose owner was not closed.
+    program = _start(_NESTED, processes)
+    assert program.wait(DEADLINE) == 1
+    assert "hangs" in program.output
 
 
 def test_an_e_stop_leaves_when_it_knows_all_of_its_owner(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:
