@@ -129,7 +129,8 @@ OFFSETS = [
 def test_every_swing_up_ends_at_its_set_point_on_a_plant_with_offsets(name, values, offsets, set_point, simulate):
     plant = DFKI.with_values(**offsets)
     controller = make_controller(name, plant, 0.01, {**values, "set_point": set_point})
-    run = simulate(plant, controller, theta=plant.angle_offset, duration=9.0)
+    # Energy is pumped in slowly; an answer of nmpc takes milliseconds.
+    run = simulate(plant, controller, theta=plant.angle_offset, duration=5.0 if name == "nmpc" else 9.0)
     # Dry friction holds it off by at most its torque over the stiffness of the catch.
     assert np.max(np.abs(run.angle[-100:] - set_point)) < 0.02
 

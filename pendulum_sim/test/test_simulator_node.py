@@ -151,7 +151,7 @@ def test_the_viewer_writes_picture_and_animation_without_a_screen(processes, dom
 
     _start(processes, "rate_hz:=100.0", "initial_theta:=2.0")
     viewer = processes.start(
-        "pendulum_sim", "viewer", "--ros-args", "-p", "window:=true", "-p", "duration:=3.0", "-p", "width:=240",
+        "pendulum_sim", "viewer", "--ros-args", "-p", "window:=true", "-p", "duration:=1.0", "-p", "width:=240",
         "-p", "height:=240", "-p", f"png:={tmp_path / 'view.png'}", "-p", f"gif:={tmp_path / 'view.gif'}",
         env={**os.environ, "SDL_VIDEODRIVER": "dummy"},
     )  # fmt: skip
