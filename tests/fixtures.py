@@ -16,11 +16,22 @@ from typing import TypeVar
 import pytest
 
 from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.host_pool import HostPool
 from tests.mcap_js_reader import McapJs, mcap_js_process
 from tests.processes import ProcessGroup
 from tests.rerun_reader import RerunMcap, find_rerun
 
-__all__ = ["PROJECT", "domain_id", "mcap_js", "own_domain", "processes", "rerun_mcap", "shared_data", "wait_for"]
+__all__ = [
+    "PROJECT",
+    "domain_id",
+    "hosts",
+    "mcap_js",
+    "own_domain",
+    "processes",
+    "rerun_mcap",
+    "shared_data",
+    "wait_for",
+]
 
 PROJECT = Path(__file__).resolve().parents[1]
 """The repository."""
@@ -107,10 +118,20 @@ def domain_id(tmp_path: Path) -> Iterator[int]:
         yield domain
 
 
+@pytest.fixture(scope="session")
+def hosts() -> Iterator[HostPool]:
+    """Keep the processes in which programs of tests run, one after the other: to start one takes half a second."""
+    with HostPool() as pool:
+        yield pool
+
+
 @pytest.fixture
-def processes(tmp_path: Path) -> Iterator[ProcessGroup]:
-    """Start programs of the project, which end with the test; one that has to be killed then fails it."""
-    group = ProcessGroup(tmp_path / "processes", cwd=PROJECT)
+def processes(tmp_path: Path, hosts: HostPool) -> Iterator[ProcessGroup]:
+    """Start programs of the project, which end with the test; one that has to be killed then fails it.
+
+    They run in hosts, as those of studies do: a test that looks at how a program starts or ends starts it ``alone``.
+    """
+    group = ProcessGroup(tmp_path / "processes", PROJECT, hosts)
     yield group
     if leftovers := group.close():
         pytest.fail("processes that did not end by themselves: " + "; ".join(leftovers))

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import psutil
 
+from pendulum_bags.experiments.host_pool import HostedProgram, HostPool
+
 __all__ = ["ProcessGroup", "RunningProgram"]
 
 _MARK = "PENDULUM_TEST_PROCESSES"
@@ -29,7 +31,7 @@ class RunningProgram:
         pid: Process id.
     """
 
-    def __init__(self, name: str, popen: subprocess.Popen[bytes], log: Path) -> None:
+    def __init__(self, name: str, popen: subprocess.Popen[bytes] | HostedProgram, log: Path) -> None:
         self.name = name
         self.pid = popen.pid
         self._popen = popen
@@ -51,6 +53,7 @@ class RunningProgram:
 
     def type(self, text: str) -> None:
         """Type into a program that was started with ``typed=True``."""
+        assert isinstance(self._popen, subprocess.Popen)
         assert self._popen.stdin is not None, f"{self.name} was not started with typed=True"
         self._popen.stdin.write(text.encode())
         self._popen.stdin.flush()
@@ -104,17 +107,19 @@ class ProcessGroup:
     Args:
         folder: Where their output is kept.
         cwd: Folder to start them in.
+        hosts: Run programs in one of these processes where they can.
 
     Attributes:
         folder: The first argument.
     """
 
-    def __init__(self, folder: Path, cwd: Path) -> None:
+    def __init__(self, folder: Path, cwd: Path, hosts: HostPool | None = None) -> None:
         self.folder = folder
         self._cwd = cwd
+        self._hosts = hosts
         self._mark = uuid.uuid4().hex
         self._programs: list[RunningProgram] = []
-        self._popens: list[subprocess.Popen[bytes]] = []
+        self._popens: list[subprocess.Popen[bytes] | HostedProgram] = []
 
     def start(
         self,
@@ -125,8 +130,11 @@ class ProcessGroup:
         cwd: Path | None = None,
         typed: bool = False,
         niceness: int = 0,
+        alone: bool = False,
     ) -> RunningProgram:
-        """Start ``python -m package executable arguments`` in a process group of its own.
+        """Start ``python -m package executable arguments``.
+
+        It runs in a host where the group has some, unless it is to be alone or differs in more than its arguments.
 
         Args:
             package: Package, such as ``pendulum_sim``.
@@ -136,9 +144,17 @@ class ProcessGroup:
             cwd: Folder to start in instead of the repository.
             typed: Whether the test types into it.
             niceness: Priority to give away, or to take where it is negative and permitted.
+            alone: Start it as its user does: its start or its end is what is looked at.
         """
         command = [sys.executable, "-m", package, executable, *map(str, arguments)]
         name = f"{package} {executable}"
+        if self._hosts is not None and not (alone or env or cwd or typed):
+            log, environment = self._prepare(name, {})
+            # A host takes what its output goes to when it begins.
+            log.touch()
+            hosted = self._hosts.start(command, environment=environment, log=log, niceness=niceness)
+            if hosted is not None:
+                return self._add(name, hosted, log)
         return self.start_command(command, name=name, env=env, cwd=cwd, typed=typed, niceness=niceness)
 
     def start_command(
@@ -152,10 +168,8 @@ class ProcessGroup:
         niceness: int = 0,
     ) -> RunningProgram:
         """Start any command in a process group of its own."""
-        self.folder.mkdir(parents=True, exist_ok=True)
         name = name or Path(command[0]).name
-        log = self.folder / f"{len(self._programs):02}_{re.sub(r'[^A-Za-z0-9]+', '_', name)}.log"
-        environment = {**os.environ, "PYTHONUNBUFFERED": "1", **(env or {}), _MARK: self._mark}
+        log, environment = self._prepare(name, env or {})
         with log.open("wb") as sink:
             popen = subprocess.Popen(
                 command,
@@ -173,6 +187,15 @@ class ProcessGroup:
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, popen.pid, nice)
                 Path(f"/proc/{popen.pid}/autogroup").write_text(str(nice), encoding="ascii")
+        return self._add(name, popen, log)
+
+    def _prepare(self, name: str, env: Mapping[str, str]) -> tuple[Path, dict[str, str]]:
+        """Return the file for a program's output, in its folder, and all of the program's variables."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        log = self.folder / f"{len(self._programs):02}_{re.sub(r'[^A-Za-z0-9]+', '_', name)}.log"
+        return log, {**os.environ, "PYTHONUNBUFFERED": "1", **env, _MARK: self._mark}
+
+    def _add(self, name: str, popen: subprocess.Popen[bytes] | HostedProgram, log: Path) -> RunningProgram:
         program = RunningProgram(name, popen, log)
         self._popens.append(popen)
         self._programs.append(program)
@@ -219,7 +242,10 @@ class ProcessGroup:
             return False
 
 
-def _signal_group(popen: subprocess.Popen[bytes], number: int) -> None:
+def _signal_group(popen: subprocess.Popen[bytes] | HostedProgram, number: int) -> None:
+    if isinstance(popen, HostedProgram):
+        popen.send_signal(number)
+        return
     try:
         os.killpg(popen.pid, number)
     except ProcessLookupError:

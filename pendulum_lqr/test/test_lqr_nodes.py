@@ -99,7 +99,7 @@ def ros(*parameters: str) -> list[str]:
 def test_a_design_while_running_makes_no_plant_wait(plant, processes):
     # Its planner takes half a second to make.
     told = ("controller:=nmpc", "period:=0.01", "realtime_priority:=7")
-    program = processes.start("pendulum_lqr", "controller", *ros(*told))
+    program = processes.start("pendulum_lqr", "controller", *ros(*told), alone=True)
     program.wait_for_output("ready", 60)
     assert os.sched_getscheduler(program.pid) == os.SCHED_FIFO
     seen: set[int] = set()
@@ -121,7 +121,7 @@ def test_a_design_while_running_makes_no_plant_wait(plant, processes):
 
 
 def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(plant, processes):
-    program = processes.start("pendulum_lqr", "controller", *ros(PATIENT))
+    program = processes.start("pendulum_lqr", "controller", *ros(PATIENT), alone=True)
     program.wait_for_output(r"lqr for plant thesis: K = \[33\.345265, 0\.158993\]", 30)
     plant.until(lambda: plant.publish() and plant.commands, "the first answer")
     plant.spin(0.5)

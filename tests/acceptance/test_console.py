@@ -93,7 +93,7 @@ def address(processes: ProcessGroup, domain_id: int, tmp_path: Path) -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    console = processes.start("pendulum_bags", "console", "--port", port, "--runs", tmp_path / "runs")
+    console = processes.start("pendulum_bags", "console", "--port", port, "--runs", tmp_path / "runs", alone=True)
     console.wait_for_output(r"console at http://localhost", 60)
     return f"http://localhost:{port}/"
 

@@ -129,7 +129,7 @@ def test_both_plants_got_the_same_noise(run_folder: Path) -> None:
 
 
 def test_ctrl_c_while_programs_start_leaves_no_process(processes: ProcessGroup, domain_id: int, tmp_path: Path) -> None:
-    program = processes.start("pendulum_bags", "experiment", "thesis", "--out", tmp_path / "run")
+    program = processes.start("pendulum_bags", "experiment", "thesis", "--out", tmp_path / "run", alone=True)
     program.wait_for_output("starting", 60)
     program.interrupt()
     assert program.wait(30) == 130
@@ -141,7 +141,7 @@ def test_a_run_whose_bridge_stood_still_is_measured_again_and_ctrl_c_leaves_read
     processes: ProcessGroup, domain_id: int, tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
-    program = processes.start("pendulum_bags", "experiment", "thesis", "--out", folder)
+    program = processes.start("pendulum_bags", "experiment", "thesis", "--out", folder, alone=True)
     program.wait_for_output("ramp up", 120)
     (bridge,) = [
         child

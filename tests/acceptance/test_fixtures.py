@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -65,6 +66,22 @@ def test_a_program_is_watched_through_its_output(processes: ProcessGroup) -> Non
     assert program.wait(10.0) == -signal.SIGTERM
     with pytest.raises(AssertionError, match=r"sleeper ended with code -15 without printing 'never'"):
         program.wait_for_output("never", 1.0)
+
+
+def test_programs_follow_each_other_in_one_process_unless_they_are_to_be_alone(processes: ProcessGroup) -> None:
+    def started(executable: str, **how: Any) -> tuple[int, str]:
+        program = processes.start("pendulum_bags", executable, "--help", **how)
+        assert program.wait(60.0) == 0, program.output
+        return program.pid, program.output
+
+    (one, told), (again, told_again) = started("info"), started("info")
+    assert one == again
+    assert told == told_again != ""
+    others = [started("info", alone=True), started("info", env={"SEEN": "1"}), started("info", cwd=processes.folder)]
+    assert len({one, *(pid for pid, _ in others)}) == 4
+    assert {output for _, output in others} == {told}
+    refused = processes.start("pendulum_bags", "info", "nothing/there")
+    assert (refused.pid, refused.wait(60.0)) == (one, 2)
 
 
 def test_a_program_that_ignores_the_interrupt_is_killed_and_told(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ class Lab(GraphPeer):
         arguments = ["-p", "backend:=emulator_process", "-p", f"emulator_address:='{self.address}'"]
         for parameter in parameters:
             arguments += ["-p", parameter]
-        return self.processes.start("pendulum_hw_bridge", "bridge", "--ros-args", *arguments)
+        return self.processes.start("pendulum_hw_bridge", "bridge", "--ros-args", *arguments, alone=True)
 
     def driving(self, *parameters: str) -> RunningProgram:
         """Return a bridge that is armed and regulates, with the watchdogs that it has by itself."""
@@ -202,6 +202,7 @@ def test_a_missing_actuator_is_one_sentence_and_exit_code_2(processes: ProcessGr
         "pendulum_hw_bridge",
         "bridge",
         *("--ros-args", "-p", "backend:=emulator_process", "-p", "emulator_address:='127.0.0.1:9'"),
+        alone=True,
     )
     assert program.wait(60.0) == 2
     assert "does not answer; start it with: python -m pendulum_hw_bridge emulator" in program.output

@@ -31,7 +31,7 @@ def peer(domain_id: int) -> Iterator[PlantPeer]:
 
 def experiment(processes: ProcessGroup, domain: int, out: Path, *arguments: str | Path) -> RunningProgram:
     told = ("thesis", "--out", out, "--domain", str(domain), "--duration", "1", "--budget", "0", *arguments)
-    return processes.start("pendulum_bags", "experiment", *told)
+    return processes.start("pendulum_bags", "experiment", *told, alone=True)
 
 
 def test_an_adopted_plant_is_compared_with_a_model_file_and_goes_on_running(

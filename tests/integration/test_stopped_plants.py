@@ -45,7 +45,7 @@ def begin(processes: ProcessGroup, domain: int, peer: PlantPeer, folder: Path) -
     write_plant(plant, load_plant("thesis"))
     run = processes.start(
         "pendulum_bags", "experiment", "thesis", "--out", folder / "run", "--domain", str(domain), "--duration", "1",
-        "--budget", "0", "--simulation", "ros:/lab", "--plant", plant, "--hardware", model, "--yes",
+        "--budget", "0", "--simulation", "ros:/lab", "--plant", plant, "--hardware", model, "--yes", alone=True,
     )  # fmt: skip
     peer.until(lambda: run.returncode is not None or peer.states[-1].position[0] > 0.3, "the way up")
     assert run.returncode is None, run.output
@@ -121,6 +121,7 @@ def test_a_plant_of_several_joints_is_refused_before_anything_of_it_is_asked(
         "--hardware",
         "ros:/lab",
         "--yes",
+        alone=True,
     )
     assert run.wait(60.0) == 2
     assert "error: /lab has the joints shoulder, elbow; expected the one of a pendulum, pendulum_joint\n" in run.output
