@@ -76,3 +76,18 @@ def test_a_program_that_stands_still_is_let_go_on_to_end_by_itself(tmp_path: Pat
         wait_for(lambda: child.log.read_text() != "", 20.0, "the program to print")
         child.process.send_signal(signal.SIGSTOP)
         assert processes.finish(child, 20.0) == 3
+
+
+def test_programs_end_but_those_that_are_to_go_on(tmp_path: Path) -> None:
+    program = "import time; print('up', flush=True); time.sleep(60)"
+    with ProcessSet(tmp_path, {}) as processes:
+        first, kept, recorder = (
+            processes.start(name, [sys.executable, "-c", program], ends_last=name == "recorder")
+            for name in ("plant", "repeat_1", "recorder")
+        )
+        wait_for(lambda: kept.log.read_text() != "", 20.0, "the program to print")
+        processes.stop(keep=[kept])
+        assert [child.process.poll() is None for child in (first, kept, recorder)] == [False, True, False]
+        # Those that were ended have not died.
+        processes.check()
+    assert kept.process.poll() is not None

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -184,15 +184,19 @@ class ProcessSet:
                 child.process.wait(0.1)
         self.check()
 
-    def stop(self) -> None:
-        """End all programs, recorders last: plants say a last zero torque that should be on record."""
+    def stop(self, keep: Collection[Child] = ()) -> None:
+        """End all programs, recorders last: plants say a last zero torque that should be on record.
+
+        Args:
+            keep: Those that go on.
+        """
         for wave in (False, True):
-            children = [child for child in self.children if child.ends_last is wave]
+            children = [child for child in self.children if child.ends_last is wave and child not in keep]
             for child in children:
                 self._interrupt(child)
             for child in children:
                 self._wait(child, _PATIENCE)
-        self.children.clear()
+        self.children = [child for child in self.children if child in keep]
 
     @staticmethod
     def _interrupt(child: Child) -> None:

@@ -69,6 +69,10 @@ def run_thesis(
         # Before anything is waited for: what is said from here on is no part of the experiment.
         for recorder in recorders:
             session.close(recorder)
+        for plant in plants:
+            session.leaves(plant)
+        # Nothing else computes beside what is still to be simulated.
+        session.processes.stop(keep=beside)
         for child in beside:
             # It has limits of its own and ends by itself; on a busy machine it takes minutes.
             longest = longest_run(max(SHORTEST, settings.noise.duration))
