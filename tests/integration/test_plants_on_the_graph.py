@@ -44,7 +44,9 @@ def test_an_adopted_plant_is_compared_with_a_model_file_and_goes_on_running(
     peer.leave_the_command()
     out = tmp_path / "run"
 
-    run = experiment(processes, domain_id, out, "--simulation", model, "--hardware", "ros:/lab", "--yes")
+    # As fast as the model's 13 N m turn it against its friction.
+    faster = ("--ramp-speed", "0.6")
+    run = experiment(processes, domain_id, out, "--simulation", model, "--hardware", "ros:/lab", "--yes", *faster)
 
     assert run.wait(150.0) == 0, run.output
     asked = "This moves what runs already in /lab on ROS domain"
@@ -57,6 +59,9 @@ def test_an_adopted_plant_is_compared_with_a_model_file_and_goes_on_running(
         assert bag.metadata["pendulum.run"]["plant"] == "ros:/lab"
         assert "stand_in" not in bag.metadata["pendulum.run"]
         assert bag["/lab/joint_states"]["position"].max() == pytest.approx(math.pi, abs=0.1)
+        assert bag.metadata["pendulum.run"]["ramp_speed"] == 0.6
+        up, down = (stored.message.points[-1].time_from_start for stored in bag.messages("/lab/joint_trajectory"))
+        assert [up.sec, down.sec] == [5, 5]
     peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the end")
     assert (robot.returncode, adopter.returncode) == (None, None)
     assert peer.states[-1].position[0] == pytest.approx(0.0, abs=0.1)

@@ -11,6 +11,8 @@ from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_parameters
 from pendulum_lqr.policy_file import write_policy
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -52,6 +54,21 @@ def test_a_plant_with_motor_and_spring_is_not_stepped_by_the_thesis_s_integrator
     assert RegulationSettings().method == RunSpec().method == "euler"
     for settings in (RegulationSettings(plant="x5_9"), RunSpec(plant="x5_9")):
         assert make_plant(load_plant("x5_9"), 0.002, method=settings.method).state.theta == 0.0
+
+
+def test_ramps_are_the_thesis_s_unless_told_and_told_slower_or_faster_in_all_that_they_are() -> None:
+    usual = RegulationSettings()
+    assert usual.ramp(0.1, UPRIGHT) == thesis_ramp(0.1, UPRIGHT)
+    assert usual.expected_wall_time == 47.0 + 5.0
+    for speed in (0.05, 0.6, 1.0):
+        told = RegulationSettings(ramp_speed=speed)
+        ramp = told.ramp(0.0, UPRIGHT)
+        assert ramp.duration == pytest.approx(UPRIGHT / speed, abs=0.01) == pytest.approx(told.ramp_time, abs=0.01)
+        assert max(point.velocity for point in ramp.points) == pytest.approx(1.5 * speed, rel=1e-3)
+        assert told.expected_wall_time == pytest.approx(52.0 - 10.0 * math.pi + 2.0 * told.ramp_time)
+    for speed in (0.0, 0.049, 1.01, math.nan):
+        with pytest.raises(ParameterError, match=r"ramp speed is .* rad/s; expected 0.05 to 1"):
+            RegulationSettings(ramp_speed=speed)
 
 
 @pytest.mark.parametrize("value", [math.nan, [-1.0, math.inf]])

@@ -25,8 +25,8 @@ from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.experiments.settings import (
     HARDWARE,
+    RAMP_SPEED,
     SETTLE_TIME,
-    TIME_BESIDE_NOISE,
     NoiseSettings,
     RegulationSettings,
 )
@@ -87,7 +87,7 @@ _OF_SEVERAL_JOINTS = {"duration", "amplitude", "hold_time"}
 """Options of ``thesis`` whose defaults are others for several joints."""
 _OF_ONE_JOINT = {
     *("simulation", "mapping", "hardware", "hardware_mapping", "lab", "yes", "domain"),
-    *("strategy", "controller", "q", "r", "budget"),
+    *("strategy", "controller", "q", "r", "ramp_speed", "budget"),
 }
 """Options of ``thesis`` that plants of several joints do not have."""
 
@@ -128,6 +128,13 @@ def thesis(
     amplitude: Amplitude = 2.5,
     hold_time: HoldTime = 0.01,
     duration: Duration = 5.0,
+    ramp_speed: Annotated[
+        float,
+        typer.Option(
+            help="Mean speed of the ramps up and down, 0.05 to 1; the largest is half as much again. Less than the "
+            "thesis's 0.2 for a machine that may not turn so fast, more where the torque suffices [rad/s]."
+        ),
+    ] = RAMP_SPEED,
     controller: Controller = "lqr",
     q: Q = (100.0, 0.01),
     r: R = 0.1,
@@ -187,6 +194,7 @@ def thesis(
         noise=NoiseSettings(seed, amplitude, hold_time, duration),
         storage=storage,
         lab=str(lab or ""),
+        ramp_speed=ramp_speed,
     )
     margins = Margins.of(margins_file, margin)
     domain = check_domain(domain)
@@ -201,7 +209,7 @@ def thesis(
             equation = foreign.write_equation(folder)
             settings = settings if plant else replace(settings, plant=str(equation))
         started = time.monotonic()
-        with PhaseProgress(TIME_BESIDE_NOISE + duration, console) as progress:
+        with PhaseProgress(settings.expected_wall_time, console) as progress:
             run_undisturbed(
                 partial(
                     run_thesis,
@@ -328,8 +336,9 @@ def _running(settings: RegulationSettings, domain: int | None, plant: str | None
 def _plan(settings: RegulationSettings) -> str:
     noise = settings.noise
     return (
-        f"It arms, turns the pendulum upright in about 15 s, balances it for {SETTLE_TIME + noise.duration:g} s under "
-        f"noise of up to {noise.amplitude:g} N m, turns it down again in about 15 s, and disarms."
+        f"It arms, turns the pendulum upright in about {settings.ramp_time:.0f} s, balances it for "
+        f"{SETTLE_TIME + noise.duration:g} s under noise of up to {noise.amplitude:g} N m, turns it down again in "
+        f"about {settings.ramp_time:.0f} s, and disarms."
     )
 
 

@@ -16,13 +16,29 @@ from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_lqr.controller import controller_parameters
 from pendulum_lqr.policy_file import POLICY_SUFFIX, load_policy, policy_record
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.trajectory import (
+    MAX_RAMP_VELOCITY,
+    RAMP_INCREMENT,
+    RAMP_PERIOD,
+    Trajectory,
+    thesis_ramp,
+)
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import require_one_joint
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_sim.engines import GYMNASIUM_PREFIX
 
-__all__ = ["HARDWARE", "SETTLE_TIME", "TIME_BESIDE_NOISE", "NoiseSettings", "RegulationSettings"]
+__all__ = [
+    "HARDWARE",
+    "RAMP_SPEED",
+    "RAMP_SPEEDS",
+    "SETTLE_TIME",
+    "TIME_BESIDE_NOISE",
+    "NoiseSettings",
+    "RegulationSettings",
+]
 
 HARDWARE = ("emulator", "hebi")
 _MODEL_FILES = (".xml", ".mjcf", ".urdf")
@@ -31,6 +47,11 @@ SETTLE_TIME = 1.0
 """Time under control before the noise starts [s]."""
 TIME_BESIDE_NOISE = 47.0
 """Wall time of the thesis's experiment without its noise, measured on two cores; 31 s are the ramps [s]."""
+RAMP_SPEED = RAMP_INCREMENT / RAMP_PERIOD
+"""Mean speed of the thesis's ramp [rad/s]."""
+RAMP_SPEEDS = (0.05, 1.0)
+"""Slowest and fastest ramps: as many points as a plant takes, and the most that a bridge with its usual limit of
+1.5 rad/s follows [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +104,7 @@ class RegulationSettings:
             ``ros:/namespace`` for one that runs already; empty for ours.
         mapping: Its mapping file; empty for none.
         hardware_mapping: Mapping file of a simulation in the hardware's place; empty for none.
+        ramp_speed: Mean speed of the ramps up and down; the largest is half as much again [rad/s].
     """
 
     plant: str = "thesis"
@@ -98,6 +120,7 @@ class RegulationSettings:
     simulation: str = ""
     mapping: str = ""
     hardware_mapping: str = ""
+    ramp_speed: float = RAMP_SPEED
 
     def __post_init__(self) -> None:
         """Refuse unknown plants and backends, and a policy that cannot be read, before anything is started."""
@@ -114,6 +137,9 @@ class RegulationSettings:
                 f"({', '.join(_MODEL_FILES)}), gymnasium:ID or ros:/NAMESPACE"
             )
         real_machine(self.hardware, self.lab)
+        slowest, fastest = RAMP_SPEEDS
+        if not slowest <= self.ramp_speed <= fastest:
+            raise ParameterError(f"ramp speed is {self.ramp_speed} rad/s; expected {slowest:g} to {fastest:g}")
         for side, mapping, option in (("sim", self.mapping, "simulation"), ("hw", self.hardware_mapping, "hardware")):
             if (foreign := self.foreign_of(side)) is not None:
                 foreign.check(self.noise.hold_time)
@@ -179,6 +205,21 @@ class RegulationSettings:
     def is_emulated(self) -> bool:
         """Whether nothing real can move: the hardware is emulated or simulated, and the experiment starts both."""
         return self.can_repeat or (self.plant_name("hw") == "emulator" and self.running("sim") is None)
+
+    @property
+    def ramp_time(self) -> float:
+        """Time of a ramp between hanging and upright [s]."""
+        return UPRIGHT / self.ramp_speed
+
+    @property
+    def expected_wall_time(self) -> float:
+        """Wall time of the thesis's experiment, measured on two cores [s]."""
+        return TIME_BESIDE_NOISE + self.noise.duration + 2.0 * (self.ramp_time - UPRIGHT / RAMP_SPEED)
+
+    def ramp(self, start: float, goal: float) -> Trajectory:
+        """Return the thesis's ramp between two positions [rad], as fast as these settings say."""
+        faster = self.ramp_speed / RAMP_SPEED
+        return thesis_ramp(start, goal, increment=RAMP_INCREMENT * faster, max_velocity=MAX_RAMP_VELOCITY * faster)
 
     @property
     def machine(self) -> RealMachine | None:

@@ -27,7 +27,6 @@ from pendulum_bags.experiments.settings import SETTLE_TIME, RegulationSettings
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.names import Event
-from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError
 
 __all__ = ["run_thesis"]
@@ -91,7 +90,9 @@ def _start(
     recorders = []
     for side in SIDES:
         namespace, plant = settings.namespace(side), settings.plant_name(side)
-        metadata = settings.metadata("thesis", side=side, plant=plant, namespace=namespace)
+        metadata = settings.metadata(
+            "thesis", side=side, plant=plant, namespace=namespace, ramp_speed=settings.ramp_speed
+        )
         recorders.append(session.record(folder / side, namespace, metadata, settings.storage))
     programs = {side: settings.plant_program(side, folder / "hw") for side in SIDES}
     others = [
@@ -132,7 +133,7 @@ def _regulate(
 
     # The ramp leaves the machine idle: the thesis's own simulation runs meanwhile, in a domain of its own.
     beside = [_start_own_protocol(processes, folder, settings)] if settings.running("sim") is None else []
-    _wait_for_goal(conductor, plants, _start_move(conductor, plants, UPRIGHT, "ramp_up", progress))
+    _wait_for_goal(conductor, plants, _start_move(conductor, plants, settings, UPRIGHT, "ramp_up", progress))
 
     progress.phase("regulation", SETTLE_TIME)
     for plant in plants:
@@ -150,7 +151,7 @@ def _regulate(
             noise.duration + 15.0,
         )
 
-    durations = _start_move(conductor, plants, 0.0, "ramp_down", progress)
+    durations = _start_move(conductor, plants, settings, 0.0, "ramp_down", progress)
     if repeat:
         # Idle again: the emulated hardware gets new noise, in case that this run alone does not decide.
         command = repeat_settings(settings, 1).lockstep_command(repeat_folder(folder, 1) / "hw", side="hw")
@@ -187,13 +188,18 @@ def _start_beside(processes: ProcessSet, name: str, command: list[str]) -> Child
 
 
 def _start_move(
-    conductor: Conductor, plants: Sequence[PlantClient], goal: float, phase: str, progress: PhaseProgress
+    conductor: Conductor,
+    plants: Sequence[PlantClient],
+    settings: RegulationSettings,
+    goal: float,
+    phase: str,
+    progress: PhaseProgress,
 ) -> list[float]:
-    """Start the thesis's ramp on all plants at once; return how long each takes [s]."""
+    """Start the ramp on all plants at once; return how long each takes [s]."""
     ramps = []
     for plant in plants:
         assert plant.sample is not None
-        ramps.append(thesis_ramp(plant.sample.position[0], goal))
+        ramps.append(settings.ramp(plant.sample.position[0], goal))
     progress.phase(phase.replace("_", " "), max(ramp.duration for ramp in ramps))
     for plant, ramp in zip(plants, ramps, strict=True):
         plant.follow(ramp, phase, goal=goal)
