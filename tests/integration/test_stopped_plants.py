@@ -10,8 +10,14 @@ from pathlib import Path
 
 import pytest
 
+from pendulum_bags.experiments.graph_plant import join
+from pendulum_bags.experiments.session import conduct
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.trajectory import thesis_ramp
+from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_sim.model_files import mjcf
+from tests.fixtures import PROJECT, own_domain, wait_for
 from tests.integration.adopting import adopt, start_robot
 from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
@@ -19,89 +25,127 @@ from tests.processes import ProcessGroup, RunningProgram
 pytest.importorskip("mujoco")
 
 
-@pytest.fixture
-def peer(domain_id: int) -> Iterator[PlantPeer]:
-    with closing(PlantPeer("/lab")) as peer:
-        yield peer
+class Laboratory:
+    """A robot of others, the adopter before it, and somebody who watches them.
+
+    Args:
+        processes: Their processes.
+        domain: Their ROS domain.
+        peer: Who watches; commands nothing.
+    """
+
+    def __init__(self, processes: ProcessGroup, domain: int, peer: PlantPeer) -> None:
+        self.domain, self.peer = domain, peer
+        self._processes = processes
+        self.robot = start_robot(processes)
+        self.adopter = adopt(processes, "/lab")
+        self._wait()
+        peer.leave_the_command()
+
+    def bring_back(self) -> None:
+        """Start again what has died, and take an e-stop back."""
+        if self.robot.returncode is not None:
+            self.robot = start_robot(self._processes, "robot again")
+        if self.adopter.returncode is not None:
+            self.adopter = adopt(self._processes, "/lab")
+        self._wait()
+        if self.peer.diagnostics["mode"] == "e_stop":
+            assert self.peer.ask("e_stop_reset").success
+
+    def _wait(self) -> None:
+        self.peer.states.clear()
+        self.peer.diagnostics.clear()
+        self.peer.until(lambda: self.peer.states and self.peer.diagnostics.get("mode"), "the adopted plant")
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Laboratory]:
+    folder = tmp_path_factory.mktemp("lab")
+    processes = ProcessGroup(folder, cwd=PROJECT)
+    with own_domain(folder) as domain, closing(PlantPeer("/lab")) as peer:
+        try:
+            yield Laboratory(processes, domain, peer)
+        finally:
+            assert processes.close() == []
 
 
 @pytest.fixture
-def robot(processes: ProcessGroup, peer: PlantPeer) -> RunningProgram:
-    return start_robot(processes)
+def lab(running: Laboratory) -> Laboratory:
+    running.bring_back()
+    return running
 
 
-@pytest.fixture
-def adopter(processes: ProcessGroup, peer: PlantPeer, robot: RunningProgram) -> RunningProgram:
-    program = adopt(processes, "/lab")
-    peer.until(lambda: peer.states and peer.diagnostics.get("mode"), "the adopted plant")
-    peer.leave_the_command()
-    return program
-
-
-def begin(processes: ProcessGroup, domain: int, peer: PlantPeer, folder: Path) -> RunningProgram:
+def begin(processes: ProcessGroup, lab: Laboratory, folder: Path) -> RunningProgram:
     """Start an experiment with the adopted plant as the simulation, and wait until it is on its way up."""
     model, plant = folder / "model.xml", folder / "plant.yaml"
     model.write_text(mjcf(load_plant("thesis")), encoding="utf-8")
     write_plant(plant, load_plant("thesis"))
+    before = lab.peer.states[-1].position[0]
     run = processes.start(
-        "pendulum_bags", "experiment", "thesis", "--out", folder / "run", "--domain", str(domain), "--duration", "1",
-        "--budget", "0", "--simulation", "ros:/lab", "--plant", plant, "--hardware", model, "--yes", alone=True,
+        "pendulum_bags", "experiment", "thesis", "--out", folder / "run", "--domain", str(lab.domain),
+        "--duration", "1", "--budget", "0", "--simulation", "ros:/lab", "--plant", plant, "--hardware", model, "--yes",
+        alone=True,
     )  # fmt: skip
-    peer.until(lambda: run.returncode is not None or peer.states[-1].position[0] > 0.3, "the way up")
+    lab.peer.until(lambda: run.returncode is not None or lab.peer.states[-1].position[0] > before + 0.1, "the way up")
     assert run.returncode is None, run.output
     return run
 
 
-@pytest.mark.timeout(200)
-@pytest.mark.parametrize("how", ["e-stop", "robot killed", "adopter killed"])
-def test_it_ends_at_once_with_the_plant_and_the_reason(
-    how: str,
-    processes: ProcessGroup,
-    domain_id: int,
-    peer: PlantPeer,
-    robot: RunningProgram,
-    adopter: RunningProgram,
-    tmp_path: Path,
+def test_an_experiment_ends_at_once_with_the_plant_and_the_reason(
+    processes: ProcessGroup, lab: Laboratory, tmp_path: Path
 ) -> None:
-    run = begin(processes, domain_id, peer, tmp_path)
-    if how == "e-stop":
-        assert peer.ask("e_stop").success
-    else:
-        (robot if how == "robot killed" else adopter).send_signal(signal.SIGKILL)
+    run = begin(processes, lab, tmp_path)
+    assert lab.peer.ask("e_stop").success
     assert run.wait(60.0) == 2
     (told,) = [line for line in run.output.splitlines() if line.startswith("error: ")]
-    assert re.search(
-        {
-            "e-stop": r"^error: /lab went to e_stop: e-stop pressed$",
-            "robot killed": r"^error: /lab went to fault: measurement is \d+ ms old; expected at most 500 ms",
-            "adopter killed": r"^error: /lab has sent no state for 5 s: .* cut the motor's supply",
-        }[how],
-        told,
-    )
+    assert told == "error: /lab went to e_stop: e-stop pressed"
     # What was not stopped goes on, and the stop stays until somebody takes it back.
-    assert (robot.returncode is None) is (how != "robot killed")
-    assert (adopter.returncode is None) is (how != "adopter killed")
-    if how == "e-stop":
-        peer.spin(0.5)
-        assert peer.diagnostics["mode"] == "e_stop"
-        assert not peer.arm().success
+    assert (lab.robot.returncode, lab.adopter.returncode) == (None, None)
+    lab.peer.spin(0.5)
+    assert lab.peer.diagnostics["mode"] == "e_stop"
+    assert not lab.peer.arm().success
 
 
 def test_ctrl_c_disarms_a_plant_that_somebody_else_started(
-    processes: ProcessGroup,
-    domain_id: int,
-    peer: PlantPeer,
-    robot: RunningProgram,
-    adopter: RunningProgram,
-    tmp_path: Path,
+    processes: ProcessGroup, lab: Laboratory, tmp_path: Path
 ) -> None:
-    run = begin(processes, domain_id, peer, tmp_path)
+    said = len(lab.adopter.output)
+    run = begin(processes, lab, tmp_path)
     run.interrupt()
     assert run.wait(60.0) == 130
     # It was on its way up by itself: without a word it would go on to upright.
-    adopter.wait_for_output(r"armed_position: following a trajectory\n(?s:.*)\bdisarmed\b", 10.0)
-    assert robot.returncode is None
-    assert adopter.returncode is None
+    moved = r"armed_position: following a trajectory\n(?s:.*)\bdisarmed\b"
+    wait_for(lambda: re.search(moved, lab.adopter.output[said:]), 10.0, "the adopted plant to be disarmed")
+    assert lab.robot.returncode is None
+    assert lab.adopter.returncode is None
+
+
+@pytest.mark.parametrize(
+    ("dies", "told"),
+    [
+        ("robot", r"^/lab went to fault: measurement is \d+ ms old; expected at most 500 ms"),
+        ("adopter", r"^/lab has sent no state for 5 s: .* cut the motor's supply"),
+    ],
+    ids=["robot", "adopter"],
+)
+def test_a_session_ends_at_once_with_the_plant_that_dies_on_its_way_up_and_the_reason(
+    dies: str, told: str, lab: Laboratory, tmp_path: Path
+) -> None:
+    def move() -> None:
+        with conduct(tmp_path / "logs", lab.domain) as session:
+            plant = join(session.conductor, "/lab")
+            session.drives(plant)
+            plant.arm()
+            assert plant.sample is not None
+            plant.follow(thesis_ramp(plant.sample.position[0], UPRIGHT), "ramp_up")
+            session.conductor.wait_for("the plant to follow", plant.is_following, 5.0)
+            (lab.robot if dies == "robot" else lab.adopter).send_signal(signal.SIGKILL)
+            session.conductor.wait_for("the end of the move", plant.trajectory_finished, 20.0)
+
+    with pytest.raises(FaultError, match=told):
+        move()
+    assert (lab.robot.returncode is None) is (dies != "robot")
+    assert (lab.adopter.returncode is None) is (dies != "adopter")
 
 
 def test_a_plant_of_several_joints_is_refused_before_anything_of_it_is_asked(
