@@ -229,6 +229,9 @@ def start_in_order(system: LiveSystem, order: tuple[str, ...], *, one_by_one: bo
     outcome.demand(not early, f"{len(early)} torques before there was a controller")
     # A recorder may meet the controller later than the plant does: before, it has only half of what is judged.
     system.wait_for("torque and commands to be recorded", partial(_has_torque_and_commands, system), START_TIMEOUT)
+    # A viewer comes last, whoever starts last: it goes behind all others, and one that is ended before says so.
+    for name in order:
+        system.wait_for(f"{name} to be on the graph", partial(system.is_on_graph, name), START_TIMEOUT)
     died = set(order) - set(system.alive())
     outcome.demand(not died, f"{', '.join(sorted(died))} died")
     for record in check_bag(system.bag, limit=EFFORT_LIMIT, allowance=MACHINE_PATIENCE):

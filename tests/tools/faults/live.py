@@ -355,7 +355,8 @@ class LiveSystem:
                 refusal = self.arm()
                 if any(each in refusal for each in _FALLEN):
                     self._begin_upright()
-            self.listen(0.5)
+            # Who has just been armed is given time to drive before it is armed anew.
+            self.listen(0.5 if asleep else 0.1)
 
     def _begin_upright(self) -> None:
         """Put the pendulum upright where it has fallen so far that the controller asks for much, or left its window."""
