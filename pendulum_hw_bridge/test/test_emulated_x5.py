@@ -1,8 +1,10 @@
 """The emulated X5-9 against closed forms, its datasheet, and itself interpreted instead of compiled."""
 
 import math
+import sys
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +12,13 @@ import pytest
 from pendulum_hw_bridge.actuator import Command, CommandLock, HardwareLimits, Strategy, TemperatureState
 from pendulum_hw_bridge.emulation import kernel
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
-from pendulum_hw_bridge.emulation.firmware import gain_rows, new_loop_memory
+from pendulum_hw_bridge.emulation.firmware import gain_rows
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters, load_emulator
 from pendulum_hw_bridge.emulation.thermal import ThermalParameters
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.gains import DEFAULT_GAINS
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.loops.machine_code import NoMachineCodeError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 SECOND = 1_000_000_000
@@ -90,24 +93,45 @@ def test_static_effort_differs_between_loading_and_unloading_by_the_hysteresis()
     assert unloading - loading == pytest.approx(2.0 * quiet.drivetrain.hysteresis_torque, rel=0.1)
 
 
+def _after_400_steps(strategy: Strategy) -> bytes:
+    """Return the whole memory of an actuator that a strategy has driven for a while."""
+    actuator = kernel.Actuator()
+    actuator.state[5:8] = 22.0
+    actuator.state[2] = 0.3
+    actuator.constants[:] = load_emulator("x5_9").constants(HardwareLimits(effort=0.35), 36.0, enabled=True)
+    actuator.gains[:] = gain_rows(DEFAULT_GAINS[max(1, int(strategy))])
+    actuator.setpoints[:] = (math.nan, math.nan, 0.2) if strategy is Strategy.DIRECT_PWM else (0.5, 0.1, 0.4)
+    actuator.advance(int(strategy), 0.7, 0, 400)
+    # Beyond the torque clamp as well: who reads it later finds what was asked for.
+    assert actuator.setpoints[2] in {0.2, 0.4}
+    return actuator.state.tobytes() + actuator.memory.tobytes()
+
+
 @pytest.mark.parametrize("strategy", list(Strategy))
-def test_compiled_and_interpreted_steps_are_the_same(strategy: Strategy) -> None:
-    if not hasattr(kernel.advance, "py_func"):
-        pytest.skip("numba is not installed: there is only the interpreted one")
-    parameters = load_emulator("x5_9")
-    states = []
-    for step in (kernel.advance, kernel.advance.py_func):
-        state = np.zeros(len(kernel.STATES))
-        state[5:8] = 22.0
-        state[2] = 0.3
-        constants = parameters.constants(HardwareLimits(), 36.0, enabled=True)
-        setpoints = (
-            np.array([math.nan, math.nan, 0.2]) if strategy is Strategy.DIRECT_PWM else np.array([0.5, 0.1, 0.4])
-        )
-        gains = DEFAULT_GAINS[max(1, int(strategy))]
-        step(state, constants, gain_rows(gains), new_loop_memory(), setpoints, int(strategy), 0.7, 0, 400)
-        states.append(state)
-    np.testing.assert_allclose(states[0], states[1], rtol=1e-12, atol=1e-15)
+def test_compiled_and_interpreted_steps_are_the_same(strategy: Strategy, monkeypatch: pytest.MonkeyPatch) -> None:
+    if kernel._machine_code() is None:
+        pytest.skip("there is no machine code here: there is only the interpreted one")
+    compiled = _after_400_steps(strategy)
+    monkeypatch.setattr(kernel, "_machine_code", lambda: None)
+    monkeypatch.setattr(kernel, "_elsewhere", lambda: kernel.advance)
+    assert _after_400_steps(strategy) == compiled
+
+
+def test_where_no_loop_can_be_loaded_numba_compiles_the_same_function_and_without_it_python_runs_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As on a Raspberry Pi."""
+    pytest.importorskip("numba")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise NoMachineCodeError("another processor")
+
+    monkeypatch.setattr(kernel, "load_loop", refuse)
+    assert kernel._machine_code.__wrapped__() is None
+    found: Any = kernel._elsewhere.__wrapped__()
+    assert (found is kernel.advance, found.py_func.__code__) == (False, kernel.advance.__code__)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    assert kernel._elsewhere.__wrapped__() is kernel.advance
 
 
 @pytest.mark.parametrize("stiffness", [40.0, 100.0, 1000.0])

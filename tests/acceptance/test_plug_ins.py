@@ -217,8 +217,8 @@ def with_drag():
         state = np.zeros(len(STATES))
         state[STATES.index("velocity")] = 2.0
         constants = EmulatorParameters(own).constants(HardwareLimits(effort=13.0), 36.0, True)
-        # Interpreted: its own functions are compiled, the loop around them would take seconds.
-        advance.py_func(state, constants, np.zeros((3, 14)), np.zeros((3, 5)), np.full(3, np.nan), 1, 0.0, 1, 1)
+        # Interpreted: the machine code, which is made of this, would take seconds.
+        advance(state, constants, np.zeros((3, 14)), np.zeros((3, 5)), np.full(3, np.nan), 1, 0.0, 1, 1)
         steps.append([elastic, state[STATES.index("velocity")]])
     model = from_plant(plant)
     slopes = np.zeros(len(PARAMETER_NAMES))

@@ -1,6 +1,6 @@
 """The X5-9's firmware: PID loops and control strategies 0 to 4, one cycle of 1 ms at a time.
 
-Plain scalar code on arrays of floats, compiled by numba where it is there. Gains are rows of 14 numbers in the order
+Plain scalar code on arrays of floats, which :mod:`.kernel` has compiled. Gains are rows of 14 numbers in the order
 of :data:`pendulum_hw_bridge.gains.GAIN_FIELDS`; the memory of a loop is a row of 5.
 
 Source: HEBI documentation, "Control strategies" and "Gains".
@@ -9,22 +9,11 @@ Source: HEBI documentation, "Control strategies" and "Gains".
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS, GainSet
-
-try:
-    from numba import njit
-except ImportError:  # the emulator then runs interpreted, some twenty times slower but the same
-
-    def njit(*_: Any, **__: Any) -> Callable[[Any], Any]:
-        """Leave a function as it is."""
-        return lambda function: function
-
 
 __all__ = [
     "CONTROL_PERIOD",
@@ -35,7 +24,6 @@ __all__ = [
     "control_pwm",
     "gain_rows",
     "new_loop_memory",
-    "njit",
     "pid_step",
 ]
 
@@ -60,7 +48,6 @@ def new_loop_memory() -> Array:
     return np.zeros((3, 5))
 
 
-@njit(cache=True)
 def pid_step(
     gains: Array,
     memory: Array,
@@ -118,7 +105,6 @@ def pid_step(
     return output
 
 
-@njit(cache=True)
 def control_pwm(
     strategy: int,
     gains: Array,

@@ -7,23 +7,28 @@ Euler: velocities first, then positions with the new velocities; dry friction im
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
 
 import pendulum_msgs_py.dynamics.rigid as _rigid
 import pendulum_msgs_py.dynamics.series_elastic as _sea
-from pendulum_hw_bridge.emulation import firmware as _firmware
 from pendulum_hw_bridge.emulation import thermal as _thermal
-from pendulum_hw_bridge.emulation.firmware import Array, control_pwm, njit
-from pendulum_msgs_py.plants import friction_terms as _terms
-from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS
-from pendulum_msgs_py.programs.kept_kernels import drop_stale_code
+from pendulum_hw_bridge.emulation.firmware import CONTROL_PERIOD, Array, control_pwm
+from pendulum_msgs_py.loops.machine_code import Loop, NoMachineCodeError, load_loop
+from pendulum_msgs_py.loops.records import structure_of
+from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_friction
+from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 
-__all__ = ["CONSTANTS", "STATES", "STEP", "STEPS_PER_CYCLE", "STEP_NS", "advance"]
+__all__ = ["CONSTANTS", "LAYOUT", "STATES", "STEP", "STEPS_PER_CYCLE", "STEP_NS", "Actuator", "advance"]
 
 STEP = 2.5e-4
 """Integration step [s]."""
 STEP_NS = 250_000
 """Integration step [ns]."""
-STEPS_PER_CYCLE = round(_firmware.CONTROL_PERIOD / STEP)
+STEPS_PER_CYCLE = round(CONTROL_PERIOD / STEP)
 
 STATES = (
     "motor_position",
@@ -133,20 +138,94 @@ _QM, _VM, _Q, _V, _Z, _TW, _TH, _TB, _PWM, _I, _TAU, _HEAT = range(12)
 _CLAMP_BAND = 0.05
 """Share of the velocity clamp over which the firmware takes the drive back to nothing."""
 
-_resistance_at = njit(cache=True)(_sea.winding_resistance_at)
-_winding_current = njit(cache=True)(_sea.winding_current)
-_spring_torque = njit(cache=True)(_sea.spring_torque)
-_dahl_step = njit(cache=True)(_sea.dahl_step)
-_motor_acceleration = njit(cache=True)(_sea.motor_acceleration)
-_dry_friction_step = njit(cache=True)(_sea.dry_friction_step)
-_link_acceleration = njit(cache=True)(_sea.link_acceleration)
-_gravity_torque = njit(cache=True)(_rigid.gravity_torque)
-_friction_magnitude = njit(cache=True)(_rigid.friction_magnitude)
-_added_friction = njit()(_terms.added_friction(CONSTANTS, njit()))
-_constant_at = njit(cache=True)(_thermal.torque_constant_at)
+# Under names of this module, by which what compiles finds them.
+_resistance_at = _sea.winding_resistance_at
+_winding_current = _sea.winding_current
+_spring_torque = _sea.spring_torque
+_dahl_step = _sea.dahl_step
+_motor_acceleration = _sea.motor_acceleration
+_dry_friction_step = _sea.dry_friction_step
+_link_acceleration = _sea.link_acceleration
+_gravity_torque = _rigid.gravity_torque
+_friction_magnitude = _rigid.friction_magnitude
+_added_friction = added_friction(CONSTANTS)
+_constant_at = _thermal.torque_constant_at
+
+LAYOUT = np.dtype(
+    [
+        ("state", "f8", (len(STATES),)),
+        ("constants", "f8", (len(CONSTANTS),)),
+        ("gains", "f8", (3, 14)),
+        ("memory", "f8", (3, 5)),
+        ("setpoints", "f8", (3,)),
+        ("link_torque", "f8"),
+        ("strategy", "i8"),
+        ("first_step", "i8"),
+        ("steps", "i8"),
+    ],
+    align=True,
+)
+"""What the compiled loop reads and writes: the arguments of :func:`advance`."""
 
 
-@njit(cache=True)
+class Actuator:
+    """The emulated actuator's numbers in one piece of memory, and its steps in machine code where it can be had.
+
+    Elsewhere numba compiles the same function in this process, and without numba Python runs it: the same bit by bit.
+
+    Attributes:
+        state: Entries as in :data:`STATES`.
+        constants: Entries as in :data:`CONSTANTS`.
+        gains: (3, 14), see :mod:`.firmware`.
+        memory: (3, 5), of the firmware's loops.
+        setpoints: Position, velocity, effort (or PWM); NaN for off.
+    """
+
+    def __init__(self) -> None:
+        self._whole = np.zeros(1, LAYOUT)
+        entries = self._whole[0]
+        self.state: Array = entries["state"]
+        self.constants: Array = entries["constants"]
+        self.gains: Array = entries["gains"]
+        self.memory: Array = entries["memory"]
+        self.setpoints: Array = entries["setpoints"]
+        # What is written for each call: numpy would take several times as long.
+        self._numbers: Any = structure_of(LAYOUT).from_buffer(self._whole.data)
+        self._loop = _machine_code()
+
+    def advance(self, strategy: int, link_torque: float, first_step: int, steps: int) -> None:
+        """Advance by some steps; arguments as of :func:`advance`."""
+        if self._loop is None:
+            arrays = (self.state, self.constants, self.gains, self.memory, self.setpoints)
+            _elsewhere()(*arrays, strategy, link_torque, first_step, steps)
+            return
+        numbers = self._numbers
+        numbers.strategy, numbers.link_torque = strategy, link_torque
+        numbers.first_step, numbers.steps = first_step, steps
+        self._loop(self._whole)
+
+
+@cache
+def _machine_code() -> Loop | None:
+    try:
+        return load_loop("pendulum_hw_bridge.emulation.kernel_loop:actuator_loop", symbols={})
+    except NoMachineCodeError:
+        return None
+
+
+@cache
+def _elsewhere() -> Callable[..., None]:
+    try:
+        import numba  # noqa: F401  (what compiles asks for it)
+    except ImportError:
+        return advance
+    from pendulum_msgs_py.loops.trees import compile_tree
+
+    compiled = compile_tree(advance, exact=True, inline=True)
+    kept: Callable[..., None] = keep_kernel(compiled, "emulated_actuator")
+    return kept
+
+
 def advance(
     state: Array,
     constants: Array,
@@ -176,15 +255,14 @@ def advance(
         deflection = state[_QM] - state[_Q]
         if number % STEPS_PER_CYCLE == 0:
             sensed = _spring_torque(deflection, 0.0, constants[_K], constants[_K3], 0.0)
-            wanted = setpoints
-            if not math.isnan(setpoints[2]) and strategy != 1 and abs(setpoints[2]) > constants[_ECLAMP]:
-                wanted = setpoints.copy()
-                wanted[2] = math.copysign(constants[_ECLAMP], setpoints[2])
+            asked = setpoints[2]
+            if not math.isnan(asked) and strategy != 1 and abs(asked) > constants[_ECLAMP]:
+                setpoints[2] = math.copysign(constants[_ECLAMP], asked)
             pwm = control_pwm(
                 strategy,
                 gains,
                 memory,
-                wanted,
+                setpoints,
                 state[_Q],
                 state[_V],
                 sensed,
@@ -192,6 +270,7 @@ def advance(
                 constants[_FF_VELOCITY],
                 period,
             )
+            setpoints[2] = asked
             pwm = min(max(pwm, -constants[_ULIMIT]), constants[_ULIMIT])
             if pwm * state[_VM] > 0.0:
                 # The firmware takes the drive back as the motor nears its speed limit.
@@ -247,6 +326,3 @@ def advance(
         state[_TW] += STEP * (power - to_housing) / constants[_CW]
         state[_TH] += STEP * (to_housing - to_body) / constants[_CH]
         state[_TB] += STEP * (to_body - to_ambient) / constants[_CB]
-
-
-drop_stale_code(advance, (_sea, _rigid, _firmware, _thermal, *_terms.modules()))

@@ -26,7 +26,7 @@ from pendulum_hw_bridge.actuator import (
 from pendulum_hw_bridge.command_check import check_lifetime
 from pendulum_hw_bridge.emulation import kernel
 from pendulum_hw_bridge.emulation.faults import ActuatorFault, distort
-from pendulum_hw_bridge.emulation.firmware import gain_rows, new_loop_memory
+from pendulum_hw_bridge.emulation.firmware import gain_rows
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
 from pendulum_hw_bridge.emulation.sensing import measure
 from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, PidGains
@@ -105,10 +105,10 @@ class EmulatedX5:
         self._random = np.random.Generator(np.random.Philox(key=seed))
         self._start_ns = start_ns
         self._steps = 0
-        self._state = np.zeros(len(kernel.STATES))
-        self._rows = gain_rows(self.gains)
-        self._memory = new_loop_memory()
-        self._setpoints = np.full(3, math.nan)
+        self._actuator = actuator = kernel.Actuator()
+        self._state, self._memory, self._setpoints = actuator.state, actuator.memory, actuator.setpoints
+        actuator.gains[:] = gain_rows(self.gains)
+        self._setpoints[:] = NO_SETPOINT
         self._expires_ns: int | None = None
         self._lock_holder: int | None = None
         self._inbox: list[tuple[int, int, int, Command]] = []
@@ -182,7 +182,7 @@ class EmulatedX5:
             self._end_command()
         if gains is not None:
             self.gains = gains
-            self._rows = gain_rows(gains)
+            self._actuator.gains[:] = gain_rows(gains)
         if limits is not None:
             self.limits = limits
         if command_lifetime is not None:
@@ -218,14 +218,14 @@ class EmulatedX5:
         elif fault is ActuatorFault.PWM_RUNAWAY:
             self._stuck_pwm = math.copysign(1.0, float(self._state[8]))
         elif fault is ActuatorFault.GAINS_LOST:
-            self._rows = gain_rows(_NO_GAINS)
+            self._actuator.gains[:] = gain_rows(_NO_GAINS)
         self._refresh()
 
     def clear_faults(self) -> None:
         """Mend everything; a module that rebooted or changed its strategy stays as it is."""
         self.faults.clear()
         self._frozen = None
-        self._rows = gain_rows(self.gains)
+        self._actuator.gains[:] = gain_rows(self.gains)
         self._refresh()
 
     # --- commands and time ----------------------------------------------------------------------------------
@@ -293,20 +293,13 @@ class EmulatedX5:
             if self.hand is not None:
                 seconds = self._steps * kernel.STEP
                 torque += self.hand(seconds, float(self._state[2]), float(self._state[3]))
-            setpoints, strategy = self._setpoints, self.strategy
-            if self.faults & _STUCK and strategy is not Strategy.OFF:
-                setpoints, strategy = np.array([math.nan, math.nan, self._stuck_pwm]), Strategy.DIRECT_PWM
-            kernel.advance(
-                self._state,
-                self._constants,
-                self._rows,
-                self._memory,
-                setpoints,
-                int(strategy),
-                torque,
-                self._steps,
-                now,
-            )
+            if self.faults & _STUCK and self.strategy is not Strategy.OFF:
+                asked = self._setpoints.copy()
+                self._setpoints[:] = (math.nan, math.nan, self._stuck_pwm)
+                self._actuator.advance(int(Strategy.DIRECT_PWM), torque, self._steps, now)
+                self._setpoints[:] = asked
+            else:
+                self._actuator.advance(int(self.strategy), torque, self._steps, now)
             self._steps += now
             steps -= now
             if self.trace is not None:
@@ -365,9 +358,9 @@ class EmulatedX5:
         fault = ActuatorFault
         stopped = fault.M_STOP in self.faults and self.limits.m_stop is not MStopAction.DISABLED
         hot = fault.OVER_TEMPERATURE_MOTOR in self.faults or fault.OVER_TEMPERATURE_BOARD in self.faults
-        self._constants = self.parameters.constants(self.limits, self.voltage, not (stopped or hot))
+        self._actuator.constants[:] = self.parameters.constants(self.limits, self.voltage, not (stopped or hot))
         if fault.WINDING_OPEN in self.faults:
-            self._constants[kernel.CONSTANTS.index("winding_resistance")] = _OPEN_CIRCUIT
+            self._actuator.constants[kernel.CONSTANTS.index("winding_resistance")] = _OPEN_CIRCUIT
 
     def _sample(self) -> None:
         self._sequence += 1

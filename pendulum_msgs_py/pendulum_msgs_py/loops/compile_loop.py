@@ -20,8 +20,10 @@ COMMON = (
     ("pendulum_sim.loop_kernel:rigid_loop", "euler"),
     ("pendulum_lqr.controller_kernel:law_loop", "pendulum_lqr.controllers.lqr:lqr_law"),
     ("pendulum_lqr.disturbance_kernel:uniform_loop",),
+    ("pendulum_hw_bridge.emulation.kernel_loop:actuator_loop",),
 )
-"""Those of the thesis's experiment: the plant by our integrator and by the thesis's, its controller, its noise."""
+"""Those of the thesis's experiment: the plant by our integrator and by the thesis's, its controller, its noise, and the
+emulated actuator."""
 
 
 def _keep_common() -> None:
