@@ -141,10 +141,10 @@ def in_phase(phase: str, kind: EffortStrategy, seed: int) -> Rig:
         rig.run(0.5)
     elif phase == "ramp":
         rig = Rig(seed, kind=kind, moving=True)
-        rig.run(2.0)
+        rig.run(1.0)
     else:
         rig = Rig(seed, kind=kind, moving=True, start=0.5, goal=0.7)
-        rig.run(2.0)
+        rig.run(1.2)
         assert rig.supervisor.trajectory_finished
     rig.run(float(rig.random.uniform(0.0, 0.02)))
     assert rig.supervisor.mode.armed

@@ -62,7 +62,7 @@ def test_a_ramp_against_a_blocked_link_stays_below_the_limit(
 ) -> None:
     rig = Rig(kind=kind, moving=True, effort_limit=limit, voltage=voltage, start=0.0)
     block(rig)
-    rig.run(4.0)
+    rig.run(2.0)
     assert 0.5 * limit < largest_torque(rig) <= limit + TOLERANCE
     # It does not push for ever: the pendulum is not where the ramp is.
     assert rig.supervisor.mode is Mode.FAULT
@@ -72,7 +72,7 @@ def test_a_ramp_against_a_blocked_link_stays_below_the_limit(
 @pytest.mark.parametrize("voltage", [24.0, 48.0])
 def test_a_ramp_at_one_newton_metre_arrives(kind: EffortStrategy, voltage: float) -> None:
     rig = Rig(kind=kind, moving=True, effort_limit=1.0, voltage=voltage, start=0.0, goal=0.3)
-    rig.run(4.0)
+    rig.run(3.0)
     assert rig.supervisor.mode is Mode.POSITION
     assert rig.supervisor.trajectory_finished
     assert rig.actuator.link.position == pytest.approx(0.3, abs=0.03)

@@ -36,8 +36,7 @@ def measure(
         random: Draws the noise: three numbers a record, whatever its values.
     """
     drive, sensors = parameters.drivetrain, parameters.sensors
-    motor_position, motor_velocity, position, velocity = (float(value) for value in state[:4])
-    winding, housing, body, pwm, current = (float(value) for value in state[5:10])
+    motor_position, motor_velocity, position, velocity, _, winding, housing, body, pwm, current = state.tolist()[:10]
     noise = sensors.velocity_noise * float(random.standard_normal())
     deflection_noise = sensors.effort_noise / drive.stiffness * float(random.uniform(-1.0, 1.0))
     deflection = position - motor_position + deflection_noise

@@ -183,7 +183,7 @@ class EmulatorServer:
             "lifetime_expiries": actuator.lifetime_expiries,
             "last_command_ns": actuator.last_command_ns,
             "faults": sorted(fault.value for fault in actuator.faults),
-            "link": asdict(actuator.link),
+            "link": actuator.link._asdict(),
         }
 
     def _send(self, packet: bytes, receiver: Address) -> None:

@@ -10,7 +10,7 @@ import heapq
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,8 +50,7 @@ _OTHER_SENDER = -1
 _OPEN_CIRCUIT = 1e9
 
 
-@dataclass(frozen=True)
-class LinkState:
+class LinkState(NamedTuple):
     """What link and motor really do: the truth behind the feedback.
 
     Attributes:
@@ -135,17 +134,17 @@ class EmulatedX5:
     @property
     def link(self) -> LinkState:
         """The truth, which no sensor sees."""
-        state, drive = self._state, self.parameters.drivetrain
+        state, drive = self._state.tolist(), self.parameters.drivetrain
         return LinkState(
             time_ns=self.now_ns,
-            position=float(state[2]),
-            velocity=float(state[3]),
-            motor_position=float(state[0]),
-            motor_velocity=float(state[1]),
-            spring_torque=float(state[10]),
-            motor_torque=drive.torque_constant * drive.gear_ratio * float(state[9]),
-            pwm=float(state[8]),
-            winding_temperature=float(state[5]),
+            position=state[2],
+            velocity=state[3],
+            motor_position=state[0],
+            motor_velocity=state[1],
+            spring_torque=state[10],
+            motor_torque=drive.torque_constant * drive.gear_ratio * state[9],
+            pwm=state[8],
+            winding_temperature=state[5],
         )
 
     def place(self, position: float, temperature: float | None = None) -> None:

@@ -37,6 +37,7 @@ _K = (33.345265, 0.158993)
 _NOISE = 2.5
 _ANSWER_DELAY_NS = MILLISECOND
 _COMMAND_LIFE_NS = 50 * MILLISECOND
+_PARAMETERS = load_emulator("thesis")
 
 
 class SteppedLoop(ActuatorLoop):
@@ -141,7 +142,7 @@ class Rig:
 
     def _build(self, kind: EffortStrategy, seed: int, start: float, voltage: float | None) -> None:
         """Make actuator, supervisor, bridge and loop."""
-        parameters = load_emulator("thesis")
+        parameters = _PARAMETERS
         drivetrain = parameters.drivetrain
         if voltage is not None:
             parameters = parameters.with_drivetrain(supply_voltage=voltage)
@@ -171,6 +172,8 @@ class Rig:
             on_state=lambda sample: None,
             decide=lambda: self.supervisor.decide(self.port.now_ns(), self.bridge.sample),
             on_outcome=lambda stamp_ns, outcome: self.supervisor.report_applied(outcome.effort),
+            # Commands come from `answer`: there is nothing to sleep for.
+            take_inputs=lambda timeout: None,
         )
 
     @property
