@@ -1,8 +1,12 @@
-"""The e-stop of the bridge answers whatever else is said to the node, as another process sees it over DDS."""
+"""The e-stop of the bridge answers whatever else is said to the node, as another process sees it over DDS.
+
+One bridge for all; at the end its actuator dies.
+"""
 
 from __future__ import annotations
 
 import signal
+import struct
 import time
 from collections.abc import Iterator
 
@@ -10,6 +14,7 @@ import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration as RclpyDuration
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -17,19 +22,41 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.ros import qos
-from tests.integration.test_bridge_processes import Lab
-from tests.processes import ProcessGroup
+from tests.integration.test_bridge_processes import Lab, laboratory
 
 POINTS = 200_000
 LATEST = 2.0
 """Far more than the answer takes, even on a busy machine; reading the points in one call takes 6 s [s]."""
 
 
+@pytest.fixture(scope="module")
+def running_lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    with laboratory(tmp_path_factory.mktemp("lab")) as lab:
+        lab.bridge("feedback_watchdog:=50")
+        lab.until(lambda: lab.states, "states", 60.0)
+        yield lab
+
+
 @pytest.fixture
-def lab(processes: ProcessGroup, domain_id: int) -> Iterator[Lab]:
-    laboratory = Lab(processes)
-    yield laboratory
-    laboratory.close()
+def lab(running_lab: Lab) -> Lab:
+    """Bring the bridge back to how it started, disarmed."""
+    lab = running_lab
+    lab.effort = None
+    lab.call(Trigger, "bridge/e_stop_reset", Trigger.Request())
+    assert lab.call(SetBool, "bridge/arm", SetBool.Request(data=False)).success
+    lab.until(lambda: lab.truth.status()["strategy"] == 0, "a drive that is off")
+    lab.states.clear()
+    lab.until(lambda: lab.states, "states")
+    return lab
+
+
+def of_many_points(count: int) -> bytes:
+    """Return the bytes of a trajectory of many equal points, which rclpy takes seconds to make."""
+    name = JOINT.encode() + b"\0"
+    head = struct.pack("<iIIB3xII", 0, 0, 1, 0, 1, len(name)) + name
+    head += b"\0" * (-len(head) % 4) + struct.pack("<I", count)
+    assert len(head) % 8 == 4  # so that no number of a point needs to be moved
+    return b"\x00\x01\x00\x00" + head + struct.pack("<IdIIIiI", 1, 0.0, 0, 0, 0, 0, 0) * count
 
 
 def press(lab: Lab) -> float:
@@ -44,8 +71,6 @@ def press(lab: Lab) -> float:
 
 
 def armed(lab: Lab) -> None:
-    lab.bridge("feedback_watchdog:=50")
-    lab.until(lambda: lab.states, "states", 60.0)
     response = lab.call(SetBool, "bridge/arm", SetBool.Request(data=True))
     assert response.success, response.message
 
@@ -54,9 +79,7 @@ def test_a_trajectory_of_200_000_points_keeps_neither_e_stop_nor_states(lab: Lab
     armed(lab)
     publisher = lab.node.create_publisher(JointTrajectory, "joint_trajectory", qos.TRAJECTORY)
     lab.until(publisher.get_subscription_count, "the bridge")
-    message = JointTrajectory(joint_names=[JOINT])
-    message.points = [JointTrajectoryPoint(positions=[0.0]) for _ in range(POINTS)]
-    publisher.publish(message)
+    publisher.publish(of_many_points(POINTS))
     waited = press(lab)
     print(f"e-stop answered after {1e3 * waited:.1f} ms")
     assert waited < LATEST
@@ -66,8 +89,6 @@ def test_a_trajectory_of_200_000_points_keeps_neither_e_stop_nor_states(lab: Lab
 
 
 def test_the_e_stop_answers_while_the_bridge_waits_for_a_module_that_does_not_answer(lab: Lab) -> None:
-    lab.bridge()
-    lab.until(lambda: lab.states, "states", 60.0)
     arm = lab.node.create_client(SetBool, "bridge/arm")
     lab.until(arm.service_is_ready, "the service")
     lab.emulator.send_signal(signal.SIGSTOP)
@@ -91,7 +112,7 @@ def test_a_trajectory_that_comes_while_the_bridge_arms_is_refused_and_moves_noth
         lambda message: told.extend({pair.key: pair.value for pair in each.values} for each in message.status),
         qos.DIAGNOSTICS,
     )
-    lab.bridge()
+    began_ns = lab.truth.status()["link"]["time_ns"]
     publisher = lab.node.create_publisher(JointTrajectory, "joint_trajectory", qos.TRAJECTORY)
     arm = lab.node.create_client(SetBool, "bridge/arm")
     lab.until(lambda: arm.service_is_ready() and publisher.get_subscription_count(), "the bridge", 60.0)
@@ -123,19 +144,33 @@ def test_a_trajectory_that_comes_while_the_bridge_arms_is_refused_and_moves_noth
     lab.spin(0.3)
     # A busy machine may keep the bridge waiting for so long that it goes into a fault.
     assert told[-1]["mode"] in {"armed_effort", "fault"}
-    assert not lab.duties()[1].any()
+    times, duties = lab.duties()
+    assert not duties[times >= began_ns].any()
 
 
 def test_the_e_stop_answers_in_a_flood_of_commands_and_trajectories(lab: Lab) -> None:
     armed(lab)
-    commands = lab.node.create_publisher(JointState, "effort_command", qos.COMMAND)
+    commands = lab.commands
     trajectories = lab.node.create_publisher(JointTrajectory, "joint_trajectory", qos.TRAJECTORY)
     lab.until(lambda: commands.get_subscription_count() and trajectories.get_subscription_count(), "the bridge")
-    move = JointTrajectory(joint_names=[JOINT])
-    move.points = [JointTrajectoryPoint(positions=[0.0]) for _ in range(2000)]
+    move = of_many_points(2000)
+    command = serialize_message(JointState(name=[JOINT], effort=[1.0]))
     for _ in range(20):
         for _ in range(200):
-            commands.publish(JointState(name=[JOINT], effort=[1.0]))
+            commands.publish(command)
         trajectories.publish(move)
     assert press(lab) < LATEST
     lab.until(lambda: lab.truth.status()["strategy"] == 0, "a drive that is off")
+
+
+def test_bytes_of_many_points_are_a_trajectory() -> None:
+    expected = JointTrajectory(joint_names=[JOINT])
+    expected.points = [JointTrajectoryPoint(positions=[0.0]) for _ in range(5)]
+    assert deserialize_message(of_many_points(5), JointTrajectory) == expected
+
+
+def test_an_emulator_that_dies_puts_the_bridge_into_its_fault_state(lab: Lab) -> None:
+    lab.drive()
+    lab.emulator.send_signal(signal.SIGKILL)
+    lab.running.wait_for_output(r"fault: feedback_lost", 15.0)
+    lab.emulator.wait(20.0)
