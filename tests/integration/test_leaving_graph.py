@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+from collections.abc import Iterator
 
 import pytest
 import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 
+from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_msgs_py.ros.e_stop import EStopServer
+from tests.fixtures import PROJECT
 from tests.processes import ProcessGroup, RunningProgram
 
 DEADLINE = 60.0
+_PLANT_NODES = ("simulator", "simulator_e_stop")
 _HANGING = """
 import ctypes, sys
 from rclpy.node import Node
@@ -44,30 +49,50 @@ with Conductor({domain}):
 """
 
 
-@pytest.mark.parametrize("name", ["simulator", "simulator_e_stop"])
-def test_a_plant_that_cannot_leave_the_graph_ends_all_the_same(
-    name: str, domain_id: int, processes: ProcessGroup
-) -> None:
-    simulator = _start(_HANGING.format(name=name) + _SIMULATOR, processes)
-    simulator.wait_for_output("ready", DEADLINE)
-    simulator.interrupt()
+@pytest.fixture(scope="module")
+def hanging(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, RunningProgram]]:
+    """Start all programs that hang while they leave, by what hangs, so that their watchdogs wait side by side."""
+    folder = tmp_path_factory.mktemp("hanging")
+    processes = ProcessGroup(folder / "processes", cwd=PROJECT)
+    programs: dict[str, RunningProgram] = {}
+    with contextlib.ExitStack() as domains:
+
+        def start(name: str, code: str) -> None:
+            domain = domains.enter_context(reserve_domain())
+            environment = {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(folder / "ros_log")}
+            code = code.format(domain=domain)
+            programs[name] = processes.start_command([sys.executable, "-c", code], name="hanging", env=environment)
+
+        for name in _PLANT_NODES:
+            start(name, _HANGING.format(name=name) + _SIMULATOR)
+        start("conductor", _HANGING.format(name="conductor") + _CONDUCTOR)
+        start("nested", _NESTED)
+        for name in _PLANT_NODES:
+            programs[name].wait_for_output("ready", DEADLINE)
+            programs[name].interrupt()
+        yield programs
+        leftovers = processes.close()
+    assert leftovers == []
+
+
+@pytest.mark.parametrize("name", _PLANT_NODES)
+def test_a_plant_that_cannot_leave_the_graph_ends_all_the_same(name: str, hanging: dict[str, RunningProgram]) -> None:
+    simulator = hanging[name]
     assert simulator.wait(DEADLINE) == 1
     # With the plant made safe before, and where it stood.
     assert simulator.output.index("hangs") < simulator.output.index("Timeout")
     assert "in close" in simulator.output or "in _close" in simulator.output
 
 
-def test_an_experiment_that_cannot_leave_the_graph_ends_all_the_same(domain_id: int, processes: ProcessGroup) -> None:
-    conductor = _start(_HANGING.format(name="conductor") + _CONDUCTOR.format(domain=domain_id), processes)
-    assert conductor.wait(DEADLINE) == 1
-    assert "hangs" in conductor.output
+def test_an_experiment_that_cannot_leave_the_graph_ends_all_the_same(hanging: dict[str, RunningProgram]) -> None:
+    assert hanging["conductor"].wait(DEADLINE) == 1
+    assert "hangs" in hanging["conductor"].output
 
 
-def test_the_end_of_one_leaving_does_not_end_the_watch_over_another(processes: ProcessGroup) -> None:
+def test_the_end_of_one_leaving_does_not_end_the_watch_over_another(hanging: dict[str, RunningProgram]) -> None:
     # A context that shuts down closes an e-stop whose owner was not closed.
-    program = _start(_NESTED, processes)
-    assert program.wait(DEADLINE) == 1
-    assert "hangs" in program.output
+    assert hanging["nested"].wait(DEADLINE) == 1
+    assert "hangs" in hanging["nested"].output
 
 
 def test_an_e_stop_leaves_when_it_knows_all_of_its_owner(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,7 +135,3 @@ def test_an_e_stop_whose_owner_has_gone_leaves_at_once(domain_id: int) -> None:
     rclpy.shutdown(context=context)  # closes it
     assert not server._thread._thread.is_alive()
     server.close()
-
-
-def _start(code: str, processes: ProcessGroup) -> RunningProgram:
-    return processes.start_command([sys.executable, "-c", code], name="hanging")
