@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -34,11 +35,12 @@ def truth(name):
     return plant
 
 
-def motion(plant, seed, seconds=8.0, period=PERIOD, amplitude=None):
+@cache
+def motion(plant, seed, seconds=6.0, period=PERIOD):
     """Return a noisy recording of a plant under slow multisines, by an integrator of its own with small steps."""
     rng = np.random.default_rng(seed)
     time = np.cumsum(period * (1.0 + rng.uniform(-0.1, 0.1, round(seconds / period))))
-    drives = amplitude or DRIVE[plant.name]
+    drives = DRIVE[plant.name]
     count = len(plant.joints)
     effort = np.zeros((time.size, count))
     for i, size in enumerate(drives):
@@ -178,7 +180,7 @@ def test_swapped_columns_are_refused_by_name(both_driven):
 )
 def test_a_wrong_sign_and_an_angle_against_the_world_are_refused_by_name(name, position, effort, words):
     plant = truth(name)
-    one = motion(plant, 3, seconds=6.0)
+    one = motion(plant, 3)
     wrong = replace(one, position=one.position @ np.array(position, dtype=float).T, effort=one.effort * effort)
     result = identify_mechanism(plant, [wrong], extras="friction")
     assert result.refused
@@ -188,7 +190,7 @@ def test_a_wrong_sign_and_an_angle_against_the_world_are_refused_by_name(name, p
 def test_a_value_ten_times_off_the_start_is_refused():
     plant = truth("furuta")
     far = plant.with_values({"arm_inertia": plant.value("arm_inertia") / 15.0})
-    result = identify_mechanism(far, [motion(plant, 3, seconds=6.0)], extras="friction")
+    result = identify_mechanism(far, [motion(plant, 3)], extras="friction")
     assert "arm_inertia is" in result.sentences()[0]
     assert "expected a plant that is near, or a start that is" in result.sentences()[0]
 

@@ -161,42 +161,51 @@ class _Simulator:
 
     def __init__(self, model: MechanismModel, free: Sequence[str]) -> None:
         self.count = len(model.plant.joints)
-        self.forward, self.derivative = step_functions(model, free)
+        self.forward, self.derivative = step_functions(model.plant, tuple(free))
         self.free = len(free)
         self.made: dict[tuple[str, int, int], Any] = {}
 
-    def _many(self, windows: int, steps: int) -> Any:
-        key = ("runs", windows, steps)
+    def _made(self, name: str, windows: int, steps: int) -> Any:
+        """Return the memory of a function over so many windows of so many steps each, and what evaluates it."""
+        key = (name, windows, steps)
         if key not in self.made:
-            self.made[key] = self.forward.mapaccum("run", steps).map(windows)
+            runs = name == "runs"
+            one = self.forward.mapaccum("run", steps) if runs else self.derivative
+            self.made[key] = one.map(windows if runs else windows * steps).buffer()
         return self.made[key]
+
+    def _evaluate(
+        self, name: str, windows: int, steps: int, arguments: Sequence[Array], results: Sequence[Array]
+    ) -> None:
+        """Evaluate from arrays into arrays, whose rows are casadi's columns: its own matrices are slow to fill."""
+        buffer, start = self._made(name, windows, steps)
+        kept = [np.ascontiguousarray(array) for array in arguments]
+        for i, array in enumerate(kept):
+            buffer.set_arg(i, array.data)
+        for i, array in enumerate(results):
+            buffer.set_res(i, array.data)
+        start()
 
     def motion(self, model: MechanismModel, data: Windows, states: Array) -> Array:
         """Return the states at each sample, shape (w, l, 2 n)."""
         n, (w, size) = self.count, data.time.shape
         mean, _, h = data.input(model["delay"])
-        flat = (mean.reshape(n, -1), h.reshape(1, -1))
-        p = np.repeat(model.values[:, None], w * (size - 1), axis=1)
-        later = self._many(w, size - 1)(states.T, *flat, p).full().T.reshape(w, size - 1, 2 * n)
+        p = np.tile(model.values, (w * (size - 1), 1))
+        later = np.empty((w, size - 1, 2 * n))
+        self._evaluate("runs", w, size - 1, (states, mean.reshape(n, -1).T, h, p), (later,))
         return np.concatenate((states[:, None], later), axis=1)
 
     def sensitivity(self, model: MechanismModel, data: Windows, path: Array) -> Array:
         """Return those of the positions of a motion to parameters and start states, shape (w, l, n, k + 2 n)."""
         n, (w, size) = self.count, data.time.shape
         mean, slope, h = data.input(model["delay"])
-        p = np.repeat(model.values[:, None], w * (size - 1), axis=1)
-        middle = (0.5 * (path[:, :-1] + path[:, 1:])).reshape(-1, 2 * n).T
-        total = w * (size - 1)
-        key = ("derivatives", total, 0)
-        if key not in self.made:
-            self.made[key] = self.derivative.map(total)
-        by_x, by_p = self.made[key](middle, mean.reshape(n, -1), slope.reshape(n, -1), p)
+        p = np.tile(model.values, (w * (size - 1), 1))
+        middle = 0.5 * (path[:, :-1] + path[:, 1:])
+        by_x, by_p = np.empty((w, size - 1, 2 * n, 2 * n)), np.empty((w, size - 1, self.free, 2 * n))
+        drive = (mean.reshape(n, -1).T, slope.reshape(n, -1).T)
+        self._evaluate("derivatives", w, size - 1, (middle, *drive, p), (by_x, by_p))
         step = h[:, :, None, None]
-        a = by_x.full().reshape(2 * n, total, 2 * n).transpose(1, 0, 2).reshape(w, size - 1, 2 * n, 2 * n) * step
-        b = (
-            by_p.full().reshape(2 * n, total, self.free).transpose(1, 0, 2).reshape(w, size - 1, 2 * n, self.free)
-            * step
-        )
+        a, b = (np.multiply(found.swapaxes(2, 3), step, order="C") for found in (by_x, by_p))
         unit = np.eye(2 * n)
         square = a @ a
         gain, b = unit + a + 0.5 * square + (square @ a) / 6.0, (unit + 0.5 * a + square / 6.0) @ b

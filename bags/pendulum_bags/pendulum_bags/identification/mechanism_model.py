@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import casadi
@@ -113,6 +114,7 @@ class MechanismModel:
         return (*names, DELAY) if delay and joints.driven else tuple(names)
 
 
+@lru_cache(maxsize=16)
 def tellable(plant: MechanismParameters) -> tuple[str, ...]:
     """Return the mechanism's own parameters that any motion under known efforts tells apart; the others are held.
 
@@ -175,9 +177,11 @@ def _rate(model: MechanismModel, x: Any, u: Any, p: Any) -> Any:
     return casadi.vertcat(*v, *forward(q, v, torque, own))
 
 
-def step_functions(model: MechanismModel, free: Sequence[str]) -> tuple[Any, Any]:
+@lru_cache(maxsize=16)
+def step_functions(plant: MechanismParameters, free: tuple[str, ...]) -> tuple[Any, Any]:
     """Return (x, u, h, p) -> next state, and (x, u, slope, p) -> d rate / d(x, free) with slope = du/d delay."""
-    count = len(model.plant.joints)
+    model = MechanismModel.of(plant)
+    count = len(plant.joints)
     x, u, h = casadi.SX.sym("x", 2 * count), casadi.SX.sym("u", count), casadi.SX.sym("h")
     slope, p = casadi.SX.sym("slope", count), casadi.SX.sym("p", len(model.names))
     at = x
