@@ -37,6 +37,7 @@ from pendulum_msgs_py.mechanisms import Mechanism
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim.compiling import compile_tree, tuple_loader
 from pendulum_sim.dry_friction import LAG as LAG_OF_ONE
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, advance_dry
@@ -333,17 +334,19 @@ def _decay(plant: MechanismParameters) -> float:
 @cache
 def _pendulum_kernel() -> Any:
     integrator = get_integrator("rk4")
-    step, coefficients_of = compile_tree(integrator.step), compile_tree(integrator.coefficients)
-    acceleration, advance = compile_tree(acceleration_with_friction), compile_tree(advance_dry)
-    lagged = compile_tree(actuator_torque)
+    step = compile_tree(integrator.step, inline=True)
+    coefficients_of = compile_tree(integrator.coefficients, inline=True)
+    acceleration = compile_tree(acceleration_with_friction, inline=True)
+    advance = compile_tree(advance_dry, inline=True)
+    lagged = compile_tree(actuator_torque, inline=True)
     load_plant = tuple_loader(len(PACKED), 1)
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", forceinline=True)
     def prepare(parameters: Any, longest: float) -> Any:
         plant = load_plant(parameters, 0)
         return plant, coefficients_of(plant[1] / plant[0], longest)
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", forceinline=True)
     def forward(q: Any, v: Any, torque: Any, command: Any, push: Any, h: float, prepared: Any) -> Any:
         plant, c = prepared
         theta, speed = advance(
@@ -351,7 +354,8 @@ def _pendulum_kernel() -> Any:
         )
         return (theta,), (speed,), (lagged(torque[0], command[0], h, plant[LAG_OF_ONE]),)
 
-    return _kernel((math.pi,), prepare, forward)
+    made_of = (acceleration_with_friction, advance_dry, integrator.step, integrator.coefficients)
+    return keep_kernel(_kernel((math.pi,), prepare, forward), "training_pendulum", *made_of)
 
 
 @cache
@@ -360,13 +364,13 @@ def _mechanism_kernel(name: str, goal: tuple[float, ...]) -> Any:
 
     mechanism = MECHANISMS[name]
     n, width = len(mechanism.joints), len(mechanism.parameter_names)
-    equation = compile_tree(mechanism.forward)
-    along, put, lag = (compile_tree(function) for function in joint_functions(n))
-    advance = compile_tree(advance_joints)
+    equation = compile_tree(mechanism.forward, inline=True)
+    along, put, lag = (compile_tree(function, inline=True) for function in joint_functions(n))
+    advance = compile_tree(advance_joints, inline=True)
     load, load_p = tuple_loader(n, 1), tuple_loader(width, 1)
     last = width + len(JOINT_ROWS) * n
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", forceinline=True)
     def prepare(parameters: Any, _longest: float) -> Any:
         table = (
             load(parameters, width),
@@ -378,14 +382,15 @@ def _mechanism_kernel(name: str, goal: tuple[float, ...]) -> Any:
         )
         return load_p(parameters, 0), table, load(parameters, last)
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", forceinline=True)
     def forward(q: Any, v: Any, torque: Any, command: Any, push: Any, h: float, prepared: Any) -> Any:
         p, table, offset = prepared
         total = along(push, 1.0, offset)
         q, v = advance(equation, along, put, lag, q, v, torque, command, total, h, p, table)
         return q, v, lag(torque, command, h, table[LAG])
 
-    return _kernel(goal, prepare, forward)
+    made_of = (mechanism.forward, compile_tree, name, goal)
+    return keep_kernel(_kernel(goal, prepare, forward), "training_mechanism", *made_of)
 
 
 def _kernel(goal: tuple[float, ...], prepare: Any, forward: Any) -> Any:
