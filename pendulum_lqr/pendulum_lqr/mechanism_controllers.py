@@ -122,9 +122,13 @@ def refuse_passive_friction(controller: str, plant: MechanismParameters) -> None
             )
 
 
-def _followed(period: float, catch: MechanismCatch, recover: MechanismController | None = None) -> MechanismTvlqr:
+def _followed(plant: MechanismParameters, period: float, *, recovers: bool) -> MechanismTvlqr:
+    # Without a swing-up no region need be sampled, which takes a second.
+    swing_up = stored_trajectory(plant)
     q, r = _CALM
-    return MechanismTvlqr(period, stored_trajectory(catch.plant), catch, q=q, r=r, recover=recover, tube=_TUBE)
+    catch = make_mechanism_catch(plant, q, r)
+    recover = MechanismMpc(period, catch) if recovers else None
+    return MechanismTvlqr(period, swing_up, catch, q=q, r=r, recover=recover, tube=_TUBE)
 
 
 def tracked_swing_up(plant: MechanismParameters, period: float) -> MechanismTvlqr:
@@ -133,13 +137,11 @@ def tracked_swing_up(plant: MechanismParameters, period: float) -> MechanismTvlq
     Raises:
         ParameterError: There is none for this plant.
     """
-    return _followed(period, make_mechanism_catch(plant, *_CALM))
+    return _followed(plant, period, recovers=False)
 
 
 def _tvlqr_mpc(plant: MechanismParameters, period: float) -> MechanismController:
-    catch = make_mechanism_catch(plant, *_CALM)
-    recover = MechanismMpc(period, catch)
-    return DifferencedVelocity(plant, _followed(period, catch, recover))
+    return DifferencedVelocity(plant, _followed(plant, period, recovers=True))
 
 
 _CONTROLLERS: dict[str, Callable[[MechanismParameters, float], MechanismController]] = {
