@@ -13,6 +13,7 @@ from pendulum_bags.runs.series import Series, Signal
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim.compiling import compile_tree
 from pendulum_sim.dry_friction import acceleration_with_friction, advance_dry, is_dry
 from pendulum_sim.integrators import get_integrator
@@ -118,7 +119,7 @@ def record_compiled(
     label: str = "simulation",
     late: float = 0.0,
 ) -> RunData:
-    """Return what :func:`record` returns, forty times as fast, for hundreds of trials; compiling takes some seconds.
+    """Return what :func:`record` returns, forty times as fast; compiling takes some seconds, once.
 
     Args:
         plant: The plant; rigid, without a delay or a lag of its own.
@@ -164,11 +165,11 @@ def _kernel() -> Any:
     import numba
 
     integrator = get_integrator("etd4")
-    one_step = compile_tree(integrator.step)
-    coefficients_of = compile_tree(integrator.coefficients)
-    acceleration = compile_tree(acceleration_with_friction)
-    advance = compile_tree(advance_dry)
-    has_dry_friction = compile_tree(is_dry)
+    one_step = compile_tree(integrator.step, inline=True)
+    coefficients_of = compile_tree(integrator.coefficients, inline=True)
+    acceleration = compile_tree(acceleration_with_friction, inline=True)
+    advance = compile_tree(advance_dry, inline=True)
+    has_dry_friction = compile_tree(is_dry, inline=True)
 
     @numba.njit(error_model="numpy")
     def run(plant, limit, count, per_state, held, noise, seen, step, gain, late, rows):
@@ -193,7 +194,8 @@ def _kernel() -> Any:
             else:
                 theta, theta_dot = one_step(acceleration, theta, theta_dot, torque, torque, torque, 0.0, STEP, c, plant)
 
-    return run
+    made_of = (acceleration_with_friction, advance_dry, is_dry, integrator.step, integrator.coefficients)
+    return keep_kernel(run, "pairs", *made_of)
 
 
 def pair(
@@ -201,7 +203,7 @@ def pair(
     duration: float = 5.0,
     plant: PlantParameters = SIMULATED,
     *,
-    compiled: bool = False,
+    compiled: bool = True,
     **hardware: Any,
 ) -> tuple[RunData, RunData]:
     """Return one run of the simulation at 500 Hz and of the machine at 100 Hz with an actuator's sensors.
@@ -210,7 +212,7 @@ def pair(
         seed: Makes all noise.
         duration: Length [s].
         plant: The machine.
-        compiled: Compile the loop, for many or long runs.
+        compiled: Compile the loop.
         hardware: In what else the machine differs, arguments of :func:`record`.
     """
     common: dict[str, Any] = {"seed": seed, "duration": duration}

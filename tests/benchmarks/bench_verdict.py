@@ -58,7 +58,6 @@ def run_trial(
     lengths: Sequence[float],
     *,
     each: bool = False,
-    compiled: bool = False,
 ) -> Trial:
     """Carry out one experiment: look, and record more while it is undecided.
 
@@ -68,7 +67,6 @@ def run_trial(
         stated: Margins.
         lengths: Of the runs behind each look [s].
         each: Go on until each test is decided, not only the answer.
-        compiled: Simulate by compiled loops, which pays for many trials.
     """
     margins = Margins.parse(stated)
     pairs: list[tuple[Series, Series]] = []
@@ -76,7 +74,7 @@ def run_trial(
     whole = Outcome.UNDECIDED
     seconds = 0.0
     for look, length in enumerate(lengths, start=1):
-        simulation, machine = pair(1000 * seed + look, length, compiled=compiled, **hardware)
+        simulation, machine = pair(1000 * seed + look, length, **hardware)
         pairs.append((simulation.window, machine.window))
         seconds += length
         tests = paired_tests(pairs, margins, looks=Looks(look), runs_differ=False)
@@ -97,19 +95,16 @@ def outcome_of(tests: Sequence[EquivalenceTest]) -> Outcome:
     return Outcome.UNDECIDED if Outcome.UNDECIDED in outcomes else Outcome.EQUIVALENT
 
 
-def margins_at(
-    hardware: dict[str, Any], duration: float = 600.0, *, less_delay: bool = False, compiled: bool = False
-) -> dict[str, str]:
+def margins_at(hardware: dict[str, Any], duration: float = 600.0, *, less_delay: bool = False) -> dict[str, str]:
     """Return margins on which a machine lies exactly, from one long run.
 
     Args:
         hardware: In what the machine differs.
         duration: Of the run [s].
         less_delay: Whether the distances are those with the delay taken out, which have the same margins.
-        compiled: Simulate by compiled loops.
     """
     less = LESS_DELAY if less_delay else ""
-    simulation, machine = pair(7, duration, compiled=compiled, **hardware)
+    simulation, machine = pair(7, duration, **hardware)
     tests = paired_tests([(simulation.window, machine.window)], Margins.parse())
     found = {test.quantity: test.interval.estimate for test in tests}
     stated = {
@@ -132,9 +127,9 @@ def repeat(function: Callable[[int], Trial], trials: int) -> list[Trial]:
 
 def rows() -> Iterator[Row]:
     """Yield false answers at each margin, and how often differences are found and equal plants are told equal."""
-    stated = margins_at(ON_THE_MARGIN, compiled=True)
+    stated = margins_at(ON_THE_MARGIN)
     trials = repeat(
-        partial(run_trial, hardware=ON_THE_MARGIN, stated=stated, lengths=FIRST_LOOKS, each=True, compiled=True),
+        partial(run_trial, hardware=ON_THE_MARGIN, stated=stated, lengths=FIRST_LOOKS, each=True),
         AT_MARGIN,
     )
     # Distances less the delay have the margins of those with it, far within which they lie: they need margins of their
@@ -143,10 +138,9 @@ def rows() -> Iterator[Row]:
         partial(
             run_trial,
             hardware=ON_THE_MARGIN,
-            stated=margins_at(ON_THE_MARGIN, less_delay=True, compiled=True),
+            stated=margins_at(ON_THE_MARGIN, less_delay=True),
             lengths=FIRST_LOOKS,
             each=True,
-            compiled=True,
         ),
         AT_MARGIN,
     )
@@ -165,7 +159,7 @@ def rows() -> Iterator[Row]:
         at_most=5.0,
     )
     for what, hardware in DIFFERENCES.items():
-        found = repeat(partial(run_trial, hardware=hardware, stated={}, lengths=DEFAULT_LOOKS, compiled=True), TRIALS)
+        found = repeat(partial(run_trial, hardware=hardware, stated={}, lengths=DEFAULT_LOOKS), TRIALS)
         yield counted(
             f"same run: “no” for {what}, default runs",
             sum(trial.whole is Outcome.DIFFERENT for trial in found),
@@ -173,7 +167,7 @@ def rows() -> Iterator[Row]:
             at_least=95.0,
             note=_noise(found),
         )
-    found = repeat(partial(run_trial, hardware={}, stated={}, lengths=DEFAULT_LOOKS, compiled=True), TRIALS)
+    found = repeat(partial(run_trial, hardware={}, stated={}, lengths=DEFAULT_LOOKS), TRIALS)
     yield counted(
         "same run: “yes” for the same plant at 100 Hz with an actuator's sensors, default runs",
         sum(trial.whole is Outcome.EQUIVALENT for trial in found),
