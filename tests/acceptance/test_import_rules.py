@@ -1,4 +1,4 @@
-"""The import rules bite: each kind of offence, put into a copy of the packages, is found and named."""
+"""The import rules bite: each kind of offence, put into one copy of the packages, is found and named."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ OFFENCES = {
         "line 1: import rclpy",
     ),
     "a core that imports messages in a function": (
-        "pendulum_lqr/pendulum_lqr/offender.py",
+        "pendulum_lqr/pendulum_lqr/late_offender.py",
         "def late():\n    from sensor_msgs.msg import JointState\n    return JointState",
         "line 2: from sensor_msgs.msg import JointState",
     ),
     "a core that imports a shell": (
-        "pendulum_lqr/pendulum_lqr/offender.py",
+        "pendulum_lqr/pendulum_lqr/shell_offender.py",
         "from pendulum_msgs_py.ros import qos",
-        "pendulum_lqr.offender, line 1",
+        "pendulum_lqr.shell_offender, line 1",
     ),
     "a robot that imports the simulator": (
         "pendulum_hw_bridge/pendulum_hw_bridge/offender.py",
@@ -53,9 +53,9 @@ OFFENCES = {
         "pendulum_rosbag.offender -> pendulum_bags",
     ),
     "a recorder that imports the control": (
-        "bags/pendulum_rosbag/pendulum_rosbag/offender.py",
+        "bags/pendulum_rosbag/pendulum_rosbag/control_offender.py",
         "import pendulum_lqr",
-        "pendulum_rosbag.offender -> pendulum_lqr",
+        "pendulum_rosbag.control_offender -> pendulum_lqr",
     ),
     "a module that imports itself through another": (
         "pendulum_msgs_py/pendulum_msgs_py/errors.py",
@@ -70,27 +70,24 @@ OFFENCES = {
 }
 
 
-def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
+@pytest.fixture(scope="module")
+def linted(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
+    """Spoil a copy of the packages by all offences, each in a module of its own, and look at it by the rules."""
+    root = tmp_path_factory.mktemp("spoilt")
+    for folder in FOLDERS:
+        shutil.copytree(PROJECT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__", "runs"))
+    (root / "tests").mkdir()
+    for name in ("pyproject.toml", "tests/__init__.py", "tests/import_rules.py"):
+        shutil.copyfile(PROJECT / name, root / name)
+    for where, code, _ in OFFENCES.values():
+        (root / where).write_text(f"{code}\n", encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(root / folder) for folder in FOLDERS)}
     command = [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"]
     return subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
 
 
-@pytest.fixture
-def copy(tmp_path: Path) -> Path:
-    """Copy the packages and the rules, to be spoilt."""
-    for folder in FOLDERS:
-        shutil.copytree(PROJECT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__", "runs"))
-    (tmp_path / "tests").mkdir()
-    for name in ("pyproject.toml", "tests/__init__.py", "tests/import_rules.py"):
-        shutil.copyfile(PROJECT / name, tmp_path / name)
-    return tmp_path
-
-
 @pytest.mark.parametrize("offence", OFFENCES)
-def test_an_offence_is_found_and_named(copy: Path, offence: str) -> None:
-    where, code, named = OFFENCES[offence]
-    (copy / where).write_text(f"{code}\n", encoding="utf-8")
-    done = lint_imports(copy)
-    assert done.returncode == 1, done.stdout
-    assert named in " ".join(done.stdout.split()), done.stdout
+def test_an_offence_is_found_and_named(linted: subprocess.CompletedProcess[str], offence: str) -> None:
+    _, _, named = OFFENCES[offence]
+    assert linted.returncode == 1, linted.stdout
+    assert named in " ".join(linted.stdout.split()), linted.stdout
