@@ -6,6 +6,7 @@ import ast
 import re
 import shlex
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -21,8 +22,9 @@ PAGE = (PROJECT / "pendulum_msgs_py" / "docs" / "install_on_ros.md").read_text(e
 _OF_ROS = re.compile(r"rclpy|launch|launch_ros|std_srvs|\w+_interfaces|\w+_msgs|pendulum_\w+")
 
 
-def imported(package: str) -> set[str]:
-    """Return the modules of others that a package imports, anywhere in its code."""
+@cache
+def imported(package: str) -> frozenset[str]:
+    """Return the modules of others that a package imports, anywhere in its code; to read all of it takes seconds."""
     found: set[str] = set()
     for path in (PROJECT / FOLDERS[package] / package).rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -30,7 +32,7 @@ def imported(package: str) -> set[str]:
                 found.update(alias.name.split(".")[0] for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
                 found.add(node.module.split(".")[0])
-    return {name for name in found if name not in sys.stdlib_module_names and not _OF_ROS.fullmatch(name)}
+    return frozenset(name for name in found if name not in sys.stdlib_module_names and not _OF_ROS.fullmatch(name))
 
 
 def keys(package: str, kind: str) -> set[str]:
@@ -54,7 +56,7 @@ def test_the_page_installs_what_rosdep_has_no_key_for() -> None:
     (line,) = re.findall(r"^.*pip install (.*)$", PAGE, re.MULTILINE)
     named = {re.split("[<>=]", requirement)[0] for requirement in shlex.split(line)}
     assert named == set(KNOWN["pip_only"].values())
-    used = set().union(*(imported(package) for package in FOLDERS))
+    used = frozenset().union(*(imported(package) for package in FOLDERS))
     assert KNOWN["pip_only"].keys() <= used
     assert {entry["module"] for entry in KNOWN["keys"].values()} <= used
 
