@@ -41,20 +41,35 @@ def _head(code: bytes, **changed: object) -> dict[str, object]:
     return {"name": "loop", "digest": hashlib.sha256(code).hexdigest(), "sources": {}} | changed
 
 
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 @pytest.mark.parametrize(
     "content",
     [
         b"",
         b"\xff\xfe\n",
         *(_kept(head, _ELF) for head in ([], 1, None, "x", {}, _head(_ELF, digest="0"), _head(_ELF, sources=None),
-                                         _head(_ELF, name=None), _head(_ELF, sources={__file__: "0"}),
+                                         _head(_ELF, name=None),
+                                         _head(_ELF, sources={"pendulum_msgs_py/errors.py": "0"}),
+                                         _head(_ELF, sources={__file__: _digest(Path(__file__))}),
+                                         _head(_ELF, sources={"pendulum_nobody/nothing.py": "0"}),
                                          _head(_ELF, sources={"/nowhere": "0"}), _head(_ELF, sources={"\0": "0"}))),
     ],
-    ids=range(13),
+    ids=range(15),
 )  # fmt: skip
 def test_what_somebody_else_has_written_counts_as_not_there(kept: Path, content: bytes) -> None:
     kept.write_bytes(content)
     with pytest.raises(NoMachineCodeError, match="cannot be read back"):
+        load_loop(_BUILDER, symbols={})
+
+
+def test_of_the_sources_those_of_the_packages_here_count(kept: Path) -> None:
+    """A copy of a folder takes what is kept along, and is changed while the folder that it came from is not."""
+    here = Path(machine_code.__file__).parent / "object_file.py"
+    kept.write_bytes(_kept(_head(b"", sources={"pendulum_msgs_py/loops/object_file.py": _digest(here)}), b""))
+    with pytest.raises(NoMachineCodeError, match="cannot be loaded"):  # so it was read back
         load_loop(_BUILDER, symbols={})
 
 

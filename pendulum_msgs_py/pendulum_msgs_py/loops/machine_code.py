@@ -13,6 +13,7 @@ import fcntl
 import hashlib
 import importlib
 import importlib.metadata
+import importlib.util
 import json
 import os
 import platform
@@ -142,14 +143,13 @@ def _addresses() -> dict[str, int]:
 def _path(builder: str, choice: tuple[str, ...]) -> Path:
     """Return where the code of a loop is kept: a file for each choice, compiler and kind of processor."""
     module, _, function = builder.partition(":")
-    package = module.partition(".")[0]
     try:
         versions = [importlib.metadata.version(each) for each in ("numba", "llvmlite", "numpy")]
     except importlib.metadata.PackageNotFoundError as error:
         raise NoMachineCodeError(f"{error.name} is not installed") from error
     known = json.dumps([builder, choice, versions, _processor(), sys.version])
     digest = hashlib.sha256(known.encode()).hexdigest()[:24]
-    home = Path(str(importlib.import_module(package).__file__)).parent / "__pycache__"
+    home = _folder(module.partition(".")[0]) / "__pycache__"
     if not os.access(home if home.exists() else home.parent, os.W_OK):
         try:
             home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pendulum"
@@ -177,10 +177,24 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes] | None:
         if (
             head["digest"] == _digest(code)
             and isinstance(head["name"], str)
-            and all(_digest(Path(source).read_bytes()) == digest for source, digest in head["sources"].items())
+            and all(_digest(_source(name).read_bytes()) == digest for name, digest in head["sources"].items())
         ):
             return head, code
     return None
+
+
+def _source(name: str) -> Path:
+    """Return a source file of the packages that are in use here, wherever the code that names it was compiled."""
+    package, _, rest = name.partition("/")
+    return _folder(package) / rest
+
+
+@cache
+def _folder(package: str) -> Path:
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:
+        raise LookupError(f"no package {package}")
+    return Path(spec.origin).parent
 
 
 def _compile_apart(path: Path, builder: str, choice: tuple[str, ...]) -> None:
@@ -236,14 +250,19 @@ def compile_loop(path: Path, builder: str, *choice: str) -> None:
         "name": compiled.fndesc.llvm_func_name,
         "digest": _digest(code),
         # All that was imported to build it: nothing else can have changed it.
-        "sources": {path: _digest(Path(path).read_bytes()) for path in _own_sources()},
+        "sources": {name: _digest(_source(name).read_bytes()) for name in _own_sources()},
     }
     write_whole(path, json.dumps(head).encode() + b"\n" + code)
 
 
 def _own_sources() -> list[str]:
-    modules = [module for name, module in sorted(sys.modules.items()) if name.startswith("pendulum_")]
-    return [str(module.__file__) for module in modules if getattr(module, "__file__", None)]
+    """Return the files of our modules in this process, each from its package on: a copy elsewhere has its own."""
+    found = []
+    for name, module in sorted(sys.modules.items()):
+        package = name.partition(".")[0]
+        if package.startswith("pendulum_") and getattr(module, "__file__", None):
+            found.append(f"{package}/{Path(str(module.__file__)).relative_to(_folder(package)).as_posix()}")
+    return found
 
 
 def _digest(content: bytes) -> str:
