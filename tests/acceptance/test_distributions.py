@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tarfile
 import zipfile
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
@@ -53,17 +54,45 @@ def _copy_of(folder: str, to: Path) -> Path:
     return to / folder
 
 
+_BUILD = """
+import os, sys, tarfile
+
+from setuptools import build_meta
+
+archives, unpacked, wheels, *folders = sys.argv[1:]
+for folder in folders:
+    if (child := os.fork()) == 0:
+        os.chdir(folder)
+        archive = build_meta.build_sdist(archives)
+        with tarfile.open(os.path.join(archives, archive)) as content:
+            content.extractall(unpacked, filter="data")
+        os.chdir(os.path.join(unpacked, archive.removesuffix(".tar.gz")))
+        assert not build_meta.get_requires_for_build_wheel()
+        os.mkdir("metadata")
+        metadata = os.path.abspath("metadata")
+        name = build_meta.prepare_metadata_for_build_wheel(metadata)
+        build_meta.build_wheel(wheels, metadata_directory=os.path.join(metadata, name))
+        raise SystemExit(0)
+    if os.waitpid(child, 0)[1]:
+        raise SystemExit(f"{folder} is not built")
+"""
+"""What pip asks of the build system, in a process for each package; its modules, most of the time, are loaded once."""
+
+
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build each package's source archive, and its wheel from that; return the folder of the wheels."""
     base = tmp_path_factory.mktemp("distributions")
-    archives = base / "archives"
-    archives.mkdir()
-    hook = f"from setuptools.build_meta import build_sdist; build_sdist({str(archives)!r})"
-    for folder in FOLDERS:
-        _run(sys.executable, "-c", hook, cwd=_copy_of(folder, base / "source"))
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--no-deps", "--no-index"]
-    _run(*pip, "--no-build-isolation", "-w", base / "wheels", *sorted(archives.iterdir()), cwd=base)
+    folders = [base / name for name in ("archives", "unpacked", "wheels")]
+    for folder in folders:
+        folder.mkdir()
+    sources = [_copy_of(name, base / "source") for name in FOLDERS]
+    # Alone with what the packages ask for, as pip builds them; among hundreds of others it takes twice as long.
+    (alone := base / "alone").mkdir()
+    installed = Path(str(distribution("setuptools").locate_file("")))
+    for path in (path for name in ("setuptools*", "_distutils_hack") for path in installed.glob(name)):
+        (alone / path.name).symlink_to(path)
+    _run(sys.executable, "-S", "-c", _BUILD, *folders, *sources, cwd=base, env={"PYTHONPATH": str(alone)})
     return base / "wheels"
 
 
