@@ -12,6 +12,7 @@ import subprocess
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import pytest
 
 from pendulum_bags.console.security import refusal
 from pendulum_bags.verdict.layers import Layer, LayerResult, Mark, sum_up
-from tests.fixtures import PROJECT, wait_for
+from tests.fixtures import PROJECT, own_domain, wait_for
 from tests.npm import install_packages
 from tests.processes import ProcessGroup, RunningProgram
 from tests.tools.faults import console_stops
@@ -77,37 +78,110 @@ def test_only_own_pages_and_bearers_of_the_token_are_let_in(
     assert bool(reason) is bool(expected)
 
 
-@pytest.fixture
-def simulator(processes: ProcessGroup, domain_id: int) -> RunningProgram:
-    """Start a simulator with controller and disturbance in /sim."""
-    at = ["--ros-args", "-r", "__ns:=/sim"]
-    plant = processes.start("pendulum_sim", "simulator", *at, "-p", "start:=top")
-    processes.start("pendulum_lqr", "controller", *at, "-p", "period:=0.002")
-    processes.start("pendulum_lqr", "disturbance", *at)
-    return plant
-
-
-@pytest.fixture
-def address(processes: ProcessGroup, domain_id: int, tmp_path: Path) -> str:
-    """Start the console and return its address."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    console = processes.start("pendulum_bags", "console", "--port", port, "--runs", tmp_path / "runs", alone=True)
-    console.wait_for_output(r"console at http://localhost", 60)
-    return f"http://localhost:{port}/"
-
-
-@pytest.fixture
-def browser() -> Iterator[Any]:
-    """Start Chromium, or skip where there is none."""
+@pytest.fixture(scope="module")
+def play() -> Iterator[Any]:
+    """Start Playwright, or skip where it or the browser is not there."""
     playwright = pytest.importorskip("playwright.sync_api")
     if not CHROMIUM.is_file():
         pytest.skip(f"no browser at {CHROMIUM}")
     with playwright.sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=QUIET)
-        yield chromium
-        chromium.close()
+        yield play
+
+
+@pytest.fixture(scope="module")
+def chromium(play: Any) -> Iterator[Any]:
+    """Start Chromium."""
+    chromium = play.chromium.launch(executable_path=str(CHROMIUM), args=QUIET)
+    yield chromium
+    chromium.close()
+
+
+def test_the_page_doubts_a_silent_server_and_gives_its_orders_to_the_next() -> None:
+    """The page's script alone: what it sends and shows while servers come and go, and when it is loaded anew."""
+    if (node := shutil.which("node")) is None:
+        pytest.skip("no node on this machine")
+    script = PROJECT / "bags" / "pendulum_bags" / "pendulum_bags" / "console" / "static" / "console.js"
+    ended = subprocess.run(
+        [node, Path(__file__).with_name("console_page.cjs"), script],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_no_stop_is_lost_whatever_is_frozen_killed_or_cut_off(play: Any, domain_id: int, tmp_path: Path) -> None:
+    rig = StopRig(tmp_path, play, patience=30.0)
+    try:
+        for name in IN_SHORT:
+            rig.rearm()
+            outcome = STOPS[name](rig)
+            assert outcome.survived, f"{name}: {outcome.detail}"
+    finally:
+        left = rig.close()
+    assert left == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [(["1", "mouse", "frozzen"], "no stop has 'frozzen' in its name"), (["0"], "tries is 0; expected at least 1")],
+)
+def test_stops_that_nobody_can_try_are_refused(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        console_stops.main(arguments)
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+@dataclass
+class Bench:
+    """A simulator with controller and disturbance in /sim, and a console.
+
+    Attributes:
+        processes: All of them, and what a test starts beside them.
+        simulator: The plant.
+        address: The console's.
+        runs: Folder of the runs that the console shows.
+    """
+
+    processes: ProcessGroup
+    simulator: RunningProgram
+    address: str
+    runs: Path
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """Start all that tests look at through a page, once; each leaves an armed plant to the next."""
+    folder = tmp_path_factory.mktemp("bench")
+    with own_domain(folder):
+        processes = ProcessGroup(folder / "processes", cwd=PROJECT)
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        at = ["--ros-args", "-r", "__ns:=/sim"]
+        try:
+            simulator = processes.start("pendulum_sim", "simulator", *at, "-p", "start:=top")
+            processes.start("pendulum_lqr", "controller", *at, "-p", "period:=0.002")
+            processes.start("pendulum_lqr", "disturbance", *at)
+            console = processes.start("pendulum_bags", "console", "--port", port, "--runs", folder / "runs")
+            console.wait_for_output(r"console at http://localhost", 60)
+            yield Bench(processes, simulator, f"http://localhost:{port}/", folder / "runs")
+        finally:
+            leftovers = processes.close()
+    if leftovers:
+        pytest.fail("processes that did not end by themselves: " + "; ".join(leftovers))
+
+
+@pytest.fixture
+def browser(bench: Bench, chromium: Any) -> Iterator[Any]:
+    """Return Chromium for the pages of one test."""
+    yield chromium
+    for context in chromium.contexts:
+        context.close()
 
 
 def _open(browser: Any, address: str, width: int = 1280, height: int = 860, **options: Any) -> Any:
@@ -129,10 +203,8 @@ def _mode(page: Any) -> str:
     return str(page.evaluate("(pendulumConsole.plants['/sim'] || {}).mode"))
 
 
-def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
-    browser: Any, address: str, simulator: RunningProgram, processes: ProcessGroup
-) -> None:
-    desk, phone = _open(browser, address), _open(browser, address, 390, 844)
+def test_two_clients_see_stop_tune_and_meet_a_new_simulator(browser: Any, bench: Bench) -> None:
+    desk, phone = _open(browser, bench.address), _open(browser, bench.address, 390, 844)
 
     # Phone: nothing hangs over the edge, and the stop is in reach.
     assert phone.evaluate("document.documentElement.scrollWidth") <= 390
@@ -185,7 +257,7 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     wait_for(lambda: _mode(desk) == "armed_effort", 10, "the plant to be armed")
 
     # The node is killed: it is no longer shown as armed, and does not go without a word.
-    simulator.send_signal(signal.SIGKILL)
+    bench.simulator.send_signal(signal.SIGKILL)
     row = desk.locator("[data-plant='/sim']")
     row.locator(".silent").wait_for(timeout=10_000)
     assert "no state for" in row.inner_text()
@@ -194,53 +266,19 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(
     desk.locator("#alarms .note", has_text=gone).wait_for(timeout=10_000)
 
     # It comes back; the page goes on with the new one.
-    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "start:=top")
+    bench.processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "start:=top")
     wait_for(lambda: _mode(desk) == "armed_effort", 60, "the new plant")
     before = desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns")
     wait_for(lambda: desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns") != before, 10, "new states")
 
 
-@pytest.mark.usefixtures("simulator")
-def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, address: str, tmp_path: Path) -> None:
-    install_packages(AXE, "axe-core")
-    page = _open(browser, address, color_scheme="light")
-    _compare(tmp_path / "runs" / "compared")
-    page.get_by_text("1 same run: ✗ no").wait_for(timeout=10_000)
-    assert page.get_by_text("It answers 9 ms later.", exact=True).is_visible()
-    page.wait_for_selector("[data-name='r']", timeout=30_000)
-    page.keyboard.press("Escape")
-    page.wait_for_selector("#alarms .good", timeout=10_000)
-    page.add_script_tag(path=str(AXE / "node_modules" / "axe-core" / "axe.min.js"))
-    tags = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]
-    # As while somebody uses it: requests are under way.
-    page.evaluate("setInterval(() => { const r = new XMLHttpRequest(); r.open('GET', '/'); r.send() }, 200)")
-    page.wait_for_timeout(1000)
-    problems = []
-    backgrounds = {}
-    cut = "[...document.querySelectorAll('.parameters')].filter(it => it.scrollWidth > it.clientWidth).length"
-    for scheme in ("light", "dark"):
-        page.emulate_media(color_scheme=scheme)
-        for width in (1280, 390):
-            page.set_viewport_size({"width": width, "height": 844})
-            found = page.evaluate("(tags) => axe.run(document, {runOnly: tags})", tags)
-            assert page.evaluate(cut) == 0, f"a table of parameters is cut at {width} px"
-            assert len(found["passes"]) > 15, "axe looked at next to nothing"
-            problems += [
-                f"{scheme}, {width} px: {it['id']}: {node['html'][:120]} {node['failureSummary']}"
-                for it in found["violations"]
-                for node in it["nodes"]
-            ]
-        backgrounds[scheme] = page.evaluate("getComputedStyle(document.body).backgroundColor")
-    assert backgrounds["light"] != backgrounds["dark"], "the page did not change its colours"
-    assert not problems, "\n".join(problems)
-
-
-@pytest.mark.usefixtures("simulator")
-def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address: str, processes: ProcessGroup) -> None:
-    page = _open(browser, address)
+def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, bench: Bench) -> None:
+    page = _open(browser, bench.address)
     of_sim = page.get_by_role("button", name="Start controller /sim")
     place = of_sim.evaluate(PLACE_AMONG_PLANTS)
-    other = processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot")
+    other = bench.processes.start(
+        "pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot"
+    )
     joints = page.get_by_label("Lines of /robot: joint")
     joints.wait_for()
     assert joints.locator("option").all_inner_texts() == ["shoulder", "elbow"]
@@ -283,56 +321,46 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, address:
     assert page.get_by_role("button", name="Stop /robot", exact=True).is_visible()
     assert robot.get_by_role("heading").is_visible()
     assert of_sim.evaluate(PLACE_AMONG_PLANTS) == place
-    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot")
+    bench.processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot")
     page.get_by_role("button", name="Arm /robot", exact=True).wait_for()
 
 
-def test_the_page_doubts_a_silent_server_and_gives_its_orders_to_the_next() -> None:
-    """The page's script alone: what it sends and shows while servers come and go, and when it is loaded anew."""
-    if (node := shutil.which("node")) is None:
-        pytest.skip("no node on this machine")
-    script = PROJECT / "bags" / "pendulum_bags" / "pendulum_bags" / "console" / "static" / "console.js"
-    ended = subprocess.run(
-        [node, Path(__file__).with_name("console_page.cjs"), script],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert ended.returncode == 0, ended.stderr
+def test_axe_finds_nothing_that_keeps_anybody_out(browser: Any, bench: Bench) -> None:
+    install_packages(AXE, "axe-core")
+    page = _open(browser, bench.address, color_scheme="light")
+    _compare(bench.runs / "compared")
+    page.get_by_text("1 same run: ✗ no").wait_for(timeout=10_000)
+    assert page.get_by_text("It answers 9 ms later.", exact=True).is_visible()
+    page.wait_for_selector("[data-name='r']", timeout=30_000)
+    page.keyboard.press("Escape")
+    page.wait_for_selector("#alarms .good", timeout=10_000)
+    page.add_script_tag(path=str(AXE / "node_modules" / "axe-core" / "axe.min.js"))
+    tags = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]
+    # As while somebody uses it: requests are under way.
+    page.evaluate("setInterval(() => { const r = new XMLHttpRequest(); r.open('GET', '/'); r.send() }, 200)")
+    page.wait_for_timeout(1000)
+    problems = []
+    backgrounds = {}
+    cut = "[...document.querySelectorAll('.parameters')].filter(it => it.scrollWidth > it.clientWidth).length"
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)
+        for width in (1280, 390):
+            page.set_viewport_size({"width": width, "height": 844})
+            found = page.evaluate("(tags) => axe.run(document, {runOnly: tags})", tags)
+            assert page.evaluate(cut) == 0, f"a table of parameters is cut at {width} px"
+            assert len(found["passes"]) > 15, "axe looked at next to nothing"
+            problems += [
+                f"{scheme}, {width} px: {it['id']}: {node['html'][:120]} {node['failureSummary']}"
+                for it in found["violations"]
+                for node in it["nodes"]
+            ]
+        backgrounds[scheme] = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert backgrounds["light"] != backgrounds["dark"], "the page did not change its colours"
+    assert not problems, "\n".join(problems)
 
 
-def test_no_stop_is_lost_whatever_is_frozen_killed_or_cut_off(domain_id: int, tmp_path: Path) -> None:
-    playwright = pytest.importorskip("playwright.sync_api")
-    if not CHROMIUM.is_file():
-        pytest.skip(f"no browser at {CHROMIUM}")
-    with playwright.sync_playwright() as play:
-        rig = StopRig(tmp_path, play, patience=30.0)
-        try:
-            for name in IN_SHORT:
-                rig.rearm()
-                outcome = STOPS[name](rig)
-                assert outcome.survived, f"{name}: {outcome.detail}"
-        finally:
-            left = rig.close()
-    assert left == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [(["1", "mouse", "frozzen"], "no stop has 'frozzen' in its name"), (["0"], "tries is 0; expected at least 1")],
-)
-def test_stops_that_nobody_can_try_are_refused(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        console_stops.main(arguments)
-    assert ended.value.code == 2
-    assert said in capsys.readouterr().err
-
-
-def test_a_foreign_page_cannot_press_the_button(address: str) -> None:
-    request = urllib.request.Request(address + "e_stop", method="POST", headers={"Origin": "http://evil.example"})
+def test_a_foreign_page_cannot_press_the_button(bench: Bench) -> None:
+    request = urllib.request.Request(bench.address + "e_stop", method="POST", headers={"Origin": "http://evil.example"})
     with pytest.raises(urllib.error.HTTPError) as caught:
         urllib.request.urlopen(request, timeout=10)
     assert caught.value.code == 403
