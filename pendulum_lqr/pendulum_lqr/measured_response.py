@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
+import scipy.special
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.errors import DataError, ParameterError
@@ -98,7 +98,8 @@ class MeasuredResponse:
             joint: Whether all discs together are meant (Bonferroni), or each for itself.
         """
         tail = (1.0 - confidence) / (self.response.size if joint else 1)
-        quantile = float(scipy.stats.f.isf(tail, 2.0, 2.0 * (self.blocks - 1.0)))
+        # Of scipy.stats the same number, but it takes a third of a second to import.
+        quantile = float(scipy.special.fdtri(2.0, 2.0 * (self.blocks - 1.0), 1.0 - tail))
         return np.sqrt(quantile) * self.deviation
 
     def to_json(self) -> dict[str, Any]:
