@@ -72,6 +72,16 @@ def test_one_controller_is_run_and_told_of_on_both_sides_and_frequencies_are_tho
     assert "controller:='lqr'" in multisine.controller_program().ros_arguments()
 
 
+def test_a_multisine_begins_at_the_inverse_of_its_period_and_lasts_for_those_averaged_and_one_more() -> None:
+    settings = JointSettings("cart_pole")
+    for multisine, lowest, duration in (
+        (JointMultisine(settings), 0.25, 36.1),
+        (JointMultisine(settings, 3, 1.0), 1.0, 4.1),
+    ):
+        assert multisine.excitation["frequency"] == 1.0 / multisine.excitation["signal_period"] == lowest
+        assert multisine.run.duration == pytest.approx(duration)
+
+
 @pytest.mark.parametrize("share", [-0.1, 1.0, float("nan")])
 def test_a_share_that_makes_no_plant_is_refused(share: float) -> None:
     with pytest.raises(ParameterError, match=r"share is .*; expected 0 to less than 1"):

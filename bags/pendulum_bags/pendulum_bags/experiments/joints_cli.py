@@ -69,8 +69,11 @@ def joints(
         ),
     ] = True,
     periods: Annotated[
-        int, typer.Option(help="Periods of 4 s that are averaged for it; one more settles.", min=3, max=1000)
+        int, typer.Option(help="Periods that are averaged for it; one more settles.", min=3, max=1000)
     ] = 8,
+    signal_period: Annotated[
+        float, typer.Option(help="Length of one period [s]; its inverse is the lowest frequency.", min=0.5, max=100.0)
+    ] = 4.0,
     design: Design = None,
     rank_seeds: Annotated[
         int,
@@ -135,7 +138,7 @@ def joints(
     with new_run(out, "joints", console) as folder:
         made = write_mechanism(folder / "machine.yaml", drawn, provenance={"stands_in_for": f"the machine of {plant}"})
         expected = _STARTING + _PACE * duration
-        multisine = JointMultisine(settings, periods)
+        multisine = JointMultisine(settings, periods, signal_period)
         longer = _STARTING + _PACE * multisine.run.duration if measured else 0.0
         analysis = None
         each = _STARTING + _PACE * min(duration, DURATION)

@@ -18,10 +18,8 @@ __all__ = ["FOLDER", "JointMultisine", "measure_joints"]
 
 FOLDER = "frequency_response"
 """Folder within a run folder that holds the recordings under the multisine, and all that they tell."""
-_SIGNAL_PERIOD = 4.0
-"""Length of one period [s]."""
-_LOWEST, _HIGHEST = 0.25, 100.0
-"""Band [Hz]. The loops of all presets are small at its end, where no line says what comes beyond."""
+_HIGHEST = 100.0
+"""End of the band [Hz]. The loops of all presets are small there, where no line says what comes beyond."""
 _LINES = 48
 
 
@@ -32,23 +30,25 @@ class JointMultisine:
     Attributes:
         settings: The run.
         periods: Periods that are averaged; one more settles.
+        signal_period: Length of one [s]; its inverse is the lowest frequency.
     """
 
     settings: JointSettings
     periods: int = 8
+    signal_period: float = 4.0
 
     @property
     def run(self) -> JointSettings:
         """The settings of the run, as long as its periods, under an LQR: a response is that of a linear loop."""
-        return replace(self.settings, controller="lqr", duration=_SIGNAL_PERIOD * (self.periods + 1) + 0.1)
+        return replace(self.settings, controller="lqr", duration=self.signal_period * (self.periods + 1) + 0.1)
 
     @property
     def excitation(self) -> dict[str, Any]:
         """Parameters of the disturbance."""
         return {
             "kind": "multisine",
-            "signal_period": _SIGNAL_PERIOD,
-            "frequency": _LOWEST,
+            "signal_period": self.signal_period,
+            "frequency": 1.0 / self.signal_period,
             "frequency_end": _HIGHEST,
             "lines": _LINES,
             "hold_time": self.settings.period,
