@@ -167,7 +167,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
             simulator = processes.start("pendulum_sim", "simulator", *at, "-p", "start:=top")
             processes.start("pendulum_lqr", "controller", *at, "-p", "period:=0.002")
             processes.start("pendulum_lqr", "disturbance", *at)
-            console = processes.start("pendulum_bags", "console", "--port", port, "--runs", folder / "runs")
+            console = processes.start("pendulum_bags", "console", "--port", port, "--runs", folder / "runs", alone=True)
             console.wait_for_output(r"console at http://localhost", 60)
             yield Bench(processes, simulator, f"http://localhost:{port}/", folder / "runs")
         finally:
