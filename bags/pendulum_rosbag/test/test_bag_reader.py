@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zstandard
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapLibraryWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
@@ -153,6 +154,13 @@ def test_topics_can_be_chosen_and_missing_ones_are_named(tmp_path: Path) -> None
     assert read_bag(path).get("/c") is None
     with pytest.raises(BagError, match="does not exist"):
         read_bag(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "notes.zstd", "notes.txt.zstd"])
+def test_a_file_is_known_for_a_bags_by_what_it_is_called(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(zstandard.compress(b"no bag"))
+    with pytest.raises(BagError, match=rf"{name} is no storage file of a bag; expected \.mcap or \.db3"):
+        read_bag(tmp_path / name)
 
 
 def test_states_of_several_joints_come_as_objects(tmp_path: Path) -> None:

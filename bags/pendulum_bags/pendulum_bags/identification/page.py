@@ -75,12 +75,12 @@ def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], fol
     drawn = thesis_figures(trials)
     figures = write_figures([one for one in drawn if isinstance(one, Figure)], target / "figures", ("png",))
     rows = [
-        (name, f"{value:.5g}", f"{result.intervals[name][0]:.5g} to {result.intervals[name][1]:.5g}")
+        (name, f"{value:.5g}", f"{result.intervals[name][0]:.5g} to {result.intervals[name][1]:.5g}", UNITS[name])
         for name, value in result.average.items()
     ]
     body = [
         _sentences(result.sentences),
-        _table("Average over trials", ("coefficient", "value", "95 % interval"), rows),
+        _table("Average over trials", ("coefficient", "value", "95 % interval", "unit"), rows),
         *(f"<h2>{escape(r.trial)}</h2><pre>{escape(r.summary)}</pre>" for r in result.trials),
         *(f"<p>No figure: {escape(one)}.</p>" for one in drawn if isinstance(one, str)),
         *map(_image, figures),

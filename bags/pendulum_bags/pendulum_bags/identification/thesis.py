@@ -231,7 +231,7 @@ def fit_inertia_damping(recordings: Sequence[Recording], *, skew: float | None =
         (
             f"A shift of 1 ms between the samples of velocity and effort is {1e-3 * average['damping']:.3g} kg m^2 of "
             f"inertia, and nothing in these recordings tells the two apart: the interval allows for "
-            f"{1e3 * shift:.3g} ms (`--skew`) and for the scatter of the trials, {scatter:.2g} kg m^2 either way. "
+            f"{1e3 * shift:.3g} ms (--skew) and for the scatter of the trials, {scatter:.2g} kg m^2 either way. "
             "A velocity that the actuator filters lags by more."
         ),
     ]

@@ -241,12 +241,12 @@ def damage_of(folder: BagFolder, sources: Iterable[Source]) -> list[str]:
 
 def open_source(file: Path, *, verify: bool | None = None) -> Source:
     """Open one storage file by its name; files compressed as a whole (``.zstd``) are decompressed first."""
+    if _ending(file) not in (".mcap", ".db3"):
+        raise BagError(f"{file} is no storage file of a bag; expected .mcap or .db3, or either with .zstd behind")
     if file.suffix == ".mcap":
         return McapSource(file, verify=verify)
     if file.suffix == ".db3":
         return SqliteSource(file)
-    if file.suffix != ".zstd":
-        raise BagError(f"{file} is no storage file of a bag; expected .mcap or .db3")
     try:
         with file.open("rb") as packed:
             data = decompress_bounded(packed, str(file), max(_LEAST_ROOM, _MAX_RATIO * file.stat().st_size))
