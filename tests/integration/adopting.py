@@ -1,4 +1,4 @@
-"""The plain node of others with our ``adopt`` before it, as processes."""
+"""The plain node of others with our ``adopt`` before it, as processes, and a model file of the same pendulum."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import math
 import sys
 from pathlib import Path
 
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_sim.model_files import mjcf
 from tests.processes import ProcessGroup, RunningProgram
 
-__all__ = ["EFFORTS", "adopt", "start_robot"]
+__all__ = ["EFFORTS", "adopt", "start_robot", "write_model"]
 
 _ROBOT = Path(__file__).with_name("plain_plant.py")
 EFFORTS = "/robot/effort_controller/commands"
@@ -34,3 +36,11 @@ def adopt(processes: ProcessGroup, namespace: str, **changes: object) -> Running
     }
     arguments = [item for name, value in told.items() for item in ("-p", f"{name}:={value}")]
     return processes.start("pendulum_sim", "adopt", "--ros-args", "-r", f"__ns:={namespace}", *arguments)
+
+
+def write_model(path: Path) -> Path:
+    """Write a MuJoCo model of the same pendulum, of 100 states a second as that node has; return the file."""
+    model = mjcf(load_plant("thesis"))
+    assert 'timestep="0.002"' in model
+    path.write_text(model.replace('timestep="0.002"', 'timestep="0.01"'), encoding="utf-8")
+    return path

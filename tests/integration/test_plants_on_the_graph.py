@@ -13,10 +13,8 @@ import pytest
 from pendulum_bags.experiments.conductor_node import Conductor
 from pendulum_bags.experiments.graph_plant import join
 from pendulum_msgs_py.errors import FaultError
-from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag
-from pendulum_sim.model_files import mjcf
-from tests.integration.adopting import adopt, start_robot
+from tests.integration.adopting import adopt, start_robot, write_model
 from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
 
@@ -37,8 +35,7 @@ def experiment(processes: ProcessGroup, domain: int, out: Path, *arguments: str 
 def test_an_adopted_plant_is_compared_with_a_model_file_and_goes_on_running(
     processes: ProcessGroup, domain_id: int, peer: PlantPeer, tmp_path: Path
 ) -> None:
-    model = tmp_path / "model.xml"
-    model.write_text(mjcf(load_plant("thesis")), encoding="utf-8")
+    model = write_model(tmp_path / "model.xml")
     robot, adopter = start_robot(processes), adopt(processes, "/lab")
     peer.until(lambda: peer.states and peer.diagnostics.get("mode"), "the adopted plant")
     peer.leave_the_command()

@@ -16,9 +16,8 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
-from pendulum_sim.model_files import mjcf
 from tests.fixtures import PROJECT, own_domain, wait_for
-from tests.integration.adopting import adopt, start_robot
+from tests.integration.adopting import adopt, start_robot, write_model
 from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
 
@@ -77,9 +76,7 @@ def lab(running: Laboratory) -> Laboratory:
 
 def begin(processes: ProcessGroup, lab: Laboratory, folder: Path) -> RunningProgram:
     """Start an experiment with the adopted plant as the simulation, and wait until it is on its way up."""
-    model, plant = folder / "model.xml", folder / "plant.yaml"
-    model.write_text(mjcf(load_plant("thesis")), encoding="utf-8")
-    write_plant(plant, load_plant("thesis"))
+    model, plant = write_model(folder / "model.xml"), write_plant(folder / "plant.yaml", load_plant("thesis"))
     before = lab.peer.states[-1].position[0]
     run = processes.start(
         "pendulum_bags", "experiment", "thesis", "--out", folder / "run", "--domain", str(lab.domain),
