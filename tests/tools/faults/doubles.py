@@ -29,6 +29,8 @@ _NOTICED = 1.0
 FIVE_NODES = (*NODES, "viewer")
 ORDERS: tuple[tuple[str, ...], ...] = tuple(itertools.permutations(FIVE_NODES))
 """All 120 orders in which five nodes can start."""
+_UNUSUAL = [order for order in ORDERS if order.index("controller") < order.index("simulator")]
+"""Those in which somebody commands before there is a plant: a system's own start is one of the others."""
 _PERIOD_NS = 2_000_000
 
 
@@ -261,10 +263,7 @@ class _EveryOrder:
 
 
 def _random_orders(system: LiveSystem, generator: random.Random) -> Outcome:
-    outcome = Outcome()
-    for _ in range(2):
-        one = start_in_order(system, generator.choice(ORDERS), one_by_one=False)
-        outcome.demand(one.survived, one.detail)
+    outcome = start_in_order(system, generator.choice(_UNUSUAL), one_by_one=False)
     system.processes.finish(system.children.pop("viewer"))
     return outcome
 

@@ -1,6 +1,6 @@
 """A process that runs programs of ours one after the other, so that a hundred runs load Python's modules once.
 
-To start a node takes half a second of a processor, nearly all of it to load numpy, numba and rclpy; to make and destroy
+To start a node takes half a second of a processor, nearly all of it to load numpy, scipy and rclpy; to make and destroy
 the node takes a sixteenth of that. ``python -m pendulum_bags.experiments.program_host DESCRIPTOR`` takes orders, a line
 of JSON each, from the socket with that number, and answers each with a line when its program has ended. A program sees
 what it would see alone: its own variables, output and signals, a fresh ROS context, exit codes. The host ends when its
