@@ -16,7 +16,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.serialization import serialize_message
 
 from pendulum_bags.comparison import Comparison, compare_folders
-from pendulum_bags.figures.figure import ROLES, Figure, Panel, thinned
+from pendulum_bags.figures import render_files
+from pendulum_bags.figures.figure import ROLES, Figure, Panel, Trace, thinned
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.figures.table import Table
@@ -505,3 +506,19 @@ def test_a_report_on_emulated_hardware_lists_the_constants_of_the_emulator(
 def test_two_dampings_that_cannot_be_compared_are_not_shown_without_a_word(comparison: Comparison) -> None:
     data = ReportData(comparison, {})
     assert "b is not" in next(it.sentence for it in make_figures(data)[0] if it.name == "gravity_fit")
+
+
+@pytest.mark.parametrize("size", [1e-7, 1.0])
+def test_a_title_gives_way_to_the_factor_above_the_axis(size: float) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Canvas
+
+    times = np.linspace(0.0, 1.0, 50)
+    panel = Panel("time [s]", "torque [N m]", [Trace(times, size * np.sin(times), "sim", "sim")], title="One run")
+    canvas = render_files._draw(Figure("one", "One run", "A sentence.", [panel]), Canvas)
+    FigureCanvasAgg(canvas).draw()
+    (ax,) = canvas.axes
+    factor, title = ax.yaxis.offsetText, ax.get_title(loc="left")
+    assert title == "One run"
+    assert bool(factor.get_text()) is (size < 1.0)
+    assert not factor.get_text() or not ax._left_title.get_window_extent().overlaps(factor.get_window_extent())
