@@ -15,9 +15,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import Subscription
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -34,6 +32,7 @@ from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message, sample_from_bytes, stamp_of_state, trajectory_to_message
 from pendulum_msgs_py.ros.leaving import leaving_graph
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
+from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
 
 __all__ = ["Conductor", "PlantClient", "RecorderClient"]
 
@@ -54,6 +53,7 @@ class Conductor:
 
     Attributes:
         listened: For how long it has listened [s]; a pause of this program does not count.
+        after_listening: Called each time that it has listened, for what is worth a look now and then.
     """
 
     def __init__(
@@ -63,6 +63,7 @@ class Conductor:
         self.watch = watch
         self.on_wait = on_wait
         self.listened = 0.0
+        self.after_listening: list[Callable[[], None]] = []
 
     def __enter__(self) -> Conductor:
         """Join the graph."""
@@ -70,7 +71,7 @@ class Conductor:
         set_middleware_defaults()
         self.context = Context()
         rclpy.init(context=self.context, domain_id=self.domain, signal_handler_options=SignalHandlerOptions.NO, args=[])
-        self.node: Node = rclpy.create_node("conductor", context=self.context, start_parameter_services=False)
+        self.node = PollingNode("conductor", context=self.context, start_parameter_services=False)
         check_closed(self.domain)
         self._executor = EventsExecutor(context=self.context)
         self._executor.add_node(self.node)
@@ -137,6 +138,8 @@ class Conductor:
         self._executor.spin_until_future_complete(Future(executor=None) if until is None else until, duration)
         # A pause of this program does not count.
         self.listened += min(duration, time.monotonic() - began)
+        for look in self.after_listening:
+            look()
 
     def _slice(self, duration: float, until: Future | None = None) -> None:
         self.listen(duration, until)
@@ -170,7 +173,6 @@ class PlantClient:
         self.conductor = conductor
         self.namespace = namespace
         self.sample: JointSample | None = None
-        self.samples = 0
         self._foreign_joints: tuple[str, ...] = ()
         self._heard = conductor.listened
         self.events: list[dict[str, Any]] = []
@@ -185,7 +187,7 @@ class PlantClient:
         )
         self._events = node.create_publisher(String, f"{namespace}/{names.EVENTS}", qos.EVENTS)
         node.create_subscription(String, f"{namespace}/{names.EVENTS}", self._on_event, qos.EVENTS)
-        self._watching: Subscription | None = None
+        self._watching: PolledInput | None = None
         if watch:
             self.watch()
 
@@ -195,16 +197,22 @@ class PlantClient:
         return self.sample is not None or bool(self._foreign_joints)
 
     def watch(self) -> None:
-        """Subscribe to the plant's states."""
-        self._watching = self.conductor.node.create_subscription(
-            JointState, f"{self.namespace}/{names.JOINT_STATES}", self._on_state, qos.NEWEST_STATE, raw=True
+        """Subscribe to the plant's states, and look at the newest now and then: nobody is woken for each of them."""
+        self._watching = self.conductor.node.create_polled_input(
+            JointState, f"{self.namespace}/{names.JOINT_STATES}", qos.NEWEST_STATE
         )
+        self.conductor.after_listening.append(self._look)
 
     def look_away(self) -> None:
         """Subscribe to its states no longer: to hear a run in lockstep takes a tenth of what the run takes."""
         if self._watching is not None:
-            self.conductor.node.destroy_subscription(self._watching)
+            self.conductor.after_listening.remove(self._look)
+            self.conductor.node.destroy_polled_input(self._watching)
             self._watching = None
+
+    def _look(self) -> None:
+        if self._watching is not None:
+            self._watching.take(self._on_state)
 
     def wait_until_ready(self, timeout: float, *, controller: bool = True, disturbance: bool = True) -> None:
         """Wait until states flow and all services and the trajectory topic are there.
@@ -380,13 +388,12 @@ class PlantClient:
         if isinstance(event, dict) and "name" in event:
             self.events.append(event)
 
-    def _on_state(self, data: bytes) -> None:
+    def _on_state(self, data: bytes, _received_ns: int) -> None:
         sample = sample_from_bytes(data)
         if sample is None:
             self._foreign_joints = stamp_of_state(data, (names.JOINT,))[1]
         else:
             self.sample = sample
-            self.samples += 1
             self._heard = self.conductor.listened
 
 
