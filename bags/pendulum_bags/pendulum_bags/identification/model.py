@@ -126,12 +126,11 @@ class FitModel:
 
     def __post_init__(self) -> None:
         """Build the vector; unknown names are an error."""
-        vector = np.zeros(len(PARAMETER_NAMES))
-        for name, value in {**_DEFAULTS, **self.values}.items():
-            if name not in INDEX:
-                raise DataError(f"fit model has no parameter {name!r}; expected one of {', '.join(PARAMETER_NAMES)}")
-            vector[INDEX[name]] = value
-        if not np.all(np.isfinite(vector)) or vector[INDEX["inertia"]] <= 0.0:
+        values = {**_DEFAULTS, **self.values}
+        for name in values.keys() - INDEX.keys():
+            raise DataError(f"fit model has no parameter {name!r}; expected one of {', '.join(PARAMETER_NAMES)}")
+        vector = np.array([values.get(name, 0.0) for name in PARAMETER_NAMES], dtype=float)
+        if not np.isfinite(vector).all() or vector[INDEX["inertia"]] <= 0.0:
             raise DataError(f"fit model has the values {dict(self.values)}; expected finite numbers and inertia > 0")
         vector.setflags(write=False)
         object.__setattr__(self, "vector", vector)
@@ -147,8 +146,7 @@ class FitModel:
 
     def with_vector(self, vector: Array) -> FitModel:
         """Return the model with other values."""
-        values = dict(zip(PARAMETER_NAMES, map(float, vector), strict=True))
-        return replace(self, values=values)
+        return replace(self, values=dict(zip(PARAMETER_NAMES, vector.tolist(), strict=True)))
 
 
 def from_plant(plant: PlantParameters) -> FitModel:

@@ -9,6 +9,7 @@ sec. 4.3 (robust weights); Golub and Pereyra, Inverse Problems 19, 2003 (separab
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -46,7 +47,7 @@ class Solution:
 
 def robust_cost(residual: Array, scale: float) -> float:
     """Return the soft-L1 cost, sum of 2 s^2 (sqrt(1 + (r/s)^2) - 1); s = inf gives the sum of squares [rad^2]."""
-    if not np.isfinite(scale):
+    if not math.isfinite(scale):
         return float(residual @ residual)
     ratio = residual / scale
     return float(2.0 * scale * scale * np.sum(np.sqrt(1.0 + ratio * ratio) - 1.0))
@@ -94,6 +95,7 @@ def solve(
     # The steps must not change within one fit, or the cost would jump with them.
     steps = [coarse * longest_step(best, piece.recording) for piece in pieces]
     masks = [piece.mask() for piece in pieces]
+    measured = [piece.recording.position[mask] for piece, mask in zip(pieces, masks, strict=True)]
     ends = np.cumsum([len(piece.windows) for piece in pieces])[:-1]
     typical = _typical_scales(index)
     damping, cost, iterations, converged = 1e-4, np.inf, 0, False
@@ -102,7 +104,7 @@ def solve(
         iterations += 1
         if blocks is None:
             cost, blocks = _linearise(best, pieces, x, index, scale, steps, masks)
-            if not np.isfinite(cost):
+            if not math.isfinite(cost):
                 break
         step = _damped_step(blocks, vector[index], low, high, damping, typical)
         if step is None:
@@ -120,9 +122,9 @@ def solve(
         candidate = model.with_vector(trial)
         x_trial = [a + b for a, b in zip(x, np.split(d_x, ends), strict=True)]
         new_cost = 0.0
-        for piece, state, h, mask in zip(pieces, x_trial, steps, masks, strict=True):
-            r = simulate(candidate, piece, state, step=h).theta[mask] - piece.recording.position[mask]
-            new_cost += robust_cost(r, scale) if np.all(np.isfinite(r)) else np.inf
+        for piece, state, h, mask, known in zip(pieces, x_trial, steps, masks, measured, strict=True):
+            r = simulate(candidate, piece, state, step=h).theta[mask] - known
+            new_cost += robust_cost(r, scale) if np.isfinite(r).all() else np.inf
         if new_cost < cost:
             relative = (cost - new_cost) / cost
             vector, best, x, blocks = trial, candidate, x_trial, None
@@ -213,11 +215,11 @@ def _linearise(
         result = simulate(model, piece, state, free=index.tolist(), step=h)
         residual = result.theta - piece.recording.position
         inside = residual[mask]
-        if not (np.all(np.isfinite(inside)) and np.all(np.isfinite(result.jacobian))):
+        if not (np.isfinite(inside).all() and np.isfinite(result.jacobian).all()):
             return np.inf, blocks
         cost += robust_cost(inside, scale)
         weight = np.ones_like(residual)
-        if np.isfinite(scale):
+        if math.isfinite(scale):
             weight = 1.0 / np.sqrt(1.0 + (residual / scale) ** 2)
         own = slice(begin, begin + len(piece.windows))
         begin = own.stop
@@ -243,26 +245,25 @@ def _damped_step(
     reduced, gradient, inverses = eliminate(blocks.h_pp, blocks.h_px, blocks.h_xx, blocks.g_p, blocks.g_x, damping)
     d_p = np.zeros(k)
     if k:
-        own = np.diag(blocks.h_pp)
+        own = blocks.h_pp.diagonal()
         floor = 1e-12 * max(float(own.max()), 1e-30)
-        system = reduced + np.diag(damping * (np.maximum(own, 0.0) + floor / typical**2))
-        active = np.zeros(k, dtype=bool)
-        for _ in range(k + 1):
-            idle = np.flatnonzero(~active)
-            if not idle.size:
-                break
-            try:
-                step = np.linalg.solve(
-                    system[idle[:, None], idle], -(gradient + system @ np.where(active, d_p, 0.0))[idle]
-                )
-            except np.linalg.LinAlgError:
-                return None
-            d_p[idle] = step
-            outside = ((values + d_p < low) | (values + d_p > high)) & ~active
-            if not outside.any():
-                break
-            # Parameters that would leave their domain stop at its edge; the others solve again around them.
-            d_p[outside] = np.clip(values + d_p, low, high)[outside] - values[outside]
-            active |= outside
+        system = reduced.copy()
+        system.flat[:: k + 1] += damping * (np.maximum(own, 0.0) + floor / typical**2)
+        try:
+            d_p = np.linalg.solve(system, -gradient)
+            active = np.zeros(k, dtype=bool)
+            for _ in range(k):
+                reached = values + d_p
+                outside = ((reached < low) | (reached > high)) & ~active
+                if not outside.any():
+                    break
+                # Parameters that would leave their domain stop at its edge; the others solve again around them.
+                d_p[outside] = np.clip(reached, low, high)[outside] - values[outside]
+                active |= outside
+                idle = np.flatnonzero(~active)
+                right = -(gradient + system @ np.where(active, d_p, 0.0))[idle]
+                d_p[idle] = np.linalg.solve(system[idle[:, None], idle], right)
+        except np.linalg.LinAlgError:
+            return None
     d_x, decrease = find_states(blocks.h_px, blocks.h_xx, blocks.g_x, inverses, d_p)
     return d_p, d_x, decrease - 2.0 * float(blocks.g_p @ d_p) - float(d_p @ blocks.h_pp @ d_p)
