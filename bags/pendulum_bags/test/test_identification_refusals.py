@@ -20,10 +20,10 @@ from tests.bag_messages import joint_state, write_bag
 from tests.synthetic_recordings import multisine, synthetic_recording
 
 TRUTH = PlantParameters(inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05, transport_delay=0.006)
-QUICK = Options(friction="coulomb", multi_start=False)
+QUICK = Options(friction="coulomb", multi_start=False, folds=2)
 
 
-def run(seed=0, *, seconds=6.0, period=0.005, amplitude=1.2, plant=TRUTH, start=(0.0, 0.0), **kwargs):
+def run(seed=0, *, seconds=6.0, period=0.01, amplitude=1.2, plant=TRUTH, start=(0.0, 0.0), **kwargs):
     rng = np.random.default_rng(seed)
     time = period * np.arange(round(seconds / period))
     effort = multisine(time, amplitude, rng) if amplitude else np.zeros_like(time)
@@ -234,7 +234,8 @@ def test_a_wrapped_angle_of_a_bag_is_unwrapped_too(tmp_path):
     np.testing.assert_allclose(np.diff(read.position), np.diff(recording.position)[: len(read.position) - 1], atol=1e-9)
 
 
-def test_an_angle_that_jumps_by_no_turn_is_refused(tmp_path, known):
+def test_an_angle_that_jumps_by_no_turn_is_refused(tmp_path):
+    known = run(period=0.005)
     position = known.position.copy()
     position[700:] += 2.0
     with pytest.raises(DataError, match=r"jumps by 1\.99 rad in 0\.005 s"):
@@ -246,10 +247,10 @@ def test_no_window_reaches_across_a_gap_and_the_gap_is_said(known):
     cut = Recording(known.time[keep], known.position[keep], None, known.input[keep], hold="zero")
     piece = prepare(cut, 1.0)
     for first, stop in piece.windows:
-        assert np.max(np.diff(cut.time[first:stop])) < 0.01
+        assert np.max(np.diff(cut.time[first:stop])) < 0.02
     result = identify([cut], QUICK, profiles=0)
     assert result.model["gravity"] == pytest.approx(1.5, rel=2e-3)
-    assert any("no samples for 0.41 s from 2.29 s after its start" in sentence for sentence in result.sentences())
+    assert any("no samples for 0.42 s from 2.29 s after its start" in sentence for sentence in result.sentences())
     # The stream of the input may have the gap while the motion goes on.
     lossy = replace(known, input=known.input[keep], input_time=known.time[keep])
     piece = prepare(lossy, 1.0)
