@@ -123,11 +123,15 @@ def test_windows_are_long_where_a_drive_damps_and_enough_are_left(kind, seconds,
 
 
 def test_a_wrong_geometry_is_contradicted_and_a_right_one_is_not(found):
-    wrong = identify([run()], Options(friction="coulomb", folds=2, multi_start=False, geometry=Geometry(0.1, 0.5)), profiles=0)
+    wrong = identify(
+        [run()], Options(friction="coulomb", folds=2, multi_start=False, geometry=Geometry(0.1, 0.5)), profiles=0
+    )
     assert wrong.geometry is not None
     assert wrong.geometry.contradicts
     assert wrong.sentences()[0].startswith("CONTRADICTION: gravity is 1.5")
-    right = identify([run()], Options(friction="coulomb", folds=2, geometry=Geometry(1.5 / 9.80665 / 0.15, 0.15)), profiles=0)
+    right = identify(
+        [run()], Options(friction="coulomb", folds=2, geometry=Geometry(1.5 / 9.80665 / 0.15, 0.15)), profiles=0
+    )
     assert right.geometry is not None
     assert not right.geometry.contradicts
 
