@@ -7,8 +7,11 @@ clock are missing. "Hardware" is the same plant with dry friction, a delay, coar
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -40,11 +43,24 @@ def regulate(
     changes: Mapping[str, float] | None = None,
 ) -> Columns:
     """Regulate the thesis's plant upright under noise; columns t, position, velocity, command, disturbance, applied."""
+    told = tuple(sorted((changes or {}).items()))
+    found = _regulated(rate, seed, hold_time, duration, amplitude, hardware, told)
+    return {name: column.copy() for name, column in found.items()}
+
+
+@cache
+def _regulated(
+    rate: float,
+    seed: int,
+    hold_time: float,
+    duration: float,
+    amplitude: float,
+    hardware: bool,
+    changes: tuple[tuple[str, float], ...],
+) -> Columns:
     plant = load_plant("thesis")
     if hardware:
-        plant = plant.with_values(
-            coulomb_friction=0.02, static_friction=0.02, transport_delay=0.004, **dict(changes or {})
-        )
+        plant = plant.with_values(coulomb_friction=0.02, static_friction=0.02, transport_delay=0.004, **dict(changes))
     period = 1.0 / rate
     model = make_plant(plant, period)
     model.reset(UPRIGHT, 0.0)
@@ -184,11 +200,22 @@ def run_metadata(seed: int, hold_time: float = 0.01) -> dict[str, Any]:
 
 
 def write_run_folder(folder: Path, seed: int = 1, *, ramps: bool = True, **hardware: Any) -> Path:
-    """Write a run folder with ``sim``, ``hw`` and ``sim_500hz``."""
+    """Write a run folder with ``sim``, ``hw`` and ``sim_500hz``; equal ones are simulated and written once."""
+    key = json.dumps([seed, ramps, hardware], sort_keys=True)
+    if key not in _kept:
+        _kept[key] = TemporaryDirectory(prefix="run_folder_")
+        _write_run_folder(Path(_kept[key].name), seed, ramps, hardware)
+    shutil.copytree(_kept[key].name, folder, dirs_exist_ok=True)
+    return folder
+
+
+_kept: dict[str, TemporaryDirectory[str]] = {}
+
+
+def _write_run_folder(folder: Path, seed: int, ramps: bool, hardware: Mapping[str, Any]) -> None:
     metadata = run_metadata(seed)
     write_bag(folder / "sim", regulate(rate=500.0, seed=seed), "/sim", metadata=metadata, ramps=ramps)
     hw = regulate(rate=100.0, seed=seed, hardware=True, **hardware)
     write_bag(folder / "hw", hw, "/hw", metadata=metadata, ramps=ramps)
     own = regulate(rate=500.0, seed=seed + 1_000_000, hold_time=0.002)
     write_bag(folder / "sim_500hz", own, "/sim", metadata=run_metadata(seed + 1_000_000, 0.002), ramps=False)
-    return folder

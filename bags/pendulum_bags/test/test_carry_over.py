@@ -106,6 +106,7 @@ def test_the_report_draws_the_certified_gains_of_a_measured_machine(
     titles = ("Gap per frequency", "Gains that carry over", "LQR weights that carry over")
     own = [(title, maker) for title, maker in FIGURES if title in titles]
     monkeypatch.setattr("pendulum_bags.report.figures.FIGURES", own)
+    monkeypatch.setattr("pendulum_bags.frequency_response.figures._GRID", 9)
     assert report([str(folder), "--layers", str(machine), "-o", str(tmp_path), "--png-only"]) == 0
     assert "K=(400, 0.1) not certified" in capsys.readouterr().out
     text = (tmp_path / "report.html").read_text(encoding="utf-8")

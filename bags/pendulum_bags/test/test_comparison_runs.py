@@ -15,6 +15,7 @@ from pendulum_bags.comparison import Outcome, compare_folders, compare_runs, rea
 from pendulum_bags.comparison.compare import _pool
 from pendulum_bags.comparison.compare_cli import main
 from pendulum_bags.experiments.experiment_cli import _print_summary
+from pendulum_bags.report import FIGURES
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.tables import make_tables
 from pendulum_bags.runs.run_data import missed_periods, timing_warning
@@ -286,12 +287,18 @@ def test_a_run_folder_without_a_bag_is_refused(tmp_path: Path) -> None:
 # -- command line ------------------------------------------------------------------------------------------------
 
 
-def test_command_prints_json_and_writes_files(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_json_and_writes_files(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The others are drawn by the tests of the report, and take seconds.
+    own = [(title, maker) for title, maker in FIGURES if title in {"Equivalence tests", "Distributions"}]
+    monkeypatch.setattr("pendulum_bags.report.figures.FIGURES", own)
     arguments = [str(folder / "sim"), str(folder / "hw"), "--margin", "mean_angle=0.5", "--json", "-o", str(tmp_path)]
     assert main(arguments) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads((tmp_path / "comparison.json").read_text())
-    assert (tmp_path / "figures" / "equivalence.pdf").stat().st_size > 1000
+    for name in ("equivalence", "distributions"):
+        assert (tmp_path / "figures" / f"{name}.pdf").stat().st_size > 1000
     assert printed["verdict"]["outcome"] == "equivalent"
 
 

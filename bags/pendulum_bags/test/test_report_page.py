@@ -267,7 +267,10 @@ def test_ratios_are_said_in_words() -> None:
     assert ratio_in_words(2.2) == "2.2 times as large"
 
 
-def test_two_bags_make_a_report_too(folder: Path, tmp_path: Path) -> None:
+def test_two_bags_make_a_report_too(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Drawing the others takes seconds; the page's own test does.
+    own = [(title, maker) for title, maker in FIGURES if title in {"Equivalence tests", "Replay of a real pendulum"}]
+    monkeypatch.setattr("pendulum_bags.report.figures.FIGURES", own)
     shutil.copytree(folder / "sim", tmp_path / "a")
     shutil.copytree(folder / "hw", tmp_path / "b")
     assert main([str(tmp_path / "a"), str(tmp_path / "b"), "--png-only"]) == 0
@@ -328,8 +331,12 @@ def staircase_trials(folder: Path) -> Path:
 
 
 def test_several_runs_are_pooled_and_identification_experiments_join_the_report(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # The others of pooled runs are made by the next test, and those of one run drawn by that of the page.
+    others = {"Equivalence tests", "All runs", "Trials by hand", "Dynamic phase", "Static phase"}
+    own = [(title, maker) for title, maker in FIGURES if title.startswith("Effort over") or title in others]
+    monkeypatch.setattr("pendulum_bags.report.figures.FIGURES", own)
     second = write_run_folder(tmp_path / "second", seed=2, ramps=False)
     trials = [str(hand_trials(tmp_path / "table")), str(staircase_trials(tmp_path / "staircase"))]
     assert main([str(folder), str(second), *trials, "-o", str(tmp_path / "out"), "--png-only"]) == 0

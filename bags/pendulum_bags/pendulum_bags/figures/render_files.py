@@ -62,6 +62,8 @@ def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str
     written = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if not formats:
+            return []
         with mpl.rc_context(_STYLE):
             for figure in figures:
                 canvas = _draw(figure, Canvas)
