@@ -157,35 +157,38 @@ def test_a_recorded_run_of_the_machine_is_scored_as_a_simulated_one_is() -> None
     assert set(HARDWARE_PERTURBATIONS) <= set(PERTURBATIONS)
 
 
-def test_page_stands_alone_and_every_row_has_its_run(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     entries = [evaluate("thesis", name, duration=4.0, robustness=False) for name in ("lqr", "pid")]
-    text = write_page(tmp_path / "board.html", entries, 4.0).read_text(encoding="utf-8")
+    return write_page(tmp_path_factory.mktemp("board") / "board.html", entries, 4.0)
+
+
+def test_page_stands_alone_and_every_row_has_its_run(board: Path) -> None:
+    text = board.read_text(encoding="utf-8")
     assert not re.search(r'(src|href)="(?!data:|#)', text)
     for anchor in re.findall(r'href="#([^"]+)"', text):
         assert f'id="{anchor}"' in text
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-@pytest.mark.parametrize("width", [1280, 390])
-def test_page_sorts_in_a_browser_without_an_error_and_opens_the_run_of_a_row(tmp_path: Path, width: int) -> None:
+def test_page_sorts_in_a_browser_without_an_error_and_opens_the_run_of_a_row(board: Path) -> None:
     playwright = pytest.importorskip("playwright.sync_api")
-    entries = [evaluate("thesis", name, duration=4.0, robustness=False) for name in ("lqr", "pid")]
-    path = write_page(tmp_path / "board.html", entries, 4.0)
     with playwright.sync_playwright() as running:
         browser = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu"])
-        page = browser.new_context(viewport={"width": width, "height": 900}, offline=True).new_page()
-        messages: list[str] = []
-        page.on("console", lambda message: messages.append(message.text))
-        page.on("pageerror", lambda error: messages.append(str(error)))
-        page.goto(path.resolve().as_uri())
-        names = page.locator("tbody th")
-        button = page.locator("thead button").first
-        button.press("Enter")
-        down = names.all_inner_texts()
-        button.press("Enter")
-        assert names.all_inner_texts() == down[::-1]
-        page.locator("tbody a").first.click()
-        page.locator("details[open] img").wait_for(timeout=5000)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        assert messages == []
+        for width in (1280, 390):
+            page = browser.new_context(viewport={"width": width, "height": 900}, offline=True).new_page()
+            messages: list[str] = []
+            page.on("console", lambda message, told=messages: told.append(message.text))
+            page.on("pageerror", lambda error, told=messages: told.append(str(error)))
+            page.goto(board.resolve().as_uri())
+            names = page.locator("tbody th")
+            button = page.locator("thead button").first
+            button.press("Enter")
+            down = names.all_inner_texts()
+            button.press("Enter")
+            assert names.all_inner_texts() == down[::-1]
+            page.locator("tbody a").first.click()
+            page.locator("details[open] img").wait_for(timeout=5000)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            assert messages == []
         browser.close()
