@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -529,3 +531,141 @@ def test_a_title_gives_way_to_the_factor_above_the_axis(size: float) -> None:
     assert title == "One run"
     assert bool(factor.get_text()) is (size < 1.0)
     assert not factor.get_text() or not ax._left_title.get_window_extent().overlaps(factor.get_window_extent())
+
+
+# -- in a real browser, offline, at desktop and phone width ---------------------------------------------------------
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+SWITCHES = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+WIDTHS = {"desktop": 1280, "phone": 390}
+
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as running:
+        opened = running.chromium.launch(executable_path=BROWSER, args=SWITCHES)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(params=WIDTHS)
+def visit(request: pytest.FixtureRequest, browser: Any, page: Path) -> Iterator[Any]:
+    context = browser.new_context(viewport={"width": WIDTHS[request.param], "height": 900}, offline=True)
+    opened = context.new_page()
+    opened.messages = []
+    opened.on("console", lambda message: opened.messages.append(message.text))
+    opened.on("pageerror", lambda error: opened.messages.append(str(error)))
+    opened.goto(page.resolve().as_uri())
+    opened.wait_for_function("document.documentElement.dataset.ready === 'true'", timeout=60_000)
+    yield opened
+    context.close()
+
+
+@needs_browser
+def test_page_is_whole_and_usable(visit: Any) -> None:
+    # One visit for all that is seen at one width: loading takes seconds on a small machine.
+    assert visit.messages == []
+    plots = visit.locator(".graph")
+    assert plots.count() >= 20
+    assert visit.locator(".graph .main-svg").count() >= plots.count()
+    drawn = "nodes => nodes.every(n => n.querySelector('.xy path, .xy g.points path, .scatterlayer path'))"
+    assert plots.evaluate_all(drawn)
+    assert visit.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    outside = "nodes => nodes.filter(n => n.getBoundingClientRect().right > window.innerWidth + 1).length"
+    assert visit.locator("header, figure, .graph").evaluate_all(outside) == 0
+    assert visit.locator("#failure").is_hidden()
+
+    # Names of rows leave half of the width to the rows, on a phone too.
+    share = "n => n._fullLayout._size.w / n._fullLayout.width"
+    assert visit.locator('[data-graph="equivalence-0"]').evaluate(share) > 0.45
+
+    # The result of a test stands beside its name, inside the screen; on a phone every other cell is labelled.
+    tests = visit.locator("figure.table", has=visit.locator("h3:text-is('Tests against the margins')"))
+    for row in tests.locator("tbody tr").all():
+        name, result = row.locator("th").bounding_box(), row.locator("td.result").bounding_box()
+        assert result["x"] + result["width"] <= visit.viewport_size["width"]
+        assert abs(result["y"] - name["y"]) < 2.0
+    cut = "nodes => nodes.filter(n => n.scrollWidth > n.clientWidth + 1).map(n => n.ariaLabel)"
+    assert visit.locator(".scroll").evaluate_all(cut) == []
+    label = "n => getComputedStyle(n, '::before').content"
+    narrow = visit.viewport_size["width"] == WIDTHS["phone"]
+    first = tests.locator("tbody tr").first.locator("td")
+    assert first.first.evaluate(label) == ('"estimate"' if narrow else "none")
+    assert tests.locator("td.result").first.evaluate(label) == "none"
+    assert tests.locator("td.result").first.inner_text() in {"equivalent", "not equivalent", "undecided"}
+
+    # Headings that are labels already take no room on a phone.
+    heading = "n => n.querySelector('tbody').getBoundingClientRect().y - n.getBoundingClientRect().y"
+    assert (tests.locator("table").evaluate(heading) < 5.0) == narrow
+
+    # Long tables open at a click, and not before.
+    metrics = visit.locator("figure.table", has=visit.locator("h3:text-is('Metrics of the regulation')"))
+    assert metrics.locator("table").is_hidden()
+    assert tests.locator("table").is_visible()
+    metrics.locator("summary").click()
+    assert metrics.locator("table").is_visible()
+    assert visit.locator(".scroll").evaluate_all(cut) == []
+    # Before the page is printed all are open; then those again that the reader opened.
+    shut = visit.locator("details:not([open])")
+    before = shut.count()
+    assert before >= 1
+    visit.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+    assert shut.count() == 0
+    visit.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    assert shut.count() == before
+    assert metrics.locator("table").is_visible()
+
+    # By keyboard: a plot takes the focus, zooms, moves and comes back.
+    plot = visit.locator('[data-graph="both_together-0"]')
+    plot.focus()
+    span = "(n => n._fullLayout.xaxis.range[1] - n._fullLayout.xaxis.range[0])"
+    before = plot.evaluate(span)
+    node = plot.element_handle()
+    visit.keyboard.press("+")
+    visit.wait_for_function(f"([n, before]) => {span}(n) < 0.8 * before", arg=[node, before])
+    visit.keyboard.press("0")
+    visit.wait_for_function(f"([n, before]) => Math.abs({span}(n) / before - 1) < 0.02", arg=[node, before])
+
+    # The animation runs from its button, also where the browser began the next picture before the press.
+    visit.evaluate("{ const now = performance.now.bind(performance); performance.now = () => now() + 200; }")
+    visit.locator("#play").focus()
+    visit.keyboard.press("Enter")
+    visit.wait_for_function("Number(document.getElementById('seek').value) > 2")
+    visit.keyboard.press("Enter")
+    visit.wait_for_function("document.getElementById('play').innerText === 'Play'")
+    assert visit.messages == []
+
+
+@needs_browser
+@pytest.mark.parametrize("scripts", [True, False], ids=["with scripts", "without scripts"])
+def test_paper_shows_every_figure_as_a_picture(browser: Any, page: Path, scripts: bool) -> None:
+    assert page.stat().st_size < 5_000_000
+    context = browser.new_context(offline=True, java_script_enabled=scripts)
+    visit = context.new_page()
+    visit.goto(page.resolve().as_uri())
+    # At once, as a browser that prints from the command line does: before any plot is drawn.
+    visit.emulate_media(media="print")
+    figures = visit.locator("figure:has(.graphs)")
+    assert figures.count() >= 12
+    for index in range(figures.count()):
+        picture = figures.nth(index).locator("img.paper")
+        box = picture.bounding_box()
+        assert box is not None
+        assert box["width"] > 300
+        assert box["height"] > 100
+        assert figures.nth(index).locator(".graphs").is_hidden()
+    # What is folded on a screen is all there.
+    tables = visit.locator("figure.table table")
+    assert visit.locator("details table").count() >= 2
+    assert all(one.bounding_box()["height"] > 40 for one in tables.all())
+    assert visit.locator("summary").first.is_hidden()
+    context.close()
