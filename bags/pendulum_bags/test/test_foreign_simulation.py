@@ -52,7 +52,7 @@ def test_a_model_with_our_parameters_moves_like_our_simulation(model: Path) -> N
 def test_two_simulations_of_one_plant_are_equivalent_and_of_two_plants_are_not(
     model: Path, tmp_path: Path, kind: str
 ) -> None:
-    noise = NoiseSettings(duration=10.0)
+    noise = NoiseSettings(duration=5.0)
     theirs = RegulationSettings(noise=noise, simulation=str(model) if kind == "mujoco" else "gymnasium:PendulumX59-v0")
     record_simulation(tmp_path / "theirs", lockstep_spec(theirs, side="sim"))
     for damping, outcome in ((11.77, Outcome.EQUIVALENT), (6.0, Outcome.DIFFERENT)):
@@ -124,7 +124,7 @@ def test_runs_with_one_plant_file_in_two_places_are_pooled_and_other_simulations
 
 
 def test_two_simulations_of_others_are_compared_without_a_process(model: Path, tmp_path: Path) -> None:
-    noise = NoiseSettings(duration=10.0)
+    noise = NoiseSettings(duration=5.0)
     settings = RegulationSettings(noise=noise, simulation="gymnasium:PendulumX59-v0", hardware=str(model))
     assert (settings.can_repeat, settings.is_emulated) == (True, True)
     record_repeat(tmp_path, settings, 1)

@@ -164,10 +164,10 @@ def rank(contenders: Sequence[Contender], generator: np.random.Generator | None 
 
 
 def _capped(costs: Array) -> Array:
-    """Return costs in which a failure is as dear as the dearest success, and a little more so that it ranks last."""
-    finite = costs[np.isfinite(costs)]
-    top = float(finite.max()) if finite.size else 1.0
-    return np.where(np.isfinite(costs), costs, 1.001 * top)
+    """Return costs, shape (..., n), in which a failure is a little dearer than the dearest success of the n."""
+    able = np.isfinite(costs)
+    top = np.max(costs, axis=-1, keepdims=True, where=able, initial=-np.inf)
+    return np.where(able, costs, 1.001 * np.where(np.isfinite(top), top, 1.0))
 
 
 def _pearson(sim: Array, hw: Array) -> Interval:
@@ -198,7 +198,7 @@ def _violations(contenders: Sequence[Contender], generator: np.random.Generator)
             if key not in draws:
                 draws[key] = generator.integers(rows.size, size=(_REPLICATES, rows.size))
             columns.append(rows[draws[key]].mean(axis=1))
-        costs[side] = np.array([_capped(row) for row in np.stack(columns, axis=1)])
+        costs[side] = _capped(np.stack(columns, axis=1))
     chosen = generator.integers(len(contenders), size=costs["sim"].shape)
     return _mmrv(*(np.take_along_axis(costs[side], chosen, axis=1) for side in ("sim", "hw")))
 
