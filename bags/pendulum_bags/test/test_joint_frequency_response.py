@@ -43,6 +43,7 @@ def _model(name: str) -> LinearModel:
     return linearise_mechanism(load_mechanism(name))
 
 
+@cache
 def _record(name: str, *, periods: int = 3, noise: float = 0.0, label: str = "sim") -> Record:
     """Return a plant under its LQR and a multisine, by the plant's own equations."""
     plant = load_mechanism(name)
