@@ -163,6 +163,13 @@ def simulate_windows(
     l_p = np.zeros(p.size)
     inertia, gravity = p[J], p[G]
     inv = 1.0 / inertia
+    # The same of each column; an initial state is in none of them.
+    by_force, by_friction, by_rate, by_inverse = np.zeros(width), np.zeros(width), np.zeros(width), np.zeros(width)
+    slows = p[S] > 0.0 or p[LS] > 0.0
+    for c in range(k):
+        if columns[c] == J:
+            by_inverse[c] = -inv * inv
+        slows = slows or columns[c] == S or columns[c] == LS
     for n in range(windows.shape[0]):
         first, stop = windows[n, 0], windows[n, 1]
         th, w = states[n, 0], states[n, 1]
@@ -189,7 +196,7 @@ def simulate_windows(
                 on = enabled[index]
                 u0, area0 = u1, area1
                 middle = th + 0.5 * h * w
-                sine, cosine = math.sin(middle - p[TH0]), math.cos(middle - p[TH0])
+                sine = math.sin(middle - p[TH0])
                 drive_u, drive_th, level = p[K] * on, 0.0, mean
                 if servo:
                     duty = servo_gain * (mean - middle)
@@ -204,7 +211,7 @@ def simulate_windows(
                 rate = (p[B] + on * p[KB]) * inv
                 smooth = drive + p[T0] - gravity * sine
                 speed = abs(w)
-                bump = math.exp(-((speed / p[VS]) ** 2)) if p[S] > 0.0 or p[LS] > 0.0 or want else 0.0
+                bump = math.exp(-((speed / p[VS]) ** 2)) if slows else 0.0
                 # What the gears carry: drive and gravity press the teeth together when they oppose each other.
                 carried = p[LG] * gravity * sine + p[LM] * drive
                 raise_load = 1.0 + p[LS] * bump
@@ -234,6 +241,7 @@ def simulate_windows(
                     ratio = 0.0 if rest else (smooth + sign * friction) / net
                     w2 = ratio * w1
                 if want:
+                    cosine = math.cos(middle - p[TH0])
                     f_p[T0] = 1.0
                     f_p[G] = -sine
                     f_p[TH0] = gravity * cosine
@@ -266,38 +274,36 @@ def simulate_windows(
                         fr_p[G] += side * sine
                         fr_p[TH0] -= side * gravity * cosine
                         fr_th += side * gravity * cosine
-                    for c in range(width):
-                        d_mid = dth[c] + 0.5 * h * dw[c]
-                        d_f = f_th * d_mid
-                        d_fr = fr_th * d_mid + fr_w * dw[c]
-                        d_l, d_inv = 0.0, 0.0
-                        if c < k:
-                            q = columns[c]
-                            d_f += f_p[q]
-                            d_fr += fr_p[q]
-                            d_l = l_p[q]
-                            if q == J:
-                                d_inv = -inv * inv
-                        if stuck:
+                    if stuck:
+                        for c in range(width):
                             dth[c] += 0.5 * h * dw[c]
                             dw[c] = 0.0
-                            continue
-                        d_w1 = (
-                            decay * (dw[c] - w * h * d_l)
-                            + phi * inv * (d_f - sign * d_fr)
-                            + net * (phi_l * d_l * inv + phi * d_inv)
-                        )
-                        if not crossing:
-                            dth[c] += 0.5 * h * (dw[c] + d_w1)
-                            dw[c] = d_w1
-                            continue
-                        d_share = (dw[c] - share * (dw[c] - d_w1)) / (w - w1)
-                        d_w2 = 0.0
-                        if not rest:
-                            d_ratio = (d_f + sign * d_fr - ratio * (d_f - sign * d_fr)) / net
-                            d_w2 = ratio * d_w1 + d_ratio * w1
-                        dth[c] += 0.5 * h * (share * dw[c] + (1.0 - share) * d_w2 + d_share * (w - w2))
-                        dw[c] = d_w2
+                    else:
+                        for c in range(k):
+                            q = columns[c]
+                            by_force[c] = f_p[q]
+                            by_friction[c] = fr_p[q]
+                            by_rate[c] = l_p[q]
+                        for c in range(width):
+                            d_mid = dth[c] + 0.5 * h * dw[c]
+                            d_f = f_th * d_mid + by_force[c]
+                            d_fr = fr_th * d_mid + fr_w * dw[c] + by_friction[c]
+                            d_w1 = (
+                                decay * (dw[c] - w * h * by_rate[c])
+                                + phi * inv * (d_f - sign * d_fr)
+                                + net * (phi_l * by_rate[c] * inv + phi * by_inverse[c])
+                            )
+                            if not crossing:
+                                dth[c] += 0.5 * h * (dw[c] + d_w1)
+                                dw[c] = d_w1
+                                continue
+                            d_share = (dw[c] - share * (dw[c] - d_w1)) / (w - w1)
+                            d_w2 = 0.0
+                            if not rest:
+                                d_ratio = (d_f + sign * d_fr - ratio * (d_f - sign * d_fr)) / net
+                                d_w2 = ratio * d_w1 + d_ratio * w1
+                            dth[c] += 0.5 * h * (share * dw[c] + (1.0 - share) * d_w2 + d_share * (w - w2))
+                            dw[c] = d_w2
                 th += 0.5 * h * (share * w + ((1.0 - share) * w2 if crossing else w2))
                 w = w2
             theta[i], omega[i] = th, w
