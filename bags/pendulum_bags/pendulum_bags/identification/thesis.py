@@ -55,7 +55,6 @@ class Regression:
         intervals: 95 % intervals, shape (k, 2), with as many degrees of freedom as there are independent samples.
         inflation: By how much these errors exceed those of independent residuals, shape (k,).
         r_squared: Uncentred, as there is no intercept.
-        summary: The full table as statsmodels prints it, for independent residuals.
         regressors, response: The data, shape (n, k) and (n,).
     """
 
@@ -68,9 +67,16 @@ class Regression:
     intervals: Array
     inflation: Array
     r_squared: float
-    summary: str
     regressors: Array
     response: Array
+
+    @property
+    def summary(self) -> str:
+        """The full table as statsmodels prints it, for independent residuals: it takes longer than all else."""
+        with warnings.catch_warnings():
+            # The table of few points says so itself, by a test of normality that has no value.
+            warnings.simplefilter("ignore")
+            return str(_fitted(self.regressors, self.response).summary(yname="effort", xname=list(self.names)))
 
 
 @dataclass(frozen=True)
@@ -144,12 +150,9 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
         regressors: In the order of time, shape (n, k).
         response: shape (n,).
     """
-    # This alone takes a second to import, all of statsmodels half as long again: only those who ask for tables wait.
-    from statsmodels.regression.linear_model import OLS
-
     if len(response) <= len(names):
         raise DataError(f"{trial} has {len(response)} points for {len(names)} coefficients; expected more")
-    table = OLS(response, regressors).fit()
+    table = _fitted(regressors, response)
     independent = np.array([_independent(regressors, np.asarray(table.resid), i) for i in range(len(names))])
     # The fit takes its share of few independent samples too: their residuals are smaller than the errors were.
     inflation = np.sqrt((len(response) - len(names)) / np.maximum(independent - len(names), 1.0))
@@ -158,10 +161,6 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
     values = np.asarray(table.params)
     t = values / np.maximum(errors, 1e-300)
     half = student_quantile(0.975, freedom) * errors
-    with warnings.catch_warnings():
-        # The table of few points says so itself, by a test of normality that has no value.
-        warnings.simplefilter("ignore")
-        summary = str(table.summary(yname="effort", xname=list(names)))
     return Regression(
         trial,
         tuple(names),
@@ -172,10 +171,16 @@ def regress(trial: str, names: Sequence[str], regressors: Array, response: Array
         np.stack((values - half, values + half), axis=1),
         inflation,
         float(table.rsquared),
-        summary,
         regressors,
         response,
     )
+
+
+def _fitted(regressors: Array, response: Array) -> Any:
+    # This alone takes a second to import, all of statsmodels half as long again: only those who ask for tables wait.
+    from statsmodels.regression.linear_model import OLS
+
+    return OLS(response, regressors).fit()
 
 
 def _independent(regressors: Array, residual: Array, index: int) -> float:
