@@ -178,11 +178,3 @@ def _bring_compiled_loops(place: Path) -> dict[Path, int]:
                 brought[to] = to.stat().st_ino
     assert len(brought) >= 2
     return brought
-
-
-@pytest.mark.parametrize("module", ["pendulum_lqr", "pendulum_bags"])
-def test_colours_respect_no_color(module: str, tmp_path: Path) -> None:
-    command = {"pendulum_lqr": ["design"], "pendulum_bags": ["compare", "--help"]}[module]
-    text = _run(sys.executable, "-m", module, *command, cwd=tmp_path, env={"NO_COLOR": "1", "FORCE_COLOR": "1"})
-    # Bold and the like are no colours; 30 to 49 and 90 to 107 are.
-    assert not any(f"\x1b[{code}m" in text for code in (*range(30, 50), *range(90, 108)))

@@ -1,4 +1,7 @@
-"""Every command in a README runs; those of the pages are collected here, so that none is forgotten."""
+"""Every command in a README runs, and in no colours where nobody wants them.
+
+Those of the pages are collected here, so that none is forgotten.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,8 @@ PAGES = sorted(
     if not {".venv", "build", "install", "node_modules", "runs"} & set(path.relative_to(PROJECT).parts)
 )
 NODES = {"simulator", "gymnasium", "adopt", "bridge", "controller", "disturbance", "effort_adapter"}
+_COLOUR = re.compile(r"\x1b\[(?:\d*;)*(?:[34]\d|9[0-7]|10[0-7])[;m]")
+"""Bold and the like are no colours; 30 to 49 and 90 to 107 are."""
 _BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -66,6 +71,7 @@ def test_command_of_a_page_runs(
         program.interrupt()
         assert program.wait(60) == 0, program.output
         return
+    environment |= {"NO_COLOR": "1", "FORCE_COLOR": "1"}
     # Pages are written for the project's root; what a command writes must not land there.
     (tmp_path / "shared").symlink_to(PROJECT.parent / "shared")
     root = tmp_path / "root"
@@ -76,6 +82,7 @@ def test_command_of_a_page_runs(
     done = subprocess.run(
         command, shell=True, cwd=root, env=environment, capture_output=True, text=True, timeout=500, check=False
     )
+    assert not _COLOUR.search(done.stdout + done.stderr), f"{page}: {command}\n{done.stdout!r}\n{done.stderr!r}"
     # Other tests run beside this one, and the checklist is right to say so.
     if words[3:4] == ["check"] and done.returncode == EXIT_BUSY:
         assert "This computer is too busy to tell" in done.stdout
