@@ -25,7 +25,7 @@ from tests.fixtures import PROJECT, own_domain, wait_for
 from tests.npm import install_packages
 from tests.processes import ProcessGroup, RunningProgram
 from tests.tools.faults import console_stops
-from tests.tools.faults.console_stops import CHROMIUM, QUIET, STOPS, StopRig
+from tests.tools.faults.console_stops import CHROMIUM, QUIET, SLOW_DISPLAY, STOPS, StopRig
 
 AXE = PROJECT / "tests" / "axe"
 IN_SHORT = (
@@ -112,7 +112,7 @@ def test_the_page_doubts_a_silent_server_and_gives_its_orders_to_the_next() -> N
 
 
 def test_no_stop_is_lost_whatever_is_frozen_killed_or_cut_off(play: Any, domain_id: int, tmp_path: Path) -> None:
-    rig = StopRig(tmp_path, play, patience=30.0)
+    rig = StopRig(tmp_path, play, patience=30.0, slow_display=True)
     try:
         for name in IN_SHORT:
             rig.rearm()
@@ -184,9 +184,13 @@ def browser(bench: Bench, chromium: Any) -> Iterator[Any]:
         context.close()
 
 
-def _open(browser: Any, address: str, width: int = 1280, height: int = 860, **options: Any) -> Any:
+def _open(
+    browser: Any, address: str, width: int = 1280, height: int = 860, *, slow_display: bool = True, **options: Any
+) -> Any:
     page = browser.new_page(viewport={"width": width, "height": height}, **options)
     page.set_default_timeout(60_000)
+    if slow_display:
+        page.add_init_script(SLOW_DISPLAY)
     page.goto(address)
     page.wait_for_selector("[data-plant='/sim'] .armed_effort")
     return page
@@ -204,7 +208,7 @@ def _mode(page: Any) -> str:
 
 
 def test_two_clients_see_stop_tune_and_meet_a_new_simulator(browser: Any, bench: Bench) -> None:
-    desk, phone = _open(browser, bench.address), _open(browser, bench.address, 390, 844)
+    desk, phone = _open(browser, bench.address, slow_display=False), _open(browser, bench.address, 390, 844)
 
     # Phone: nothing hangs over the edge, and the stop is in reach.
     assert phone.evaluate("document.documentElement.scrollWidth") <= 390

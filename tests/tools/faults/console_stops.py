@@ -32,10 +32,15 @@ from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup, RunningProgram
 from tests.tools.faults.outcome import Outcome
 
-__all__ = ["CHROMIUM", "MAX_DELAY", "QUIET", "STOPS", "StopRig"]
+__all__ = ["CHROMIUM", "MAX_DELAY", "QUIET", "SLOW_DISPLAY", "STOPS", "StopRig"]
 
 CHROMIUM = Path("/usr/bin/chromium")
 QUIET = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+SLOW_DISPLAY = """
+    const next = window.requestAnimationFrame.bind(window);
+    window.requestAnimationFrame = (draw) => setTimeout(() => next(draw), 200);
+"""
+"""Has a page draw five pictures a second: without a graphics card sixty take a third of a core."""
 MAX_DELAY = 5.0
 """Longest time from a whole way to a stopped plant [s]: a service may have to be found anew, on a busy machine."""
 _TORQUE = 0.5
@@ -61,10 +66,12 @@ class StopRig:
         folder: For logs.
         play: Playwright.
         patience: Longest time until plant and page have answered [s].
+        slow_display: Whether pages draw seldom.
     """
 
-    def __init__(self, folder: Path, play: Any, patience: float = MAX_DELAY) -> None:
+    def __init__(self, folder: Path, play: Any, patience: float = MAX_DELAY, *, slow_display: bool = False) -> None:
         self.patience = patience
+        self._slow_display = slow_display
         self._processes = ProcessGroup(folder / "logs", folder)
         self._folder = folder
         with socket.socket() as probe:
@@ -114,6 +121,8 @@ class StopRig:
     def open(self, **options: Any) -> Any:
         """Open the page and wait until it shows the plant."""
         page = self.browser.new_page(**({"viewport": {"width": 1280, "height": 860}} | options))
+        if self._slow_display:
+            page.add_init_script(SLOW_DISPLAY)
         page.goto(self.address)
         page.wait_for_selector("[data-plant='/sim'] .armed_effort, [data-plant='/sim'] .disarmed", timeout=60_000)
         return page
