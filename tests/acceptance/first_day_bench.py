@@ -21,6 +21,7 @@ from std_srvs.srv import Trigger
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_hw_bridge.nudge import EMULATED_NUDGE
 from tests.acceptance.first_day_page import Step
+from tests.fixtures import wait_for
 from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = ["PATIENCE", "TRIES", "Button", "Day"]
@@ -199,9 +200,13 @@ class Day:
 
     def until(self, wanted: Callable[[dict[str, Any]], bool], what: str, timeout: float = PATIENCE) -> dict[str, Any]:
         """Wait until the emulated machine itself says so."""
-        deadline = self.truth.now_ns() + round(timeout * 1e9)
-        while not wanted(status := self.truth.status()):
-            assert self.truth.now_ns() < deadline, f"waited {timeout:g} s for {what}; {status['link']}"
+        status: dict[str, Any] = {}
+
+        def is_wanted() -> bool:
+            status.update(self.truth.status())
+            return wanted(status)
+
+        wait_for(is_wanted, timeout, what)
         return status
 
     def close(self) -> None:
