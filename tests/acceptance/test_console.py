@@ -164,8 +164,8 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
             port = probe.getsockname()[1]
         at = ["--ros-args", "-r", "__ns:=/sim"]
         try:
-            simulator = processes.start("pendulum_sim", "simulator", *at, "-p", "start:=top")
-            processes.start("pendulum_lqr", "controller", *at, "-p", "period:=0.002")
+            simulator = processes.start("pendulum_sim", "simulator", *at, "-p", "start:=top", "-p", "rate_hz:=100.0")
+            processes.start("pendulum_lqr", "controller", *at, "-p", "period:=0.01")
             processes.start("pendulum_lqr", "disturbance", *at)
             console = processes.start("pendulum_bags", "console", "--port", port, "--runs", folder / "runs", alone=True)
             console.wait_for_output(r"console at http://localhost", 60)
@@ -270,7 +270,8 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(browser: Any, bench:
     desk.locator("#alarms .note", has_text=gone).wait_for(timeout=10_000)
 
     # It comes back; the page goes on with the new one.
-    bench.processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "start:=top")
+    at = ["--ros-args", "-r", "__ns:=/sim"]
+    bench.processes.start("pendulum_sim", "simulator", *at, "-p", "start:=top", "-p", "rate_hz:=100.0")
     wait_for(lambda: _mode(desk) == "armed_effort", 60, "the new plant")
     before = desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns")
     wait_for(lambda: desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns") != before, 10, "new states")
@@ -278,6 +279,7 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(browser: Any, bench:
 
 def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, bench: Bench) -> None:
     page = _open(browser, bench.address)
+    acrobot = ["-p", "plant:=acrobot", "-p", "rate_hz:=100.0"]
     of_sim = page.get_by_role("button", name="Start controller /sim")
     place = of_sim.evaluate(PLACE_AMONG_PLANTS)
     other = bench.processes.start(
@@ -325,7 +327,7 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, bench: B
     assert page.get_by_role("button", name="Stop /robot", exact=True).is_visible()
     assert robot.get_by_role("heading").is_visible()
     assert of_sim.evaluate(PLACE_AMONG_PLANTS) == place
-    bench.processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot")
+    bench.processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", *acrobot)
     page.get_by_role("button", name="Arm /robot", exact=True).wait_for()
 
 
