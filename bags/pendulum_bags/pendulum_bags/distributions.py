@@ -119,11 +119,9 @@ def share_interval(hits: int, runs: int) -> tuple[float, float]:
         runs: Of so many, at least one.
 
     Source:
-        Wilson, Journal of the American Statistical Association 22 (1927).
+        Wilson, Journal of the American Statistical Association 22 (1927), as in statsmodels.
     """
-    share, quantile = hits / runs, -normal_quantile(0.025)
-    square = quantile**2
-    scale = 1.0 + square / runs
-    centre = (share + square / (2 * runs)) / scale
-    half = quantile * math.sqrt(share * (1.0 - share) / runs + square / (4.0 * runs**2)) / scale
-    return max(0.0, centre - half), min(1.0, centre + half)
+    from statsmodels.stats.proportion import proportion_confint
+
+    low, high = proportion_confint(hits, runs, alpha=0.05, method="wilson")
+    return float(low), float(high)
