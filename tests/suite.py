@@ -59,7 +59,6 @@ _SIMULATED_TIME = (
     "tests/faults/test_security_policy.py",
     "tests/integration/test_course.py",
     "tests/integration/test_several_joints.py",
-    "tests/integration/test_frequency_experiment.py",
 )
 """Whole systems whose processes wait for each other and not for a clock: they compute."""
 _COMPUTES = (

@@ -1,4 +1,4 @@
-"""The course where it needs running plants: a sealed one is played on and identified; both controllers run."""
+"""The course where it needs running plants: a sealed one is played on and identified."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _run(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_the_answers_page_identifies_the_hidden_plant_and_names_the_winner(domain_id: int, tmp_path: Path) -> None:
+def test_the_answers_page_identifies_the_hidden_plant(domain_id: int, tmp_path: Path) -> None:
     made = _run("python -m pendulum_bags course make --seed 1 --out course", tmp_path)
     assert made.returncode == 0, made.stderr
     blocks = re.findall(r"^```console\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
@@ -30,5 +30,3 @@ def test_the_answers_page_identifies_the_hidden_plant_and_names_the_winner(domai
             done = _run(line[2:], tmp_path)
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
     assert done.stdout.startswith("right: every parameter")
-    judged = _run("python -m pendulum_bags course check winner b --course course", tmp_path)
-    assert (judged.returncode, judged.stdout.split(":")[0]) == (0, "right"), judged.stdout + judged.stderr

@@ -1,4 +1,4 @@
-"""Experiments over the real middleware: determinism in lockstep, the thesis's two identifications, studies."""
+"""Experiments over the real middleware: determinism in lockstep, identifications, frequencies, a course, studies."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,17 @@ import numpy as np
 import psutil
 import pytest
 
+from pendulum_bags.course.course_cli import main as course_main
 from pendulum_bags.experiments import lockstep
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
 from pendulum_bags.experiments.experiment_cli import main
-from pendulum_bags.experiments.host_pool import HostPool
+from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, keep_pool
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.joint_run import JointRun, JointSettings
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
+from pendulum_bags.verdict import Layer, read_layers
 from pendulum_lqr.measured_response import read_response
 from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.errors import FaultError
@@ -46,8 +49,31 @@ def run_experiment(
     return done
 
 
+@pytest.fixture(scope="module", autouse=True)
+def hosts() -> Iterator[HostPool]:
+    """Hosts of the programs of all runs that a test carries out in its own process, commands of ours among them."""
+    with HostPool() as pool, keep_pool(pool):
+        yield pool
+
+
+@pytest.fixture
+def pids(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """Return which process runs a program, as soon as one was started."""
+    found: dict[str, int] = {}
+    start = HostPool.start
+
+    def noted(pool: HostPool, command: Sequence[str], **more: Any) -> HostedProgram | None:
+        program = start(pool, command, **more)
+        if program is not None:
+            found[command[3]] = program.pid
+        return program
+
+    monkeypatch.setattr(HostPool, "start", noted)
+    return found
+
+
 def test_lockstep_runs_of_a_policy_on_the_emulated_hardware_with_one_seed_are_identical(
-    domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    domain_id: int, tmp_path: Path, hosts: HostPool, pids: dict[str, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_policy(tmp_path / "upright.npz", linear_policy(load_plant("thesis"), 20.0, 1.0))
     first_bag = tmp_path / "first"
@@ -55,16 +81,15 @@ def test_lockstep_runs_of_a_policy_on_the_emulated_hardware_with_one_seed_are_id
     # A bridge offers its services before its emulator is compiled, half a minute on a busy machine the first time, and
     # is waited for as long as any start. Here a call that does not say how long it waits waits for nothing.
     monkeypatch.setattr(Conductor.call, "__defaults__", (0.0,))
-    hosts_after = []
+    ran_in = []
     # In one domain: what is left of the first run would be counted among those who hear the second.
-    with HostPool() as hosts:
-        for name, seed in (("other", 6), ("in_the_same_processes", 5)):
-            settings = RegulationSettings(controller=str(path), noise=NoiseSettings(seed=seed, duration=1.0))
-            spec = lockstep.lockstep_spec(settings, side="hw")
-            lockstep.record_run(tmp_path / name, spec, domain=domain_id, hosts=hosts)
-            hosts_after.append({child.pid for child in psutil.Process().children()})
-    assert hosts_after[0] == hosts_after[1]
-    assert len(hosts_after[0]) == 4
+    for name, seed in (("other", 6), ("in_the_same_processes", 5)):
+        settings = RegulationSettings(controller=str(path), noise=NoiseSettings(seed=seed, duration=1.0))
+        spec = lockstep.lockstep_spec(settings, side="hw")
+        lockstep.record_run(tmp_path / name, spec, domain=domain_id, hosts=hosts)
+        ran_in.append(dict(pids))
+    assert ran_in[0] == ran_in[1]
+    assert len(set(ran_in[0].values())) == 4
     first, second, other = (read_bag(tmp_path / name) for name in ("first", "in_the_same_processes", "other"))
     topics = ["joint_states", "effort_command", "disturbance", "applied_effort", "actuator/feedback"]
     topics = [f"/hw/{topic}" for topic in topics] + ["/clock"]
@@ -84,7 +109,7 @@ def test_lockstep_runs_of_a_policy_on_the_emulated_hardware_with_one_seed_are_id
 
 
 def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
-    domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    domain_id: int, tmp_path: Path, hosts: HostPool, pids: dict[str, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looks = 0
     spent_at_look: list[float] = []
@@ -100,15 +125,16 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
 
         Ten states take it a twentieth of that; a run at full speed would only cost more.
         """
-        for one in psutil.Process().children(recursive=True):
-            if looks and "simulator" in one.cmdline():
-                spent = sum(one.cpu_times()[:2])
-                if looks > len(spent_at_look):
-                    spent_at_look.append(spent)
-                if looks < 3 and spent < spent_at_look[-1] + 0.1:
-                    one.resume()
-                else:
-                    one.suspend()
+        if not looks:
+            return
+        simulator = psutil.Process(pids["simulator"])
+        spent = sum(simulator.cpu_times()[:2])
+        if looks > len(spent_at_look):
+            spent_at_look.append(spent)
+        if looks < 3 and spent < spent_at_look[-1] + 0.1:
+            simulator.resume()
+        else:
+            simulator.suspend()
 
     monkeypatch.setattr(Conductor, "wait_for", noted)
     # Longer than a busy machine needs for ten states.
@@ -118,7 +144,7 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
     with pytest.raises(
         FaultError, match=r"waited 1\.5 s for 10 more states of a run of 20 s of simulated time, in vain"
     ):
-        lockstep.record_run(tmp_path / "frozen", spec, on_wait=hold)
+        lockstep.record_run(tmp_path / "frozen", spec, on_wait=hold, hosts=hosts)
     # Patience counts from the last look: the run was taken for a live one twice.
     assert looks == 3
 
@@ -174,7 +200,7 @@ def test_a_policy_that_cannot_play_is_refused_before_anything_starts(
 
 
 def test_a_lockstep_run_of_the_simulator_gives_the_numbers_of_one_process_to_the_last_bit(
-    domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    domain_id: int, tmp_path: Path, hosts: HostPool, pids: dict[str, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = tmp_path / "logs" / "bag" / "sim_simulator.log"
     frozen: list[psutil.Process] = []
@@ -182,8 +208,7 @@ def test_a_lockstep_run_of_the_simulator_gives_the_numbers_of_one_process_to_the
 
     def freeze_the_controller(plant: PlantClient, timeout: float) -> None:
         """Let it answer late, so that the plant publishes a state again."""
-        children = psutil.Process().children(recursive=True)
-        frozen.extend(one for one in children if "controller" in one.cmdline())
+        frozen.append(psutil.Process(pids["controller"]))
         frozen[0].suspend()
         resume(plant, timeout)
 
@@ -193,7 +218,8 @@ def test_a_lockstep_run_of_the_simulator_gives_the_numbers_of_one_process_to_the
 
     monkeypatch.setattr(PlantClient, "resume", freeze_the_controller)
     settings = RegulationSettings(noise=NoiseSettings(seed=7, duration=1.0, hold_time=0.002))
-    lockstep.run_lockstep(tmp_path / "bag", settings, on_wait=go_on)
+    run = lockstep.lockstep_spec(settings, side="sim")
+    lockstep.record_run(tmp_path / "bag", run, on_wait=go_on, hosts=hosts)
     assert "publishing it again" in log.read_text()
     bag = read_bag(tmp_path / "bag")
     assert bag.metadata["pendulum.recorder.counts"]["/sim/joint_states"]["repeated"] > 0
@@ -214,7 +240,7 @@ def test_a_lockstep_run_of_the_simulator_gives_the_numbers_of_one_process_to_the
 
 
 def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(domain_id: int, tmp_path: Path) -> None:
-    run_experiment("inertia_damping", "--out", tmp_path / "hand", "--trials", 2)
+    assert main(["inertia_damping", "--out", str(tmp_path / "hand"), "--trials", "2"]) == 0
     # As its page has it: stairs, and then a controller designed for what they tell.
     environment = {**os.environ, "PATH": f"{PROJECT / '.venv' / 'bin'}:{os.environ['PATH']}"}
     done = subprocess.run(
@@ -234,6 +260,33 @@ def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(domain_id:
     quantities = bag["/hw/actuator/feedback"][0].message.name
     recorded = {"position", "velocity", "effort", "position_command", "velocity_command", "effort_command"}
     assert recorded | {"pwm_command", "motor_current", "winding_current"} <= set(quantities)
+
+
+def test_both_plants_are_measured_in_lockstep_and_designs_certified(domain_id: int, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    words = ["--signal-period", "1", "--lowest", "1", "--periods", "3", "--lines", "12"]
+    assert main(["frequency_response", "--out", str(folder), *words, "--design", "q=100,0.01 r=0.1"]) == 0
+    measured = read_response(folder)
+    assert measured.period == pytest.approx(0.01)
+    assert measured.coherence[0][:6].min() > 0.99
+    simulated = read_response(folder / "sim_response.json")
+    # Both had the same torque as a function of time, sampled at 500 and at 100 Hz.
+    assert simulated.period == pytest.approx(0.002)
+    assert list(simulated.frequency) == pytest.approx(list(measured.frequency))
+    assert [layer.layer for layer in read_layers(folder)] == [Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS]
+    numbers = json.loads((folder / "frequency_response.json").read_text(encoding="utf-8"))
+    assert numbers["designs"][0]["certified"]
+    assert (folder / "frequency_response.html").is_file()
+
+
+def test_a_course_names_the_controller_that_wins_on_the_machine(
+    domain_id: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    course = ["--course", str(tmp_path / "course")]
+    assert course_main(["make", "--seed", "1", "--out", course[1]]) == 0
+    capfd.readouterr()
+    assert course_main(["check", "winner", "b", *course]) == 0
+    assert capfd.readouterr().out.startswith("right:")
 
 
 def test_a_study_over_dds_runs_in_parallel_and_leaves_a_table(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
         "plant:=acrobot_frictionless",
         "clock:=lockstep",
         "lockstep_inputs:=[effort_command, disturbance]",
-        "lockstep_duration:=3.0",
+        "lockstep_duration:=2.0",
         "lockstep_subscribers:=4",
         "initial_position:=[3.19, -0.05]",
     )
@@ -88,7 +88,7 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
     # A plant that waits for an answer repeats its state each second: where nodes start slowly, the first comes twice.
     # And a recorder that met it a moment after it knew of the recorder counts what it did not hear.
     unheard = _unheard(counts, "/sim/joint_states")
-    assert 1501 - unheard <= len(np.unique(states.stamp_ns)) <= 1501
+    assert 1001 - unheard <= len(np.unique(states.stamp_ns)) <= 1001
     if not unheard:
         assert states.position[0] == pytest.approx([3.19, -0.05])
     late = states.stamp_ns > 2_500_000_000
@@ -99,8 +99,8 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
     push = dict(zip(pushes.stamp_ns, pushes.effort[:, 0], strict=True))
     # A recorder that met somebody a moment after the plant did counts what it did not hear.
     for heard, topic in ((both, "/sim/effort_command"), (push, "/sim/disturbance")):
-        assert len(set(applied.stamp_ns[:1000]) - set(heard)) <= _unheard(counts, topic)
-    for stamp, effort in zip(applied.stamp_ns[:1000], applied.effort[:1000, 0], strict=True):
+        assert len(set(applied.stamp_ns[:800]) - set(heard)) <= _unheard(counts, topic)
+    for stamp, effort in zip(applied.stamp_ns[:800], applied.effort[:800, 0], strict=True):
         if stamp in both and stamp in push:
             assert effort == pytest.approx(np.clip(both[stamp] + push[stamp], -6.0, 6.0))
     # A passive joint has no effort.
@@ -120,9 +120,9 @@ def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: JointsPeer, processes,
         "use_sim_time:=true",
     )
     controller.wait_for_output(rf"{name} for plant acrobot_frictionless: swing-up of .*sampled from", 240)
-    _start_lockstep(processes, "acrobot_frictionless", 8.0, "rate_hz:=250.0")
+    _start_lockstep(processes, "acrobot_frictionless", 5.0, "rate_hz:=250.0")
     # The event may come before the states that wait here.
-    peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 9, "the last state, after 8 s", 200.0)
+    peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 6, "the last state, after 5 s", 200.0)
     # A plant knows of a listener before the listener knows of the plant, so the first states may be missed here.
     assert np.abs(peer.states[0].position).max() < 0.01
     turned = (np.array(peer.states[-1].position) - [math.pi, 0.0] + math.pi) % (2.0 * math.pi) - math.pi

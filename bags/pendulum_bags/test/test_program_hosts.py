@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, kept_pool
+from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, keep_pool, kept_pool, open_pool
 from pendulum_bags.experiments.processes import ProcessSet
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs.realtime import may_run_in_real_time
@@ -273,6 +273,20 @@ def test_what_is_no_program_of_ours_gets_a_process_of_its_own(pool: HostPool, tm
         with pytest.raises(FaultError, match=r"hosted ended with code 1; its last output: .*the plant has gone"):
             processes.check()
     assert child.log.read_text() == "mine\n"
+
+
+def test_a_program_uses_the_hosts_that_outlive_it_or_ends_its_own(pool: HostPool, tmp_path: Path) -> None:
+    with keep_pool(pool):
+        with open_pool() as kept:
+            assert kept is pool
+        program = _start(pool, tmp_path / "log", "tell")
+        assert program.wait(30.0) == 0
+        assert _runs(program.pid)
+    with open_pool() as own:
+        assert own is not pool
+        program = _start(own, tmp_path / "log", "tell")
+        assert program.wait(30.0) == 0
+    assert not _runs(program.pid)
 
 
 def test_hosts_end_with_the_program_that_started_them(pool: HostPool, tmp_path: Path) -> None:

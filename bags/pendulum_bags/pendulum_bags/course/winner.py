@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pendulum_bags.course.checks import WEIGHTS, Judgement
 from pendulum_bags.course.tasks import Tasks
-from pendulum_bags.experiments.host_pool import HostPool
+from pendulum_bags.experiments.host_pool import HostPool, open_pool
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.runs.run_data import read_run
@@ -37,7 +37,7 @@ def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], 
     if name not in weights:
         raise ParameterError(f"winner is {name!r}; expected a or b")
     spreads = {}
-    with HostPool() as hosts:
+    with open_pool() as hosts:
         for letter, r in weights.items():
             on_run(letter)
             spreads[letter] = spread_on_machine(folder / letter, r, tasks.noise_seed, hosts)

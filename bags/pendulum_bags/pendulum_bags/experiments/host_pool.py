@@ -11,14 +11,14 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
 from pendulum_bags.experiments.bound_process import start_bound_process
 
-__all__ = ["AGAIN", "BEGUN", "LAST", "HostPool", "HostedProgram", "keep_pool", "kept_pool"]
+__all__ = ["AGAIN", "BEGUN", "LAST", "HostPool", "HostedProgram", "keep_pool", "kept_pool", "open_pool"]
 
 BEGUN = "begun"
 """Line that a host sends when its program may be asked to end."""
@@ -207,11 +207,26 @@ def _end(hosts: Sequence[_Host]) -> None:
 _kept: list[HostPool] = []
 
 
-def keep_pool(pool: HostPool) -> None:
+@contextlib.contextmanager
+def keep_pool(pool: HostPool) -> Iterator[None]:
     """Let programs that run in this process one after the other share their hosts."""
     _kept.append(pool)
+    try:
+        yield
+    finally:
+        _kept.remove(pool)
 
 
 def kept_pool() -> HostPool | None:
     """Return the hosts that outlive the running program, where another may follow it in this process; else None."""
     return _kept[-1] if _kept else None
+
+
+@contextlib.contextmanager
+def open_pool() -> Iterator[HostPool]:
+    """Offer the hosts that outlive the running program, or new ones that end with it."""
+    if (kept := kept_pool()) is not None:
+        yield kept
+        return
+    with HostPool() as pool:
+        yield pool

@@ -100,7 +100,7 @@ def joints(
     Example: python -m pendulum_bags experiment joints --plant acrobot --share 0.1
     """
     from pendulum_bags.comparison.compare_cli import compare
-    from pendulum_bags.experiments.host_pool import HostPool
+    from pendulum_bags.experiments.host_pool import open_pool
     from pendulum_bags.experiments.joint_run import (
         JointSettings,
         design_for,
@@ -145,7 +145,7 @@ def joints(
         runs = 2.0 * rank_seeds * len(ranked)
         # Four programs a run: started once for all runs.
         with (
-            HostPool() as hosts,
+            open_pool() as hosts,
             PhaseProgress(2.0 * (expected + longer) + _ANALYSING * measured + each * runs, console) as progress,
         ):
             record_joints(

@@ -42,15 +42,18 @@ def main() -> int:
         return EXIT_USAGE
     # Between two programs nobody is asked to end: the socket tells.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with socket.socket(fileno=int(sys.argv[1])) as connection, HostPool() as pool:
-        keep_pool(pool)
-        with connection.makefile("r", encoding="utf-8") as orders:
-            for number, line in enumerate(orders, 1):
-                code = _run(json.loads(line), lambda: connection.sendall(f"{BEGUN}\n".encode()))
-                again = number < _MOST_PROGRAMS and not _left_behind()
-                connection.sendall(f"{code} {AGAIN if again else LAST}\n".encode())
-                if not again:
-                    break
+    with (
+        socket.socket(fileno=int(sys.argv[1])) as connection,
+        HostPool() as pool,
+        keep_pool(pool),
+        connection.makefile("r", encoding="utf-8") as orders,
+    ):
+        for number, line in enumerate(orders, 1):
+            code = _run(json.loads(line), lambda: connection.sendall(f"{BEGUN}\n".encode()))
+            again = number < _MOST_PROGRAMS and not _left_behind()
+            connection.sendall(f"{code} {AGAIN if again else LAST}\n".encode())
+            if not again:
+                break
     return 0
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pendulum_bags.experiments.conductor_node import PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
-from pendulum_bags.experiments.host_pool import HostPool
+from pendulum_bags.experiments.host_pool import HostPool, open_pool
 from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE, lockstep_parameters
@@ -181,7 +181,7 @@ def run_trials(
         FaultError: A program ended, or the plant refused or faulted; the drive is at rest when this is raised.
     """
     bags = []
-    with reserve_domain(domain) as reserved, HostPool() as hosts:
+    with reserve_domain(domain) as reserved, open_pool() as hosts:
         for trial in range(1, settings.trials + 1):
             progress.phase(f"trial {trial} of {settings.trials}", settings.expected_wall_time)
             bags.append(

@@ -116,7 +116,7 @@ def experiment(
     Example: python -m pendulum_bags experiment frequency_response --design "q=100,0.01 r=0.1" --design pid
     """
     from pendulum_bags.experiments.domain import check_domain
-    from pendulum_bags.experiments.host_pool import HostPool
+    from pendulum_bags.experiments.host_pool import open_pool
     from pendulum_bags.experiments.lockstep import record_run
     from pendulum_bags.experiments.new_run import new_run
     from pendulum_bags.experiments.progress import PhaseProgress
@@ -164,7 +164,7 @@ def experiment(
     expected = [6.0 + share * spec.duration for spec, share in zip(specs, shares, strict=True)]
     with (
         new_run(out, "frequency_response", console) as folder,
-        HostPool() as hosts,
+        open_pool() as hosts,
         PhaseProgress(sum(expected) + 12.0, console) as progress,
     ):
         for spec, length in zip(specs, expected, strict=True):
