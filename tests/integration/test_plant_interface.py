@@ -36,7 +36,13 @@ _PLANT = Path(__file__).with_name("tiny_plant.py")
 
 
 class Peer(GraphPeer):
-    """Everybody who may speak to the plant, in one node of this process."""
+    """Everybody who may speak to the plant, in one node of this process.
+
+    Attributes:
+        program: The plant, where several tests share it.
+    """
+
+    program: RunningProgram
 
     def __init__(self) -> None:
         super().__init__("peer")
@@ -51,7 +57,21 @@ class Peer(GraphPeer):
         self.node.create_subscription(JointState, "joint_states", self._on_state, qos.STATE)
         self.node.create_subscription(JointState, "applied_effort", self._on_applied, qos.STATE)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.DIAGNOSTICS)
+        self._reset = self.node.create_client(Trigger, "tiny_plant/e_stop_reset")
         self.answer: Callable[[JointState], None] | None = None
+
+    def told(self, predicate: Callable[[], object], what: str) -> None:
+        """Wait for something in diagnostics, which come twice a second, and to whoever asks for a reset in vain."""
+        asked = self._reset.call_async(Trigger.Request())
+
+        def seen() -> object:
+            nonlocal asked
+            if asked.done():
+                asked = self._reset.call_async(Trigger.Request())
+            return predicate()
+
+        self.until(seen, what)
+        self.until(asked.done, "the last answer")
 
     def _on_state(self, message: JointState) -> None:
         self.states.append(message)
@@ -152,7 +172,8 @@ def plant(processes: ProcessGroup, peer: Peer) -> RunningProgram:
     return _await(peer, _start(processes))
 
 
-@pytest.fixture(scope="module", params=["tiny_plant", "mujoco", "compiled", "interpreted"])
+# The tiny one at last: the tests that follow have it run beside them.
+@pytest.fixture(scope="module", params=["interpreted", "compiled", "mujoco", "tiny_plant"])
 def running_plant(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:
     """Start a plant for all the tests that leave it as sound as they found it, and who speaks to it."""
     if request.param == "mujoco":
@@ -168,13 +189,15 @@ def running_plant(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempP
                 program = _start_mujoco(processes, folder)
             else:
                 program = _start_simulator(processes, request.param == "compiled")
-            _await(peer, program)
+            peer.program = _await(peer, program)
             # As a plant starts: whoever uses it first finds this, too.
             assert peer.diagnostics["mode"] == "disarmed"
             yield peer
             if request.param in {"compiled", "interpreted"}:
                 assert peer.diagnostics["loop"].startswith(request.param)
-                assert (int(peer.diagnostics.get("periods_compiled", 0)) > 100) == (request.param == "compiled")
+                assert ("periods_compiled" in peer.diagnostics) == (request.param == "compiled")
+            if request.param == "compiled":
+                peer.until(lambda: int(peer.diagnostics["periods_compiled"]) > 100, "compiled periods")
         finally:
             peer.close()
             assert processes.close() == []
@@ -189,7 +212,7 @@ def any_peer(running_plant: Peer) -> Peer:
     assert peer.arm(False).success
     # Its counts, too, as they are now.
     peer.diagnostics = {}
-    peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "a disarmed plant")
+    peer.told(lambda: peer.diagnostics.get("mode") == "disarmed", "a disarmed plant")
     for heard in (peer.states, peer.applied):
         heard.clear()
     peer.until(lambda: peer.states and peer.applied, "new states")
@@ -234,7 +257,7 @@ def test_every_refusal_is_counted_under_its_name_and_moves_nothing(any_peer: Pee
     peer.command.publish(elbow)
     peer.command.publish(peer.message(3.0, stamp=stamp_to_message(now_ns - 10**9)))
     peer.command.publish(peer.message(3.0, stamp=stamp_to_message(now_ns + 10**10)))
-    peer.until(lambda: peer.count("from_future") == before["from_future"] + 1, "the last refusal")
+    peer.told(lambda: peer.count("from_future") == before["from_future"] + 1, "the last refusal")
     assert {key: peer.count(key) - before[key] for key in before} == expected
     assert all(message.effort[0] == 0.0 for message in peer.applied)
 
@@ -245,20 +268,20 @@ def test_a_trajectory_is_followed_and_handed_over(any_peer: Peer) -> None:
     start = peer.states[-1].position[0]
     move = trajectory_to_message(from_points([0.0, 0.3], [start, start + 0.05], [0.0, 0.0]))
     peer.trajectory.publish(move)
-    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.disarmed") == "1", "the refusal")
+    peer.told(lambda: peer.diagnostics.get("joint_trajectory.refused.disarmed") == "1", "the refusal")
     assert peer.arm().success
     peer.trajectory.publish(move)
-    peer.until(lambda: peer.diagnostics["mode"] == "armed_position", "position control")
-    peer.until(lambda: "holding" in peer.diagnostics["reason"], "the end of the trajectory")
+    peer.told(lambda: peer.diagnostics["mode"] == "armed_position", "position control")
+    peer.told(lambda: "holding" in peer.diagnostics["reason"], "the end of the trajectory")
     peer.stream(0.4)
-    peer.until(lambda: peer.diagnostics["mode"] == "armed_effort", "effort control")
+    peer.told(lambda: peer.diagnostics["mode"] == "armed_effort", "effort control")
     peer.until(lambda: peer.applied[-1].effort[0] == 0.4, "the controller's torque")
     bad = trajectory_to_message(from_points([0.0], [start + 2.0], [0.0]))
     peer.trajectory.publish(bad)
-    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "1", "the second refusal")
+    peer.told(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "1", "the second refusal")
     stale = trajectory_to_message(from_points([0.0, 1.0], [start, start], [0.0, 0.0]), stamp_ns=5)
     peer.trajectory.publish(stale)
-    peer.until(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "2", "the third refusal")
+    peer.told(lambda: peer.diagnostics.get("joint_trajectory.refused.invalid") == "2", "the third refusal")
 
 
 def test_a_second_commander_is_refused_named_and_reported(any_peer: Peer) -> None:
@@ -279,8 +302,13 @@ def test_a_second_commander_is_refused_named_and_reported(any_peer: Peer) -> Non
     assert min(message.effort[0] for message in peer.applied) >= 0.0
 
 
+tiny_plant_alone = pytest.mark.parametrize("running_plant", ["tiny_plant"], indirect=True)
+
+
+@tiny_plant_alone
 @pytest.mark.parametrize("name", ["peer", "another"])
-def test_twins_behind_one_frame_id_get_no_torque(plant: RunningProgram, peer: Peer, name: str) -> None:
+def test_twins_behind_one_frame_id_get_no_torque(any_peer: Peer, name: str) -> None:
+    peer = any_peer
     assert peer.arm().success
     peer.stream(1.0)
     peer.until(lambda: peer.applied[-1].effort[0] == 1.0, "torque")
@@ -293,7 +321,7 @@ def test_twins_behind_one_frame_id_get_no_torque(plant: RunningProgram, peer: Pe
         twin.publish(peer.message(-4.0, stamp=state.header.stamp))
 
     peer.answer = both
-    peer.until(lambda: "expected" in peer.diagnostics["reason"], "the conflict to be seen")
+    peer.told(lambda: "expected" in peer.diagnostics["reason"], "the conflict to be seen")
     assert peer.applied[-1].effort[0] == 0.0
     twin_node.destroy_publisher(twin)
     peer.stream(1.0)
@@ -319,21 +347,27 @@ def test_torque_is_the_clamped_sum_and_ends_with_the_commands(any_peer: Peer) ->
     peer.until(lambda: peer.applied[-1].effort[0] == 2.0, "recovery by itself")
 
 
-def test_commands_that_come_too_slowly_do_not_flood_the_log(plant: RunningProgram, peer: Peer) -> None:
+@tiny_plant_alone
+def test_commands_that_come_too_slowly_do_not_flood_the_log(any_peer: Peer) -> None:
+    peer, plant = any_peer, any_peer.program
+    before = len(plant.output)
     assert peer.arm().success
     peer.stream(0.4)
     peer.until(lambda: peer.applied[-1].effort[0] == 0.4, "the controller's torque")
     peer.answer = None
-    for _ in range(25):
+    for _ in range(15):
         # 10 Hz, and commands count for 50 ms: each starts the plant and starves it.
         peer.command.publish(peer.message(0.4))
         peer.spin(0.1)
-    lines = [line for line in plant.output.splitlines() if "armed_effort: " in line]
+    lines = [line for line in plant.output[before:].splitlines() if "armed_effort: " in line]
     assert len(lines) <= 10
     plant.wait_for_output(r"\d+ changes since the last line: do commands come more slowly than every 0\.05 s\?", 20.0)
 
 
-def test_parameters_change_at_run_time_or_say_why_not(plant: RunningProgram, peer: Peer) -> None:
+@tiny_plant_alone
+def test_parameters_change_at_run_time_or_say_why_not(any_peer: Peer) -> None:
+    peer = any_peer
+
     def set_parameter(name: str, **value: object) -> tuple[bool, str]:
         parameter = Parameter(name=name, value=ParameterValue(**value))
         request = SetParameters.Request(parameters=[parameter])
@@ -358,7 +392,7 @@ def test_parameters_change_at_run_time_or_say_why_not(plant: RunningProgram, pee
     assert refusals["choice"][1] == "method is 'rk4'; expected one of exact, euler"
     assert "offsets is inf rad; expected a finite number" in refusals["list"][1]
     assert all(reason for _, reason in refusals.values())
-    assert plant.returncode is None
+    assert peer.program.returncode is None
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -383,27 +417,29 @@ def test_a_stop_signal_ends_torque_at_once_and_the_program_with_zero_torque_last
 def test_an_echo_of_the_signal_does_not_cut_the_way_out_short_but_a_second_wish_does(
     processes: ProcessGroup, domain_id: int
 ) -> None:
-    program = _start(processes, "--ros-args", "-p", "stubborn:=0.5")
-    program.wait_for_output("running", 20.0)
-    program.send_signal(signal.SIGINT)
-    program.send_signal(signal.SIGINT)
-    assert program.wait(20.0) == 0
-    assert "closed" in program.output
+    patient = _start(processes, "--ros-args", "-p", "stubborn:=0.5")
+    stubborn = _start(processes, "--ros-args", "-r", "__ns:=/other", "-p", "stubborn:=60.0")
+    for program in (patient, stubborn):
+        program.wait_for_output("running", 20.0)
+    stubborn.send_signal(signal.SIGTERM)
+    patient.send_signal(signal.SIGINT)
+    patient.send_signal(signal.SIGINT)
+    assert patient.wait(20.0) == 0
+    assert "closed" in patient.output
 
-    program = _start(processes, "--ros-args", "-p", "stubborn:=60.0")
-    program.wait_for_output("running", 20.0)
-    program.send_signal(signal.SIGTERM)
     time.sleep(1.2)
-    program.send_signal(signal.SIGTERM)
-    assert program.wait(20.0) == 128 + signal.SIGTERM
-    assert "second SIGTERM: leaving at once" in program.output
+    stubborn.send_signal(signal.SIGTERM)
+    assert stubborn.wait(20.0) == 128 + signal.SIGTERM
+    assert "second SIGTERM: leaving at once" in stubborn.output
 
 
 @pytest.fixture(scope="module")
 def refused_starts(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, str]]:
     """Return exit code and output of one process for each of the bad parameters; what it imports is imported once."""
     folder = tmp_path_factory.mktemp("refused")
-    every = json.dumps([arguments for arguments, _ in BAD_PARAMETERS])
+    for name, content in BAD_FILES.items():
+        (folder / name).write_text(content, encoding="utf-8")
+    every = json.dumps([[each.format(folder=folder) for each in arguments] for arguments, _ in BAD_PARAMETERS])
     with own_domain(folder):
         command = [sys.executable, "-c", _FORKS, every, str(folder)]
         done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, timeout=60, check=True)
@@ -414,6 +450,11 @@ def refused_starts(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, 
 _FORKS = """
 import json, os, sys
 from tests.integration import tiny_plant
+children = []
+
+def await_one():
+    print(os.waitstatus_to_exitcode(os.waitpid(children.pop(0), 0)[1]), flush=True)
+
 for number, arguments in enumerate(json.loads(sys.argv[1])):
     child = os.fork()
     if not child:
@@ -421,8 +462,16 @@ for number, arguments in enumerate(json.loads(sys.argv[1])):
             os.dup2(sink.fileno(), 1)
             os.dup2(sink.fileno(), 2)
         raise SystemExit(tiny_plant.main(["--ros-args", *arguments]))
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+    children.append(child)
+    if len(children) == 4:  # of more, each would look for all others
+        await_one()
+while children:
+    await_one()
 """
+BAD_FILES = {
+    "misspelt.yaml": "/**:\n  ros__parameters: {effort_limt: 1.0}\n",
+    "of_another.yaml": "/tiny_plant:\n  ros__parameters: {of_another: 1.0}\n",
+}
 BAD_PARAMETERS = [
     (["-p", "gain:=1"], "gain is 1; expected a number >= 0; ROS tells whole numbers and decimals apart: write 1.0"),
     (["-p", "gain:=-1.0"], "gain is -1.0 N m/rad; expected >= 0"),
@@ -438,6 +487,8 @@ BAD_PARAMETERS = [
     (["-p", "gain"], "ROS arguments are not understood: Couldn't parse parameter override rule"),
     (["-r", "__ns:=no namespace"], "ROS arguments are not understood"),
     (["--params-file", "/nowhere.yaml"], "ROS arguments are not understood"),
+    (["--params-file", "{folder}/misspelt.yaml"], "unknown parameter 'effort_limt'"),
+    (["--params-file", "{folder}/of_another.yaml"], "unknown parameter 'of_another'"),
 ]
 
 
@@ -451,36 +502,21 @@ def test_a_bad_parameter_is_one_sentence_and_exit_code_2(refused_starts: list[tu
     assert "Traceback" not in output
 
 
-def test_parameters_of_ros_itself_are_no_strangers(processes: ProcessGroup, domain_id: int) -> None:
-    program = _start(
-        processes,
-        "--ros-args",
-        *("-p", "use_sim_time:=false", "-p", "start_type_description_service:=false"),
-        *("-p", "qos_overrides./parameter_events.publisher.depth:=10"),
-    )
-    program.wait_for_output("running", 20.0)
-    program.send_signal(signal.SIGINT)
-    assert program.wait(20.0) == 0
-
-
-def test_a_file_for_every_node_may_hold_what_other_nodes_know_but_no_misspelling(
+def test_parameters_of_ros_itself_are_no_strangers_nor_is_in_a_file_for_every_node_what_other_nodes_know(
     processes: ProcessGroup, domain_id: int, tmp_path: Path
 ) -> None:
     file = tmp_path / "all.yaml"
     file.write_text("/**:\n  ros__parameters: {use_sim_time: false, gain: 3.0, of_another: 1.0}\n", encoding="utf-8")
-    program = _start(processes, "--ros-args", "--params-file", str(file))
+    program = _start(
+        processes,
+        *("--ros-args", "--params-file", str(file)),
+        *("-p", "use_sim_time:=false", "-p", "start_type_description_service:=false"),
+        *("-p", "qos_overrides./parameter_events.publisher.depth:=10"),
+    )
     program.wait_for_output("left to other nodes, from a section for every node: of_another", 20.0)
     program.wait_for_output("running", 20.0)
     program.send_signal(signal.SIGINT)
     assert program.wait(20.0) == 0
-    file.write_text("/**:\n  ros__parameters: {effort_limt: 1.0}\n", encoding="utf-8")
-    program = _start(processes, "--ros-args", "--params-file", str(file))
-    assert program.wait(20.0) == 2
-    assert "unknown parameter 'effort_limt'" in program.output
-    file.write_text("/tiny_plant:\n  ros__parameters: {of_another: 1.0}\n", encoding="utf-8")
-    program = _start(processes, "--ros-args", "--params-file", str(file))
-    assert program.wait(20.0) == 2
-    assert "unknown parameter 'of_another'" in program.output
 
 
 def test_help_shows_every_parameter_and_survives_a_reader_that_goes() -> None:
