@@ -178,9 +178,10 @@ _MESSAGES = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, tim
 
 def _zip_bomb(folder: Path) -> Path:
     path = folder / "bomb.npz"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("time.npy", "w") as file:
+    deflated = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+    with deflated as archive, archive.open("time.npy", "w") as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (2**27,)})
-        for _ in range(512):
+        for _ in range(256):
             file.write(bytes(1 << 20))
     return path
 
@@ -243,7 +244,7 @@ HOSTILE: Sequence[HostileFile] = (
         "an encoding of its own", "HEBI gains XML",
         _text("g.xml", '<?xml version="1.0" encoding="UTF-7"?>+ADw-group_gains/>'),
     ),
-    HostileFile("half a gigabyte of zeros", "feedback NPZ", _zip_bomb),
+    HostileFile("a quarter of a gigabyte of zeros", "feedback NPZ", _zip_bomb),
     HostileFile(
         "a billion laughs in custom_data", "bag: metadata.yaml",
         _metadata(lambda text: text.replace("  ros_distro", _laughs("", "    ") + "  ros_distro")), refused=False,
