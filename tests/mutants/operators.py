@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import copy
 import inspect
 import textwrap
 from collections import Counter
@@ -88,13 +87,14 @@ def mutants_of(function: FunctionType, name: str) -> Iterator[Mutant]:
         lines, first = inspect.getsourcelines(function)
     except OSError:
         return  # made at run time, such as a NamedTuple's methods
-    tree = ast.parse(textwrap.dedent("".join(lines)))
+    source = textwrap.dedent("".join(lines))
+    tree = ast.parse(source)
     if not isinstance(tree.body[0], (ast.FunctionDef, ast.AsyncFunctionDef)):
         return  # made by a decorator, such as a dataclass's __init__
     seen = {function.__code__.co_code}
     told_before: Counter[tuple[int, str]] = Counter()
     for number, _ in enumerate(_changes(tree)):
-        broken = copy.deepcopy(tree)
+        broken = ast.parse(source)
         line, change = next(told() for index, told in enumerate(_changes(broken)) if index == number)
         code = _code_of(broken, function, first)
         if code is None or (code.co_code in seen and code.co_consts == function.__code__.co_consts):
