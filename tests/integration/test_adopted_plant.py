@@ -1,4 +1,7 @@
-"""A plain node of others behind our rules: adopted, driven, e-stopped, killed, and with an intruder at its efforts."""
+"""A plain node of others behind our rules: adopted, with an intruder at its efforts, driven, e-stopped, and killed.
+
+One robot and its adopter for most of it; in the end the robot dies, and then the adopter is ended.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from trajectory_msgs.msg import JointTrajectory
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message, trajectory_to_message
+from tests.fixtures import PROJECT, own_domain
 from tests.integration.adopting import EFFORTS, adopt, start_robot
 from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
@@ -42,19 +46,60 @@ def peer(domain_id: int) -> Iterator[Peer]:
     peer.close()
 
 
-@pytest.fixture
-def robot(processes: ProcessGroup, peer: Peer) -> RunningProgram:
-    return start_robot(processes)
+class Pair:
+    """A robot with its adopter, and who speaks to it."""
+
+    def __init__(self, processes: ProcessGroup) -> None:
+        self.processes = processes
+        self.robot = start_robot(processes)
+        self.adopter = adopt(processes, "/sim")
+        self.peer = Peer()
+        self.peer.program = self.adopter
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
+    folder = tmp_path_factory.mktemp("pair")
+    processes = ProcessGroup(folder / "processes", cwd=PROJECT)
+    with own_domain(folder):
+        pair = Pair(processes)
+        peer = pair.peer
+        try:
+            peer.until(lambda: peer.states and peer.sent and peer.diagnostics.get("mode"), "the adopted plant")
+            yield pair
+        finally:
+            peer.close()
+            leftovers = processes.close()
+    assert leftovers == []
 
 
 @pytest.fixture
-def adopter(processes: ProcessGroup, peer: Peer, robot: RunningProgram) -> RunningProgram:
-    peer.program = program = adopt(processes, "/sim")
-    peer.until(lambda: peer.states and peer.sent and peer.diagnostics.get("mode"), "the adopted plant")
-    return program
+def adopted(pair: Pair) -> Peer:
+    """Bring the plant back to how it started, disarmed."""
+    peer = pair.peer
+    peer.torque = None
+    peer.ask("e_stop_reset")
+    assert peer.arm(False).success
+    peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "a disarmed plant")
+    peer.sent.clear()
+    peer.until(lambda: peer.sent, "efforts")
+    return peer
 
 
-def test_it_is_stamped_armed_driven_limited_moved_and_stopped(adopter: RunningProgram, peer: Peer) -> None:
+def test_somebody_else_at_its_efforts_is_refused_and_faults(adopted: Peer) -> None:
+    peer = adopted
+    assert peer.arm().success
+    intruder = peer.node.create_publisher(Float64MultiArray, EFFORTS, 10)
+    peer.until(lambda: peer.diagnostics["mode"] == "fault", "the fault")
+    assert peer.diagnostics["reason"].startswith("1 other publishers on /robot/effort_controller/commands")
+    assert peer.arm(False).success
+    assert "expected none" in peer.arm().message
+    peer.node.destroy_publisher(intruder)
+    peer.until(lambda: peer.arm().success, "it to be armed again")
+
+
+def test_it_is_stamped_armed_driven_limited_moved_and_stopped(adopted: Peer) -> None:
+    peer = adopted
     first = peer.states[0]
     assert (list(first.name), first.position[0]) == ([names.JOINT], pytest.approx(0.0, abs=1e-6))
     assert stamp_from_message(first.header.stamp) > 1e18
@@ -76,7 +121,7 @@ def test_it_is_stamped_armed_driven_limited_moved_and_stopped(adopter: RunningPr
     peer.until(lambda: peer.sent[-1] == 0.0, "zero torque without commands")
 
     start = peer.states[-1].position[0]
-    peer.moves.publish(trajectory_to_message(from_points([0.0, 5.0], [start, 2.2], [0.0, 0.0])))
+    peer.moves.publish(trajectory_to_message(from_points([0.0, 4.0], [start, 2.2], [0.0, 0.0])))
     peer.until(lambda: "holding" in peer.diagnostics["reason"], "the end of the move")
     # Past a right angle, where theirs wraps; slow enough for 13 N m against 11.77 N m s/rad.
     assert peer.states[-1].position[0] == pytest.approx(2.2, abs=0.05)
@@ -89,43 +134,31 @@ def test_it_is_stamped_armed_driven_limited_moved_and_stopped(adopter: RunningPr
     assert not peer.arm().success
 
 
-def test_a_robot_that_dies_is_a_fault_and_a_new_one_gets_no_torque_by_itself(
-    adopter: RunningProgram, robot: RunningProgram, peer: Peer, processes: ProcessGroup
+def test_a_robot_that_dies_is_a_fault_a_new_one_gets_no_torque_by_itself_and_the_adopters_end_leaves_none_behind(
+    pair: Pair, adopted: Peer
 ) -> None:
+    peer = adopted
     assert peer.arm().success
     peer.torque = 0.5
     peer.until(lambda: peer.sent[-1] == -0.5, "torque")
-    robot.send_signal(signal.SIGKILL)
+    pair.robot.send_signal(signal.SIGKILL)
     peer.until(lambda: peer.diagnostics["mode"] == "fault", "the fault")
     assert "ms old; expected at most 500 ms" in peer.diagnostics["reason"]
     peer.until(lambda: peer.sent[-1] == 0.0, "zero torque")
     states, count = len(peer.states), len(peer.sent)
-    start_robot(processes, "robot again")
+    start_robot(pair.processes, "robot again")
     peer.until(lambda: len(peer.states) > states + 30, "states of the new one")
     assert set(peer.sent[count:]) == {0.0}
-    adopter.interrupt()
-    peer.until(lambda: adopter.returncode is not None, "the end")
-    assert adopter.returncode == 0
 
-
-def test_the_end_of_the_adopter_leaves_no_torque_behind(adopter: RunningProgram, peer: Peer) -> None:
-    assert peer.arm().success
-    peer.torque = 0.5
-    peer.until(lambda: peer.sent[-1] == -0.5, "torque")
-    adopter.send_signal(signal.SIGTERM)
-    peer.until(lambda: adopter.returncode is not None, "the end")
-    assert peer.sent[-1] == 0.0
-
-
-def test_somebody_else_at_its_efforts_is_refused_and_faults(adopter: RunningProgram, peer: Peer) -> None:
-    assert peer.arm().success
-    intruder = peer.node.create_publisher(Float64MultiArray, EFFORTS, 10)
-    peer.until(lambda: peer.diagnostics["mode"] == "fault", "the fault")
-    assert peer.diagnostics["reason"].startswith("1 other publishers on /robot/effort_controller/commands")
+    peer.torque = None
     assert peer.arm(False).success
-    assert "expected none" in peer.arm().message
-    peer.node.destroy_publisher(intruder)
     peer.until(lambda: peer.arm().success, "it to be armed again")
+    peer.torque = 0.5
+    peer.until(lambda: peer.sent[-1] == -0.5, "torque again")
+    pair.adopter.send_signal(signal.SIGTERM)
+    peer.until(lambda: pair.adopter.returncode is not None, "the end")
+    assert pair.adopter.returncode == 0
+    assert peer.sent[-1] == 0.0
 
 
 def test_states_that_are_not_finite_or_of_another_joint_are_refused(processes: ProcessGroup, peer: Peer) -> None:

@@ -160,8 +160,8 @@ def test_in_real_time_both_answer_and_refuse_alike(twins: Twins, processes: Proc
     assert len({int(each["answered"]) - int(first["answered"]) for first, each in zip(before, after, strict=True)}) == 1
 
 
-def test_in_simulated_time_both_begin_anew_and_repeat_alike(twins: Twins, processes: ProcessGroup) -> None:
-    start(twins, processes, "use_sim_time:=true")
+def begin_anew(twins: Twins) -> None:
+    """Send three runs, each from the same stamp on, with states that come twice."""
     for run in range(3):
         for step in range(40):
             data = encode_joint_state(SECOND + step * 2_000_000, **(STATE | {"velocity": 0.001 * step + run}))
@@ -171,7 +171,6 @@ def test_in_simulated_time_both_begin_anew_and_repeat_alike(twins: Twins, proces
         # Another period, another state under the stamp of the newest.
         twins.send(encode_joint_state(2 * SECOND, **STATE))
         twins.send(encode_joint_state(2 * SECOND, **(STATE | {"velocity": 1.0 + run})))
-    check(twins)
 
 
 _REDESIGNS: dict[str, tuple[dict[str, Any], ...]] = {
@@ -182,10 +181,11 @@ _REDESIGNS: dict[str, tuple[dict[str, Any], ...]] = {
 
 
 @pytest.mark.parametrize("name", _REDESIGNS)
-def test_a_law_that_remembers_answers_alike_also_when_it_is_designed_anew(
+def test_in_simulated_time_a_law_that_remembers_answers_alike_in_new_runs_and_when_it_is_designed_anew(
     twins: Twins, processes: ProcessGroup, name: str
 ) -> None:
     start(twins, processes, "use_sim_time:=true", f"controller:={name}", "period:=0.002")
+    begin_anew(twins)
     generator, stamp_ns = random.Random(3), SECOND
     for values in ({}, *_REDESIGNS[name]):
         change = SetParametersAtomically.Request(
