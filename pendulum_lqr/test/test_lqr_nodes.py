@@ -264,17 +264,6 @@ def test_a_policy_answers_at_its_own_period_and_says_when_it_gives_up(plant, pro
         assert period or not any(command.effort[0] for command in plant.commands)
 
 
-def test_a_controller_that_waits_is_silent_until_it_is_activated(plant, processes):
-    program = processes.start("pendulum_lqr", "controller", *ros("autoactivate:=false", PATIENT))
-    program.wait_for_output(r"waits inactive.*: /sim/controller/change_state", 30)
-    plant.connect()
-    plant.run(5)
-    assert not plant.commands
-    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE))
-    assert plant.call(ChangeState, "controller/change_state", request).success
-    plant.until(lambda: plant.publish() and plant.commands, "the first answer")
-
-
 def test_a_manager_can_hold_the_controller_and_deactivation_sends_zero(plant, processes):
     program = processes.start("pendulum_lqr", "controller", *ros("autostart:=false", "controller:=pd_gravity", PATIENT))
     plant.connect()
@@ -305,9 +294,17 @@ def test_a_manager_can_hold_the_controller_and_deactivation_sends_zero(plant, pr
     assert program.wait(15) == 0
 
 
-def test_multi_array_speaks_to_an_effort_controller_of_ros2_control(plant, processes):
-    program = processes.start("pendulum_lqr", "controller", *ros("command_type:=multi_array", PATIENT))
+def test_a_controller_that_waits_is_silent_until_it_is_activated_also_where_it_speaks_to_one_of_ros2_control(
+    plant, processes
+):
+    told = ("autoactivate:=false", "command_type:=multi_array", PATIENT)
+    program = processes.start("pendulum_lqr", "controller", *ros(*told))
+    program.wait_for_output(r"waits inactive.*: /sim/controller/change_state", 30)
     plant.connect()
+    plant.run(5)
+    assert not plant.arrays
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE))
+    assert plant.call(ChangeState, "controller/change_state", request).success
     plant.until(lambda: plant.publish() and plant.arrays, "commands")
     assert plant.arrays[-1] == pytest.approx(ANSWER, abs=1e-5)
     assert not plant.commands
@@ -316,7 +313,9 @@ def test_multi_array_speaks_to_an_effort_controller_of_ros2_control(plant, proce
     plant.until(lambda: plant.arrays[-1] == 0.0, "the last zero")
 
 
-def test_the_disturbance_follows_seed_and_stamp_between_start_and_end(plant, processes):
+def test_the_disturbance_follows_seed_and_stamp_between_start_and_end_and_a_stopped_process_ends_it_with_zero(
+    plant, processes
+):
     program = processes.start("pendulum_lqr", "disturbance", *ros("seed:=7", "duration:=0.2"))
     plant.until(lambda: plant.publish() and plant.disturbances, "the first answer")
     plant.run(20, period=0.01)
@@ -340,15 +339,11 @@ def test_the_disturbance_follows_seed_and_stamp_between_start_and_end(plant, pro
     assert {answer.effort[0] for answer in during} <= allowed
     assert end["stamp_ns"] - begin["stamp_ns"] >= 200_000_000
     assert all(a.effort[0] == 0.0 for a in plant.disturbances if a.stamp_ns >= end["stamp_ns"])
-    assert plant.set_parameters("disturbance", amplitude=1.0).successful
-    program.send_signal(signal.SIGINT)
-    assert program.wait(15) == 0
+    assert plant.set_parameters("disturbance", kind="step", duration=60.0).successful
 
-
-def test_a_stopped_process_ends_a_running_disturbance_with_zero(plant, processes):
-    program = processes.start("pendulum_lqr", "disturbance", *ros("kind:=step", "autostart:=true"))
-    plant.connect()
-    plant.until(lambda: plant.publish() and any(a.effort[0] == 2.5 for a in plant.disturbances), "the step")
+    plant.events.clear()
+    assert plant.call(Trigger, "disturbance/start", Trigger.Request()).success
+    plant.until(lambda: plant.publish() and plant.disturbances[-1].effort[0] == 2.5, "the step")
     program.send_signal(signal.SIGTERM)
     assert program.wait(15) == 0
     plant.until(lambda: plant.disturbances[-1].effort[0] == 0.0, "the last zero")
