@@ -87,7 +87,8 @@ def mutants_of(function: FunctionType, name: str) -> Iterator[Mutant]:
         lines, first = inspect.getsourcelines(function)
     except OSError:
         return  # made at run time, such as a NamedTuple's methods
-    source = textwrap.dedent("".join(lines))
+    # Each line where it stands in the file.
+    source = "\n" * (first - 1) + textwrap.dedent("".join(lines))
     tree = ast.parse(source)
     if not isinstance(tree.body[0], (ast.FunctionDef, ast.AsyncFunctionDef)):
         return  # made by a decorator, such as a dataclass's __init__
@@ -96,13 +97,13 @@ def mutants_of(function: FunctionType, name: str) -> Iterator[Mutant]:
     for number, _ in enumerate(_changes(tree)):
         broken = ast.parse(source)
         line, change = next(told() for index, told in enumerate(_changes(broken)) if index == number)
-        code = _code_of(broken, function, first)
+        code = _code_of(broken, function)
         if code is None or (code.co_code in seen and code.co_consts == function.__code__.co_consts):
             continue
         told_before[line, change] += 1
         count = told_before[line, change]
         change += f" (number {count} of the line)" if count > 1 else ""
-        yield Mutant(name, first + line - 1, change, lines[line - 1].strip(), code)
+        yield Mutant(name, line, change, lines[line - first].strip(), code)
 
 
 def _changes(tree: ast.Module) -> Iterator[Callable[[], tuple[int, str]]]:
@@ -225,13 +226,12 @@ def _swap(node: ast.Compare, items: list[Any], at: int, value: Any, told: str) -
     return change
 
 
-def _code_of(tree: ast.Module, function: FunctionType, first: int) -> CodeType | None:
+def _code_of(tree: ast.Module, function: FunctionType) -> CodeType | None:
     """Compile a broken function as the whole one was: with its closure's names, so that its code can take the place."""
     free = function.__code__.co_freevars
     top = tree.body[0]
     assert isinstance(top, (ast.FunctionDef, ast.AsyncFunctionDef))
     top.decorator_list = []
-    ast.increment_lineno(tree, first - 1)
     if free:
         outer = ast.parse("def outer():\n" + "".join(f"    {name} = None\n" for name in free) + "    pass")
         assert isinstance(outer.body[0], ast.FunctionDef)
