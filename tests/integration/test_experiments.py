@@ -49,6 +49,11 @@ def run_experiment(
     return done
 
 
+def _program(name: str) -> psutil.Process:
+    """Return the process of a program that this process has started, and that has it to itself."""
+    return next(one for one in psutil.Process().children(recursive=True) if name in one.cmdline())
+
+
 @pytest.fixture(scope="module", autouse=True)
 def hosts() -> Iterator[HostPool]:
     """Hosts of the programs of all runs that a test carries out in its own process, commands of ours among them."""
@@ -109,7 +114,7 @@ def test_lockstep_runs_of_a_policy_on_the_emulated_hardware_with_one_seed_are_id
 
 
 def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
-    domain_id: int, tmp_path: Path, hosts: HostPool, pids: dict[str, int], monkeypatch: pytest.MonkeyPatch
+    domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looks = 0
     spent_at_look: list[float] = []
@@ -127,7 +132,7 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
         """
         if not looks:
             return
-        simulator = psutil.Process(pids["simulator"])
+        simulator = _program("simulator")
         spent = sum(simulator.cpu_times()[:2])
         if looks > len(spent_at_look):
             spent_at_look.append(spent)
@@ -144,7 +149,7 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
     with pytest.raises(
         FaultError, match=r"waited 1\.5 s for 10 more states of a run of 20 s of simulated time, in vain"
     ):
-        lockstep.record_run(tmp_path / "frozen", spec, on_wait=hold, hosts=hosts)
+        lockstep.record_run(tmp_path / "frozen", spec, on_wait=hold)
     # Patience counts from the last look: the run was taken for a live one twice.
     assert looks == 3
 
@@ -200,7 +205,7 @@ def test_a_policy_that_cannot_play_is_refused_before_anything_starts(
 
 
 def test_a_lockstep_run_of_the_simulator_gives_the_numbers_of_one_process_to_the_last_bit(
-    domain_id: int, tmp_path: Path, hosts: HostPool, pids: dict[str, int], monkeypatch: pytest.MonkeyPatch
+    domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = tmp_path / "logs" / "bag" / "sim_simulator.log"
     frozen: list[psutil.Process] = []
@@ -208,7 +213,7 @@ def test_a_lockstep_run_of_the_simulator_gives_the_numbers_of_one_process_to_the
 
     def freeze_the_controller(plant: PlantClient, timeout: float) -> None:
         """Let it answer late, so that the plant publishes a state again."""
-        frozen.append(psutil.Process(pids["controller"]))
+        frozen.append(_program("controller"))
         frozen[0].suspend()
         resume(plant, timeout)
 
@@ -218,8 +223,7 @@ def test_a_lockstep_run_of_the_simulator_gives_the_numbers_of_one_process_to_the
 
     monkeypatch.setattr(PlantClient, "resume", freeze_the_controller)
     settings = RegulationSettings(noise=NoiseSettings(seed=7, duration=1.0, hold_time=0.002))
-    run = lockstep.lockstep_spec(settings, side="sim")
-    lockstep.record_run(tmp_path / "bag", run, on_wait=go_on, hosts=hosts)
+    lockstep.run_lockstep(tmp_path / "bag", settings, on_wait=go_on)
     assert "publishing it again" in log.read_text()
     bag = read_bag(tmp_path / "bag")
     assert bag.metadata["pendulum.recorder.counts"]["/sim/joint_states"]["repeated"] > 0
