@@ -18,7 +18,7 @@ import pytest
 
 from pendulum_bags.course.course_cli import main as course_main
 from pendulum_bags.experiments import lockstep
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.experiment_cli import main
 from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, keep_pool
 from pendulum_bags.experiments.in_process import simulate
@@ -152,6 +152,27 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
         lockstep.record_run(tmp_path / "frozen", spec, on_wait=hold)
     # Patience counts from the last look: the run was taken for a live one twice.
     assert looks == 3
+
+
+def test_a_run_of_which_the_recorder_was_told_nothing_on_a_topic_fails_and_names_it(
+    tmp_path: Path, hosts: HostPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It knows of a publisher that does not know of it yet: what that says goes to nobody."""
+    deaf = "^/diagnostics$|/transition_event$|/disturbance$"
+    start, heard = HostPool.start, RecorderClient.heard
+
+    def start_deaf(pool: HostPool, command: Sequence[str], **more: Any) -> HostedProgram | None:
+        words = [deaf if before == "--exclude" else word for before, word in zip(["", *command], command, strict=False)]
+        return start(pool, words, **more)
+
+    monkeypatch.setattr(HostPool, "start", start_deaf)
+    monkeypatch.setattr(RecorderClient, "heard", lambda recorder: {*heard(recorder), "/sim/disturbance"})
+    monkeypatch.setattr(RecorderClient.wait_for_all, "__defaults__", (1.0,))
+    # The recorder is no listener of it.
+    monkeypatch.setitem(lockstep._RUN_LISTENERS, "disturbance", 1)
+    spec = lockstep.lockstep_spec(RegulationSettings(noise=NoiseSettings(duration=0.2)), side="sim")
+    with pytest.raises(FaultError, match=r"the recorder has 0 of 100 messages of /sim/disturbance after 1 s"):
+        lockstep.record_run(tmp_path / "run", spec, hosts=hosts)
 
 
 def test_several_joints_and_what_stands_in_for_their_machine_end_in_one_answer(tmp_path: Path) -> None:

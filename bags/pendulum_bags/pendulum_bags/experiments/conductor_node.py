@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
@@ -432,12 +432,11 @@ class RecorderClient:
         """Return how many messages of a topic it has."""
         return self._counts().get(topic, 0)
 
-    def wait_for_all(self, topics: Sequence[str], expected: int, timeout: float = 60.0) -> None:
+    def wait_for_all(self, expected: Mapping[str, int], timeout: float = 60.0) -> None:
         """Wait until the messages of topics have arrived, and no more of any other do: it may be seconds behind.
 
         Args:
-            topics: Names of the topics.
-            expected: Messages that were published on each.
+            expected: How many messages were published on each topic, by its name.
             timeout: Longest time to wait [s].
 
         Raises:
@@ -446,11 +445,12 @@ class RecorderClient:
         counts: dict[str, int] = {}
         quiet = 0
         deadline = time.monotonic() + timeout
-        while quiet < _QUIET_POLLS or any(counts.get(topic, 0) < expected for topic in topics):
+        while quiet < _QUIET_POLLS or any(counts.get(topic, 0) < count for topic, count in expected.items()):
             if time.monotonic() > deadline:
-                behind = min(topics, key=lambda topic: counts.get(topic, 0))
+                behind = min(expected, key=lambda topic: counts.get(topic, 0) - expected[topic])
                 raise FaultError(
-                    f"the recorder has {counts.get(behind, 0)} of {expected} messages of {behind} after {timeout:g} s"
+                    f"the recorder has {counts.get(behind, 0)} of {expected[behind]} messages of {behind} after "
+                    f"{timeout:g} s"
                 )
             self._conductor.spin(_SLICE)
             before, counts = counts, self._counts()

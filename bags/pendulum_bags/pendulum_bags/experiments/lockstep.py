@@ -49,6 +49,7 @@ _RUN_LISTENERS = {
     names.EVENTS: 2,
 }
 """How many listen to each topic of a run: its reader, the recorder, and to events the conductor."""
+_TOLD_EACH_STEP = (names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT)
 
 
 def run_lockstep(
@@ -190,7 +191,7 @@ def record_run(
         if not spec.has_bridge:
             plant.resume(START_TIMEOUT)
         _wait_for_end(session.conductor, plant, spec.duration)
-        session.close_in_lockstep(recorder, plant, spec.steps + 1)
+        session.close_in_lockstep(recorder, plant, spec.steps + 1, _TOLD_EACH_STEP)
     return bag
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -89,7 +89,9 @@ class Session:
         if self.processes.finish(recorder) != 0:
             raise FaultError(recorder.last_words(1))
 
-    def close_in_lockstep(self, recorder: Child, plant: PlantClient, states: int) -> None:
+    def close_in_lockstep(
+        self, recorder: Child, plant: PlantClient, states: int, steps_are_told_on: Collection[str] = ()
+    ) -> None:
         """Close the bag of a run in lockstep when it holds everything.
 
         Simulated time stands still by then: what the nodes say on their way out is no part of the run.
@@ -98,13 +100,17 @@ class Session:
             recorder: The recorder.
             plant: The plant.
             states: How many states the plant has published.
+            steps_are_told_on: Relative names of the topics that have a message for each step, of which there is one
+                less. A publisher may know of the recorder only after the recorder knows of it, and what it says
+                meanwhile goes to nobody: a short run can be over by then.
 
         Raises:
             FaultError: Messages were lost.
         """
-        # The clock ticks once for each state, and neither topic waits for the other.
-        topics = (f"{plant.namespace}/{names.JOINT_STATES}", names.CLOCK)
-        RecorderClient(self.conductor, plant.namespace).wait_for_all(topics, states)
+        # The clock ticks once for each state, and no topic waits for another.
+        expected = {f"{plant.namespace}/{names.JOINT_STATES}": states, names.CLOCK: states}
+        expected |= {f"{plant.namespace}/{topic}": states - 1 for topic in steps_are_told_on}
+        RecorderClient(self.conductor, plant.namespace).wait_for_all(expected)
         self.close(recorder)
 
     def drives(self, *plants: PlantClient) -> None:
