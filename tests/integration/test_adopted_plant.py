@@ -78,6 +78,7 @@ def adopted(pair: Pair) -> Peer:
     """Bring the plant back to how it started, disarmed."""
     peer = pair.peer
     peer.torque = None
+    peer.spin(0.2)  # no plant arms while a large torque is still fresh
     peer.ask("e_stop_reset")
     assert peer.arm(False).success
     peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "a disarmed plant")
@@ -138,7 +139,8 @@ def test_a_robot_that_dies_is_a_fault_a_new_one_gets_no_torque_by_itself_and_the
     pair: Pair, adopted: Peer
 ) -> None:
     peer = adopted
-    assert peer.arm().success
+    armed = peer.arm()
+    assert armed.success, armed.message
     peer.torque = 0.5
     peer.until(lambda: peer.sent[-1] == -0.5, "torque")
     pair.robot.send_signal(signal.SIGKILL)

@@ -208,6 +208,7 @@ def any_peer(running_plant: Peer) -> Peer:
     """Bring the plant back to how it started, disarmed; forget what was heard."""
     peer = running_plant
     peer.answer = None
+    peer.spin(0.15)  # no plant arms while a large torque is still fresh
     peer.call(Trigger, "tiny_plant/e_stop_reset", Trigger.Request())
     assert peer.arm(False).success
     # Its counts, too, as they are now.
