@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -29,6 +30,8 @@ class Lab:
         self.peer = GraphPeer("plants")
         self.stopped: list[str] = []
         for plant in (FIRST, SECOND):
+            # Before the other: of two requests that wait, a reset is served first.
+            self.peer.node.create_service(Trigger, f"{plant}/e_stop_reset", self._reset(plant))
             self.peer.node.create_service(Trigger, f"{plant}/e_stop", self._stop(plant))
         self.events = self.peer.node.create_publisher(String, "/first/events", qos.EVENTS)
         self.hub = Hub()
@@ -41,6 +44,14 @@ class Lab:
             return response
 
         return stop
+
+    def _reset(self, plant: str) -> Callable[..., Trigger.Response]:
+        def reset(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            response.success = plant in self.stopped
+            self.stopped = [one for one in self.stopped if one != plant]
+            return response
+
+        return reset
 
     def until(self, condition: Callable[[], object], what: str) -> None:
         self.peer.until(condition, what, DEADLINE)
@@ -81,6 +92,17 @@ def test_a_plant_whose_service_breaks_keeps_no_other_from_being_stopped(
     assert "client of a service that is gone" in order["rows"][FIRST]["text"]
     broken.clear()
     lab.until(lambda: lab.state(FIRST) == "stopped", "stop of a plant that is whole again")
+
+
+def test_a_reset_is_not_overtaken_by_a_stop_that_was_asked_for_before(lab: Lab) -> None:
+    # Nobody serves the plants meanwhile: the stop is on its way when the reset is pressed.
+    asyncio.run(lab.hub.e_stop([FIRST]))
+    pressed = threading.Thread(target=lambda: asyncio.run(lab.hub.reset(FIRST)))
+    pressed.start()
+    time.sleep(0.3)
+    lab.until(lambda: not pressed.is_alive(), "answer to the reset")
+    lab.peer.spin(0.3)
+    assert lab.stopped == []
 
 
 def test_an_event_that_makes_no_sense_keeps_no_answer_to_a_stop_away(lab: Lab) -> None:

@@ -180,6 +180,10 @@ class Hub:
     async def reset(self, node: str) -> str:
         """Reset the e-stop of a plant, which ends the order for it."""
         self.release_stop(node)
+        # What is on its way would stop the plant again behind its reset.
+        deadline = time.monotonic() + _TIMEOUT
+        while self._is_asked_to_stop(node) and time.monotonic() < deadline:
+            await asyncio.sleep(0.01)
         return await self.trigger(f"{node}/e_stop_reset")
 
     def _keep_stopping(self) -> None:
@@ -230,9 +234,16 @@ class Hub:
                 elif response is not None:
                     self._order.problem(node, f"refuses: {response.message}")
 
-        call = client.call_async(Trigger.Request())
-        calls.append((now, call))
+        with self._order_lock:
+            if not self._order.holds(node):
+                return
+            call = client.call_async(Trigger.Request())
+            calls.append((now, call))
         call.add_done_callback(take)
+
+    def _is_asked_to_stop(self, node: str) -> bool:
+        with self._order_lock:
+            return any(not call.done() for _, call in self._stop_calls.get(node, ()))
 
     async def trigger(self, service: str) -> str:
         """Call a service without arguments; raise a FaultError with its reason where it refuses."""

@@ -90,6 +90,10 @@ class StopOrder:
                 found.append(plant)
         return found
 
+    def holds(self, plant: str) -> bool:
+        """Return whether a plant is to be stopped."""
+        return plant in self._rows
+
     def answer(self, plant: str, text: str, now: float) -> None:
         """Note that a plant said it is stopped."""
         row = self._rows.get(plant)
