@@ -57,6 +57,21 @@ OFFENCES = {
         "import pendulum_lqr",
         "pendulum_rosbag.control_offender -> pendulum_lqr",
     ),
+    "a writer of bags that imports a reader": (
+        "bags/pendulum_rosbag/pendulum_rosbag/storage/offender.py",
+        "import pendulum_rosbag.reader",
+        "pendulum_rosbag.storage.offender -> pendulum_rosbag.reader",
+    ),
+    "equations that import the contract": (
+        "pendulum_msgs_py/pendulum_msgs_py/dynamics/offender.py",
+        "import pendulum_msgs_py.contract.names",
+        "pendulum_msgs_py.dynamics.offender -> pendulum_msgs_py.contract.names",
+    ),
+    "recordings that reach into the robot": (
+        "bags/pendulum_bags/pendulum_bags/offender.py",
+        "import pendulum_hw_bridge",
+        "pendulum_bags.offender -> pendulum_hw_bridge",
+    ),
     "a module that imports itself through another": (
         "pendulum_msgs_py/pendulum_msgs_py/errors.py",
         "def late():\n    from pendulum_msgs_py import parameters",
