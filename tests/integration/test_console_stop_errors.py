@@ -10,12 +10,14 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from pendulum_bags.console.console_node import Hub
 from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.ros import qos
 from tests.graph_peer import GraphPeer
 
@@ -55,6 +57,22 @@ class Lab:
 
     def until(self, condition: Callable[[], object], what: str) -> None:
         self.peer.until(condition, what, DEADLINE)
+
+    def reset(self, plant: str, meanwhile: Callable[[], object] = lambda: None) -> str:
+        """Reset a plant by the console, with something done before the plants serve again; return what is refused."""
+        refusals: list[str] = []
+
+        def press() -> None:
+            try:
+                asyncio.run(self.hub.reset(plant))
+            except FaultError as error:
+                refusals.append(str(error))
+
+        pressed = threading.Thread(target=press)
+        pressed.start()
+        meanwhile()
+        self.until(lambda: not pressed.is_alive(), "answer to the reset")
+        return "".join(refusals)
 
     def state(self, plant: str) -> str:
         order = self.hub.stop_state()
@@ -97,12 +115,30 @@ def test_a_plant_whose_service_breaks_keeps_no_other_from_being_stopped(
 def test_a_reset_is_not_overtaken_by_a_stop_that_was_asked_for_before(lab: Lab) -> None:
     # Nobody serves the plants meanwhile: the stop is on its way when the reset is pressed.
     asyncio.run(lab.hub.e_stop([FIRST]))
-    pressed = threading.Thread(target=lambda: asyncio.run(lab.hub.reset(FIRST)))
-    pressed.start()
-    time.sleep(0.3)
-    lab.until(lambda: not pressed.is_alive(), "answer to the reset")
+    assert lab.reset(FIRST, lambda: time.sleep(0.3)) == ""
     lab.peer.spin(0.3)
     assert lab.stopped == []
+
+
+def test_a_reset_that_waits_takes_back_no_stop_that_is_pressed_after_it(lab: Lab) -> None:
+    asyncio.run(lab.hub.e_stop([FIRST]))
+
+    def press_again() -> None:
+        time.sleep(0.1)
+        asyncio.run(lab.hub.e_stop([FIRST]))
+
+    assert "was told to stop again meanwhile" in lab.reset(FIRST, press_again)
+    assert lab.state(FIRST) == "stopped"
+    assert FIRST in lab.stopped
+
+
+def test_a_stop_that_a_plant_died_over_holds_no_later_reset_up(lab: Lab) -> None:
+    asyncio.run(lab.hub.e_stop([FIRST]))
+    lab.until(lambda: lab.state(FIRST) == "stopped", "stop")
+    lab.hub._stop_calls[FIRST].append((time.monotonic() - 60.0, Future(executor=None)))
+    began = time.monotonic()
+    assert lab.reset(FIRST) == ""
+    assert time.monotonic() - began < 2.0
 
 
 def test_an_event_that_makes_no_sense_keeps_no_answer_to_a_stop_away(lab: Lab) -> None:

@@ -178,12 +178,15 @@ class Hub:
             self._order.release(node)
 
     async def reset(self, node: str) -> str:
-        """Reset the e-stop of a plant, which ends the order for it."""
+        """Reset the e-stop of a plant, which ends the order for it; raise a FaultError where a stop came after it."""
         self.release_stop(node)
         # What is on its way would stop the plant again behind its reset.
         deadline = time.monotonic() + _TIMEOUT
         while self._is_asked_to_stop(node) and time.monotonic() < deadline:
             await asyncio.sleep(0.01)
+        with self._order_lock:
+            if self._order.holds(node):
+                raise FaultError(f"{node} was told to stop again meanwhile: its e-stop is not reset")
         return await self.trigger(f"{node}/e_stop_reset")
 
     def _keep_stopping(self) -> None:
@@ -242,8 +245,10 @@ class Hub:
         call.add_done_callback(take)
 
     def _is_asked_to_stop(self, node: str) -> bool:
+        # A request to a plant that was ended before it answered is never answered.
+        since = time.monotonic() - _TIMEOUT
         with self._order_lock:
-            return any(not call.done() for _, call in self._stop_calls.get(node, ()))
+            return any(asked > since and not call.done() for asked, call in self._stop_calls.get(node, ()))
 
     async def trigger(self, service: str) -> str:
         """Call a service without arguments; raise a FaultError with its reason where it refuses."""
