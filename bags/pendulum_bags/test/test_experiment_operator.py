@@ -57,6 +57,14 @@ def test_the_bridge_of_a_real_machine_gets_the_lab_file_and_nothing_that_contrad
         assert TrialSettings(kind, 1, "hebi", lab=str(lab)).plant_program(1).parameters["lab_file"] == str(lab)
 
 
+def test_a_ramp_that_the_machine_would_refuse_with_the_pendulum_upright_is_refused_before_it_moves(lab: Path) -> None:
+    lab.write_text(LAB.replace("limits:", "limits:\n  velocity: {value: 0.3, unit: rad/s}"), encoding="utf-8")
+    for speed in (0.2, 0.8):
+        with pytest.raises(ParameterError, match=r"expected up to 0\.27 rad/s at a velocity limit of 0\.3 rad/s \(lab"):
+            RegulationSettings(hardware="hebi", lab=str(lab), ramp_speed=speed)
+    assert RegulationSettings(hardware="hebi", lab=str(lab), ramp_speed=0.18).ramp_time > 17.0
+
+
 def test_emulators_on_the_network_of_hebi_are_a_rehearsal_with_the_limits_of_a_real_machine(lab: Path) -> None:
     lab.write_text(LAB.replace("emulator_process", "hebi, interface: 192.168.1.10"), encoding="utf-8")
     machine = real_machine("hebi", lab)

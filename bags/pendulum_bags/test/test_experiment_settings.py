@@ -8,11 +8,15 @@ from pathlib import Path
 import pytest
 
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.experiments.settings import RegulationSettings
+from pendulum_bags.experiments.settings import RAMP_SPEEDS, RegulationSettings
+from pendulum_hw_bridge.node_specs import SPECS
 from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_parameters
 from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.plant_specs import limits_from_parameters
+from pendulum_msgs_py.contract.supervisor import PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
+from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -60,15 +64,26 @@ def test_ramps_are_the_thesis_s_unless_told_and_told_slower_or_faster_in_all_tha
     usual = RegulationSettings()
     assert usual.ramp(0.1, UPRIGHT) == thesis_ramp(0.1, UPRIGHT)
     assert usual.expected_wall_time == 47.0 + 5.0
-    for speed in (0.05, 0.6, 1.0):
+    for speed in (0.05, 0.6, 0.8):
         told = RegulationSettings(ramp_speed=speed)
         ramp = told.ramp(0.0, UPRIGHT)
         assert ramp.duration == pytest.approx(UPRIGHT / speed, abs=0.01) == pytest.approx(told.ramp_time, abs=0.01)
         assert max(point.velocity for point in ramp.points) == pytest.approx(1.5 * speed, rel=1e-3)
         assert told.expected_wall_time == pytest.approx(52.0 - 10.0 * math.pi + 2.0 * told.ramp_time)
-    for speed in (0.0, 0.049, 1.01, math.nan):
-        with pytest.raises(ParameterError, match=r"ramp speed is .* rad/s; expected 0.05 to 1"):
+    for speed in (0.0, 0.049, 0.81, math.nan):
+        with pytest.raises(ParameterError, match=r"ramp speed is .* rad/s; expected 0.05 to 0.8"):
             RegulationSettings(ramp_speed=speed)
+
+
+def test_the_fastest_ramp_is_one_that_a_bridge_with_its_usual_limit_follows_from_where_the_pendulum_stands() -> None:
+    # The ramp down was refused, with the pendulum upright.
+    limits = limits_from_parameters({spec.name: spec.default for spec in SPECS}, (13.0,), feedback_timeout=0.1)
+    for gap in (-0.29, -0.001, 0.001, 0.29):
+        plant = PlantSupervisor(limits)
+        sample = JointSample.of_one(0, UPRIGHT, 0.0, 0.0)
+        assert plant.arm(0, sample) == ""
+        ramp = RegulationSettings(ramp_speed=RAMP_SPEEDS[1]).ramp(UPRIGHT + gap, 0.0)
+        assert plant.accept_trajectory(ramp, 0, sample) == ""
 
 
 @pytest.mark.parametrize("value", [math.nan, [-1.0, math.inf]])

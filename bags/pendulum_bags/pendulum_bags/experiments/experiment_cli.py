@@ -131,7 +131,7 @@ def thesis(
     ramp_speed: Annotated[
         float,
         typer.Option(
-            help="Mean speed of the ramps up and down, 0.05 to 1; the largest is half as much again. Less than the "
+            help="Mean speed of the ramps up and down, 0.05 to 0.8; the largest is half as much again. Less than the "
             "thesis's 0.2 for a machine that may not turn so fast, more where the torque suffices [rad/s]."
         ),
     ] = RAMP_SPEED,

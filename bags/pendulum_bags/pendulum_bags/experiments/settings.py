@@ -49,9 +49,12 @@ TIME_BESIDE_NOISE = 47.0
 """Wall time of the thesis's experiment without its noise, measured on two cores; 31 s are the ramps [s]."""
 RAMP_SPEED = RAMP_INCREMENT / RAMP_PERIOD
 """Mean speed of the thesis's ramp [rad/s]."""
-RAMP_SPEEDS = (0.05, 1.0)
+RAMP_SPEEDS = (0.05, 0.8)
 """Slowest and fastest ramps: as many points as a plant takes, and the most that a bridge with its usual limit of
-1.5 rad/s follows [rad/s]."""
+1.5 rad/s follows whatever gap to where the pendulum stands it has to close meanwhile, by up to 0.3 rad/s [rad/s]."""
+_LARGEST_OF_LIMIT = 0.9
+"""Largest speed of a ramp, as a share of the machine's limit: a pendulum that stands upright is not where the ramp down
+begins, and one that was refused there would be let go where it stands."""
 
 
 @dataclass(frozen=True)
@@ -136,10 +139,17 @@ class RegulationSettings:
                 f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}, a model file "
                 f"({', '.join(_MODEL_FILES)}), gymnasium:ID or ros:/NAMESPACE"
             )
-        real_machine(self.hardware, self.lab)
+        machine = real_machine(self.hardware, self.lab)
         slowest, fastest = RAMP_SPEEDS
         if not slowest <= self.ramp_speed <= fastest:
             raise ParameterError(f"ramp speed is {self.ramp_speed} rad/s; expected {slowest:g} to {fastest:g}")
+        limit = 0.0 if machine is None else machine.lab.values.get("velocity_limit", 0.0)
+        largest = self.ramp_speed / RAMP_SPEED * MAX_RAMP_VELOCITY
+        if limit and largest > _LARGEST_OF_LIMIT * limit:
+            raise ParameterError(
+                f"ramp speed is {self.ramp_speed:g} rad/s, with up to {largest:g} rad/s; expected up to "
+                f"{_LARGEST_OF_LIMIT * limit:g} rad/s at a velocity limit of {limit:g} rad/s (lab file)"
+            )
         for side, mapping, option in (("sim", self.mapping, "simulation"), ("hw", self.hardware_mapping, "hardware")):
             if (foreign := self.foreign_of(side)) is not None:
                 foreign.check(self.noise.hold_time)
