@@ -424,6 +424,7 @@ def test_an_echo_of_the_signal_does_not_cut_the_way_out_short_but_a_second_wish_
         program.wait_for_output("running", 20.0)
     stubborn.send_signal(signal.SIGTERM)
     patient.send_signal(signal.SIGINT)
+    time.sleep(0.2)  # sent at once, the two would be one
     patient.send_signal(signal.SIGINT)
     assert patient.wait(20.0) == 0
     assert "closed" in patient.output
