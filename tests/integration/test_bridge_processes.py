@@ -162,11 +162,10 @@ def bridge_alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningPr
 def test_lifecycle_moves_states_and_torque_and_a_signal_ends_torque_at_once_and_the_process_cleanly(lab: Lab) -> None:
     bridge = lab.bridge("autostart:=false", "command_lifetime:=2.0", "command_timeout:=1.0")
     assert lab.lifecycle_state() == State.PRIMARY_STATE_UNCONFIGURED
-    refused = lab.call(SetBool, "bridge/arm", SetBool.Request(data=True))
-    assert not refused.success
-    assert "not active" in refused.message
+    _is_refused_as_inactive(lab)
     assert lab.change(Transition.TRANSITION_CONFIGURE)
     assert lab.lifecycle_state() == State.PRIMARY_STATE_INACTIVE
+    _is_refused_as_inactive(lab)
     assert not lab.states
     assert lab.change(Transition.TRANSITION_ACTIVATE)
     lab.until(lambda: len(lab.states) > 20, "states", 30.0)
@@ -174,6 +173,7 @@ def test_lifecycle_moves_states_and_torque_and_a_signal_ends_torque_at_once_and_
     assert lab.truth.status()["strategy"] == Strategy.DIRECT_PWM
     assert lab.change(Transition.TRANSITION_DEACTIVATE)
     assert lab.truth.status()["strategy"] == Strategy.OFF
+    _is_refused_as_inactive(lab)
     assert lab.change(Transition.TRANSITION_CLEANUP)
     assert lab.change(Transition.TRANSITION_CONFIGURE)
     assert lab.change(Transition.TRANSITION_ACTIVATE)
@@ -198,6 +198,12 @@ def test_lifecycle_moves_states_and_torque_and_a_signal_ends_torque_at_once_and_
     lab.until(lambda: bridge.returncode is not None, "the end of the bridge", 15.0)
     assert bridge.returncode == 0
     _is_off(lab, expiries)
+
+
+def _is_refused_as_inactive(lab: Lab) -> None:
+    refused = lab.call(SetBool, "bridge/arm", SetBool.Request(data=True))
+    assert not refused.success
+    assert "not active" in refused.message
 
 
 def _is_off(lab: Lab, expiries: int) -> None:
