@@ -75,6 +75,8 @@ def test_experiment_leaves_two_bags_a_summary_figures_and_a_report(run_folder: P
         assert 0.2 < figures["max_abs_u"] < 0.9
     assert summary["plants"]["sim"]["rate_hz"] == pytest.approx(500.0, rel=0.1)
     assert summary["plants"]["hw"]["rate_hz"] == pytest.approx(100.0, rel=0.1)
+    # Under noise of its own, held for 2 ms: the same bands.
+    assert 0.001 < summary["plants"]["sim_500hz"]["std_theta"] < 0.004
     assert {"paired", "unpaired", "seed", "strategy", "versions"} <= summary.keys()
     assert list((run_folder / "figures").glob("*.png"))
     assert (run_folder / "report.html").stat().st_size < 5_000_000

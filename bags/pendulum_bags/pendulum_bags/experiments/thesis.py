@@ -10,10 +10,10 @@ from pathlib import Path
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.graph_plant import join
-from pendulum_bags.experiments.lockstep import longest_run
+from pendulum_bags.experiments.lockstep import lockstep_spec, longest_run
 from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.repeats import SHORTEST, repeat_folder, repeat_settings
+from pendulum_bags.experiments.repeats import SHORTEST, record_simulation, repeat_folder, repeat_settings
 from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.experiments.session import (
     ANSWER_PRIORITY,
@@ -63,7 +63,7 @@ def run_thesis(
         _refuse_occupied_domain(session.conductor, settings)
         plants, recorders = _start(session, folder, settings)
         session.drives(*plants)
-        beside = _regulate(session, plants, settings, progress, folder, repeat=repeat)
+        beside = _regulate(session, plants, settings, progress, folder if repeat else None)
         progress.phase("closing the bags", 2.0)
         # Before anything is waited for: what is said from here on is no part of the experiment.
         for recorder in recorders:
@@ -72,6 +72,8 @@ def run_thesis(
             session.leaves(plant)
         # Nothing else computes beside what is still to be simulated.
         session.processes.stop(keep=beside)
+        if settings.running("sim") is None:
+            _simulate_own_protocol(folder, settings)
         for child in beside:
             # It has limits of its own and ends by itself; on a busy machine it takes minutes.
             longest = longest_run(max(SHORTEST, settings.noise.duration))
@@ -117,11 +119,9 @@ def _regulate(
     plants: Sequence[PlantClient],
     settings: RegulationSettings,
     progress: PhaseProgress,
-    folder: Path,
-    *,
-    repeat: bool,
+    repeated: Path | None,
 ) -> list[Child]:
-    """Carry out the phases, ramp to ramp; return what was started beside them."""
+    """Carry out the phases, ramp to ramp; return what was started beside them: a repeat for a run's folder, if any."""
     conductor, processes, noise = session.conductor, session.processes, settings.noise
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
@@ -131,8 +131,6 @@ def _regulate(
         plant.configure_controller()
         plant.arm()
 
-    # The ramp leaves the machine idle: the thesis's own simulation runs meanwhile, in a domain of its own.
-    beside = [_start_own_protocol(processes, folder, settings)] if settings.running("sim") is None else []
     _wait_for_goal(conductor, plants, _start_move(conductor, plants, settings, UPRIGHT, "ramp_up", progress))
 
     progress.phase("regulation", SETTLE_TIME)
@@ -152,10 +150,8 @@ def _regulate(
         )
 
     durations = _start_move(conductor, plants, settings, 0.0, "ramp_down", progress)
-    if repeat:
-        # Idle again: the emulated hardware gets new noise, in case that this run alone does not decide.
-        command = repeat_settings(settings, 1).lockstep_command(repeat_folder(folder, 1) / "hw", side="hw")
-        beside.append(_start_beside(processes, "repeat_1", command))
+    # The ramp leaves the machine idle: emulated hardware gets new noise, in case that this run alone does not decide.
+    beside = [] if repeated is None else [_start_repeat(processes, repeated, settings)]
     # Before the ramp ends: a controller that is still awake then would be handed a pendulum half a turn from upright.
     for plant in plants:
         plant.switch_controller(on=False)
@@ -173,18 +169,18 @@ def _noise_ended(plant: PlantClient) -> bool:
     return plant.newest_event(Event.NOISE_END) is not None
 
 
-def _start_own_protocol(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> Child:
-    """Start the simulation as the thesis ran it: noise of its own, a new sample every 2 ms."""
+def _simulate_own_protocol(folder: Path, settings: RegulationSettings) -> None:
+    """Simulate as the thesis did: noise of its own, a new sample every 2 ms; what nodes would record, without them."""
     foreign = settings.foreign
     hold_time = 0.002 if foreign is None else max(0.002, foreign.period)
     noise = replace(settings.noise, seed=settings.noise.seed + OWN_PROTOCOL_SEED_STEP, hold_time=hold_time)
-    command = replace(settings, noise=noise).lockstep_command(folder / "sim_500hz")
-    return _start_beside(processes, "sim_500hz", command)
+    record_simulation(folder / "sim_500hz", lockstep_spec(replace(settings, noise=noise), side="sim"))
 
 
-def _start_beside(processes: ProcessSet, name: str, command: list[str]) -> Child:
-    """Start what runs while a ramp leaves the machine idle, in a domain of its own and behind all others."""
-    return processes.start(name, command, ends_by_itself=True, niceness=10, environment={"ROS_DOMAIN_ID": ""})
+def _start_repeat(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> Child:
+    """Start the hardware's side of the first repeat, in a domain of its own and behind all others."""
+    command = repeat_settings(settings, 1).lockstep_command(repeat_folder(folder, 1) / "hw", side="hw")
+    return processes.start("repeat_1", command, ends_by_itself=True, niceness=10, environment={"ROS_DOMAIN_ID": ""})
 
 
 def _start_move(
