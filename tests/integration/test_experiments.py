@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shlex
 import subprocess
 import sys
@@ -32,21 +31,25 @@ from pendulum_lqr.policy_file import write_policy
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.programs.executables import run_package
 from pendulum_rosbag.reader import read_bag, same_messages
 from tests.acceptance.test_docs import JOINTS
 from tests.acceptance.test_readme import FROM_STAIRS
-from tests.fixtures import PROJECT
 from tests.policies import linear_policy
 
 
-def run_experiment(
-    *arguments: str | Path | float, timeout: float = 150.0, cwd: Path | None = None
-) -> subprocess.CompletedProcess[str]:
+def run_experiment(*arguments: str | Path | float, timeout: float = 150.0) -> subprocess.CompletedProcess[str]:
     """Run ``python -m pendulum_bags experiment``; its output is in the message of a failure."""
     command = [sys.executable, "-m", "pendulum_bags", "experiment", *map(str, arguments)]
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done
+
+
+def run_command(words: Sequence[str], *more: str) -> None:
+    """Run ``python -m PACKAGE PROGRAM ...`` of a page in this process, whose hosts it shares."""
+    assert list(words[:2]) == ["python", "-m"]
+    assert run_package(words[2], [*words[3:], *more]) == 0
 
 
 def _program(name: str) -> psutil.Process:
@@ -175,12 +178,15 @@ def test_a_run_of_which_the_recorder_was_told_nothing_on_a_topic_fails_and_names
         lockstep.record_run(tmp_path / "run", spec, hosts=hosts)
 
 
-def test_several_joints_and_what_stands_in_for_their_machine_end_in_one_answer(tmp_path: Path) -> None:
+def test_several_joints_and_what_stands_in_for_their_machine_end_in_one_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     words = shlex.split(JOINTS)
+    monkeypatch.chdir(tmp_path)
     # As its page has it, with more delay, and for less time.
-    done = run_experiment(*words[4:], "--delay", "0.02", "--signal-period", 1, "--json", cwd=tmp_path)
+    run_command(words, "--delay", "0.02", "--signal-period", "1", "--json")
     out = tmp_path / words[words.index("--out") + 1]
-    content = json.loads(done.stdout)
+    content = json.loads(capfd.readouterr().out)
     assert list(content["joints"]) == ["cart", "pole"]
     delays = [
         test for one in content["joints"].values() for test in one["verdict"]["tests"] if test["quantity"] == "delay"
@@ -264,14 +270,14 @@ def test_a_lockstep_run_of_the_simulator_gives_the_numbers_of_one_process_to_the
     assert np.array_equal(bag["/sim/applied_effort"]["effort"], arrays.applied)
 
 
-def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(domain_id: int, tmp_path: Path) -> None:
-    assert main(["inertia_damping", "--out", str(tmp_path / "hand"), "--trials", "2"]) == 0
+def test_the_two_experiments_of_the_thesis_give_back_its_coefficients(
+    domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["inertia_damping", "--out", "hand", "--trials", "2"]) == 0
     # As its page has it: stairs, and then a controller designed for what they tell.
-    environment = {**os.environ, "PATH": f"{PROJECT / '.venv' / 'bin'}:{os.environ['PATH']}"}
-    done = subprocess.run(
-        FROM_STAIRS, shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=250, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    for command in FROM_STAIRS.split("&&"):
+        run_command(shlex.split(command))
 
     hand = json.loads((tmp_path / "hand" / "identified.json").read_text())["intervals"]
     stairs = json.loads((tmp_path / "stairs" / "identified.json").read_text())["intervals"]
@@ -356,7 +362,7 @@ def test_twenty_seeds_reproduce_the_thesis_under_noise(
     assert np.median([run.velocity.std() for run in runs]) == pytest.approx(std_theta_dot, rel=0.05)
 
 
-def test_a_swing_up_brings_the_emulated_machine_up_for_the_board() -> None:
-    line = evaluate_hardware("energy_swing_up", duration=9.0, robustness=False)
+def test_a_swing_up_brings_the_emulated_machine_up_for_the_board(hosts: HostPool) -> None:
+    line = evaluate_hardware("energy_swing_up", duration=9.0, robustness=False, hosts=hosts)
     assert line.reason == ""
     assert line.success

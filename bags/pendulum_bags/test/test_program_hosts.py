@@ -22,6 +22,7 @@ import ctypes, gc, os, signal, socket, sys, threading, time
 
 def tell(argv):
     print("pid", os.getpid(), "word", os.environ.get("WORD"), *argv)
+    print("in", os.getcwd())
     print("to the other stream", file=sys.stderr)
     return 3 if "three" in argv else 0
 
@@ -32,8 +33,8 @@ def leaves(argv):
     raise SystemExit({"text": "error: no such plant", "number": 7, "nothing": None}[argv[0]])
 
 def waits(argv):
-    print("waiting", flush=True)
     try:
+        print("waiting", flush=True)
         time.sleep(60)
     except KeyboardInterrupt:
         print("asked to end")
@@ -111,16 +112,21 @@ def _start(pool: HostPool, log: Path, name: str, *arguments: str, **more: str) -
     return program
 
 
-def test_two_programs_share_a_process_and_nothing_else(pool: HostPool, tmp_path: Path) -> None:
+def test_two_programs_share_a_process_and_nothing_else(
+    pool: HostPool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = _start(pool, tmp_path / "first.log", "tell", "one", WORD="north")
     assert first.wait(30.0) == 0
+    monkeypatch.chdir(tmp_path)
     second = _start(pool, tmp_path / "second.log", "tell", "three")
     assert second.wait(30.0) == 3
     assert first.pid == second.pid
     told = (tmp_path / "first.log").read_text()
     assert f"pid {first.pid} word north one\n" in told
     assert "to the other stream\n" in told
-    # The variable of the first is gone, and each has its own log.
+    assert f"in {tmp_path}\n" not in told
+    # The variable of the first is gone, each has its own log, and runs where its starter is.
+    assert f"in {tmp_path}\n" in (tmp_path / "second.log").read_text()
     assert f"pid {first.pid} word None three\n" in (tmp_path / "second.log").read_text()
     assert "to the other stream\n" in (tmp_path / "second.log").read_text()
     assert "three" not in told

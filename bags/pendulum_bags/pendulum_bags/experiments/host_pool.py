@@ -151,6 +151,7 @@ class HostPool:
             "package": package,
             "arguments": list(command[3:]),
             "environment": dict(environment),
+            "folder": str(Path.cwd()),
             "log": str(log.resolve()),
         }
         text = json.dumps(order).encode() + b"\n"

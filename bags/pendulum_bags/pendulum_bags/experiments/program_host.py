@@ -3,8 +3,8 @@
 To start a node takes half a second of a processor, nearly all of it to load numpy, scipy and rclpy; to make and destroy
 the node takes a sixteenth of that. ``python -m pendulum_bags.experiments.program_host DESCRIPTOR`` takes orders, a line
 of JSON each, from the socket with that number, and answers each with a line when its program has ended. A program sees
-what it would see alone: its own variables, output and signals, a fresh ROS context, exit codes. The host ends when its
-socket does.
+what it would see alone: its own variables, folder, output and signals, a fresh ROS context, exit codes. The host ends
+when its socket does.
 
 :mod:`pendulum_bags.experiments.host_pool` is the other side.
 """
@@ -58,9 +58,10 @@ def main() -> int:
 
 
 def _run(order: Mapping[str, Any], on_begin: Callable[[], None]) -> int:
-    """Run one program with its own variables, output and signals; return its exit code."""
+    """Run one program with its own variables, folder, output and signals; return its exit code."""
     os.environ.clear()
     os.environ.update(order["environment"])
+    os.chdir(order["folder"])
     _write_to(Path(order["log"]))
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,17 +1,16 @@
 """The board's lines for the machine: the same nodes over the same DDS as on a real X5-9, here on the emulated one.
 
-Each run is a program of its own in a ROS domain of its own, in lockstep, so that a line is the same whenever it is
-computed. A run in which the bridge faults (too fast, out of its window) is a failure with the bridge's own words.
+Each run has a ROS domain of its own and is in lockstep, so that a line is the same whenever it is computed; the
+programs stay loaded from one run to the next. A run in which the bridge faults (too fast, out of its window) is a
+failure with the bridge's own words.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,12 +18,14 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.in_process import RunArrays
+from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies.leaderboard import HARDWARE, Entry, Run, entry_of, model_errors, push_trains
 from pendulum_lqr.controllers.policy import START_TIME
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.errors import DataError, FaultError
+from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_rosbag.reader import read_bag
 
@@ -32,7 +33,6 @@ __all__ = ["HARDWARE_PERTURBATIONS", "arrays_of_bag", "evaluate_hardware"]
 
 _PLANT = "thesis"
 _STRATEGY = "direct_pwm"
-_LONGEST = 300.0
 
 
 def arrays_of_bag(bag: Path, namespace: str) -> RunArrays:
@@ -84,6 +84,7 @@ def evaluate_hardware(
     parameters: Mapping[str, Any] | None = None,
     duration: float = 10.0,
     robustness: bool = True,
+    hosts: HostPool | None = None,
 ) -> Entry:
     """Return the line of a controller on the emulated machine: from hanging down to upright, over DDS.
 
@@ -92,6 +93,7 @@ def evaluate_hardware(
         parameters: Of the controller; by default those that it comes with.
         duration: Length of each run [s].
         robustness: Whether to try the perturbations.
+        hosts: Run the programs; without them others do, which end with the line.
     """
     spec: dict[str, Any] = {
         "side": "hw",
@@ -105,33 +107,28 @@ def evaluate_hardware(
         "duration": duration,
     }
 
-    def perturbed() -> Iterator[tuple[str, Sequence[Run]]]:
+    def perturbed(run: Callable[[RunSpec], RunArrays]) -> Iterator[tuple[str, Sequence[Run]]]:
         with tempfile.TemporaryDirectory(prefix="pendulum_board_") as folder:
             for kind, vary in HARDWARE_PERTURBATIONS.items() if robustness else ():
-                yield kind, [partial(_run, RunSpec(**{**spec, **change})) for change in vary(Path(folder), duration)]
+                yield kind, [partial(run, RunSpec(**{**spec, **change})) for change in vary(Path(folder), duration)]
 
-    return entry_of(HARDWARE, controller, lambda: _run(RunSpec(**spec)), perturbed())
+    # Not those of whoever started this process: lines are computed at once, in forks of it.
+    with HostPool() if hosts is None else nullcontext(hosts) as pool:
+        run = partial(_run, hosts=pool)
+        return entry_of(HARDWARE, controller, lambda: run(RunSpec(**spec)), perturbed(run))
 
 
-def _run(spec: RunSpec) -> RunArrays:
-    with tempfile.TemporaryDirectory(prefix="pendulum_board_") as folder:
-        place = Path(folder)
-        (place / "spec.json").write_text(json.dumps(spec.to_json()), encoding="utf-8")
-        command = [sys.executable, "-m", "pendulum_bags", "experiment", "run", str(place / "spec.json")]
-        # Without a domain of ours it finds a free one, whoever else runs beside it.
-        environment = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
-        try:
-            done = subprocess.run(
-                [*command, "--bag", str(place / "bag")],
-                capture_output=True,
-                text=True,
-                timeout=_LONGEST,
-                check=False,
-                env=environment,
-            )
-        except subprocess.TimeoutExpired as error:
-            raise FaultError(f"a run on the emulated machine did not end within {_LONGEST:g} s") from error
-        if done.returncode:
-            said = [line for line in done.stderr.splitlines() if line.strip()]
-            raise FaultError((said or [f"the run ended with code {done.returncode}"])[-1].removeprefix("error: "))
-        return arrays_of_bag(place / "bag", spec.namespace)
+def _run(spec: RunSpec, hosts: HostPool) -> RunArrays:
+    with tempfile.TemporaryDirectory(prefix="pendulum_board_") as folder, _any_domain():
+        return arrays_of_bag(record_run(Path(folder, "bag"), spec, hosts=hosts), spec.namespace)
+
+
+@contextmanager
+def _any_domain() -> Iterator[None]:
+    """Let a run find a free ROS domain, whoever else runs beside it and whatever the user's is."""
+    own = os.environ.pop("ROS_DOMAIN_ID", None)
+    try:
+        yield
+    finally:
+        if own is not None:
+            os.environ["ROS_DOMAIN_ID"] = own
