@@ -88,21 +88,6 @@ def begin(processes: ProcessGroup, lab: Laboratory, folder: Path) -> RunningProg
     return run
 
 
-def test_an_experiment_ends_at_once_with_the_plant_and_the_reason(
-    processes: ProcessGroup, lab: Laboratory, tmp_path: Path
-) -> None:
-    run = begin(processes, lab, tmp_path)
-    assert lab.peer.ask("e_stop").success
-    assert run.wait(60.0) == 2
-    (told,) = [line for line in run.output.splitlines() if line.startswith("error: ")]
-    assert told == "error: /lab went to e_stop: e-stop pressed"
-    # What was not stopped goes on, and the stop stays until somebody takes it back.
-    assert (lab.robot.returncode, lab.adopter.returncode) == (None, None)
-    lab.peer.spin(0.5)
-    assert lab.peer.diagnostics["mode"] == "e_stop"
-    assert not lab.peer.arm().success
-
-
 def test_ctrl_c_disarms_a_plant_that_somebody_else_started(
     processes: ProcessGroup, lab: Laboratory, tmp_path: Path
 ) -> None:
@@ -118,16 +103,23 @@ def test_ctrl_c_disarms_a_plant_that_somebody_else_started(
 
 
 @pytest.mark.parametrize(
-    ("dies", "told"),
+    ("what", "told"),
     [
+        ("e-stop", r"^/lab went to e_stop: e-stop pressed$"),
         ("robot", r"^/lab went to fault: measurement is \d+ ms old; expected at most 500 ms"),
         ("adopter", r"^/lab has sent no state for 5 s: .* cut the motor's supply"),
     ],
-    ids=["robot", "adopter"],
+    ids=["e-stop", "robot", "adopter"],
 )
-def test_a_session_ends_at_once_with_the_plant_that_dies_on_its_way_up_and_the_reason(
-    dies: str, told: str, lab: Laboratory, tmp_path: Path
+def test_a_session_ends_at_once_with_the_plant_that_is_stopped_or_dies_on_its_way_up_and_the_reason(
+    what: str, told: str, lab: Laboratory, tmp_path: Path
 ) -> None:
+    def stop() -> None:
+        if what == "e-stop":
+            assert lab.peer.ask("e_stop").success
+        else:
+            (lab.robot if what == "robot" else lab.adopter).send_signal(signal.SIGKILL)
+
     def move() -> None:
         with conduct(tmp_path / "logs", lab.domain) as session:
             plant = join(session.conductor, "/lab")
@@ -136,13 +128,18 @@ def test_a_session_ends_at_once_with_the_plant_that_dies_on_its_way_up_and_the_r
             assert plant.sample is not None
             plant.follow(thesis_ramp(plant.sample.position[0], UPRIGHT), "ramp_up")
             session.conductor.wait_for("the plant to follow", plant.is_following, 5.0)
-            (lab.robot if dies == "robot" else lab.adopter).send_signal(signal.SIGKILL)
+            stop()
             session.conductor.wait_for("the end of the move", plant.trajectory_finished, 20.0)
 
     with pytest.raises(FaultError, match=told):
         move()
-    assert (lab.robot.returncode is None) is (dies != "robot")
-    assert (lab.adopter.returncode is None) is (dies != "adopter")
+    # What did not die goes on, and a stop stays until somebody takes it back.
+    assert (lab.robot.returncode is None) is (what != "robot")
+    assert (lab.adopter.returncode is None) is (what != "adopter")
+    if what == "e-stop":
+        lab.peer.spin(0.5)
+        assert lab.peer.diagnostics["mode"] == "e_stop"
+        assert not lab.peer.arm().success
 
 
 def test_a_plant_of_several_joints_is_refused_before_anything_of_it_is_asked(
