@@ -12,6 +12,7 @@ import pytest
 from pendulum_bags.console.console_node import Hub
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import FaultError, ParameterError
@@ -63,7 +64,9 @@ async def _drive(hub: Hub) -> None:
         await hub.set_parameter(f"{space}/disturbance", "amplitude", 1.0)
 
 
-def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nodes_do_what_the_policy_allows_and_nothing_else(
+    tmp_path: Path, hosts: HostPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     programs = [
         graph.simulator("/sim"),
         graph.bridge("/hw", backend="emulator"),
@@ -78,7 +81,7 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, monkey
     allowed = granted()
     with (
         reserve_domain() as domain,
-        ProcessSet(tmp_path, ros_environment(domain, tmp_path)) as processes,
+        ProcessSet(tmp_path, ros_environment(domain, tmp_path), hosts) as processes,
         Conductor(domain) as conductor,
     ):
         for program in programs:
