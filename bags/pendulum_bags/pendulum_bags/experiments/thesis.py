@@ -125,7 +125,7 @@ def _regulate(
     conductor, processes, noise = session.conductor, session.processes, settings.noise
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
-        recorded = [f"{plant.namespace}/{topic}" for topic in names.SIGNALS]
+        recorded = [f"{plant.namespace}/{topic}" for topic in (*names.SIGNALS, names.JOINT_TRAJECTORY)]
         RecorderClient(conductor, plant.namespace).wait_until_heard(recorded, START_TIMEOUT)
     for plant in plants:
         plant.configure_controller()
