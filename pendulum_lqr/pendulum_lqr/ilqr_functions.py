@@ -15,6 +15,7 @@ import numpy as np
 from pendulum_lqr.small_matrices import keep_convex
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
+from pendulum_msgs_py.loops.trees import WITHIN
 from pendulum_msgs_py.mechanisms import Mechanism
 
 __all__ = ["cost_functions", "step_functions"]
@@ -48,14 +49,14 @@ def step_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
     n, m = len(mechanism.joints), len(driven)
     size = 2 * n + m
     where = np.array(driven)
-    along = numba.njit(along_functions(n))
-    pick = numba.njit(_TUPLES[n])
+    along = numba.njit(along_functions(n), **WITHIN)
+    pick = numba.njit(_TUPLES[n], **WITHIN)
     # Written into its callers: machine code that is told no functions can be kept on disk.
-    rk4 = numba.njit(_fresh(rk4_joints), forceinline=True)
-    forward = numba.njit(_fresh(mechanism.forward), error_model="numpy")
-    forward_c = numba.njit(in_arithmetic(mechanism.forward, cmath), error_model="numpy")
+    rk4 = numba.njit(_fresh(rk4_joints), forceinline=True, **WITHIN)
+    forward = numba.njit(_fresh(mechanism.forward), error_model="numpy", **WITHIN)
+    forward_c = numba.njit(in_arithmetic(mechanism.forward, cmath), error_model="numpy", **WITHIN)
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def advance(z: Any, u: Any, h: float, p: Any, work: Any, out: Any) -> None:
         for i in range(n):
             work[0, i] = 0.0
@@ -72,7 +73,7 @@ def step_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
         for j in range(m):
             out[2 * n + j] = u[j]
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def derive(z: Any, u: Any, h: float, p: Any, work: Any, zc: Any, A: Any, B: Any) -> None:
         """Fill A (size, size) and B (size, m)."""
         for column in range(size + m):
@@ -116,11 +117,11 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
     n, m = len(mechanism.joints), len(driven)
     turns = np.array([joint.turns for joint in mechanism.joints])
     where = np.array(driven)
-    pick = numba.njit(_TUPLES[n])
-    potential = numba.njit(_fresh(mechanism.potential), error_model="numpy")
-    potential_c = numba.njit(in_arithmetic(mechanism.potential, cmath), error_model="numpy")
+    pick = numba.njit(_TUPLES[n], **WITHIN)
+    potential = numba.njit(_fresh(mechanism.potential), error_model="numpy", **WITHIN)
+    potential_c = numba.njit(in_arithmetic(mechanism.potential, cmath), error_model="numpy", **WITHIN)
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def missing(q: Any, p: Any, goal: Any, scale: Any) -> float:
         e = 1.0 - (potential(pick(q, 0), p) - scale[0]) / scale[1]
         for i in range(n):
@@ -128,7 +129,7 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
                 e += (q[i] - goal[i]) ** 2
         return e
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def far_slope(q: Any, p: Any, goal: Any, scale: Any, qc: Any, out: Any) -> None:
         outer = (1.0 + _SOFTNESS) * _SOFTNESS / (missing(q, p, goal, scale) + _SOFTNESS) ** 2
         for i in range(n):
@@ -140,7 +141,7 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
                 slope += 2.0 * (q[i] - goal[i])
             out[i] = outer * slope
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def stage(z: Any, u: Any, h: float, p: Any, goal: Any, scale: Any, w: Any) -> float:
         power, squares, change, speed = 0.0, 0.0, 0.0, 0.0
         for j in range(m):
@@ -153,7 +154,7 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
         far = (1.0 + _SOFTNESS) * e / (e + _SOFTNESS)
         return h * (w[0] * far + w[1] * power + w[2] * squares + w[4] * speed) + w[3] * change / h
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def deviation(z: Any, goal: Any, out: Any) -> None:
         for i in range(n):
             out[i] = z[i] - goal[i]
@@ -161,7 +162,7 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
                 out[i] -= 2.0 * np.pi * np.rint(out[i] / (2.0 * np.pi))
             out[n + i] = z[n + i]
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def final(z: Any, goal: Any, S: Any, w: Any, d: Any) -> float:
         deviation(z, goal, d)
         total = 0.0
@@ -170,7 +171,7 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
                 total += d[i] * S[i, j] * d[j]
         return w[5] * total
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def final_slopes(z: Any, goal: Any, S: Any, w: Any, d: Any, Vz: Any, Vzz: Any) -> None:
         deviation(z, goal, d)
         Vz[:] = 0.0
@@ -180,7 +181,7 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
                 Vz[i, 0] += 2.0 * w[5] * S[i, j] * d[j]
                 Vzz[i, j] = 2.0 * w[5] * S[i, j]
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def expand(
         z: Any, u: Any, h: float, p: Any, goal: Any, scale: Any, w: Any, qc: Any, slopes: Any, lz: Any, lu: Any,
         lzz: Any, luu: Any, luz: Any,

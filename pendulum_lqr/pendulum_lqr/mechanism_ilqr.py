@@ -29,6 +29,7 @@ from pendulum_lqr.small_matrices import copy, eliminate, newton, product
 from pendulum_msgs_py.contract.values import written
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.loops.trees import WITHIN
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
@@ -143,7 +144,7 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
     advance, derive = step_functions(mechanism, driven)
     stage, expand, final, final_slopes = cost_functions(mechanism, driven)
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def follow(
         Z: Any, U: Any, K: Any, k_0: Any, alpha: float, Z_new: Any, U_new: Any, p: Any, goal: Any, scale: Any, h: float,
         w: Any, S: Any, limits: Any, work: Any, d: Any,
@@ -160,7 +161,7 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
             advance(Z_new[k], U_new[k], h, p, work, Z_new[k + 1])
         return cost + final(Z_new[-1], goal, S, w, d)
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def linearise(Z: Any, U: Any, h: float, p: Any, As: Any, Bs: Any) -> None:
         """Fill the derivatives of each step."""
         work, zc = np.zeros((3, n), np.complex128), np.zeros(size, np.complex128)
@@ -169,7 +170,7 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
             Bs[k, :, :] = 0.0
             derive(Z[k], U[k], h, p, work, zc, As[k], Bs[k])
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", **WITHIN)
     def improve(
         Z: Any, U: Any, As: Any, Bs: Any, regular: float, p: Any, goal: Any, scale: Any, h: float, w: Any, S: Any,
         limits: Any, K: Any, k_0: Any,
@@ -226,7 +227,7 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
                     Vzz[i, j] = Vzz[j, i] = 0.5 * (Vzz[i, j] + Vzz[j, i])
         return promised
 
-    @numba.njit(error_model="numpy")
+    @numba.njit(error_model="numpy", no_cfunc_wrapper=True)
     def solve(
         Z: Any, U: Any, Z_old: Any, K: Any, p: Any, goal: Any, scale: Any, h: float, w: Any, S: Any, limits: Any,
         iterations: int,

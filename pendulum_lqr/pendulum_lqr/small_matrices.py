@@ -7,10 +7,12 @@ from typing import Any
 import numba
 import numpy as np
 
+from pendulum_msgs_py.loops.trees import WITHIN
+
 __all__ = ["copy", "eliminate", "keep_convex", "newton", "product"]
 
 
-@numba.njit(error_model="numpy", fastmath={"contract"})
+@numba.njit(error_model="numpy", fastmath={"contract"}, **WITHIN)
 def product(a: Any, b: Any, out: Any, transposed: bool, add: bool) -> None:
     """Fill ``out`` with a b, or a' b, or add it: small matrices, without the price of a call to a library."""
     for i in range(out.shape[0]):
@@ -21,7 +23,7 @@ def product(a: Any, b: Any, out: Any, transposed: bool, add: bool) -> None:
             out[i, j] = total
 
 
-@numba.njit(error_model="numpy")
+@numba.njit(error_model="numpy", **WITHIN)
 def copy(source: Any, target: Any) -> None:
     """Copy a matrix, without numpy's words about shapes that do not fit, which take seconds to compile."""
     for i in range(source.shape[0]):
@@ -29,7 +31,7 @@ def copy(source: Any, target: Any) -> None:
             target[i, j] = source[i, j]
 
 
-@numba.njit(error_model="numpy", fastmath={"contract"})
+@numba.njit(error_model="numpy", fastmath={"contract"}, **WITHIN)
 def newton(H: Any, g: Any, low: Any, high: Any, step: Any, free: Any, work: Any) -> None:
     """Fill ``step`` with what minimises g' s + s' H s / 2 between limits, and which entries are free of them.
 
@@ -63,7 +65,7 @@ def newton(H: Any, g: Any, low: Any, high: Any, step: Any, free: Any, work: Any)
             return
 
 
-@numba.njit(error_model="numpy", fastmath={"contract"})
+@numba.njit(error_model="numpy", fastmath={"contract"}, **WITHIN)
 def eliminate(work: Any, m: int) -> None:
     """Solve the positive definite system whose right-hand sides stand in the columns from m on, in place."""
     for j in range(m):
@@ -78,7 +80,7 @@ def eliminate(work: Any, m: int) -> None:
             work[j, c] /= scale
 
 
-@numba.njit(error_model="numpy")
+@numba.njit(error_model="numpy", **WITHIN)
 def keep_convex(M: Any, n: int) -> None:
     """Leave out of the symmetric part of the first n (1 or 2) rows and columns what is concave, in place."""
     if n == 1:

@@ -12,8 +12,7 @@ Memory does not depend on the number of steps, unless the trajectories are asked
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +27,7 @@ from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import check_step, pack
 from pendulum_sim.stability import MOST_GROWTH, check_stability, growth_rate
 
-__all__ = ["BatchResult", "batch_size", "check_counts", "noise_keys", "on_threads", "simulate_batch"]
+__all__ = ["BatchResult", "batch_size", "check_counts", "noise_keys", "simulate_batch"]
 
 Array = NDArray[np.float64]
 
@@ -102,7 +101,7 @@ def simulate_batch(
     Raises:
         ParameterError: Shapes do not go together, or a value is outside its domain.
     """
-    from pendulum_sim.batch_kernels import ROWS, coefficients_kernel, general_kernel, smooth_kernel
+    from pendulum_sim.batch_kernels import BLOCK, ROWS, coefficients_kernel, general_kernel, run_blocks, smooth_kernel
 
     check_step(dt, substeps)
     integrator = get_integrator(method)
@@ -174,9 +173,8 @@ def simulate_batch(
     for name, values in zip(PACKED, packed.T, strict=True):
         rows[name][:] = values
     table[len(ROWS) :] = coefficients.T
-    with on_threads(threads):
-        run = smooth_kernel(method, coefficients.shape[1]) if smooth else general_kernel(method)
-        run(table, keys, target, dt, steps, hold, substeps, record_of)
+    run = smooth_kernel(method, coefficients.shape[1]) if smooth else general_kernel(method)
+    run_blocks(run, BLOCK if smooth else 1, threads, table, keys, target, dt, steps, hold, substeps, record_of)
     mean_x, mean_v = rows["sum_x"] / steps, rows["sum_v"] / steps
     return BatchResult(
         theta=rows["x"].copy(),
@@ -223,19 +221,6 @@ def batch_size(lengths: Mapping[str, int]) -> int:
         if length not in {1, size}:
             raise ParameterError(f"{name} has {length} entries; expected 1 or {size}")
     return size
-
-
-@contextmanager
-def on_threads(threads: int | None) -> Iterator[None]:
-    """Run compiled loops on a number of threads, None for numba's default, and leave the default as it was."""
-    import numba
-
-    before = numba.get_num_threads()
-    numba.set_num_threads(min(threads or before, numba.config.NUMBA_NUM_THREADS))
-    try:
-        yield
-    finally:
-        numba.set_num_threads(before)
 
 
 def _is_whole(value: object) -> bool:

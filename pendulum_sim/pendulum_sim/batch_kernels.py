@@ -7,13 +7,16 @@ of the single plant, compiled.
 
 from __future__ import annotations
 
-from functools import cache
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
 from typing import Any
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract import noise
+from pendulum_msgs_py.loops.trees import WITHIN
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
 from pendulum_sim.compiling import compile_tree, tuple_loader
@@ -21,7 +24,7 @@ from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, is_dry
 from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import advance_rigid
 
-__all__ = ["BLOCK", "block_loop", "coefficients_kernel", "general_kernel", "smooth_kernel"]
+__all__ = ["BLOCK", "block_loop", "coefficients_kernel", "general_kernel", "run_blocks", "smooth_kernel"]
 
 BLOCK = 256
 """Pendulums in a block."""
@@ -37,7 +40,7 @@ _wrap = compile_tree(vector_math.wrap)
 
 
 def block_loop(run_block: Any, lanes: int) -> Any:
-    """Return the loop over blocks, in parallel.
+    """Return the loop over blocks, for :func:`run_blocks`.
 
     Args:
         run_block: Compiled loop of one block: (array, keys, target, step [s], steps, hold, more, record); ``more`` is
@@ -45,10 +48,14 @@ def block_loop(run_block: Any, lanes: int) -> Any:
         lanes: Plants in a block.
     """
 
-    @numba.njit(parallel=True)
-    def run(columns: Any, keys: Any, target: Any, step: float, steps: int, hold: int, more: Any, record: Any) -> None:
+    # Threads of Python share the blocks: numba's own would have all that is in the loop compiled three times.
+    @numba.njit(nogil=True, no_cfunc_wrapper=True)
+    def run(
+        columns: Any, keys: Any, target: Any, step: float, steps: int, hold: int, more: Any, record: Any, begin: int,
+        end: int,
+    ) -> None:  # fmt: skip
         rows, size = columns.shape
-        for block in numba.prange((size + lanes - 1) // lanes):
+        for block in range(begin, end):
             first = block * lanes
             last = min(first + lanes, size)
             # One array with rows at fixed distances: the compiler sees that no row overlaps another. Loops, because
@@ -69,6 +76,28 @@ def block_loop(run_block: Any, lanes: int) -> Any:
     return run
 
 
+def run_blocks(kernel: Any, lanes: int, threads: int | None, columns: NDArray[np.float64], *others: Any) -> None:
+    """Run a kernel on all plants of a batch.
+
+    Args:
+        kernel: What :func:`block_loop` returned.
+        lanes: Plants in its blocks.
+        threads: Threads to use; None for numba's default, which is also the most.
+        columns: Array of the plants, one in a column.
+        others: Further arguments of the kernel, up to the record.
+    """
+    blocks = -(-columns.shape[1] // lanes)
+    most = numba.config.NUMBA_NUM_THREADS
+    count = min(threads or most, most, blocks)
+    ends = [blocks * index // count for index in range(count + 1)]
+    if count == 1:
+        kernel(columns, *others, 0, blocks)
+        return
+    with ThreadPoolExecutor(count) as pool:
+        # All are waited for, and what one raises is raised here.
+        list(pool.map(partial(kernel, columns, *others), ends[:-1], ends[1:]))
+
+
 def _starts(lanes: int) -> dict[str, int]:
     """Return where each row begins in a block's array."""
     return {name: row * lanes for row, name in enumerate((*ROWS, "coefficients"))}
@@ -81,7 +110,7 @@ def _control(lanes: int) -> Any:
     o_gain_1, o_gain_2, o_max, o_max_x = (s[key] for key in ("gain_1", "gain_2", "max", "max_x"))
     o_sum_x, o_sum_xx, o_sum_v, o_sum_vv = (s[key] for key in ("sum_x", "sum_xx", "sum_v", "sum_vv"))
 
-    @numba.njit(fastmath={"contract"}, error_model="numpy")
+    @numba.njit(fastmath={"contract"}, error_model="numpy", **WITHIN)
     def control(w: Any, keys: Any, target: float, k: int, hold: int, record: Any) -> None:
         if k % hold == 0:
             index = np.uint64(k // hold)
@@ -118,7 +147,7 @@ def smooth_kernel(method: str, coefficient_rows: int) -> Any:
     control = _control(BLOCK)
     o_v, o_torque, o_plant, o_coefficients = (_starts(BLOCK)[key] for key in ("v", "torque", PACKED[0], "coefficients"))
 
-    @numba.njit(fastmath={"contract"}, error_model="numpy")
+    @numba.njit(fastmath={"contract"}, error_model="numpy", **WITHIN)
     def run_block(
         w: Any, keys: Any, target: float, dt: float, steps: int, hold: int, substeps: int, record: Any
     ) -> None:
@@ -150,9 +179,9 @@ def coefficients_kernel(method: str) -> Any:
     integrator = get_integrator(method)
     coefficients_of = compile_tree(integrator.coefficients, inline=True)
 
-    @numba.njit(parallel=True, error_model="numpy")
+    @numba.njit(error_model="numpy", no_cfunc_wrapper=True)
     def run(rates: Any, h: float, out: Any) -> None:
-        for j in numba.prange(rates.size):
+        for j in range(rates.size):
             for row, value in enumerate(coefficients_of(rates[j], h)):
                 out[row, j] = value
 
@@ -172,7 +201,7 @@ def general_kernel(method: str) -> Any:
     control = _control(1)
     o_torque, o_delay, o_plant = (_starts(1)[key] for key in ("torque", "delay", PACKED[0]))
 
-    @numba.njit(fastmath={"contract"}, error_model="numpy")
+    @numba.njit(fastmath={"contract"}, error_model="numpy", **WITHIN)
     def run_block(
         w: Any, keys: Any, target: float, dt: float, steps: int, hold: int, substeps: int, record: Any
     ) -> None:

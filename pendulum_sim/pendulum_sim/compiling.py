@@ -28,7 +28,8 @@ def compile_tree(function: Callable[..., Any], *, vector: bool = False, inline: 
     Args:
         function: A plain function of this project that uses scalars, tuples and ``math``.
         vector: Take ``pendulum_sim.vector_math`` in the place of ``math``, and write each function into its caller.
-        inline: Write each function into its caller: machine code that is told no functions can be kept on disk.
+        inline: Write each function into its caller, a compiled one: machine code that is told no functions can be kept
+            on disk.
     """
     substitutes = {math: _vector_module} if vector else {}
-    return _compile_tree(function, inline=inline or vector, substitutes=substitutes)
+    return _compile_tree(function, inline=inline or vector, substitutes=substitutes, within=inline)

@@ -18,7 +18,7 @@ from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.joint_steps import COULOMB, JOINT_ROWS, LOWER, STATIC, UPPER
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
-from pendulum_sim.batch import batch_size, check_counts, noise_keys, on_threads
+from pendulum_sim.batch import batch_size, check_counts, noise_keys
 from pendulum_sim.mechanism_plant import check_decay, check_stable_step, is_smooth_mechanism
 from pendulum_sim.plant import check_step
 
@@ -89,6 +89,7 @@ def simulate_mechanisms(
     Raises:
         ParameterError: Shapes do not go together, or a value is outside its domain.
     """
+    from pendulum_sim.batch_kernels import BLOCK, run_blocks
     from pendulum_sim.mechanism_kernels import Layout, general_joints_kernel, smooth_joints_kernel
 
     check_step(dt, substeps)
@@ -129,12 +130,11 @@ def simulate_mechanisms(
     keys = np.broadcast_to(own_keys, (size,)).copy()
     recorded = np.empty((steps, 3 * n, size)) if record else np.empty((0, 3 * n, size))
     smooth = is_smooth_mechanism(parameters) and not any(name.partition(".")[2] in JOINT_ROWS for name in varied)
-    with on_threads(threads):
-        if smooth:
-            smooth_joints_kernel(layout)(w, keys, aim, dt, steps, hold, substeps, recorded)
-        else:
-            more = np.array([float(substeps), common_delay(parameters)])
-            general_joints_kernel(layout)(w, keys, aim, dt, steps, hold, more, recorded)
+    if smooth:
+        run_blocks(smooth_joints_kernel(layout), BLOCK, threads, w, keys, aim, dt, steps, hold, substeps, recorded)
+    else:
+        more = np.array([float(substeps), common_delay(parameters)])
+        run_blocks(general_joints_kernel(layout), 1, threads, w, keys, aim, dt, steps, hold, more, recorded)
 
     def rows(name: str, count: int) -> Array:
         return w[starts[name] : starts[name] + count].T.copy()

@@ -16,6 +16,7 @@ import numpy as np
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.dynamics.joint_steps import JOINT_ROWS, LAG, advance_joints, joint_functions
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
+from pendulum_msgs_py.loops.trees import WITHIN
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
@@ -84,7 +85,7 @@ def _control(layout: Layout, lanes: int) -> Any:
     turns = tuple(joint.turns for joint in MECHANISMS[layout.name].joints)
     driven = layout.driven
 
-    @numba.njit(fastmath={"contract"}, error_model="numpy")
+    @numba.njit(fastmath={"contract"}, error_model="numpy", **WITHIN)
     def control(w: Any, keys: Any, goal: Any, k: int, hold: int, record: Any) -> None:
         for i in range(n):
             for j in range(lanes):
@@ -130,10 +131,10 @@ def smooth_joints_kernel(layout: Layout) -> Any:
     step = compile_tree(rk4_joints, vector=True)
     load = tuple_loader(n, BLOCK)
     load_p = tuple_loader(len(mechanism.parameter_names), BLOCK)
-    store = numba.njit(_STORES[n], forceinline=True)
+    store = numba.njit(_STORES[n], forceinline=True, **WITHIN)
     control = _control(layout, BLOCK)
 
-    @numba.njit(fastmath={"contract"}, error_model="numpy")
+    @numba.njit(fastmath={"contract"}, error_model="numpy", **WITHIN)
     def run_block(w: Any, keys: Any, goal: Any, dt: float, steps: int, hold: int, substeps: int, record: Any) -> None:
         h = dt / substeps
         for k in range(steps):
@@ -170,10 +171,10 @@ def general_joints_kernel(layout: Layout) -> Any:
     advance = compile_tree(advance_joints, inline=True)
     load = tuple_loader(n, 1)
     load_p = tuple_loader(len(mechanism.parameter_names), 1)
-    store = numba.njit(_STORES[n])
+    store = numba.njit(_STORES[n], **WITHIN)
     control = _control(layout, 1)
 
-    @numba.njit(fastmath={"contract"}, error_model="numpy")
+    @numba.njit(fastmath={"contract"}, error_model="numpy", **WITHIN)
     def run_block(w: Any, keys: Any, goal: Any, dt: float, steps: int, hold: int, more: Any, record: Any) -> None:
         substeps = int(more[0])
         periods = more[1] / dt

@@ -14,13 +14,15 @@ from typing import Any
 
 from pendulum_msgs_py.programs.kept_kernels import name_symbols_apart
 
-__all__ = ["compile_tree", "tuple_loader"]
+__all__ = ["WITHIN", "compile_tree", "tuple_loader"]
 
 # Whoever compiles has it: simulator and control. This package needs it nowhere else.
 numba = importlib.import_module("numba")
 # What is compiled here becomes part of kernels that are kept.
 name_symbols_apart()
 
+WITHIN = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""Options for ``numba.njit`` of a function that compiled ones alone call: wrappers for others take time to compile."""
 _OWN = "pendulum_"
 _NO_SUBSTITUTES: Mapping[ModuleType, ModuleType] = {}
 _cache: dict[tuple[Any, ...], Any] = {}
@@ -32,6 +34,7 @@ def compile_tree(
     exact: bool = False,
     inline: bool = False,
     substitutes: Mapping[ModuleType, ModuleType] = _NO_SUBSTITUTES,
+    within: bool = False,
 ) -> Any:
     """Return a function, and those it calls, compiled.
 
@@ -40,15 +43,16 @@ def compile_tree(
         exact: Give the very bits that Python gives; else a fused multiply-add may change the last one.
         inline: Write each function into its caller: machine code that is told no functions can be kept on disk.
         substitutes: Modules that are found in the place of those that the functions name.
+        within: Compiled functions alone call it, as they do what it calls.
     """
-    key = (function, exact, inline, *substitutes.items())
+    key = (function, exact, inline, within, *substitutes.items())
     if key not in _cache:
         assert isinstance(function, FunctionType)
         scope = dict(function.__globals__)
         for name in function.__code__.co_names:
             value = scope.get(name)
             if isinstance(value, FunctionType) and value.__module__.startswith(_OWN):
-                scope[name] = compile_tree(value, exact=exact, inline=inline, substitutes=substitutes)
+                scope[name] = compile_tree(value, exact=exact, inline=inline, substitutes=substitutes, within=True)
             elif isinstance(value, ModuleType) and value in substitutes:
                 scope[name] = substitutes[value]
         copy = FunctionType(function.__code__, scope, function.__name__, function.__defaults__, function.__closure__)
@@ -56,8 +60,9 @@ def compile_tree(
         # time to compile.
         allowed = False if exact else {"contract"}
         # Arrays are lent to what loops run: nobody there counts who holds them, as numba would in a law with a loop.
+        wrappers = WITHIN if within else {"no_cfunc_wrapper": True}
         options = {"fastmath": allowed, "error_model": "numpy", "forceinline": inline, "_nrt": not exact}
-        _cache[key] = numba.njit(copy, no_cfunc_wrapper=True, **options)
+        _cache[key] = numba.njit(copy, **wrappers, **options)
     return _cache[key]
 
 
@@ -69,17 +74,19 @@ def tuple_loader(length: int, stride: int) -> Any:
         length: Values to load, >= 1; compiled code needs to know it.
         stride: Distance between two of them.
     """
-    offset = (length - 1) * stride
     if length == 1:
 
         def load(array: Any, start: int) -> Any:
             return (array[start],)
 
     else:
-        others = tuple_loader(length - 1, stride)
+        # By halves: each length that comes is a function to compile, and so they are few.
+        half = length // 2
+        first, second = tuple_loader(half, stride), tuple_loader(length - half, stride)
+        offset = half * stride
 
         def load(array: Any, start: int) -> Any:
-            # Not (*others, x): compilers of Python 3.10 to 3.12 spell that differently, and numba follows late.
-            return others(array, start) + (array[start + offset],)  # noqa: RUF005
+            # Not (*first, *second): compilers of Python 3.10 to 3.12 spell that differently, and numba follows late.
+            return first(array, start) + second(array, start + offset)
 
-    return numba.njit(load, forceinline=True, no_cfunc_wrapper=True)
+    return numba.njit(load, forceinline=True, **WITHIN)
