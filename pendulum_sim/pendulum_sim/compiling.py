@@ -9,11 +9,11 @@ from typing import Any
 
 import numba
 
+from pendulum_msgs_py.loops.trees import WITHIN, compile_to_tell, tuple_loader
 from pendulum_msgs_py.loops.trees import compile_tree as _compile_tree
-from pendulum_msgs_py.loops.trees import tuple_loader
 from pendulum_sim import vector_math
 
-__all__ = ["compile_tree", "tuple_loader"]
+__all__ = ["WITHIN", "compile_to_tell", "compile_tree", "tuple_loader"]
 
 # What compiled code finds under the name ``math``; its attributes must be compiled themselves.
 _vector_module = ModuleType("vector_math_compiled")

@@ -14,7 +14,7 @@ from typing import Any
 
 from pendulum_msgs_py.programs.kept_kernels import name_symbols_apart
 
-__all__ = ["WITHIN", "compile_tree", "tuple_loader"]
+__all__ = ["WITHIN", "compile_to_tell", "compile_tree", "tuple_loader"]
 
 # Whoever compiles has it: simulator and control. This package needs it nowhere else.
 numba = importlib.import_module("numba")
@@ -64,6 +64,23 @@ def compile_tree(
         options = {"fastmath": allowed, "error_model": "numpy", "forceinline": inline, "_nrt": not exact}
         _cache[key] = numba.njit(copy, **wrappers, **options)
     return _cache[key]
+
+
+def compile_to_tell(function: Callable[..., Any]) -> Any:
+    """Return a function, compiled by :func:`compile_tree`, for compiled functions to call or to be told.
+
+    Numba tells a compiled function by its address in this process, and machine code with addresses is not kept on
+    disk, unless each function that is told it is written into its caller: much to compile. What this returns is told by
+    its type alone.
+    """
+    compiled = compile_tree(function)
+
+    def told(*arguments: Any) -> Any:
+        return function(*arguments)
+
+    options = {key: compiled.targetoptions[key] for key in ("fastmath", "error_model")}
+    numba.extending.overload(told, jit_options=options, strict=False)(lambda *_: compiled.py_func)
+    return told
 
 
 @cache

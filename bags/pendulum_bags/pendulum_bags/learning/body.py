@@ -38,7 +38,7 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, co
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
-from pendulum_sim.compiling import compile_tree, tuple_loader
+from pendulum_sim.compiling import WITHIN, compile_to_tell, compile_tree, tuple_loader
 from pendulum_sim.dry_friction import LAG as LAG_OF_ONE
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, advance_dry
 from pendulum_sim.integrators import get_integrator
@@ -341,12 +341,12 @@ def _pendulum_kernel() -> Any:
     lagged = compile_tree(actuator_torque, inline=True)
     load_plant = tuple_loader(len(PACKED), 1)
 
-    @numba.njit(error_model="numpy", forceinline=True)
+    @numba.njit(error_model="numpy", forceinline=True, **WITHIN)
     def prepare(parameters: Any, longest: float) -> Any:
         plant = load_plant(parameters, 0)
         return plant, coefficients_of(plant[1] / plant[0], longest)
 
-    @numba.njit(error_model="numpy", forceinline=True)
+    @numba.njit(error_model="numpy", forceinline=True, **WITHIN)
     def forward(q: Any, v: Any, torque: Any, command: Any, push: Any, h: float, prepared: Any) -> Any:
         plant, c = prepared
         theta, speed = advance(
@@ -364,13 +364,12 @@ def _mechanism_kernel(name: str, goal: tuple[float, ...]) -> Any:
 
     mechanism = MECHANISMS[name]
     n, width = len(mechanism.joints), len(mechanism.parameter_names)
-    equation = compile_tree(mechanism.forward, inline=True)
-    along, put, lag = (compile_tree(function, inline=True) for function in joint_functions(n))
-    advance = compile_tree(advance_joints, inline=True)
+    equation, along, put, lag = (compile_to_tell(each) for each in (mechanism.forward, *joint_functions(n)))
+    advance = compile_tree(advance_joints)
     load, load_p = tuple_loader(n, 1), tuple_loader(width, 1)
     last = width + len(JOINT_ROWS) * n
 
-    @numba.njit(error_model="numpy", forceinline=True)
+    @numba.njit(error_model="numpy", forceinline=True, **WITHIN)
     def prepare(parameters: Any, _longest: float) -> Any:
         table = (
             load(parameters, width),
@@ -382,7 +381,7 @@ def _mechanism_kernel(name: str, goal: tuple[float, ...]) -> Any:
         )
         return load_p(parameters, 0), table, load(parameters, last)
 
-    @numba.njit(error_model="numpy", forceinline=True)
+    @numba.njit(error_model="numpy", forceinline=True, **WITHIN)
     def forward(q: Any, v: Any, torque: Any, command: Any, push: Any, h: float, prepared: Any) -> Any:
         p, table, offset = prepared
         total = along(push, 1.0, offset)
