@@ -59,8 +59,8 @@ _TAKE_FAILED = 401
 
 
 def compiled(function: Any) -> Any:
-    """Return a function compiled as Python would run it: not one operation fused or reordered."""
-    return numba.njit(error_model="numpy")(function)
+    """Return a function, for compiled ones to call, that runs as in Python: no operation fused or reordered."""
+    return numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
 
 
 def entry(layout: np.dtype[Any]) -> Any:
