@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract import noise
-from pendulum_msgs_py.loops.trees import WITHIN
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
-from pendulum_sim.compiling import compile_tree, tuple_loader
+from pendulum_sim.compiling import WITHIN, compile_tree, tuple_loader
 from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, is_dry
 from pendulum_sim.integrators import get_integrator
 from pendulum_sim.plant import advance_rigid

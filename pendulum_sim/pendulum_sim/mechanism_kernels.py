@@ -16,12 +16,11 @@ import numpy as np
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.dynamics.joint_steps import JOINT_ROWS, LAG, advance_joints, joint_functions
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
-from pendulum_msgs_py.loops.trees import WITHIN
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
 from pendulum_sim import vector_math
 from pendulum_sim.batch_kernels import BLOCK, block_loop
-from pendulum_sim.compiling import compile_tree, tuple_loader
+from pendulum_sim.compiling import WITHIN, compile_tree, tuple_loader
 
 __all__ = ["Layout", "general_joints_kernel", "smooth_joints_kernel"]
 

@@ -58,10 +58,10 @@ def _program(name: str) -> psutil.Process:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def hosts() -> Iterator[HostPool]:
-    """Hosts of the programs of all runs that a test carries out in its own process, commands of ours among them."""
-    with HostPool() as pool, keep_pool(pool):
-        yield pool
+def kept_hosts(hosts: HostPool) -> Iterator[None]:
+    """Let all runs that a test carries out in its own process use the hosts of tests, commands of ours among them."""
+    with keep_pool(hosts):
+        yield
 
 
 @pytest.fixture

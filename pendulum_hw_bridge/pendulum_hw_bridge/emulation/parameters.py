@@ -8,10 +8,11 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_hw_bridge.actuator import HardwareLimits
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES, EMULATOR_PRESETS
+from pendulum_hw_bridge.emulation.firmware import Array
+from pendulum_hw_bridge.emulation.kernel import CONSTANTS
 from pendulum_hw_bridge.emulation.thermal import ThermalParameters, torque_constant_at
 from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
@@ -139,7 +140,7 @@ class EmulatorParameters:
             winding_resistance_at(temperature, drive.winding_resistance, drive.resistance_temperature_coefficient),
         )
 
-    def constants(self, limits: HardwareLimits, supply_voltage: float, enabled: bool) -> NDArray[np.float64]:
+    def constants(self, limits: HardwareLimits, supply_voltage: float, enabled: bool) -> Array:
         """Return the constant vector of the kernel.
 
         Args:
@@ -147,9 +148,6 @@ class EmulatorParameters:
             supply_voltage: Present supply voltage [V].
             enabled: Whether the motor may be driven (motion stop, temperature).
         """
-        # Numba comes with the kernel: a bridge that drives a real module need not wait for it.
-        from pendulum_hw_bridge.emulation.kernel import CONSTANTS
-
         drive, thermal = self.drivetrain, self.thermal
         # The firmware normalises with nominal constants: it does not know the temperature of its winding.
         effort_normaliser = drive.winding_resistance / (

@@ -263,7 +263,7 @@ def lockstep(
     Example: python -m pendulum_bags experiment lockstep --bag /tmp/seed_7 --seed 7
     """
     from pendulum_bags.experiments.host_pool import kept_pool
-    from pendulum_bags.experiments.lockstep import lockstep_spec, record_run
+    from pendulum_bags.experiments.lockstep import run_lockstep
 
     if side not in {"sim", "hw"}:
         raise ParameterError(f"side is {side!r}; expected sim or hw")
@@ -283,7 +283,7 @@ def lockstep(
         storage=storage,
     )
     started = time.monotonic()
-    record_run(bag, lockstep_spec(settings, side=side), domain=domain, hosts=kept_pool())
+    run_lockstep(bag, settings, side=side, domain=domain, hosts=kept_pool())
     elapsed = time.monotonic() - started
     print(f"{bag}: {duration:g} s simulated in {elapsed:.1f} s, starting the nodes included", file=sys.stderr)
 

@@ -59,6 +59,7 @@ def run_lockstep(
     side: str = "sim",
     domain: int | None = None,
     on_wait: Callable[[], None] = lambda: None,
+    hosts: HostPool | None = None,
 ) -> Path:
     """Run one plant of the thesis's experiment under control and noise, as fast as the loop allows, and record it.
 
@@ -68,12 +69,13 @@ def run_lockstep(
         side: ``sim`` for the simulator, ``hw`` for the emulated hardware.
         domain: ROS domain, or None for any free one.
         on_wait: Called while waiting.
+        hosts: As of :func:`record_run`.
 
     Raises:
         BagError: The bag exists.
         FaultError: A program ended or did not answer.
     """
-    return record_run(bag, lockstep_spec(settings, side=side), domain=domain, on_wait=on_wait)
+    return record_run(bag, lockstep_spec(settings, side=side), domain=domain, on_wait=on_wait, hosts=hosts)
 
 
 def lockstep_spec(settings: RegulationSettings, *, side: str) -> RunSpec:
