@@ -1,8 +1,9 @@
-"""The end of a node where the middleware does not come back from it, and what keeps that rare."""
+"""The end of a program where a library does not come back from it, and what keeps that rare."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import sys
 from collections.abc import Iterator
 
@@ -47,6 +48,20 @@ from pendulum_bags.experiments.conductor_node import Conductor
 with Conductor({domain}):
     pass
 """
+_GROUP = """
+import ctypes
+from pendulum_hw_bridge.backends.hebi import HebiBackend, import_hebi
+hebi = import_hebi()
+from hebi._internal.ffi import api
+def release(group):
+    print("hangs", flush=True)
+    ctypes.CDLL(None).sleep(600)  # as hebi-py's library does, once in thousands of groups
+api.hebiGroupRelease = release
+backend = HebiBackend(make_group=lambda: hebi.util.create_imitation_group(1), imitation=True)
+backend.connect()
+{end}
+"""
+_GROUP_ENDS = {"closed": "backend.close()", "left": "print('end')"}
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +82,9 @@ def hanging(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Runn
             start(name, _HANGING.format(name=name) + _SIMULATOR)
         start("conductor", _HANGING.format(name="conductor") + _CONDUCTOR)
         start("nested", _NESTED)
+        if importlib.util.find_spec("hebi"):
+            for name, end in _GROUP_ENDS.items():
+                start(name, _GROUP.replace("{end}", end))
         for name in _PLANT_NODES:
             programs[name].wait_for_output("ready", DEADLINE)
             programs[name].interrupt()
@@ -93,6 +111,16 @@ def test_the_end_of_one_leaving_does_not_end_the_watch_over_another(hanging: dic
     # A context that shuts down closes an e-stop whose owner was not closed.
     assert hanging["nested"].wait(DEADLINE) == 1
     assert "hangs" in hanging["nested"].output
+
+
+@pytest.mark.parametrize("name", _GROUP_ENDS)
+def test_a_program_ends_though_the_hebi_library_does_not_let_its_group_go(
+    name: str, hanging: dict[str, RunningProgram]
+) -> None:
+    pytest.importorskip("hebi", reason="hebi-py is not installed")
+    assert hanging[name].wait(DEADLINE) == 1
+    assert "hangs" in hanging[name].output
+    assert "Timeout" in hanging[name].output
 
 
 def test_an_e_stop_leaves_when_it_knows_all_of_its_owner(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:

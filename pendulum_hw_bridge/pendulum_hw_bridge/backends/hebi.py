@@ -37,6 +37,7 @@ from pendulum_hw_bridge.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
+from pendulum_msgs_py.programs.hang_guard import hang_guard
 
 __all__ = [
     "ACKNOWLEDGE_MS",
@@ -314,7 +315,9 @@ class HebiBackend:
         finally:
             if self._log is not None and self._group is not None:
                 stop_log(self._group)
-            self._group = self._command = self._feedback = None
+            # Of thousands of groups one is never released: the library waits for a thread of its own that never ends.
+            with hang_guard():
+                self._group = self._command = self._feedback = None
 
     # --- inside ---------------------------------------------------------------------------------------------
 

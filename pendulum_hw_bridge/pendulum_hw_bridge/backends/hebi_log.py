@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pendulum_hw_bridge.actuator import FEEDBACK_QUANTITIES, ActuatorError
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.extras import how_to_install
+from pendulum_msgs_py.programs.hang_guard import guard_exit
 
 __all__ = ["ATTRIBUTES", "import_hebi", "read_hebilog", "start_log", "stop_log", "to_joint"]
 
@@ -44,6 +45,8 @@ def import_hebi() -> Any:
             import hebi
     except ImportError as error:
         raise ActuatorError("not_installed", how_to_install(error) or f"hebi-py cannot be imported: {error}") from error
+    # It releases all groups then, and of thousands of releases one never returns.
+    guard_exit()
     return hebi
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import faulthandler
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,19 +9,14 @@ from contextlib import contextmanager
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 
+from pendulum_msgs_py.programs.hang_guard import hang_guard
+
 __all__ = ["leaving_graph", "wait_until_heard"]
 
 _LAST_WORDS = 0.2
 """Time that a node gives its last words to be heard before it ends [s]."""
 _LOOK = 0.001
 """Time between two looks whether all have heard [s]."""
-
-_LONGEST = 5.0
-"""Time that the middleware may take to leave the graph [s]."""
-_STANDARD_ERROR = 2
-"""Its descriptor: what stands for it in Python may have none, as in a notebook."""
-_lock = threading.Lock()
-_under_way = 0
 
 
 def wait_until_heard(publisher: Publisher) -> None:
@@ -43,17 +36,8 @@ def leaving_graph() -> Iterator[None]:
 
     Fast DDS waits for those whom it just tells of somebody else, while it keeps from them the lock that they need to
     end, wherever it was built with an older standard library, as in the wheels (eProsima/Fast-DDS issue 6513): once in
-    thousands of times it does not come back, and holds Python's lock meanwhile, so that no signal ends the process. The
-    watchdog needs no interpreter. Whatever is to be made safe, or written, comes before.
+    thousands of times it does not come back, and holds Python's lock meanwhile. Whatever is to be made safe, or
+    written, comes before.
     """
-    global _under_way  # noqa: PLW0603  # the watchdog is one for the process
-    with _lock:
-        _under_way += 1
-        faulthandler.dump_traceback_later(_LONGEST, exit=True, file=_STANDARD_ERROR)
-    try:
+    with hang_guard():
         yield
-    finally:
-        with _lock:
-            _under_way -= 1
-            if not _under_way:
-                faulthandler.cancel_dump_traceback_later()

@@ -1,0 +1,50 @@
+"""Ends a process whose libraries hang for good: a watchdog that needs neither the interpreter nor its lock."""
+
+from __future__ import annotations
+
+import atexit
+import faulthandler
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+
+__all__ = ["guard_exit", "hang_guard"]
+
+_LONGEST = 5.0
+"""Time that what is guarded may take [s]."""
+_STANDARD_ERROR = 2
+"""Its descriptor: what stands for it in Python may have none, as in a notebook."""
+_lock = threading.Lock()
+_under_way = 0
+
+
+@contextmanager
+def hang_guard() -> Iterator[None]:
+    """End the process with exit code 1, and say where it stood, if this context is not left within 5 s.
+
+    No signal does that while a library keeps Python's lock. Whatever is to be made safe, or written, comes before.
+    """
+    global _under_way  # noqa: PLW0603  # the watchdog is one for the process
+    _watch()
+    try:
+        yield
+    finally:
+        with _lock:
+            _under_way -= 1
+            if not _under_way:
+                faulthandler.cancel_dump_traceback_later()
+
+
+@cache
+def guard_exit() -> None:
+    """Let what was imported until now, and hangs while the interpreter ends, not keep the process."""
+    # What is registered last is called first.
+    atexit.register(_watch)
+
+
+def _watch() -> None:
+    global _under_way  # noqa: PLW0603
+    with _lock:
+        _under_way += 1
+        faulthandler.dump_traceback_later(_LONGEST, exit=True, file=_STANDARD_ERROR)
