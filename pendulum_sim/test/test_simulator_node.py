@@ -126,9 +126,9 @@ def test_two_lockstep_runs_with_one_seed_give_the_same_messages(peer: Peer, proc
             "sensor.position_noise:=0.001", "sensor.velocity_step:=0.01", "sensor.drop_rate:=0.05",
         )  # fmt: skip
         peer.until(lambda: "1.4" in f"{_newest(peer):.3f}", "the end of the run")
-        runs.append(
-            [(stamp_from_message(s.header.stamp), s.position[0], s.velocity[0], s.effort[0]) for s in peer.states]
-        )
+        states = ((stamp_from_message(s.header.stamp), s.position[0], s.velocity[0], s.effort[0]) for s in peer.states)
+        # One whose answer a busy machine keeps for long is sent again, as it was.
+        runs.append(list(dict.fromkeys(states)))
         program.send_signal(signal.SIGINT)
         assert program.wait(60.0) == 0
         time.sleep(0.5)

@@ -18,6 +18,7 @@ __all__ = [
     "JOINT_TRAJECTORY",
     "LINK",
     "PUSH",
+    "RECORDER",
     "SIGNALS",
     "Event",
     "full_name",
@@ -25,6 +26,9 @@ __all__ = [
 
 JOINT = "pendulum_joint"
 LINK = "pendulum_link"
+
+RECORDER = "recorder"
+"""Name of the node that records a plant, in the plant's namespace."""
 
 # Relative names: a namespace or a remap swaps the plant.
 JOINT_STATES = "joint_states"

@@ -15,6 +15,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
+from rclpy.qos import DurabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
@@ -232,6 +233,22 @@ class PlantClient:
             lambda: self._trajectory.get_subscription_count() > 0,
             timeout,
         )
+
+    def wait_until_moves_are_recorded(self, timeout: float) -> None:
+        """Wait until what this program asks to be followed reaches a recorder: one side of a match knows of it first.
+
+        Raises:
+            FaultError: No recorder comes in time [s].
+        """
+        topic = f"{self.namespace}/{names.JOINT_TRAJECTORY}"
+
+        def recorded() -> bool:
+            listeners = self.conductor.node.get_subscriptions_info_by_topic(topic)
+            # One that asks for what was said before never matches: a plant must not be moved by an old one.
+            suited = [each.node_name for each in listeners if each.qos_profile.durability == DurabilityPolicy.VOLATILE]
+            return names.RECORDER in suited and self._trajectory.get_subscription_count() >= len(suited)
+
+        self.conductor.wait_for(f"a recorder on {topic}", recorded, timeout)
 
     def _has_state(self) -> bool:
         if self.sample is None and self._foreign_joints:

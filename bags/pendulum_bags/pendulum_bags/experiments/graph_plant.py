@@ -20,7 +20,7 @@ _PATIENCE = 20.0
 _HALF_TURN = 3.15
 """Farthest from hanging at 0 that a ramp to upright starts, with room for noise [rad]."""
 _COMMANDS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.JOINT_TRAJECTORY)
-_OURS = ("controller", "disturbance", "recorder")
+_OURS = ("controller", "disturbance", names.RECORDER)
 """Names of the nodes that an experiment starts beside a plant."""
 
 

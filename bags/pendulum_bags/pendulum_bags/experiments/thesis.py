@@ -127,6 +127,7 @@ def _regulate(
         plant.wait_until_ready(START_TIMEOUT)
         recorded = [f"{plant.namespace}/{topic}" for topic in (*names.SIGNALS, names.JOINT_TRAJECTORY)]
         RecorderClient(conductor, plant.namespace).wait_until_heard(recorded, START_TIMEOUT)
+        plant.wait_until_moves_are_recorded(START_TIMEOUT)
     for plant in plants:
         plant.configure_controller()
         plant.arm()

@@ -13,7 +13,7 @@ from typing import Any
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
-from pendulum_msgs_py.contract.names import EVENTS
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -63,7 +63,7 @@ class Recorder(PollingNode):
 
     def __init__(self, options: RecorderOptions, stop: Callable[[], None]) -> None:
         self._taps: dict[str, Tap] = {}
-        super().__init__("recorder")
+        super().__init__(names.RECORDER)
         self.exit_code = 0
         self.reports: list[SessionReport] = []
         self._options = options
@@ -74,7 +74,7 @@ class Recorder(PollingNode):
         self._unstamped: list[tuple[Tap, int, bytes]] = []
         self._refused: dict[str, str] = {}
         self._lock = threading.RLock()
-        self._events = f"{self.get_fully_qualified_name()}/{EVENTS}"
+        self._events = f"{self.get_fully_qualified_name()}/{names.EVENTS}"
         self._settings = NodeParameters(self, SPECS, apply=self._on_parameters)
         self._parameter_reader = ParameterReader(self, self._on_node_parameters)
         if not options.wait:
