@@ -65,13 +65,20 @@ _COMPUTES = (
     *_SIMULATED_TIME,
     "tests/acceptance/test_readme.py",
     "tests/acceptance/test_docs.py",
-    "pendulum_sim/test/test_batch.py",
-    "pendulum_sim/test/test_mechanism_batch.py",
+    "tests",
+    "bags/pendulum_rosbag/test",
+    "pendulum_hw_bridge/test",
+    "pendulum_sim/test/test_shown_mechanisms.py",
+    "pendulum_sim/test/test_simulator_node.py",
+    "bags/pendulum_bags/test/test_report_page.py",
     "bags/pendulum_bags/test/test_identification_intervals.py",
     "bags/pendulum_bags/test",
-    "tests",
+    "pendulum_lqr/test/test_plants_as_they_run.py",
+    "pendulum_sim/test/test_mechanism_batch.py",
+    "pendulum_sim/test/test_batch.py",
 )
-"""What comes first of all others, longest first too: a long file at the end would leave a core idle."""
+"""What comes first of all others: what waits for its own processes now and then, since the cores have enough to do only
+as long as something keeps time beside it; and longest first, since a long file at the end would leave a core idle."""
 _NOTHING_SELECTED = int(pytest.ExitCode.NO_TESTS_COLLECTED)
 _NICE = 5
 """Priority of what computes: real time goes before it, and beside a busy machine it still gets a quarter of a core."""

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import yaml
+from yaml.composer import Composer
 
 from pendulum_msgs_py.errors import ParameterError
 
@@ -219,16 +220,24 @@ class _StrictDumper(yaml.SafeDumper):
 _StrictDumper.add_representer(str, _StrictDumper.represent_text)
 
 
+_LOADER: tuple[Any, ...] = (Composer, yaml.CSafeLoader) if hasattr(yaml, "CSafeLoader") else (yaml.SafeLoader,)
+"""Bases of ours: libyaml cuts the text into tokens, in a sixth of the time, unless PyYAML was built without it."""
+
+
 @_read_numbers_as_yaml_1_2
-class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML that refuses what YAML allows silently: keys given twice, aliases and nesting without bound."""
+class _StrictLoader(*_LOADER):  # type: ignore[misc]
+    """Safe YAML that refuses what YAML allows silently: keys given twice, aliases and nesting without bound.
+
+    Nodes are composed here and not by libyaml, which overflows its stack where they are nested deeply.
+    """
 
     def __init__(self, text: str) -> None:
-        super().__init__(text)
+        _LOADER[-1].__init__(self, text)
+        Composer.__init__(self)
         self._depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        event: Any = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML's own
+        event: Any = self.peek_event()
         problem = ""
         if isinstance(event, yaml.AliasEvent):
             problem = f"alias *{event.anchor} is not allowed here"
