@@ -103,6 +103,8 @@ def main(arguments: Sequence[str]) -> int:
     # modules that were compiled once.
     for name in ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS", "ARGS", "PYTHONDONTWRITEBYTECODE"):
         os.environ.pop(name, None)
+    # Where colorama is installed, numba colours each of thousands of messages that a compilation makes for itself.
+    os.environ["NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"] = "1"
     if any((PROJECT / argument.split("::")[0]).exists() for argument in arguments):
         return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=PROJECT, check=False).returncode
     # Who edits a loop would have programs compile it in the middle of tests that keep time.
