@@ -142,7 +142,9 @@ def test_what_the_wheels_install_comes_from_an_experiment_to_its_report_with_the
 ) -> None:
     """The one in simulated time, whose bags go through the same comparison and report; nothing waits for a clock."""
     place = tmp_path / "place"
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--no-deps", "--no-index"]
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install"]
+    # What is never imported need not be compiled.
+    pip += ["--no-deps", "--no-index", "--no-compile"]
     _run(*pip, "--target", place, *sorted(wheels.glob("*.whl")), cwd=tmp_path)
     env = environment_of(tmp_path / "hide", "run")
     env["PYTHONPATH"] = f"{place}:{env['PYTHONPATH']}"
@@ -174,6 +176,7 @@ def _bring_compiled_loops(place: Path) -> dict[Path, int]:
         for folder in FOLDERS:
             for path in (PROJECT / folder).glob(pattern):
                 to = place / path.relative_to(PROJECT / folder)
+                to.parent.mkdir(exist_ok=True)
                 shutil.copyfile(path, to)
                 brought[to] = to.stat().st_ino
     assert len(brought) >= 2
