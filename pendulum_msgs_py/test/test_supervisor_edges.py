@@ -6,9 +6,12 @@ import ctypes
 import math
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from pendulum_msgs_py.contract import shared_supervisor
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import Trajectory
@@ -449,16 +452,74 @@ def test_an_effort_beyond_a_small_limit_keeps_its_sign(sign: float) -> None:
     assert supervisor.decide(0, sample).effort == (0.5 * sign,)
 
 
-def test_who_has_waited_for_the_supervisor_is_next() -> None:
+def _wait_for(supervisor: SharedSupervisor, step: Callable[[], object]) -> threading.Thread:
+    """Return a thread that waits to take a step until nobody has the supervisor alone any more."""
+    waiting = ctypes.c_int64.from_address(supervisor.waiting_at)
+    thread = threading.Thread(target=step)
+    thread.start()
+    while not waiting.value:
+        time.sleep(0.0)
+    return thread
+
+
+def test_who_has_waited_for_the_supervisor_is_next(monkeypatch: pytest.MonkeyPatch) -> None:
     # Nothing but the lock's own fairness would decide else, and it has none: a plant would act once more.
+    monkeypatch.setattr(shared_supervisor, "_LONGEST_COURTESY", 60.0)
     for _ in range(20):
         supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
-        waiting = ctypes.c_int64.from_address(supervisor.waiting_at)
+        assert supervisor.arm(0, JointSample.of_one(0, 0.0, 0.0)) == ""
         with supervisor.alone():
-            stop = threading.Thread(target=supervisor.e_stop, args=(0,))
-            stop.start()
-            while not waiting.value:
-                time.sleep(0.0)
+            disarms = _wait_for(supervisor, lambda supervisor=supervisor: supervisor.disarm(0))
+        assert supervisor.mode is Mode.DISARMED
+        disarms.join()
+        assert not ctypes.c_int64.from_address(supervisor.waiting_at).value
+
+
+def test_a_press_counts_from_when_it_is_made_however_late_its_thread_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    # As on a machine that is so busy that the courtesy is over before the other thread has run.
+    monkeypatch.setattr(shared_supervisor, "_LONGEST_COURTESY", 0.0)
+    sample = JointSample.of_one(0, 0.0, 0.0)
+    for next_step in (
+        lambda supervisor: supervisor.decide(0, sample),
+        lambda supervisor: supervisor.arm(0, sample),
+        lambda supervisor: supervisor.e_stop_reset(0),
+        lambda supervisor: supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(0, 1.0, "/me"), 0),
+        lambda supervisor: supervisor.report_applied((0.0,)),
+        lambda supervisor: supervisor.disarm(0),
+        lambda supervisor: supervisor.fault("x", 0),
+        lambda supervisor: supervisor.set_commander_conflict(""),
+    ):
+        supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+        assert supervisor.arm(0, sample) == ""
+        # Its thread hangs between press and lock.
+        supervisor._presses.append((0, "e-stop pressed"))
+        next_step(supervisor)
         assert supervisor.mode is Mode.E_STOP
-        stop.join()
-        assert not waiting.value
+        assert supervisor.reason == "e-stop pressed"
+        assert supervisor.decide(0, sample).effort == (0.0,)
+
+
+def test_compiled_code_begins_behind_a_press() -> None:
+    supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+    supervisor._presses.append((0, "e-stop pressed"))
+    with supervisor.alone():
+        assert supervisor.mode is Mode.E_STOP
+
+
+def test_no_reset_takes_back_a_press_that_nobody_has_carried_out_yet() -> None:
+    supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+    supervisor.e_stop(0)
+    supervisor._presses.append((0, "once more"))
+    assert supervisor.e_stop_reset(0) == "the e-stop has just been pressed; reset it once more"
+    assert (supervisor.mode, supervisor.reason) == (Mode.E_STOP, "once more")
+    assert supervisor.e_stop_reset(0) == ""
+
+
+def test_many_presses_at_once_are_all_carried_out_before_they_return() -> None:
+    supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+    for _ in range(50):
+        with ThreadPoolExecutor(8) as pool:
+            modes = list(pool.map(lambda _: (supervisor.e_stop(0), supervisor.mode)[1], range(16)))
+        assert modes == [Mode.E_STOP] * 16
+        assert supervisor.e_stop_reset(0) == ""
+        assert not ctypes.c_int64.from_address(supervisor.waiting_at).value

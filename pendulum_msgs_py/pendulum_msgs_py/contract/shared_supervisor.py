@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 
 from pendulum_msgs_py.contract.commands import Refusal
@@ -46,6 +47,7 @@ class SharedSupervisor(PlantSupervisor):
         self._lock = threading.RLock()
         self._counting = threading.Condition()
         self._waiting = ctypes.c_int64(0)
+        self._presses: deque[tuple[int, str]] = deque()
         self._prepare = prepare
         self._withdraw = withdraw
         self._measure = measure
@@ -58,23 +60,35 @@ class SharedSupervisor(PlantSupervisor):
         return ctypes.addressof(self._waiting)
 
     @contextlib.contextmanager
+    def _step(self) -> Iterator[bool]:
+        """Take the lock and carry out what e-stops were pressed before; yield whether there were any.
+
+        On a busy machine the thread that pressed one may not have run since.
+        """
+        with self._lock:
+            pressed = bool(self._presses)
+            while self._presses:
+                super().e_stop(*self._presses.popleft())
+            yield pressed
+
+    @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
         """Keep everybody else from the supervisor; who comes in the meantime is counted, waits, and is next."""
-        with self._lock:
+        with self._step():
             yield
-        # A lock is whose who asks first, and we are awake: without this an e-stop waits for one more decision.
+        # A lock is whose who asks first, and we are awake: without this who disarms waits for one more decision.
         if self._waiting.value:
             with self._counting:
                 self._counting.wait_for(lambda: not self._waiting.value, _LONGEST_COURTESY)
 
     @contextlib.contextmanager
-    def _in_turn(self) -> Iterator[None]:
-        """Take the lock, and let compiled code that has it know that somebody wants it."""
+    def _in_turn(self) -> Iterator[bool]:
+        """Take a step, and let compiled code that has the lock know that somebody wants it."""
         with self._counting:
             self._waiting.value += 1
         try:
-            with self._lock:
-                yield
+            with self._step() as pressed:
+                yield pressed
         finally:
             with self._counting:
                 self._waiting.value -= 1
@@ -82,7 +96,7 @@ class SharedSupervisor(PlantSupervisor):
 
     def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
         """Offer a message of an input."""
-        with self._lock:
+        with self._step():
             return super().offer(kind, command, now_ns, problem)
 
     def set_commander_conflict(self, conflict: str) -> None:
@@ -119,13 +133,16 @@ class SharedSupervisor(PlantSupervisor):
             super().disarm(now_ns, reason)
 
     def e_stop(self, now_ns: int, reason: str = "e-stop pressed") -> None:
-        """Latch the e-stop."""
+        """Latch the e-stop: whatever is decided from now on knows of it, even before this thread has the lock."""
+        self._presses.append((now_ns, reason))
         with self._in_turn():
-            super().e_stop(now_ns, reason)
+            pass  # it is carried out on the way in, unless somebody has been faster
 
     def e_stop_reset(self, now_ns: int) -> str:
-        """Leave the e-stop for disarmed."""
-        with self._in_turn():
+        """Leave the e-stop for disarmed, unless another was pressed that nobody has carried out yet."""
+        with self._in_turn() as pressed:
+            if pressed:
+                return "the e-stop has just been pressed; reset it once more"
             return super().e_stop_reset(now_ns)
 
     def fault(self, reason: str, now_ns: int) -> None:
@@ -135,10 +152,10 @@ class SharedSupervisor(PlantSupervisor):
 
     def decide(self, now_ns: int, sample: JointSample | None) -> Drive:
         """Return what the plant has to do now."""
-        with self._lock:
+        with self._step():
             return super().decide(now_ns, sample)
 
     def report_applied(self, effort: Vector) -> None:
         """Tell what efforts were really applied."""
-        with self._lock:
+        with self._step():
             super().report_applied(effort)
