@@ -457,7 +457,9 @@ def _wait_for(supervisor: SharedSupervisor, step: Callable[[], object]) -> threa
     waiting = ctypes.c_int64.from_address(supervisor.waiting_at)
     thread = threading.Thread(target=step)
     thread.start()
+    ends = time.monotonic() + 60.0
     while not waiting.value:
+        assert time.monotonic() < ends
         time.sleep(0.0)
     return thread
 

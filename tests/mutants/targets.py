@@ -67,7 +67,11 @@ TARGETS: tuple[Target, ...] = (
     Target(
         "pendulum_msgs_py.contract.shared_supervisor",
         ("SharedSupervisor",),
-        (f"{_BRIDGE}/test_settings_read_back.py", f"{_BRIDGE}/test_bridge_states.py"),
+        (
+            f"{_BRIDGE}/test_settings_read_back.py",
+            f"{_BRIDGE}/test_bridge_states.py",
+            "pendulum_msgs_py/test/test_supervisor_edges.py",
+        ),
     ),
     Target(
         "pendulum_hw_bridge.bridge_consistency",
