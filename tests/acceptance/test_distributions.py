@@ -65,7 +65,9 @@ for folder in folders:
         os.chdir(folder)
         archive = build_meta.build_sdist(archives)
         with tarfile.open(os.path.join(archives, archive)) as content:
-            content.extractall(unpacked, filter="data")
+            # CPython knows filters from 3.10.12 and 3.11.4 on.
+            content.extraction_filter = getattr(tarfile, "data_filter", None)
+            content.extractall(unpacked)
         os.chdir(os.path.join(unpacked, archive.removesuffix(".tar.gz")))
         assert not build_meta.get_requires_for_build_wheel()
         os.mkdir("metadata")
