@@ -163,11 +163,10 @@ class Part:
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
         if not self._realtime:
             environment[NO_REALTIME] = "1"
-        command = [sys.executable, "-m", "pytest", "-p", "tests.suite_events"]
-        if self._workers > 1:
-            command += ["-n", str(self._workers), "--dist", "loadfile", "--no-loadscope-reorder"]
+        # One worker too has a process that waits for it, and tells if it crashes.
+        command = [sys.executable, "-m", "pytest", "-p", "tests.suite_events", "-n", str(self._workers)]
         self._popen = subprocess.Popen(
-            [*command, *self._arguments],
+            [*command, "--dist", "loadfile", "--no-loadscope-reorder", *self._arguments],
             cwd=PROJECT,
             env={**environment, PIPE: str(writer)},
             stdin=subprocess.DEVNULL,

@@ -26,12 +26,6 @@ def _reports() -> bool:
     return PIPE in os.environ and "PYTEST_XDIST_WORKER" not in os.environ
 
 
-def pytest_collection_finish(session: pytest.Session) -> None:
-    """Tell how many tests there are, where no workers collect them."""
-    if _reports() and session.items:
-        _tell({"collected": len(session.items)})
-
-
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_node_collection_finished(ids: list[str]) -> None:
     """Tell how many tests there are; each worker finds the same."""

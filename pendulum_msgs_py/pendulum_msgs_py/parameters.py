@@ -6,17 +6,18 @@ a package's README.
 
 from __future__ import annotations
 
+import copy
 import math
 import re
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import yaml
-from yaml.composer import Composer
 
 from pendulum_msgs_py.errors import ParameterError
 
@@ -220,29 +221,21 @@ class _StrictDumper(yaml.SafeDumper):
 _StrictDumper.add_representer(str, _StrictDumper.represent_text)
 
 
-_LOADER: tuple[Any, ...] = (Composer, yaml.CSafeLoader) if hasattr(yaml, "CSafeLoader") else (yaml.SafeLoader,)
-"""Bases of ours: libyaml cuts the text into tokens, in a sixth of the time, unless PyYAML was built without it."""
-
-
 @_read_numbers_as_yaml_1_2
-class _StrictLoader(*_LOADER):  # type: ignore[misc]
-    """Safe YAML that refuses what YAML allows silently: keys given twice, aliases and nesting without bound.
-
-    Nodes are composed here and not by libyaml, which overflows its stack where they are nested deeply.
-    """
+class _StrictLoader(yaml.SafeLoader):
+    """Safe YAML that refuses what YAML allows silently: keys given twice, aliases and nesting without bound."""
 
     def __init__(self, text: str) -> None:
-        _LOADER[-1].__init__(self, text)
-        Composer.__init__(self)
+        super().__init__(text)
         self._depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        event: Any = self.peek_event()
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML's own
         problem = ""
         if isinstance(event, yaml.AliasEvent):
             problem = f"alias *{event.anchor} is not allowed here"
         elif event.tag is not None:
-            problem = f"tag {event.tag} is not allowed here"
+            problem = f"tag {event.tag!r} is not allowed here"
         elif self._depth > _MAX_YAML_DEPTH:
             problem = f"nested deeper than {_MAX_YAML_DEPTH} levels"
         if problem:
@@ -318,10 +311,8 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
         ParameterError: The file is missing, not text, not YAML (with line and column), or holds no mapping.
     """
     text = read_text(path, what)
-    loader = None
     try:
-        loader = _StrictLoader(text)
-        return require_mapping(loader.get_single_data(), f"{what} {path}")
+        return require_mapping(copy.deepcopy(_parse_yaml(text)), f"{what} {path}")
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
@@ -331,9 +322,16 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
             raise
         sentence = " ".join(str(error).split())
         raise ParameterError(f"{what} {path} is not YAML: {sentence}") from error
+
+
+@lru_cache(maxsize=32)
+def _parse_yaml(text: str) -> Any:
+    """Return what a text says, not to be changed; to parse one takes ten times as long as to read and copy it."""
+    loader = _StrictLoader(text)
+    try:
+        return loader.get_single_data()
     finally:
-        if loader is not None:
-            loader.dispose()
+        loader.dispose()
 
 
 def parameter_sections(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import os
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pendulum_msgs_py import parameters
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import (
     ParameterSpec,
@@ -128,27 +123,10 @@ def test_the_markdown_table_has_a_row_for_each_parameter() -> None:
 # --- YAML ------------------------------------------------------------------------------------------------------
 
 
-def _without_libyaml() -> Callable[[Path], dict[str, object]]:
-    """Return what ``load_yaml`` is where PyYAML was built without libyaml."""
-    spec = importlib.util.spec_from_file_location("parameters_without_libyaml", str(parameters.__file__))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.delattr(yaml, "CSafeLoader")
-        # Its data classes look their module up.
-        patch.setitem(sys.modules, spec.name, module)
-        spec.loader.exec_module(module)
-    return module.load_yaml
-
-
-_LOADERS = {"libyaml": load_yaml, "without libyaml": _without_libyaml()}
-
-
-def _written(tmp_path: Path, text: str) -> Path:
+def _load(tmp_path: Path, text: str) -> dict[str, object]:
     path = tmp_path / "file.yaml"
     path.write_text(text, encoding="utf-8")
-    return path
+    return load_yaml(path)
 
 
 @pytest.mark.parametrize(
@@ -158,16 +136,17 @@ def _written(tmp_path: Path, text: str) -> Path:
         ("b: {a: 1, a: 2}", "file.yaml:1:11: key 'a' is given twice"),
         ("a: &x 1\nb: *x", "alias *x is not allowed here"),
         ("a: &x [*x]", "alias *x is not allowed here"),
-        ("a: !!python/object/apply:os.system [ls]", "tag tag:yaml.org,2002:python/object/apply:os.system"),
+        ("a: !!python/object/apply:os.system [ls]", "tag 'tag:yaml.org,2002:python/object/apply:os.system'"),
         ("a: !!python/name:os.system", "is not allowed here"),
         ("a: !!timestamp x", "is not allowed here"),
         ("a: !!bool maybe", "is not allowed here"),
-        ("a: !custom x", "tag !custom is not allowed here"),
+        ("a: !x%0aerror:%20other 1", r"tag '!x\nerror: other' is not allowed here"),
+        ("a: !custom x", "tag '!custom' is not allowed here"),
         ("<<: {a: 1}", "merge"),
         ("a: " + "[" * 10_000, "nested deeper than 40 levels"),
         ("a: " + "{b: " * 10_000, "nested deeper than 40 levels"),
-        ("a: \x00", "characters are not allowed"),
-        ("a: [1", "expected ',' or ']'"),
+        ("a: \x00", "special characters are not allowed"),
+        ("a: [1", "file.yaml:1:6: expected ',' or ']'"),
         ("? [1]\n: 2", "a key must be text"),
         ("1: 2", "has the key 1; expected a name"),
         ("yes: 2", "has the key True; expected a name"),
@@ -180,10 +159,9 @@ def _written(tmp_path: Path, text: str) -> Path:
         ("x" * 300_000, "has 300000 bytes; expected at most 250000"),
     ],
 )
-@pytest.mark.parametrize("load", _LOADERS.values(), ids=_LOADERS)
-def test_yaml_that_could_mislead_is_refused_in_one_sentence(tmp_path: Path, load, text: str, message: str) -> None:
+def test_yaml_that_could_mislead_is_refused_in_one_sentence(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ParameterError) as caught:
-        load(_written(tmp_path, text))
+        _load(tmp_path, text)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -206,11 +184,18 @@ def test_yaml_that_could_mislead_is_refused_in_one_sentence(tmp_path: Path, load
         ("true", True),
     ],
 )
-@pytest.mark.parametrize("load", _LOADERS.values(), ids=_LOADERS)
-def test_numbers_are_what_they_look_like(tmp_path: Path, load, text: str, value: object) -> None:
-    loaded = load(_written(tmp_path, f"a: {text}"))["a"]
+def test_numbers_are_what_they_look_like(tmp_path: Path, text: str, value: object) -> None:
+    loaded = _load(tmp_path, f"a: {text}")["a"]
     assert loaded == value
     assert type(loaded) is type(value)
+
+
+def test_who_changes_what_was_loaded_changes_it_for_nobody_else(tmp_path: Path) -> None:
+    first = _load(tmp_path, "a: {b: [1, 2]}")
+    first["a"]["b"].append(3)
+    del first["a"]
+    assert _load(tmp_path, "a: {b: [1, 2]}") == {"a": {"b": [1, 2]}}
+    assert _load(tmp_path, "a: {b: [4]}") == {"a": {"b": [4]}}
 
 
 @given(
@@ -227,7 +212,7 @@ def test_numbers_are_what_they_look_like(tmp_path: Path, load, text: str, value:
 def test_what_is_dumped_is_loaded_again(tmp_path_factory: pytest.TempPathFactory, document: dict) -> None:
     path = tmp_path_factory.getbasetemp() / "round_trip.yaml"
     path.write_text(dump_yaml(document), encoding="utf-8", newline="")
-    assert [load(path) for load in _LOADERS.values()] == [document] * len(_LOADERS)
+    assert load_yaml(path) == document
 
 
 @given(st.one_of(st.binary(max_size=60), st.text("ab:-[]{}!&*?|>%@`'\"#,\n\t 0.1~<", max_size=40).map(str.encode)))
