@@ -508,6 +508,47 @@ def test_compiled_code_begins_behind_a_press() -> None:
         assert supervisor.mode is Mode.E_STOP
 
 
+def test_the_step_behind_a_press_knows_of_it_though_its_thread_still_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_supervisor, "_LONGEST_COURTESY", 0.0)
+    for _ in range(20):
+        supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+        assert supervisor.arm(0, JointSample.of_one(0, 0.0, 0.0)) == ""
+        with supervisor.alone():
+            stop = _wait_for(supervisor, lambda supervisor=supervisor: supervisor.e_stop(7, "button"))
+        assert supervisor.decide(8, JointSample.of_one(8, 0.0, 0.0)).effort == (0.0,)
+        assert supervisor.mode is Mode.E_STOP
+        stop.join()
+        assert supervisor.transitions[1:] == [(7, Mode.E_STOP, "button")]
+
+
+def test_of_several_presses_the_newest_says_why() -> None:
+    supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+    supervisor._presses.extend([(1, "first"), (2, "second")])
+    supervisor.decide(3, None)
+    assert (supervisor.mode, supervisor.reason) == (Mode.E_STOP, "second")
+
+
+def test_a_reset_that_has_waited_does_not_take_back_a_press_of_meanwhile() -> None:
+    for _ in range(20):
+        supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+        supervisor.e_stop(0)
+        said: list[str] = []
+        with supervisor.alone():
+            reset = _wait_for(
+                supervisor, lambda supervisor=supervisor, said=said: said.append(supervisor.e_stop_reset(2))
+            )
+            stop = threading.Thread(target=supervisor.e_stop, args=(1, "meanwhile"))
+            stop.start()
+            while not supervisor._presses:
+                time.sleep(0.0)
+            # Whoever steps first carries it out.
+            supervisor.decide(3, None)
+        reset.join()
+        stop.join()
+        assert said == ["the e-stop has just been pressed; reset it once more"]
+        assert (supervisor.mode, supervisor.reason) == (Mode.E_STOP, "meanwhile")
+
+
 def test_no_reset_takes_back_a_press_that_nobody_has_carried_out_yet() -> None:
     supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
     supervisor.e_stop(0)

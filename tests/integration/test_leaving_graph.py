@@ -48,6 +48,18 @@ from pendulum_bags.experiments.conductor_node import Conductor
 with Conductor({domain}):
     pass
 """
+_IN_TIME = """
+import time
+from pendulum_msgs_py.programs.hang_guard import guard_exit, hang_guard
+guard_exit()
+try:
+    with hang_guard(), hang_guard():
+        raise ValueError
+except ValueError:
+    with hang_guard():
+        pass
+time.sleep(7.0)  # longer than what is guarded may take
+"""
 _GROUP = """
 import ctypes
 from pendulum_hw_bridge.backends.hebi import HebiBackend, import_hebi
@@ -82,6 +94,7 @@ def hanging(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Runn
             start(name, _HANGING.format(name=name) + _SIMULATOR)
         start("conductor", _HANGING.format(name="conductor") + _CONDUCTOR)
         start("nested", _NESTED)
+        start("in time", _IN_TIME)
         if importlib.util.find_spec("hebi"):
             for name, end in _GROUP_ENDS.items():
                 start(name, _GROUP.replace("{end}", end))
@@ -111,6 +124,10 @@ def test_the_end_of_one_leaving_does_not_end_the_watch_over_another(hanging: dic
     # A context that shuts down closes an e-stop whose owner was not closed.
     assert hanging["nested"].wait(DEADLINE) == 1
     assert "hangs" in hanging["nested"].output
+
+
+def test_who_leaves_in_time_is_left_alone(hanging: dict[str, RunningProgram]) -> None:
+    assert hanging["in time"].wait(DEADLINE) == 0, hanging["in time"].output
 
 
 @pytest.mark.parametrize("name", _GROUP_ENDS)

@@ -10,6 +10,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
@@ -43,11 +44,13 @@ def test_of_several_events_of_a_name_the_newest_counts() -> None:
 
 
 @contextmanager
-def _listener(domain: int, name: str, moves: list[JointTrajectory]) -> Iterator[None]:
+def _listener(
+    domain: int, name: str, moves: list[JointTrajectory], profile: QoSProfile = qos.TRAJECTORY
+) -> Iterator[None]:
     context = Context()
     rclpy.init(context=context, domain_id=domain)
     node = Node(name, namespace="/hw", context=context)
-    node.create_subscription(JointTrajectory, "joint_trajectory", moves.append, qos.TRAJECTORY)
+    node.create_subscription(JointTrajectory, "joint_trajectory", moves.append, profile)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     thread = threading.Thread(target=executor.spin)
@@ -71,7 +74,9 @@ def test_a_move_is_asked_for_when_it_reaches_the_recorder_too(domain_id: int) ->
             conductor.wait_for("the plant", lambda: plant._trajectory.get_subscription_count() == 1, 10.0)
             with pytest.raises(FaultError, match="recorder on /hw/joint_trajectory"):
                 plant.wait_until_moves_are_recorded(0.2)
-            with _listener(domain_id, RECORDER, recorded):
+            # Who asks for old moves gets none at all, and keeps nobody waiting.
+            wants_old = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            with _listener(domain_id, "late", [], wants_old), _listener(domain_id, RECORDER, recorded):
                 plant.wait_until_moves_are_recorded(10.0)
                 plant.follow(thesis_ramp(0.0, 0.1), "ramp_up")
                 conductor.wait_for("the move to arrive", lambda: seen and recorded, 10.0)

@@ -48,6 +48,7 @@ class SharedSupervisor(PlantSupervisor):
         self._counting = threading.Condition()
         self._waiting = ctypes.c_int64(0)
         self._presses: deque[tuple[int, str]] = deque()
+        self._newest_press: tuple[int, str] | None = None
         self._prepare = prepare
         self._withdraw = withdraw
         self._measure = measure
@@ -134,14 +135,16 @@ class SharedSupervisor(PlantSupervisor):
 
     def e_stop(self, now_ns: int, reason: str = "e-stop pressed") -> None:
         """Latch the e-stop: whatever is decided from now on knows of it, even before this thread has the lock."""
-        self._presses.append((now_ns, reason))
+        self._newest_press = press = (now_ns, reason)
+        self._presses.append(press)
         with self._in_turn():
             pass  # it is carried out on the way in, unless somebody has been faster
 
     def e_stop_reset(self, now_ns: int) -> str:
-        """Leave the e-stop for disarmed, unless another was pressed that nobody has carried out yet."""
+        """Leave the e-stop for disarmed, unless one was pressed since that who asks for this cannot have known of."""
+        known = self._newest_press
         with self._in_turn() as pressed:
-            if pressed:
+            if pressed or self._newest_press is not known:
                 return "the e-stop has just been pressed; reset it once more"
             return super().e_stop_reset(now_ns)
 
