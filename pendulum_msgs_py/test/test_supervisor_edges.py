@@ -515,10 +515,26 @@ def test_the_step_behind_a_press_knows_of_it_though_its_thread_still_waits(monke
         assert supervisor.arm(0, JointSample.of_one(0, 0.0, 0.0)) == ""
         with supervisor.alone():
             stop = _wait_for(supervisor, lambda supervisor=supervisor: supervisor.e_stop(7, "button"))
-        assert supervisor.decide(8, JointSample.of_one(8, 0.0, 0.0)).effort == (0.0,)
-        assert supervisor.mode is Mode.E_STOP
+            assert supervisor.decide(8, JointSample.of_one(8, 0.0, 0.0)).effort == (0.0,)
+            assert supervisor.mode is Mode.E_STOP
         stop.join()
         assert supervisor.transitions[1:] == [(7, Mode.E_STOP, "button")]
+
+
+def test_an_exception_while_a_press_is_carried_out_does_not_lose_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+    assert supervisor.arm(0, JointSample.of_one(0, 0.0, 0.0)) == ""
+    with monkeypatch.context() as patch:
+        patch.setattr(supervisor, "_release", _interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            supervisor.e_stop(0)
+    assert supervisor.mode is Mode.EFFORT
+    supervisor.decide(1, JointSample.of_one(1, 0.0, 0.0))
+    assert supervisor.mode is Mode.E_STOP
+
+
+def _interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_of_several_presses_the_newest_says_why() -> None:

@@ -74,7 +74,7 @@ def test_a_move_is_asked_for_when_it_reaches_the_recorder_too(domain_id: int) ->
             conductor.wait_for("the plant", lambda: plant._trajectory.get_subscription_count() == 1, 10.0)
             with pytest.raises(FaultError, match="recorder on /hw/joint_trajectory"):
                 plant.wait_until_moves_are_recorded(0.2)
-            # Who asks for old moves gets none at all, and keeps nobody waiting.
+            # Who asks for old moves gets none at all, and keeps nobody waiting for long.
             wants_old = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             with _listener(domain_id, "late", [], wants_old), _listener(domain_id, RECORDER, recorded):
                 plant.wait_until_moves_are_recorded(10.0)

@@ -38,6 +38,7 @@ from pendulum_hw_bridge.backends.hebi_discovery import (
 from pendulum_hw_bridge.backends.hebi_log import import_hebi, start_log, stop_log
 from pendulum_hw_bridge.clocks import Clock, WallClock
 from pendulum_hw_bridge.command_check import check_command
+from pendulum_msgs_py.programs.hang_guard import hang_guard
 
 __all__ = ["GroupDrive", "GroupEncoder", "HebiGroup"]
 
@@ -99,7 +100,9 @@ class HebiGroup:
         if self._users == 0:
             if self._log is not None:
                 stop_log(self.group)
-            self.group = self._packet = self._buffer = self._frame = None
+            # As in HebiBackend.close: of thousands of groups one is never released.
+            with hang_guard():
+                self.group = self._packet = self._buffer = self._frame = None
 
     def _connect(self) -> None:
         hebi = import_hebi()

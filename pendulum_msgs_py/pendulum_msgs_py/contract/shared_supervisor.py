@@ -69,7 +69,9 @@ class SharedSupervisor(PlantSupervisor):
         with self._lock:
             pressed = bool(self._presses)
             while self._presses:
-                super().e_stop(*self._presses.popleft())
+                super().e_stop(*self._presses[0])
+                # Only now: an exception in between must not lose it.
+                self._presses.popleft()
             yield pressed
 
     @contextlib.contextmanager

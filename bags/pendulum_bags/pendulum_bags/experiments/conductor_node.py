@@ -15,7 +15,6 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
-from rclpy.qos import DurabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
@@ -41,6 +40,8 @@ _SLICE = 0.05
 _QUIET_POLLS = 3
 _SILENCE = 5.0
 """Time of listening without a state after which a plant in real time counts as gone [s]."""
+_MATCHING = 1.0
+"""Longest wait for listeners on the graph to match with a publisher [s]."""
 _T = TypeVar("_T")
 
 
@@ -240,15 +241,18 @@ class PlantClient:
         Raises:
             FaultError: No recorder comes in time [s].
         """
-        topic = f"{self.namespace}/{names.JOINT_TRAJECTORY}"
+        topic, node = f"{self.namespace}/{names.JOINT_TRAJECTORY}", self.conductor.node
 
-        def recorded() -> bool:
-            listeners = self.conductor.node.get_subscriptions_info_by_topic(topic)
-            # One that asks for what was said before never matches: a plant must not be moved by an old one.
-            suited = [each.node_name for each in listeners if each.qos_profile.durability == DurabilityPolicy.VOLATILE]
-            return names.RECORDER in suited and self._trajectory.get_subscription_count() >= len(suited)
+        def listeners() -> list[tuple[str, str]]:
+            return [(each.node_namespace, each.node_name) for each in node.get_subscriptions_info_by_topic(topic)]
 
-        self.conductor.wait_for(f"a recorder on {topic}", recorded, timeout)
+        self.conductor.wait_for(
+            f"a recorder on {topic}", lambda: (self.namespace, names.RECORDER) in listeners(), timeout
+        )
+        # Some never match: who asks for old moves, or for a deadline. Who does match does so within moments.
+        deadline = time.monotonic() + _MATCHING
+        while self._trajectory.get_subscription_count() < len(listeners()) and time.monotonic() < deadline:
+            self.conductor.spin(_SLICE)
 
     def _has_state(self) -> bool:
         if self.sample is None and self._foreign_joints:
