@@ -477,9 +477,7 @@ def test_who_has_waited_for_the_supervisor_is_next(monkeypatch: pytest.MonkeyPat
         assert not ctypes.c_int64.from_address(supervisor.waiting_at).value
 
 
-def test_a_press_counts_from_when_it_is_made_however_late_its_thread_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    # As on a machine that is so busy that the courtesy is over before the other thread has run.
-    monkeypatch.setattr(shared_supervisor, "_LONGEST_COURTESY", 0.0)
+def test_a_press_counts_from_when_it_is_made_however_late_its_thread_runs() -> None:
     sample = JointSample.of_one(0, 0.0, 0.0)
     for next_step in (
         lambda supervisor: supervisor.decide(0, sample),
@@ -508,8 +506,7 @@ def test_compiled_code_begins_behind_a_press() -> None:
         assert supervisor.mode is Mode.E_STOP
 
 
-def test_the_step_behind_a_press_knows_of_it_though_its_thread_still_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_supervisor, "_LONGEST_COURTESY", 0.0)
+def test_the_step_behind_a_press_knows_of_it_though_its_thread_still_waits() -> None:
     for _ in range(20):
         supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
         assert supervisor.arm(0, JointSample.of_one(0, 0.0, 0.0)) == ""

@@ -60,24 +60,23 @@ class SharedSupervisor(PlantSupervisor):
         """Address of an ``int64`` that counts who waits for :meth:`alone` to end, for compiled code to look at."""
         return ctypes.addressof(self._waiting)
 
-    @contextlib.contextmanager
-    def _step(self) -> Iterator[bool]:
-        """Take the lock and carry out what e-stops were pressed before; yield whether there were any.
+    def _carry_out_presses(self) -> bool:
+        """Latch what e-stops were pressed before, at the beginning of each step; return whether there were any.
 
         On a busy machine the thread that pressed one may not have run since.
         """
-        with self._lock:
-            pressed = bool(self._presses)
-            while self._presses:
-                super().e_stop(*self._presses[0])
-                # Only now: an exception in between must not lose it.
-                self._presses.popleft()
-            yield pressed
+        pressed = bool(self._presses)
+        while self._presses:
+            super().e_stop(*self._presses[0])
+            # Only now: an exception in between must not lose it.
+            self._presses.popleft()
+        return pressed
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
         """Keep everybody else from the supervisor; who comes in the meantime is counted, waits, and is next."""
-        with self._step():
+        with self._lock:
+            self._carry_out_presses()
             yield
         # A lock is whose who asks first, and we are awake: without this who disarms waits for one more decision.
         if self._waiting.value:
@@ -86,12 +85,15 @@ class SharedSupervisor(PlantSupervisor):
 
     @contextlib.contextmanager
     def _in_turn(self) -> Iterator[bool]:
-        """Take a step, and let compiled code that has the lock know that somebody wants it."""
+        """Take the lock, and let compiled code that has it know that somebody wants it.
+
+        Yields whether e-stops had been pressed that nobody had carried out yet.
+        """
         with self._counting:
             self._waiting.value += 1
         try:
-            with self._step() as pressed:
-                yield pressed
+            with self._lock:
+                yield self._carry_out_presses()
         finally:
             with self._counting:
                 self._waiting.value -= 1
@@ -99,7 +101,8 @@ class SharedSupervisor(PlantSupervisor):
 
     def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
         """Offer a message of an input."""
-        with self._step():
+        with self._lock:
+            self._carry_out_presses()
             return super().offer(kind, command, now_ns, problem)
 
     def set_commander_conflict(self, conflict: str) -> None:
@@ -157,10 +160,12 @@ class SharedSupervisor(PlantSupervisor):
 
     def decide(self, now_ns: int, sample: JointSample | None) -> Drive:
         """Return what the plant has to do now."""
-        with self._step():
+        with self._lock:
+            self._carry_out_presses()
             return super().decide(now_ns, sample)
 
     def report_applied(self, effort: Vector) -> None:
         """Tell what efforts were really applied."""
-        with self._step():
+        with self._lock:
+            self._carry_out_presses()
             super().report_applied(effort)
