@@ -16,7 +16,7 @@ _RUN = """
 import sys
 from tests.suite import Part, run_parts
 lanes = [[Part(name, ["-p", "tests.fixtures", name], workers=1, nice=nice) for name in lane.split()]
-         for lane, nice in zip(sys.argv[1:], (0, 5))]
+         for lane, nice in zip(sys.argv[1:], (0, 7))]
 raise SystemExit(run_parts(*lanes))
 """
 
@@ -39,18 +39,28 @@ from pathlib import Path
 from tests.fixtures import wait_for
 
 def test_share() -> None:
-    share = Path("/proc/self/autogroup")
-    if not share.exists():
+    if not Path("/proc/self/autogroup").exists():
         return  # this Linux shares its cores without sessions
-    program = subprocess.Popen(["sleep", "60"], start_new_session=True)
-    share = Path(f"/proc/{program.pid}/autogroup")
+    began, held_back = Path({folder!r}, "began"), Path({folder!r}, "held_back")
+    if {steps_back}:
+        wait_for(began.exists, 60, "a program of the other part")
+    program = subprocess.Popen(["sleep", "100"], start_new_session=True)
+    share = Path(f"/proc/{{program.pid}}/autogroup")
     try:
-        wait_for(lambda: share.read_text().endswith(" nice %d\\n"), 30, "its share")
+        if {steps_back}:
+            wait_for(lambda: share.read_text().endswith(" nice 7\\n"), 30, "its share")
+            held_back.touch()
+        else:
+            began.touch()
+            wait_for(held_back.exists, 60, "the other part's program to be held back")
+            assert not share.read_text().endswith(" nice 7\\n")
     finally:
         program.kill()
         program.wait()
 """
-"""What a test starts in a session of its own has its part's share of the cores."""
+"""What a test starts in a session of its own has its part's share of the cores, and no other part's.
+
+The share is one that ``make test`` gives to nobody: this test may run in a part that is held back itself."""
 
 
 def test_a_lane_runs_its_parts_in_turn_and_a_failure_is_named_at_once_and_explained_at_the_end(
@@ -61,8 +71,9 @@ def test_a_lane_runs_its_parts_in_turn_and_a_failure_is_named_at_once_and_explai
     first = f"import time\n\ndef test_first():\n    time.sleep(1.0)\n    open({str(mark)!r}, 'w').close()\n"
     second = f"import os\n\ndef test_second():\n    assert os.path.exists({str(mark)!r})\n"
     wrong = "\ndef test_wrong():\n    assert 40 + 1 == 42\n"
-    program = processes.start_command(_run(tmp_path, [first + _SHARE % 0, second], [_SHARE % 5 + wrong]))
-    assert program.wait(60) == 1, program.output
+    stays, steps_back = (_SHARE.format(folder=str(tmp_path), steps_back=it) for it in (False, True))
+    program = processes.start_command(_run(tmp_path, [first + stays, second], [steps_back + wrong]))
+    assert program.wait(120) == 1, program.output
     named, explained = (program.output.index(words) for words in ("FAILED ", "assert (40 + 1) == 42"))
     assert named < explained
     assert "test_part_10.py::test_wrong (" in program.output[named:explained]
