@@ -256,7 +256,7 @@ class Proof:
     """A proof whose drive and end of duty are given."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, ended: float, *, pressed: bool = True) -> None:
-        self.person, self.patience, self.port = Person(), list[float](), emulator()
+        self.person, self.limits, self.port = Person(), list[float](), emulator()
         self.goes_on: Any = None
         self._pressed = pressed
         self._ended = ended
@@ -269,9 +269,9 @@ class Proof:
             goes_on(feedback_record(stamp_ns=1_000_000_000, m_stop=True), 1.0)
         return 1_000_000_000
 
-    def _duty_ends(self, port: object, since_ns: int, patience: float) -> float:
+    def _duty_ends(self, port: object, since_ns: int, limit: float) -> float:
         assert since_ns == 1_000_000_000
-        self.patience.append(patience)
+        self.limits.append(limit)
         return self._ended
 
 
@@ -284,7 +284,7 @@ def test_a_lifetime_is_proved_up_to_two_records_later_and_driven_for_no_longer_t
     assert guided.prove_lifetime(proof.port, settings, proof.person) == limit
     assert proof.person.said[-1].startswith("Proved: the torque ended 70 ms after the last command (at most 70 ms")
     assert [proof.goes_on(feedback_record(), now) for now in (0.0, 0.2999, 0.3)] == [True, True, False]
-    assert proof.patience == [pytest.approx(10.0 * limit)]
+    assert proof.limits == [limit]
     proof = Proof(monkeypatch, limit + 1e-6)
     with pytest.raises(ActuatorError, match=r"expected at most 70 ms\. Do not arm"):
         guided.prove_lifetime(proof.port, settings, proof.person)
@@ -299,7 +299,7 @@ def test_a_motion_stop_is_proved_within_60_ms_and_waited_for_no_longer_than_told
     assert proof.person.said[-1] == "Proved: the torque ended within 60 ms. Release the motion stop."
     assert [proof.goes_on(feedback_record(), now) for now in (0.0, 19.99, 20.0)] == [True, True, False]
     assert not proof.goes_on(feedback_record(m_stop=True), 0.0)
-    assert proof.patience == [pytest.approx(0.6)]
+    assert proof.limits == [0.06]
     proof = Proof(monkeypatch, 0.060001)
     with pytest.raises(ActuatorError, match=r"expected at most 60 ms\. Do not arm"):
         guided.prove_m_stop(proof.port, BridgeSettings(), proof.person)
@@ -326,7 +326,7 @@ def test_a_proof_is_watched_by_the_checks_that_the_bridge_has_at_its_own_rate(
 
 def test_the_duty_has_ended_with_the_first_record_after_the_last_command_that_has_none() -> None:
     def ended(*records: tuple[float, float]) -> float:
-        return guided._duty_ends(Given(*records), 100_000_000, 0.7)  # type: ignore[arg-type]
+        return guided._duty_ends(Given(*records), 100_000_000, 0.07)  # type: ignore[arg-type]
 
     # A record from before the last command says nothing of it, and half of the duty is duty.
     assert ended((90.0, 0.0), (110.0, 0.01), (120.0, 0.005), (130.0, 1e-8), (140.0, 0.0)) == pytest.approx(0.04)
@@ -341,6 +341,26 @@ def test_the_duty_has_ended_with_the_first_record_after_the_last_command_that_ha
     with pytest.raises(ActuatorError, match=r"no feedback for 0\.4 s"):
         ended(*kept[:34])
     assert ended((110.0, 1e-9), (120.0, 0.0)) == pytest.approx(0.02)
+
+
+def test_a_duty_that_ended_while_no_feedback_came_is_judged_only_where_that_can_be() -> None:
+    def ended(*records: tuple[float, float]) -> float:
+        return guided._duty_ends(Given(*records), 100_000_000, 0.07)  # type: ignore[arg-type]
+
+    # In time for certain, and late for certain.
+    assert ended((110.0, 0.01), (170.0, 0.0)) == pytest.approx(0.07)
+    assert ended((110.0, 0.01), (171.0, -0.01), (250.0, 0.0)) == pytest.approx(0.15)
+    # Records that come as they should are what a machine is judged by, up to half of the limit between two.
+    assert ended((135.0, 0.01), (170.0, 0.0)) == pytest.approx(0.07)
+    assert ended((136.0, 0.01), (171.0, 0.0)) == pytest.approx(0.071)
+    for record in ((136.0, 0.01), (170.0, 0.01)):
+        with pytest.raises(
+            ActuatorError, match=r"no feedback for \d+ ms while the duty ended; .* within 70 ms"
+        ) as told:
+            ended((110.0, 0.01), record, (206.0, 0.0))
+        assert told.value.fault == "feedback_lost"
+    with pytest.raises(ActuatorError, match=r"no feedback for 71 ms while"):
+        ended((90.0, 0.01), (171.0, 0.0))
 
 
 @pytest.mark.parametrize(
