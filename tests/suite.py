@@ -205,9 +205,11 @@ class Part:
                 ancestors = {parent.pid for parent in psutil.Process(pid).parents()}
                 if self._popen.pid in {pid, *ancestors} and os.getsid(pid) == pid:
                     group = Path(f"/proc/{pid}/autogroup")
-                    # Who stepped further back by itself stays there.
+                    # Who stepped further back by itself stays there; and whoever holds it further back may write at the
+                    # same moment, and must not be the one who is overwritten for good.
                     if int(group.read_text(encoding="ascii").split()[-1]) < self._nice:
                         group.write_text(str(self._nice), encoding="ascii")
+                        continue
                 self._looked_at.add(pid)
 
     def send(self, number: int) -> None:
