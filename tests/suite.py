@@ -86,6 +86,8 @@ _TELLS_EVERY = 20.0
 """Time between two lines of progress [s]."""
 _LOOK_EVERY = 0.2
 """Time between two looks at the parts [s]."""
+_YOUNG = 5.0
+"""Age up to which a process that was started in a session of its own may not have begun it, on a busy machine [s]."""
 _GRAVITY = ("", "passed", "skipped", "failed")
 _PATIENCE = 20.0
 """Time to end after Ctrl-C [s]; then a part is killed."""
@@ -202,14 +204,17 @@ class Part:
         for pid in every - self._looked_at:
             # Refused to who asks often without being root: the next look asks again.
             with contextlib.suppress(OSError, psutil.Error):
-                ancestors = {parent.pid for parent in psutil.Process(pid).parents()}
-                if self._popen.pid in {pid, *ancestors} and os.getsid(pid) == pid:
+                process = psutil.Process(pid)
+                ours = self._popen.pid in {pid, *(parent.pid for parent in process.parents())}
+                if ours and os.getsid(pid) == pid:
                     group = Path(f"/proc/{pid}/autogroup")
                     # Who stepped further back by itself stays there; and whoever holds it further back may write at the
                     # same moment, and must not be the one who is overwritten for good.
                     if int(group.read_text(encoding="ascii").split()[-1]) < self._nice:
                         group.write_text(str(self._nice), encoding="ascii")
                         continue
+                elif ours and time.time() - process.create_time() < _YOUNG:
+                    continue  # it may be about to begin a session
                 self._looked_at.add(pid)
 
     def send(self, number: int) -> None:

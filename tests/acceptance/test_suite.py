@@ -34,7 +34,9 @@ def _run(tmp_path: Path, *lanes: list[str]) -> list[str]:
 
 
 _SHARE = """
+import os
 import subprocess
+import sys
 from pathlib import Path
 from tests.fixtures import wait_for
 
@@ -44,15 +46,18 @@ def test_share() -> None:
     began, held_back = Path({folder!r}, "began"), Path({folder!r}, "held_back")
     if {steps_back}:
         wait_for(began.exists, 60, "a program of the other part")
-    program = subprocess.Popen(["sleep", "100"], start_new_session=True)
+    # On a busy machine some time goes by until a session is begun.
+    words = "import os, time; time.sleep(0.7); os.setsid(); time.sleep(100)"
+    program = subprocess.Popen([sys.executable, "-c", words])
     share = Path(f"/proc/{{program.pid}}/autogroup")
     try:
+        wait_for(lambda: os.getsid(program.pid) == program.pid, 30, "its session")
         if {steps_back}:
             wait_for(lambda: share.read_text().endswith(" nice 7\\n"), 30, "its share")
             held_back.touch()
         else:
             began.touch()
-            wait_for(held_back.exists, 60, "the other part's program to be held back")
+            wait_for(held_back.exists, 90, "the other part's program to be held back")
             assert not share.read_text().endswith(" nice 7\\n")
     finally:
         program.kill()
