@@ -14,6 +14,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import load_lab
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option
+from pendulum_msgs_py.whole_file import writing
 
 __all__ = ["main"]
 
@@ -46,11 +47,9 @@ def convert(
         if name not in kept:
             raise ParameterError(f"{log}: {name} is not a number everywhere; expected a log of one running module")
     target = out or log.with_suffix(".csv")
-    try:
+    with writing(f"table {target}", ParameterError):
         table = np.column_stack(list(kept.values()))
         np.savetxt(target, table, delimiter=",", header=",".join(kept), comments="", fmt="%.9g")
-    except OSError as error:
-        raise ParameterError(f"{target} cannot be written: {error.strerror}") from error
     print(f"{target}: {len(kept['time'])} records, {kept['time'][-1]:.2f} s, {len(kept) - 1} quantities")
 
 

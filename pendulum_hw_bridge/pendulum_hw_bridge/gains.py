@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import read_text, reject_unknown
+from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
     "DEFAULT_GAINS",
@@ -196,10 +197,8 @@ def write_gains(path: str | Path, gains: GainSet) -> Path:
                 ElementTree.SubElement(element, name).text = text
     ElementTree.indent(root)
     path = Path(path)
-    try:
-        path.write_text('<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n")
-    except OSError as error:
-        raise ParameterError(f"gains file {path} cannot be written: {error.strerror}") from error
+    with writing(f"gains file {path}", ParameterError):
+        write_whole(path, '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n")
     return path
 
 

@@ -39,6 +39,7 @@ from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_N
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import make_console
+from pendulum_msgs_py.whole_file import writing
 
 __all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main", "read_diagonal"]
 
@@ -311,15 +312,13 @@ def _save(
         (f"{index}: Q = ({diagonal[0]:g}, {diagonal[1]:g}), R = {cost:g}", gain)
         for index, ((diagonal, cost), gain) in enumerate(zip(weights, gains, strict=True), start=1)
     ]
-    try:
+    paths = []
+    with writing(f"figures in {folder}", ParameterError):
         folder.mkdir(parents=True, exist_ok=True)
-        paths = []
         for name, figure in design_figures(plant, model, rows, chosen - 1, effort_limit).items():
             path = folder / f"{name}.png"
             figure.savefig(path)
             paths.append(path)
-    except OSError as error:
-        raise ParameterError(f"figures cannot be written to {folder}: {error.strerror}") from error
     return paths
 
 

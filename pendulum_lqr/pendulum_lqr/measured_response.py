@@ -14,6 +14,7 @@ import scipy.special
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = ["FORMAT", "MeasuredResponse", "read_response", "write_response"]
 
@@ -162,11 +163,9 @@ def write_response(path: str | os.PathLike[str], response: MeasuredResponse) -> 
         ParameterError: The file cannot be written.
     """
     target = Path(path)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(json.dumps(response.to_json(), allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ParameterError(f"response {target} cannot be written: {error.strerror or error}") from error
+    text = json.dumps(response.to_json(), allow_nan=False) + "\n"
+    with writing(f"response {target}", ParameterError):
+        write_whole(target, text)
     return target
 
 

@@ -20,7 +20,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import read_text
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.whole_file import write_whole
+from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
     "FORMAT",
@@ -215,11 +215,9 @@ def write_trajectory(path: Path, trajectory: MechanismTrajectory) -> None:
         "efforts": rows(trajectory.efforts),
     }
     text = json.dumps(document)
-    try:
+    with writing(f"trajectory {path}", ParameterError):
         # One node a line, so that a change shows as one.
         write_whole(path, text.replace("], [", "],\n[") + "\n")
-    except OSError as error:
-        raise ParameterError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def load_trajectory(path: Path) -> MechanismTrajectory:

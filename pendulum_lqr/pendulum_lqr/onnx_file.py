@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pendulum_lqr.policy import Network, Policy
 from pendulum_lqr.policy_file import header_of
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.whole_file import write_whole
+from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = ["OPSET", "dumps_onnx", "observation_names", "write_onnx"]
 
@@ -38,11 +38,8 @@ def write_onnx(path: str | Path, policy: Policy) -> Path:
         DataError: The file cannot be written.
     """
     path = Path(path)
-    try:
+    with writing(f"model {path}", DataError):
         write_whole(path, dumps_onnx(policy))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise DataError(f"model {path} cannot be written: {reason}") from error
     return path
 
 

@@ -23,7 +23,7 @@ from pendulum_lqr.bounded_files import read_bounded, read_parts, sentence_of, sh
 from pendulum_lqr.policy import MODELS, Network, Policy, fingerprint, model_of
 from pendulum_msgs_py.errors import DataError, PendulumError
 from pendulum_msgs_py.plants.plant_differences import describe_plants, read_plants
-from pendulum_msgs_py.whole_file import write_whole
+from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
     "FORMAT",
@@ -63,11 +63,8 @@ def write_policy(path: str | Path, policy: Policy) -> Path:
     """
     path = Path(path)
     content = dumps_policy(policy)
-    try:
+    with writing(f"policy file {path}", DataError):
         write_whole(path, content)
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise DataError(f"policy file {path} cannot be written: {reason}") from error
     return path
 
 

@@ -18,6 +18,7 @@ from pendulum_msgs_py.programs.counted_progress import counting_bar
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.programs.terminal import make_console
+from pendulum_msgs_py.whole_file import writing
 
 __all__ = ["app", "main"]
 
@@ -51,10 +52,8 @@ def swing_up(
             f"--weights is {weights!r}; expected {len(IlqrWeights._fields)} numbers, for "
             f"{', '.join(IlqrWeights._fields)}"
         ) from error
-    try:
+    with writing(f"trajectory {output}", ParameterError):
         output.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ParameterError(f"{output} cannot be written: {error.strerror}") from error
     catch = default_catch(load_mechanism(preset))
     search = SwingUpSearch(values, duration=duration)
     console = make_console(highlight=False)

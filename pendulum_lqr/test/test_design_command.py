@@ -116,7 +116,7 @@ def test_a_moving_reference_is_designed_for_with_the_weights_of_the_chosen_row(c
         (["--tracking", "reference=saw"], "reference is 'saw'; expected one of sine, steps"),
         (["--tracking", "frequency=2"], "following the reference takes up to"),
         (["--tracking", "period=0.9"], "unstable at -0.3 rad from upright with a period of 0.9 s"),
-        (["--figures", "/proc/nowhere"], "figures cannot be written to /proc/nowhere"),
+        (["--figures", "/proc/nowhere"], "figures in /proc/nowhere cannot be written"),
     ],
 )
 def test_a_mistake_ends_with_one_sentence_and_code_2(arguments, message, capsys):

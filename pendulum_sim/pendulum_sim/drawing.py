@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.whole_file import writing
 from pendulum_sim.canvas import BACKGROUND, BOB, DISTURBANCE, INK, LINK, TORQUE, Picture
 
 __all__ = ["PendulumPicture", "Window", "rotation_matrix", "save_gif", "save_png"]
@@ -200,9 +201,7 @@ def _save(
     if append:
         palette = [image.quantize(colors=64, dither=Image.Dither.NONE) for image in images]
         images, options["append_images"], options["save_all"] = palette[:1], palette[1:], True
-    try:
+    with writing(f"picture {path}", ParameterError):
         path.parent.mkdir(parents=True, exist_ok=True)
         images[0].save(path, kind, **options)
-    except OSError as error:
-        raise ParameterError(f"{path} cannot be written: {error.strerror or error}") from error
     return path

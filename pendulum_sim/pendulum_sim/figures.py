@@ -17,6 +17,7 @@ from pendulum_msgs_py.plants.equilibrium import (
     total_damping,
 )
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.whole_file import writing
 
 __all__ = ["overdamped_points", "plot_overdamped_phase", "save_figure"]
 
@@ -94,9 +95,7 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     if path.suffix.lower() not in {".png", ".svg", ".pdf"}:
         raise ParameterError(f"figure {path} ends in {path.suffix!r}; expected .png, .svg or .pdf")
-    try:
+    with writing(f"figure {path}", ParameterError):
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=150)
-    except OSError as error:
-        raise ParameterError(f"figure {path} cannot be written: {error.strerror}") from error
     return path

@@ -22,6 +22,7 @@ from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option
+from pendulum_msgs_py.whole_file import write_whole, writing
 from pendulum_sim.mechanism_files import mechanism_mjcf, mechanism_urdf
 from pendulum_sim.ros2_control_tags import add_ros2_control
 from pendulum_sim.xml_files import add, document_text, number, safe_name
@@ -270,11 +271,8 @@ def export(
     if output is None:
         typer.echo(text, nl=False)
         return
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        output.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ParameterError(f"{output} cannot be written: {error.strerror}") from error
+    with writing(f"model file {output}", ParameterError):
+        write_whole(output, text)
 
 
 def main(argv: list[str] | None = None) -> int:

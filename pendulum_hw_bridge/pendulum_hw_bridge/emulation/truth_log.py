@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pendulum_hw_bridge.emulation.x5 import LinkState
 from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.whole_file import writing
 
 __all__ = ["COLUMNS", "truth_log"]
 
@@ -27,11 +28,9 @@ def truth_log(path: Path) -> Iterator[Callable[[LinkState], None]]:
     Raises:
         PendulumError: It cannot be written.
     """
-    try:
+    with writing(f"truth of the emulator {path}", PendulumError):
         file = path.open("w", buffering=1, encoding="ascii")
         file.write(",".join(COLUMNS) + "\n")
-    except OSError as error:
-        raise PendulumError(f"truth of the emulator cannot be written to {path}: {error.strerror}") from error
 
     def note(link: LinkState) -> None:
         file.write(f"{link.time_ns},{link.position:.6g},{link.velocity:.5g},{link.motor_torque:.5g},{link.pwm:.5g}\n")

@@ -28,7 +28,7 @@ from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown, require_mapping
-from pendulum_msgs_py.whole_file import write_whole
+from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
     "EMULATED_BACKENDS",
@@ -227,10 +227,8 @@ def write_lab(path: str | Path, lab: LabFile) -> Path:
             document[section] = content
     if lab.proofs:
         document["proofs"] = {name: dict(proof) for name, proof in lab.proofs.items()}
-    try:
+    with writing(f"lab file {path}", ParameterError):
         write_whole(path, _HEADER + dump_yaml(document, "lab file"))
-    except OSError as error:
-        raise ParameterError(f"lab file {path} cannot be written: {error.strerror}") from error
     return path
 
 

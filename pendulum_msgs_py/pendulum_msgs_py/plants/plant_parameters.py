@@ -33,7 +33,7 @@ from pendulum_msgs_py.plants.quantities import (
     specs_of,
     write_quantities,
 )
-from pendulum_msgs_py.whole_file import write_whole
+from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
     "DRIVETRAIN_SPECS",
@@ -298,11 +298,8 @@ def save_document(path: str | Path, document: Mapping[str, Any], provenance: Map
     path = Path(path)
     whole = {**document, "provenance": dict(provenance)} if provenance else document
     text = dump_yaml(whole, f"plant file {path}")
-    try:
+    with writing(f"plant file {path}", ParameterError):
         write_whole(path, text)
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise ParameterError(f"plant file {path} cannot be written: {reason}") from error
     return path
 
 

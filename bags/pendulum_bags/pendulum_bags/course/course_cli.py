@@ -13,6 +13,7 @@ import typer
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
+from pendulum_msgs_py.whole_file import writing
 
 if TYPE_CHECKING:
     from pendulum_bags.course.checks import Judgement
@@ -64,13 +65,11 @@ def make(
             "name it with --out DIR (make course OUT=DIR)"
         )
     tasks = draw_tasks(seed)
-    try:
+    with writing(f"course folder {out}", BagError):
         out.mkdir(parents=True, exist_ok=True)
         write_tasks(out / "course.yaml", tasks)
         (out / "hidden.yaml").write_text(seal_plant(draw_plant(seed)), encoding="utf-8")
         (out / "exercises.md").write_text(exercises_text(tasks, str(out)), encoding="utf-8")
-    except OSError as error:
-        raise BagError(f"course folder {out} cannot be written: {error.strerror or error}") from error
     print(f"the exercises are in {out / 'exercises.md'}; hand out the folder, and keep the seed to yourself")
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pendulum_bags.figures.figure import ROLES, Figure, Panel, Trace, thinned
 from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.whole_file import writing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +61,7 @@ def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str
     from matplotlib.figure import Figure as Canvas
 
     written = []
-    try:
+    with writing(f"figures in {folder}", BagError):
         folder.mkdir(parents=True, exist_ok=True)
         if not formats:
             return []
@@ -72,8 +73,6 @@ def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str
                     path = folder / f"{figure.name}.{suffix}"
                     canvas.savefig(path, dpi=_RESOLUTION, metadata=_metadata(figure, suffix))
                     written.append(path)
-    except OSError as error:
-        raise BagError(f"figures cannot be written to {folder}: {error.strerror or error}") from error
     return written
 
 

@@ -16,6 +16,7 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
+from pendulum_msgs_py.whole_file import write_whole
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.mechanism_result import MechanismResult
@@ -195,8 +196,7 @@ def _thesis(
     gravity = experiment == "gravity"
     result = fit_gravity(recordings) if gravity else fit_inertia_damping(recordings, skew=skew)
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.with_suffix(".json").write_text(json.dumps(result.to_dict(), indent=2) + "\n", encoding="utf-8")
+        write_whole(out.with_suffix(".json"), json.dumps(result.to_dict(), indent=2) + "\n")
         if page:
             from pendulum_bags.identification.page import write_thesis_page
 

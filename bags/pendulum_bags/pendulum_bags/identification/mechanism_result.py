@@ -30,6 +30,7 @@ from pendulum_bags.identification.mechanism_notes import notes_of
 from pendulum_bags.identification.wording import Interval
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, write_mechanism
+from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["MechanismResult", "Score", "identify_mechanism"]
 
@@ -165,7 +166,7 @@ class MechanismResult:
             "remarks": self.sentences(),
         }
         write_mechanism(target, plant, provenance=provenance, intervals=intervals)
-        target.with_suffix(".json").write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
+        write_whole(target.with_suffix(".json"), json.dumps(self.to_dict(), indent=2) + "\n")
         return target
 
 

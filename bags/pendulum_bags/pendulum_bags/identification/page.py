@@ -18,6 +18,7 @@ from pendulum_bags.identification.problem import simulate
 from pendulum_bags.identification.thesis import ThesisResult, trial_part
 from pendulum_bags.identification.thesis_figures import TrialSet, thesis_figures
 from pendulum_bags.runs.datasets import Recording
+from pendulum_msgs_py.whole_file import write_whole
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.result import IdentificationResult
@@ -115,9 +116,7 @@ def _write(folder: Path, title: str, body: Sequence[str]) -> Path:
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     style, lines = f"<title>{escape(title)}</title><style>{_STYLE}</style>", "\n".join(body)
     path = folder / "index.html"
-    path.write_text(
-        f'<!doctype html><html lang="en">{head}{style}<h1>{escape(title)}</h1>{lines}</html>\n', encoding="utf-8"
-    )
+    write_whole(path, f'<!doctype html><html lang="en">{head}{style}<h1>{escape(title)}</h1>{lines}</html>\n')
     return path
 
 

@@ -34,6 +34,7 @@ from pendulum_bags.runs.next_test import next_test_of, question_of
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
+from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["ALARMS", "IdentificationResult", "fingerprint", "load_fit_model"]
 
@@ -301,7 +302,7 @@ class IdentificationResult:
                 f"the best fit has friction {self.fit.chosen.friction}, which a plant file cannot hold; see the JSON",
             )
         write_plant(target, plant, provenance=provenance, intervals=intervals)
-        target.with_suffix(".json").write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
+        write_whole(target.with_suffix(".json"), json.dumps(self.to_dict(), indent=2) + "\n")
         return target
 
     def _file_intervals(self, plant: PlantParameters) -> tuple[dict[str, tuple[float, float]], list[str]]:

@@ -11,6 +11,7 @@ from pendulum_bags.figures.table import Table
 from pendulum_bags.report.html import render
 from pendulum_bags.verdict import LayerResult
 from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = ["evidence_table", "write_layer_page"]
 
@@ -44,10 +45,8 @@ def write_layer_page(
         tables=[*(evidence_table(layer) for layer in layers), *tables],
         notes=notes,
     )
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise BagError(f"page {path} cannot be written: {error.strerror or error}") from error
+    with writing(f"page {path}", BagError):
+        write_whole(path, text)
     return path
 
 

@@ -17,6 +17,7 @@ from pendulum_bags.report.tables import make_tables
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import BagError, PendulumError
+from pendulum_msgs_py.whole_file import write_whole, writing
 from pendulum_rosbag.reader import read_bag
 
 if TYPE_CHECKING:
@@ -130,13 +131,8 @@ def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
     drawn = write_figures(figures, out / "figures", formats)
     text = render_page(page, {path.stem: _for_paper(path) for path in drawn if path.suffix == ".png"})
     target = out / "report.html"
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        partial = out / ".report.html.part"
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(target)
-    except OSError as error:
-        raise BagError(f"report {target} cannot be written: {error.strerror or error}") from error
+    with writing(f"report {target}", BagError):
+        write_whole(target, text)
     return target
 
 

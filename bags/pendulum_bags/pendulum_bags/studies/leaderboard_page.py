@@ -20,6 +20,7 @@ from pendulum_bags.studies.leaderboard import (
     PERTURBATIONS,
     Entry,
 )
+from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["best_sentence", "to_json", "write_page"]
 
@@ -57,7 +58,7 @@ def write_page(path: Path, entries: Sequence[Entry], duration: float) -> Path:
         sentence=best_sentence(entries),
         provenance={"revision": git_revision() or "unknown", **versions()},
     )
-    path.write_text(text, encoding="utf-8")
+    write_whole(path, text)
     return path
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
+from pendulum_msgs_py.whole_file import writing
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.joint_table import JointTable
 
@@ -185,7 +186,7 @@ def export_lerobot(
     written: list[pa.Table] = []
     total, file_index = 0, 0
     everything: dict[str, list[NDArray[Any]]] = {name: [] for name in features}
-    try:
+    with writing(f"folder {folder}", BagError):
         (folder / "meta").mkdir(parents=True)
 
         def flush() -> None:
@@ -253,8 +254,6 @@ def export_lerobot(
         for name, content in (("info.json", info), ("stats.json", statistics)):
             files.append(folder / "meta" / name)
             files[-1].write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise BagError(f"{folder} cannot be written: {error.strerror or error}") from error
     return files
 
 

@@ -15,6 +15,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.json_values import without_nan
 from pendulum_msgs_py.programs.extras import how_to_install
+from pendulum_msgs_py.whole_file import writing
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.decode import store_for
 from pendulum_rosbag.reader.topic_info import TopicInfo
@@ -97,7 +98,7 @@ def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
     if folder.exists():
         raise BagError(f"{folder} exists already; expected a new folder")
     files = []
-    try:
+    with writing(f"folder {folder}", BagError):
         folder.mkdir(parents=True)
         for topic in bag.topics:
             table = to_pandas(bag, topic)
@@ -113,8 +114,6 @@ def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
         path = folder / "metadata.json"
         path.write_text(json.dumps(bag.metadata, indent=2, sort_keys=True) + "\n", encoding="utf-8")
         files.append(path)
-    except OSError as error:
-        raise BagError(f"{folder} cannot be written: {error.strerror or error}") from error
     return files
 
 
