@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pendulum_hw_bridge import guided, module_files
+from pendulum_hw_bridge import guided, module_files, proofs
 from pendulum_hw_bridge.actuator import HardwareLimits
 from pendulum_hw_bridge.backends import hebi
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
@@ -180,7 +180,7 @@ def prove_lifetime(file: File, yes: Yes = False) -> None:
     Example: python -m pendulum_hw_bridge lab prove_lifetime lab.yaml
     """
     with _machine(file) as (module, _):
-        took = guided.prove_lifetime(
+        took = proofs.prove_lifetime(
             module.port, module.settings, _Terminal(yes=yes), module.monitor.limits, module.mapping.drivetrain
         )
     _keep(file, "command_lifetime", f"torque ended {1e3 * took:.0f} ms after the last command")
@@ -193,7 +193,7 @@ def prove_m_stop(file: File, yes: Yes = False) -> None:
     Example: python -m pendulum_hw_bridge lab prove_m_stop lab.yaml
     """
     with _machine(file) as (module, _):
-        took = guided.prove_m_stop(
+        took = proofs.prove_m_stop(
             module.port, module.settings, _Terminal(yes=yes), module.monitor.limits, module.mapping.drivetrain
         )
     _keep(file, "m_stop", f"torque ended within {1e3 * took:.0f} ms")

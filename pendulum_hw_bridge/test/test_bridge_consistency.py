@@ -24,6 +24,7 @@ from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 LIMITS: dict[str, float] = {
     "effort": (13.0,),
@@ -238,3 +239,9 @@ def test_position_control_may_ask_for_no_more_than_the_velocity_limit_nor_the_mo
     )
     assert slow == 0.5
     assert fast < 10.0
+
+
+def test_a_plant_without_a_drivetrain_has_no_mapping_of_efforts() -> None:
+    limits = PlantLimits(**LIMITS)  # type: ignore[arg-type]
+    with pytest.raises(ParameterError, match="plant 'thesis' has no drivetrain; expected one for the effort mapping"):
+        effort_mapping(validate(BRIDGE_SPECS, {}), load_plant("thesis"), DEFAULT_GAINS, limits)

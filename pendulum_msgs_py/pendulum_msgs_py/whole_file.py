@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,12 +14,16 @@ from pendulum_msgs_py.errors import PendulumError
 
 __all__ = ["write_whole", "writing"]
 
+_NOT_REPLACED = {errno.EACCES, errno.EPERM, errno.EBUSY}
+"""Errors of who may write to a file, but not replace it: its folder is somebody else's, or it is a mount."""
+
 
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file and the folders above it; until all is written, what was there before stays.
 
-    Nothing is left beside it where the disk is full or Ctrl-C comes in between. A link stays a link, and what is no
-    file, such as ``/dev/stdout``, is written to as it is.
+    Nothing is left beside it where the disk is full or Ctrl-C comes in between. Links stay links, and owner and mode of
+    a file what they are. What may not be replaced is written over: devices and pipes, a file of several names, one in a
+    folder of somebody else.
 
     Args:
         path: Where to write.
@@ -28,23 +34,55 @@ def write_whole(path: Path, content: str | bytes) -> None:
     """
     try:
         data = content.encode() if isinstance(content, str) else content
-        if path.exists() and not path.is_file():
-            path.write_bytes(data)
-            return
-        target = path.resolve()
-        if target.exists() and not os.access(target, os.W_OK):
-            # A folder that may be written to would let it be replaced.
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-    except (ValueError, RuntimeError) as error:  # no path, no text, or links in a circle
+        # No other path is resolved: somebody may not be allowed to look at the folders above their own.
+        target = path.resolve() if path.is_symlink() else path
+    except ValueError as error:
         raise OSError(errno.EINVAL, str(error), str(path)) from error
-    beside = target.with_name(f".{target.name}.{os.getpid()}")
+    except RuntimeError as error:
+        raise _circle(path) from error
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "embedded null character", str(path))
+    # Newer Pythons resolve links in a circle as far as they get.
+    if target.is_symlink():
+        raise _circle(path)
+    # Where a descriptor stands for no file that has a name, there is a status of the path alone.
+    status = path.stat() if path.exists() else None
+    if status is not None and not _may_be_replaced(path, target, status):
+        path.write_bytes(data)
+        return
+    try:
+        _replace(target, data, status)
+    except OSError as error:
+        if status is None or error.errno not in _NOT_REPLACED:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        path.write_bytes(data)
+
+
+def _may_be_replaced(path: Path, target: Path, status: os.stat_result) -> bool:
+    # A shell goes on to write to what a program has as /dev/stdout, be it a file.
+    is_descriptor = path.absolute().parts[1:2] in {("dev",), ("proc",)} and path.absolute().parts[2:3] != ("shm",)
+    # Who may not write to a file must not replace it, although the folder would let them: written over, it is refused.
+    return stat.S_ISREG(status.st_mode) and status.st_nlink == 1 and not is_descriptor and os.access(target, os.W_OK)
+
+
+def _replace(target: Path, data: bytes, status: os.stat_result | None) -> None:
+    # Nobody can have laid a link to something else there, and another thread has another name.
+    beside = target.with_name(f".{secrets.token_hex(8)}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_bytes(data)
+        with beside.open("xb") as file:
+            file.write(data)
+        if status is not None:
+            os.chown(beside, status.st_uid, status.st_gid)
+            beside.chmod(stat.S_IMODE(status.st_mode))
         beside.replace(target)
     finally:
         with suppress(OSError):
             beside.unlink(missing_ok=True)
+
+
+def _circle(path: Path) -> OSError:
+    return OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
 
 
 @contextmanager

@@ -203,3 +203,9 @@ def test_states_of_the_last_128_stamps_are_ours(watched: Watched) -> None:
     assert watched.supervisor.commander_conflict == ""
     watched.watch.suspect_second_plant(JointCommand.of_one(0, 1.0, "controller"))
     assert "2 plants" in watched.supervisor.commander_conflict
+
+
+def test_states_that_were_published_period_by_period_are_remembered_as_if_one_by_one(watched: Watched) -> None:
+    watched.watch.note_state(600)
+    watched.watch.note_states(1000, 100, 4)
+    assert list(watched.watch.own_stamps) == [1000, 900, 800, 700, 600]

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import resource
+import shlex
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -19,24 +25,50 @@ def test_a_file_is_written_with_the_folders_above_it(tmp_path: Path, content: st
     assert list(path.parent.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("cause", [KeyboardInterrupt(), OSError(28, "No space left on device")], ids=["Ctrl-C", "full"])
-@pytest.mark.parametrize("moment", ["write_bytes", "replace"])
+@pytest.mark.parametrize("moment", ["chmod", "replace"])
 def test_what_ends_the_writing_leaves_the_old_file_and_nothing_beside_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cause: BaseException, moment: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text("old", encoding="utf-8")
-    real = getattr(Path, moment)
 
     def end(self: Path, *told: object) -> None:
-        if moment == "write_bytes":
-            real(self, b"ha")  # half of it
-        raise cause
+        raise KeyboardInterrupt
 
     monkeypatch.setattr(Path, moment, end)
-    with pytest.raises(type(cause)):
+    with pytest.raises(KeyboardInterrupt):
         write_whole(path, "half and half")
     assert path.read_text(encoding="utf-8") == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("before", ["old", None])
+def test_what_does_not_fit_leaves_the_old_file_and_nothing_beside_it(tmp_path: Path, before: str | None) -> None:
+    path = tmp_path / "plant.yaml"
+    if before is not None:
+        path.write_text(before, encoding="utf-8")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OSError, match=r"File too large: '.*plant.yaml'"):
+            write_whole(path, 2000 * "x")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == ([] if before is None else [path])
+    assert before is None or path.read_text(encoding="utf-8") == before
+
+
+def test_threads_that_write_one_file_leave_it_whole_and_nothing_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    texts = [letter * 10_000 for letter in "abcd"]
+
+    def write_often(text: str) -> None:
+        for _ in range(30):
+            write_whole(path, text)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write_often, texts))
+    assert path.read_text(encoding="utf-8") in texts
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -50,7 +82,7 @@ def test_a_path_that_is_none_is_refused_and_hides_no_reason(tmp_path: Path) -> N
         write_whole(tmp_path / "file" / "below", "")
     circle = tmp_path / "circle"
     circle.symlink_to(circle)
-    with pytest.raises(OSError, match="circle"):
+    with pytest.raises(OSError, match=r"Too many levels of symbolic links: '.*circle'"):
         write_whole(circle, "")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["circle", "file"]
 
@@ -87,14 +119,94 @@ def test_what_is_no_file_is_written_to_and_never_replaced(tmp_path: Path) -> Non
         write_whole(tmp_path, "")
 
 
-def test_a_file_that_is_protected_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_keeps_mode_and_owner_and_a_new_one_has_the_usual_ones(tmp_path: Path) -> None:
+    path, plain = tmp_path / "plant.yaml", tmp_path / "plain.yaml"
+    path.write_text("old", encoding="utf-8")
+    path.chmod(0o640)
+    if os.geteuid() == 0:
+        os.chown(path, 65534, 65533)
+    before = path.stat()
+    write_whole(path, "new")
+    after = path.stat()
+    assert (after.st_mode, after.st_uid, after.st_gid) == (before.st_mode, before.st_uid, before.st_gid)
+    assert after.st_ino != before.st_ino
+    plain.write_text("", encoding="utf-8")
+    write_whole(tmp_path / "new.yaml", "")
+    assert (tmp_path / "new.yaml").stat().st_mode == plain.stat().st_mode
+
+
+def test_a_file_of_two_names_keeps_both(tmp_path: Path) -> None:
+    one, other = tmp_path / "one.yaml", tmp_path / "other.yaml"
+    one.write_text("old", encoding="utf-8")
+    os.link(one, other)
+    write_whole(one, "new")
+    assert other.read_text(encoding="utf-8") == "new"
+
+
+def test_a_name_as_long_as_there_may_be_is_written(tmp_path: Path) -> None:
+    path = tmp_path / ("x" * 255)
+    write_whole(path, "new")
+    assert path.read_text(encoding="utf-8") == "new"
+
+
+def test_what_a_shell_redirected_to_a_file_goes_on_there(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    code = "import sys; from pathlib import Path; from pendulum_msgs_py.whole_file import write_whole as w; "
+    code += "w(Path(sys.argv[1]), 'from us\\n')"
+    for device in ("/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"):
+        command = f"({shlex.join([sys.executable, '-c', code, device])}; echo tail) >> {log}"
+        subprocess.run(["sh", "-c", command], check=True)
+    assert log.read_text(encoding="utf-8").endswith("from us\ntail\n")
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM, errno.EBUSY, errno.ENOSPC])
+def test_what_may_be_written_to_but_not_replaced_is_written_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
     path = tmp_path / "plant.yaml"
-    path.write_text("mine", encoding="utf-8")
-    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)  # root may write to all
-    with pytest.raises(PermissionError, match="Permission denied"):
-        write_whole(path, "yours")
-    assert path.read_text(encoding="utf-8") == "mine"
-    write_whole(tmp_path / "other.yaml", "new")
+
+    def refuse(self: Path, target: Path) -> None:
+        raise OSError(number, "no", str(self))
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    with pytest.raises(OSError, match=r"no: '.*/plant.yaml'"):
+        write_whole(path, "new")
+    assert not list(tmp_path.iterdir())
+    path.write_text("an old text", encoding="utf-8")
+    if number == errno.ENOSPC:
+        with pytest.raises(OSError, match=r"no: '.*/plant.yaml'"):
+            write_whole(path, "new")
+    else:
+        write_whole(path, "new")
+    assert path.read_text(encoding="utf-8") == ("an old text" if number == errno.ENOSPC else "new")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_who_may_not_write_to_a_file_does_not_replace_it_either(tmp_path: Path) -> None:
+    theirs, open_to_all = tmp_path / "theirs.yaml", tmp_path / "open.yaml"
+    for path in (theirs, open_to_all):
+        path.write_text("mine", encoding="utf-8")
+    theirs.chmod(0o444)
+    open_to_all.chmod(0o666)
+    program = (
+        "import os, sys; from pathlib import Path; from pendulum_msgs_py.whole_file import write_whole\n"
+        "os.chdir(sys.argv[1])\n"
+        "if os.geteuid() == 0: os.setgroups([]); os.setgid(65534); os.setuid(65534)\n"
+        "for name in ('theirs.yaml', 'open.yaml'):\n"
+        "    try: write_whole(Path(name), 'yours')\n"
+        "    except PermissionError as error: print(error.filename)\n"
+    )
+
+    def run() -> str:
+        command = [sys.executable, "-c", program, str(tmp_path)]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+    for mode in (0o777, 0o555):
+        tmp_path.chmod(mode)
+        assert run() == "theirs.yaml\n"
+        assert theirs.read_text(encoding="utf-8") == "mine"
+        assert open_to_all.read_text(encoding="utf-8") == "yours"
+    tmp_path.chmod(0o755)
 
 
 def test_what_cannot_be_written_is_told_in_a_sentence_with_the_thing_and_the_reason(tmp_path: Path) -> None:

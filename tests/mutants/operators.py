@@ -112,7 +112,8 @@ def _changes(tree: ast.Module) -> Iterator[Callable[[], tuple[int, str]]]:
     assert isinstance(top, (ast.FunctionDef, ast.AsyncFunctionDef))
     docstring = top.body[0] if ast.get_docstring(top) is not None else None
     for statement in top.body:
-        if statement is docstring:
+        is_words = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+        if statement is docstring or is_words:
             continue
         for node in _walk(statement):
             yield from _of_expression(node)
@@ -171,7 +172,8 @@ def _of_list(
 ) -> Iterator[Callable[[], tuple[int, str]]]:
     """Leave statements out of a block: an early return, a raise, a reset, a call."""
     for index, statement in enumerate(statements):
-        if statement is docstring:
+        is_words = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+        if statement is docstring or is_words:
             continue
         what = {
             ast.Return: "return",

@@ -139,20 +139,23 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target(
         "pendulum_hw_bridge.guided",
+        ("find_zero_and_sign", "measure_tare", "_turned", "_rest", "_listen", "expect_numbers"),
+        (f"{_BRIDGE}/test_guided_rules.py", f"{_BRIDGE}/test_guided_procedures.py"),
+    ),
+    Target(
+        "pendulum_hw_bridge.proofs",
         (
-            "find_zero_and_sign",
-            "measure_tare",
             "prove_lifetime",
             "prove_m_stop",
-            "_drive",
+            "_GentleDrive",
+            "_while_pressed",
+            "_has_duty",
+            "_expect_driven_until",
+            "_end_of_duty",
+            "_expect_allowed",
             "_expect_inside",
-            "_duty_ends",
-            "_turned",
-            "_rest",
-            "_listen",
-            "_expect_numbers",
         ),
-        (f"{_BRIDGE}/test_guided_rules.py", f"{_BRIDGE}/test_guided_procedures.py"),
+        (f"{_BRIDGE}/test_proofs.py", f"{_BRIDGE}/test_guided_procedures.py"),
     ),
     Target(
         "pendulum_hw_bridge.nudge", ("watch_nudge", "hand_of", "Person", "EmulatedHand"), (f"{_BRIDGE}/test_nudge.py",)
