@@ -122,7 +122,7 @@ def prove_m_stop(
         )
     dialogue.go_on(
         f"Proof of the motion stop. THE MOTOR WILL TURN GENTLY: duty {PROOF_DUTY:g} (about 0.4 N m) for at most "
-        f"{_PRESS_SECONDS:g} s, until you press the motion stop. Nobody in the pendulum's plane."
+        f"{_PRESS_SECONDS:g} s, until you press the motion stop; keep it pressed then. Nobody in the pendulum's plane."
     )
     with _stopped_after(port):
         dialogue.say("Press the motion stop NOW.")

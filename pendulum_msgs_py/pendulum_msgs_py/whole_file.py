@@ -14,16 +14,16 @@ from pendulum_msgs_py.errors import PendulumError
 
 __all__ = ["write_whole", "writing"]
 
-_NOT_REPLACED = {errno.EACCES, errno.EPERM, errno.EBUSY}
-"""Errors of who may write to a file, but not replace it: its folder is somebody else's, or it is a mount."""
+_NOT_REPLACED = {errno.EACCES, errno.EPERM, errno.EBUSY, errno.EROFS, errno.EINVAL}
+"""Errors of who may write to a file, but not replace it: its folder or its owner is beyond them, or it is a mount."""
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file and the folders above it; until all is written, what was there before stays.
 
     Nothing is left beside it where the disk is full or Ctrl-C comes in between. Links stay links, and owner and mode of
-    a file what they are. What may not be replaced is written over: devices and pipes, a file of several names, one in a
-    folder of somebody else.
+    a file what they are. What may not be replaced is written over: devices and pipes, a file of several names or with
+    attributes of its own, one in a folder of somebody else, our own standard output.
 
     Args:
         path: Where to write.
@@ -34,20 +34,19 @@ def write_whole(path: Path, content: str | bytes) -> None:
     """
     try:
         data = content.encode() if isinstance(content, str) else content
+        if b"\0" in os.fsencode(path):
+            raise ValueError("embedded null character")
         # No other path is resolved: somebody may not be allowed to look at the folders above their own.
         target = path.resolve() if path.is_symlink() else path
     except ValueError as error:
         raise OSError(errno.EINVAL, str(error), str(path)) from error
     except RuntimeError as error:
         raise _circle(path) from error
-    if "\0" in str(path):
-        raise OSError(errno.EINVAL, "embedded null character", str(path))
     # Newer Pythons resolve links in a circle as far as they get.
     if target.is_symlink():
         raise _circle(path)
-    # Where a descriptor stands for no file that has a name, there is a status of the path alone.
     status = path.stat() if path.exists() else None
-    if status is not None and not _may_be_replaced(path, target, status):
+    if status is not None and not _may_be_replaced(target, status):
         path.write_bytes(data)
         return
     try:
@@ -58,11 +57,21 @@ def write_whole(path: Path, content: str | bytes) -> None:
         path.write_bytes(data)
 
 
-def _may_be_replaced(path: Path, target: Path, status: os.stat_result) -> bool:
-    # A shell goes on to write to what a program has as /dev/stdout, be it a file.
-    is_descriptor = path.absolute().parts[1:2] in {("dev",), ("proc",)} and path.absolute().parts[2:3] != ("shm",)
+def _may_be_replaced(target: Path, status: os.stat_result) -> bool:
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:
+        return False
+    for descriptor in range(3):
+        # A shell goes on to write to what a program has as its standard output.
+        with suppress(OSError):
+            if os.path.samestat(status, os.fstat(descriptor)):
+                return False
     # Who may not write to a file must not replace it, although the folder would let them: written over, it is refused.
-    return stat.S_ISREG(status.st_mode) and status.st_nlink == 1 and not is_descriptor and os.access(target, os.W_OK)
+    if not os.access(target, os.W_OK):
+        return False
+    attributes: list[str] = []
+    with suppress(OSError):  # not every file system has any
+        attributes = os.listxattr(target)
+    return not any(name.startswith(("user.", "system.posix_acl")) for name in attributes)
 
 
 def _replace(target: Path, data: bytes, status: os.stat_result | None) -> None:
@@ -70,7 +79,9 @@ def _replace(target: Path, data: bytes, status: os.stat_result | None) -> None:
     beside = target.with_name(f".{secrets.token_hex(8)}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with beside.open("xb") as file:
+        # What a file keeps from others is in no other file either, be it for a moment.
+        mode = 0o666 if status is None else 0o600
+        with open(beside, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.write(data)
         if status is not None:
             os.chown(beside, status.st_uid, status.st_gid)

@@ -77,6 +77,8 @@ def test_a_path_that_is_none_is_refused_and_hides_no_reason(tmp_path: Path) -> N
         write_whole(tmp_path / "a\0b", "")
     with pytest.raises(OSError, match="surrogates"):
         write_whole(tmp_path / "text", "\udc80")
+    with pytest.raises(OSError, match="surrogates"):
+        write_whole(tmp_path / "\ud800", "")
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(OSError, match="file"):
         write_whole(tmp_path / "file" / "below", "")
@@ -135,6 +137,36 @@ def test_a_file_keeps_mode_and_owner_and_a_new_one_has_the_usual_ones(tmp_path: 
     assert (tmp_path / "new.yaml").stat().st_mode == plain.stat().st_mode
 
 
+def test_what_a_file_keeps_from_others_is_in_no_other_file_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text("old", encoding="utf-8")
+    path.chmod(0o600)
+    modes: list[int] = []
+    chown = os.chown
+
+    def look(beside: Path, *owner: int) -> None:
+        modes.append(beside.stat().st_mode & 0o777)
+        chown(beside, *owner)
+
+    monkeypatch.setattr(os, "chown", look)
+    write_whole(path, "new")
+    assert modes == [0o600]
+
+
+def test_a_file_with_attributes_of_its_own_keeps_them(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text("old", encoding="utf-8")
+    try:
+        os.setxattr(path, "user.made_by", b"me")
+    except OSError:
+        pytest.skip("this file system has no attributes")
+    write_whole(path, "new")
+    assert path.read_text(encoding="utf-8") == "new"
+    assert os.getxattr(path, "user.made_by") == b"me"
+
+
 def test_a_file_of_two_names_keeps_both(tmp_path: Path) -> None:
     one, other = tmp_path / "one.yaml", tmp_path / "other.yaml"
     one.write_text("old", encoding="utf-8")
@@ -153,13 +185,14 @@ def test_what_a_shell_redirected_to_a_file_goes_on_there(tmp_path: Path) -> None
     log = tmp_path / "log"
     code = "import sys; from pathlib import Path; from pendulum_msgs_py.whole_file import write_whole as w; "
     code += "w(Path(sys.argv[1]), 'from us\\n')"
-    for device in ("/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"):
+    (tmp_path / "link").symlink_to("/dev/stdout")
+    for device in ("/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", str(log), str(tmp_path / "link")):
         command = f"({shlex.join([sys.executable, '-c', code, device])}; echo tail) >> {log}"
         subprocess.run(["sh", "-c", command], check=True)
-    assert log.read_text(encoding="utf-8").endswith("from us\ntail\n")
+        assert log.read_text(encoding="utf-8").endswith("from us\ntail\n")
 
 
-@pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM, errno.EBUSY, errno.ENOSPC])
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM, errno.EBUSY, errno.EROFS, errno.EINVAL, errno.ENOSPC])
 def test_what_may_be_written_to_but_not_replaced_is_written_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
