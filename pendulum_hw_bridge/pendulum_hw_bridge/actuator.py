@@ -7,7 +7,8 @@ A backend (HEBI module, emulated X5-9, emulator in another process, replay of a 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -34,6 +35,7 @@ __all__ = [
     "MStopAction",
     "Strategy",
     "TemperatureState",
+    "afterwards",
     "state_name",
 ]
 
@@ -55,6 +57,31 @@ class ActuatorError(FaultError):
     def __init__(self, fault: str, message: str) -> None:
         super().__init__(message)
         self.fault = fault
+
+
+@contextmanager
+def afterwards(action: Callable[[], object]) -> Iterator[None]:
+    """Stop or let go of a motor, whatever ends what is within; an error of that hides none that was before.
+
+    Args:
+        action: Such as a port's ``stop``.
+
+    Raises:
+        ActuatorError: That of what is within, with what became of the action; or the action's own.
+    """
+    try:
+        yield
+    except ActuatorError as error:
+        try:
+            action()
+        # Whatever else went wrong: what was wrong with the machine comes first.
+        except Exception as failed:  # noqa: BLE001
+            raise ActuatorError(error.fault, f"{error}; and then: {failed}") from error
+        raise
+    except BaseException:
+        action()
+        raise
+    action()
 
 
 class Strategy(IntEnum):

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from pendulum_hw_bridge import guided, module_files, proofs
-from pendulum_hw_bridge.actuator import HardwareLimits
+from pendulum_hw_bridge.actuator import ActuatorError, HardwareLimits, afterwards
 from pendulum_hw_bridge.backends import hebi
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.bridge_parameters import plant_of
@@ -179,7 +179,7 @@ def prove_lifetime(file: File, yes: Yes = False) -> None:
 
     Example: python -m pendulum_hw_bridge lab prove_lifetime lab.yaml
     """
-    with _machine(file) as (module, _):
+    with _machine(file) as (module, _), _proves(file, "command_lifetime"):
         took = proofs.prove_lifetime(
             module.port, module.settings, _Terminal(yes=yes), module.monitor.limits, module.mapping.drivetrain
         )
@@ -192,7 +192,7 @@ def prove_m_stop(file: File, yes: Yes = False) -> None:
 
     Example: python -m pendulum_hw_bridge lab prove_m_stop lab.yaml
     """
-    with _machine(file) as (module, _):
+    with _machine(file) as (module, _), _proves(file, "m_stop"):
         took = proofs.prove_m_stop(
             module.port, module.settings, _Terminal(yes=yes), module.monitor.limits, module.mapping.drivetrain
         )
@@ -284,11 +284,22 @@ def _as_the_bridge(file: Path) -> tuple[DrivenModule, PlantParameters]:
 def _machine(file: Path) -> Iterator[tuple[DrivenModule, PlantParameters]]:
     """Connect the machine of a lab file; on every way out its motor is off."""
     module, plant = _as_the_bridge(file)
-    try:
+    with afterwards(module.port.close):
         module.port.connect()
         yield module, plant
-    finally:
-        module.port.close()
+
+
+@contextlib.contextmanager
+def _proves(file: Path, procedure: str) -> Iterator[None]:
+    """Strike an older proof off the lab file where a machine does not stand a new one."""
+    try:
+        yield
+    except ActuatorError:
+        lab = load_lab(file)
+        if procedure in lab.proofs:
+            write_lab(file, lab.no_longer_proved(procedure))
+            print(f"{file}: {procedure}: no longer proved", file=sys.stderr)
+        raise
 
 
 def _group(lab: LabFile) -> Any:

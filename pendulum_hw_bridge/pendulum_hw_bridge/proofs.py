@@ -5,11 +5,19 @@ Pure: the actuator is a port, the person a dialogue, time the port's clock.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
-from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, Command, Feedback, MStopAction, Strategy
+from pendulum_hw_bridge.actuator import (
+    ActuatorError,
+    ActuatorPort,
+    Command,
+    Feedback,
+    MStopAction,
+    Strategy,
+    afterwards,
+)
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.guided import Dialogue, expect_numbers
@@ -35,6 +43,10 @@ _SILENT_PERIODS = 10
 """Feedback periods without feedback after which a proof is broken off [-]."""
 _MARGIN_PERIODS = 2
 """Feedback periods by which the end of the duty may be seen late [-]."""
+_LEAST_MARGIN = 0.02
+"""Time by which it may be seen late in any case: computer and network take some, at whatever rate [s]."""
+_LIFETIME_MEANWHILE = 0.25
+"""Command lifetime while a motion stop is proved [s]: commands that get lost must not be what ends the duty."""
 
 
 def prove_lifetime(
@@ -62,8 +74,9 @@ def prove_lifetime(
         f"torque within {1e3 * settings.command_lifetime:g} ms. A hand on the motion stop, nobody in the pendulum's "
         "plane."
     )
-    limit = settings.command_lifetime + _MARGIN_PERIODS / settings.feedback_rate
-    with _stopped_after(port):
+    margin = max(_MARGIN_PERIODS / settings.feedback_rate, _LEAST_MARGIN)
+    limit = settings.command_lifetime + margin
+    with afterwards(port.stop):
         drive = _GentleDrive(port, settings, checks, drivetrain)
         record = drive.read()
         while record.stamp_ns - drive.begin_ns < _PROOF_SECONDS * NANOSECONDS:
@@ -73,6 +86,7 @@ def prove_lifetime(
             raise ActuatorError(
                 "command_not_in_force", f"motor did not have the duty {PROOF_DUTY:g} when it was to end"
             )
+        drive.expects_nothing()
         ended = _end_of_duty(iter(drive.read, None), drive.sent_ns, limit)
         if ended > limit:
             raise ActuatorError(
@@ -82,7 +96,7 @@ def prove_lifetime(
             )
     dialogue.say(
         f"Proved: the torque ended {1e3 * ended:.0f} ms after the last command (at most {1e3 * limit:.0f} ms: "
-        f"the lifetime, and {_MARGIN_PERIODS:g} records until it shows)."
+        f"the lifetime, and {1e3 * margin:.0f} ms until it shows)."
     )
     return ended
 
@@ -96,7 +110,8 @@ def prove_m_stop(
 ) -> float:
     """Drive gently until somebody presses the motion stop, and return for how long the motor kept its duty [s].
 
-    The duty is commanded on meanwhile, or the command lifetime would end it whether the motion stop does or not.
+    The duty is commanded on meanwhile, with a longer command lifetime, or that would end it whether the motion stop
+    does or not.
 
     Args:
         port: Connected, strategy off.
@@ -124,7 +139,8 @@ def prove_m_stop(
         f"Proof of the motion stop. THE MOTOR WILL TURN GENTLY: duty {PROOF_DUTY:g} (about 0.4 N m) for at most "
         f"{_PRESS_SECONDS:g} s, until you press the motion stop; keep it pressed then. Nobody in the pendulum's plane."
     )
-    with _stopped_after(port):
+    settings = replace(settings, command_lifetime=max(settings.command_lifetime, _LIFETIME_MEANWHILE))
+    with afterwards(port.stop):
         dialogue.say("Press the motion stop NOW.")
         drive = _GentleDrive(port, settings, checks, drivetrain)
         driven_ns = heard_ns = drive.begin_ns
@@ -182,9 +198,11 @@ class _GentleDrive:
         period = 1.0 / self._settings.feedback_rate
         for _ in range(_SILENT_PERIODS + 1):
             record = self._port.read(period)
-            # One that is older than the one before it says nothing of what is.
-            if record is not None and record.stamp_ns >= self._newest_ns:
+            # One that is older than the one before it, or the same again, says nothing of what is.
+            if record is not None and record.stamp_ns >= self._newest_ns and self._monitor.is_new(record):
                 self._newest_ns = record.stamp_ns
+                if may_be_pressed and record.m_stop:
+                    self.expects_nothing()
                 self._judge(record._replace(m_stop=False) if may_be_pressed else record)
                 return record
         raise ActuatorError(
@@ -207,24 +225,21 @@ class _GentleDrive:
         """Command the duty, where the newest record's voltage lets it."""
         effort = self._mapping.motor_effort(PROOF_DUTY, 0.0, record.voltage)
         _expect_allowed(effort, record.voltage, self._settings)
-        self.sent_ns = self._port.write(Command(pwm=PROOF_DUTY)).sent_ns
+        command = Command(pwm=PROOF_DUTY)
+        sent_ns = self._port.write(command).sent_ns
+        pause, self.sent_ns = (sent_ns - self.sent_ns) / NANOSECONDS, sent_ns
+        self._monitor.told(command, Strategy.DIRECT_PWM, sent_ns)
+        if pause >= self._settings.command_lifetime:
+            raise ActuatorError(
+                "host_stalled",
+                f"{1e3 * pause:.0f} ms passed between two commands; expected less than the command lifetime, "
+                f"{1e3 * self._settings.command_lifetime:.0f} ms. Nothing is proved. Try again while this computer has "
+                "nothing else to do",
+            )
 
-
-@contextlib.contextmanager
-def _stopped_after(port: ActuatorPort) -> Iterator[None]:
-    """Stop the motor, whatever ends a proof; what it ended with is not hidden by a stop that fails."""
-    try:
-        yield
-    except ActuatorError as error:
-        try:
-            port.stop()
-        except ActuatorError as failed:
-            raise ActuatorError(error.fault, f"{error}; nor could it be stopped: {failed}") from error
-        raise
-    except BaseException:
-        port.stop()
-        raise
-    port.stop()
+    def expects_nothing(self) -> None:
+        """Let the motor lose the duty that it was commanded."""
+        self._monitor.stopped()
 
 
 def _while_pressed(drive: _GentleDrive, record: Feedback, settings: BridgeSettings) -> Iterator[Feedback]:

@@ -15,7 +15,7 @@ from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.nudge import EmulatedHand, Person, watch_nudge
 from pendulum_hw_bridge.settings import BridgeSettings
-from pendulum_msgs_py.plants.lab_file import load_lab
+from pendulum_msgs_py.plants.lab_file import LabFile, load_lab, write_lab
 
 
 class Rig:
@@ -376,6 +376,37 @@ def test_a_step_that_fails_or_is_left_keeps_the_lab_file_as_it_was(
     assert "a person is needed" in capsys.readouterr().err
     assert lab.read_text() == before
     assert not rig.driven_before_agreed
+
+
+def test_a_machine_that_does_not_stand_a_proof_loses_an_older_one_and_a_person_that_leaves_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab = tmp_path / "lab.yaml"
+    write_lab(
+        lab, LabFile({"backend": "emulator"}).proved("command_lifetime", "today", "ok").proved("m_stop", "1", "2")
+    )
+    rig = Rig()
+    monkeypatch.setattr("pendulum_hw_bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
+
+    def left(*_: object, **__: object) -> float:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(proofs, "prove_lifetime", left)
+        assert lab_cli.main(["prove_lifetime", str(lab), "--yes"]) == 130
+        assert set(load_lab(lab).proofs) == {"command_lifetime", "m_stop"}
+    monkeypatch.setattr(rig.port, "set_command_lifetime", lambda lifetime: lifetime)
+    rig.actuator.configure(command_lifetime=5.0)
+
+    def fail() -> None:
+        raise ActuatorError("stop_unacknowledged", "nobody has acknowledged it")
+
+    monkeypatch.setattr(rig.port, "close", fail)
+    assert lab_cli.main(["prove_lifetime", str(lab), "--yes"]) == 2
+    assert set(load_lab(lab).proofs) == {"m_stop"}
+    told = capsys.readouterr().err
+    assert "command_lifetime: no longer proved" in told
+    assert "Do not arm this machine; and then: nobody has acknowledged it" in told
 
 
 @pytest.mark.parametrize("way", ["done", "failed", "left", "not connected"])

@@ -5,12 +5,22 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from pendulum_hw_bridge import proofs
-from pendulum_hw_bridge.actuator import ActuatorError, Command, Feedback, HardwareLimits, MStopAction, Strategy
+from pendulum_hw_bridge.actuator import (
+    ActuatorError,
+    Command,
+    Feedback,
+    HardwareLimits,
+    MStopAction,
+    Strategy,
+    afterwards,
+)
 from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
@@ -107,7 +117,9 @@ def test_a_proof_sends_its_gentle_duty_and_sets_what_the_bridge_sets(
     assert max(later - sent for sent, later in itertools.pairwise(bench.sent)) < 0.008
     assert took == pytest.approx(lifetime, abs=0.012) if proof is proofs.prove_lifetime else 0.0 < took <= 0.015
     status = bench.port.connect()
-    assert (status.feedback_rate, status.command_lifetime) == (200.0, lifetime)
+    # While a motion stop is proved, commands live for longer, or those that get lost could end the duty.
+    expected = lifetime if proof is proofs.prove_lifetime else 0.25
+    assert (status.feedback_rate, status.command_lifetime) == (200.0, expected)
     assert status.limits == settings.limits
     assert bench.port.strategy is Strategy.OFF
 
@@ -192,6 +204,37 @@ def test_a_proof_stays_within_window_velocity_and_one_radian(given: dict[str, fl
     proofs._expect_inside(feedback_record(position=3.0), settings, 2.0)
 
 
+@BOTH
+def test_the_torque_of_the_duty_is_that_of_the_drivetrain_that_is_there(proof: Any) -> None:
+    drivetrain = PARAMETERS.plant.drivetrain
+    assert drivetrain is not None
+    strong = replace(drivetrain, gear_ratio=10.0 * drivetrain.gear_ratio)
+    settings = BridgeSettings(limits=HardwareLimits(effort=1.0))
+    with pytest.raises(ActuatorError, match="expected at most the effort limit, 1 N m"):
+        proof(emulator(), settings, Person(), None, strong)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ZeroDivisionError("first"), ActuatorError("m_stop", "first")])
+def test_a_motor_is_stopped_whatever_ends_what_it_does(error: BaseException) -> None:
+    done: list[str] = []
+    with pytest.raises(type(error)) as told, afterwards(lambda: done.append("stopped")):
+        raise error
+    assert told.value is error
+    assert done == ["stopped"]
+    with afterwards(lambda: done.append("again")):
+        assert done == ["stopped"]
+    assert done == ["stopped", "again"]
+
+    def fail() -> None:
+        raise RuntimeError("no stop")
+
+    if isinstance(error, ActuatorError):
+        with pytest.raises(ActuatorError, match=r"^first; and then: no stop$"), afterwards(fail):
+            raise error
+    with pytest.raises(RuntimeError, match="no stop"), afterwards(fail):
+        pass
+
+
 @pytest.mark.parametrize("at", [0.1, 0.33])
 @pytest.mark.parametrize(
     ("change", "message"),
@@ -249,6 +292,9 @@ class GivenDrive:
     def command(self, record: Feedback) -> None:
         self.commands += 1
 
+    def expects_nothing(self) -> None:
+        pass
+
 
 def test_the_motor_is_driven_for_the_times_that_a_person_is_told_and_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(proofs, "_end_of_duty", lambda *_: 0.05)
@@ -291,7 +337,7 @@ def test_a_stop_that_fails_does_not_hide_what_was_wrong(monkeypatch: pytest.Monk
     bench = Bench(monkeypatch, press_at=0.3 if proof is proofs.prove_m_stop else math.inf)
     bench.change = lambda record, now: record._replace(pwm_command=0.01)  # type: ignore[method-assign]
     monkeypatch.setattr(bench.port, "stop", fail)
-    with pytest.raises(ActuatorError, match=r"Do not arm this machine; nor could it be stopped: nobody has") as told:
+    with pytest.raises(ActuatorError, match=r"Do not arm this machine; and then: nobody has") as told:
         proof(bench.port, BridgeSettings(), bench.person)
     assert told.value.fault != "stop_unacknowledged"
     # A proof that held is none if the motor could not be stopped behind it.
@@ -363,7 +409,8 @@ def test_a_module_that_goes_while_the_duty_should_end_has_neither_kept_nor_lost_
 @pytest.mark.parametrize("rate", [20.0, 100.0, 1000.0])
 def test_a_lifetime_is_proved_up_to_two_records_later(monkeypatch: pytest.MonkeyPatch, rate: float) -> None:
     bench = Bench(monkeypatch)
-    limit = 0.05 + 2.0 / rate
+    lifetime = max(0.05, 2.2 / rate)
+    limit = lifetime + max(2.0 / rate, 0.02)
     asked: list[tuple[int, float]] = []
 
     def end(records: Any, since_ns: int, within: float) -> float:
@@ -372,7 +419,7 @@ def test_a_lifetime_is_proved_up_to_two_records_later(monkeypatch: pytest.Monkey
         return limit
 
     monkeypatch.setattr(proofs, "_end_of_duty", end)
-    settings = BridgeSettings(feedback_rate=rate, command_lifetime=0.05)
+    settings = BridgeSettings(feedback_rate=rate, command_lifetime=lifetime)
     assert proofs.prove_lifetime(bench.port, settings, bench.person) == limit
     assert [(bench.time_of(since_ns), within) for since_ns, within in asked] == [(bench.sent[-1], limit)]
     expected = f"Proved: the torque ended {1e3 * limit:.0f} ms after the last command (at most {1e3 * limit:.0f} ms"
@@ -389,8 +436,9 @@ def test_a_module_that_keeps_its_duty_for_longer_is_condemned_as_soon_as_it_show
 ) -> None:
     bench = Bench(monkeypatch)
     keeps_its_lifetime(monkeypatch, bench, 5.0)
-    bench.refused(proofs.prove_lifetime, BridgeSettings(feedback_rate=rate), "kept its duty for .* Do not arm")
-    assert bench.now() < bench.sent[-1] + 0.05 + 4.0 / rate
+    settings = BridgeSettings(feedback_rate=rate, command_lifetime=max(0.05, 2.2 / rate))
+    bench.refused(proofs.prove_lifetime, settings, "kept its duty for .* Do not arm")
+    assert bench.now() < bench.sent[-1] + settings.command_lifetime + max(2.0 / rate, 0.02) + 2.0 / rate
 
 
 @pytest.mark.parametrize("pressed", [0.25, 0.28, 0.29, 0.3, 0.31, 0.33, 0.35, 0.36])
@@ -401,12 +449,16 @@ def test_a_motion_stop_that_is_pressed_proves_no_lifetime(monkeypatch: pytest.Mo
     assert pressed > 0.34 or fault == "m_stop"
 
 
-def test_a_duty_that_was_gone_before_the_silence_proves_no_lifetime(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("gone", "words"), [(0.2, "acts on PWM 0"), (0.3, r"did not have the duty 0\.01 when it was to")]
+)
+def test_a_duty_that_was_gone_before_the_silence_proves_no_lifetime(
+    monkeypatch: pytest.MonkeyPatch, gone: float, words: str
+) -> None:
     bench = Bench(monkeypatch)
     keeps_its_lifetime(monkeypatch, bench, 5.0)
-    bench.change = lambda record, now: record._replace(pwm_command=0.01 * (now < 0.2))  # type: ignore[method-assign]
-    fault = bench.refused(proofs.prove_lifetime, BridgeSettings(), r"did not have the duty 0\.01 when it was to end")
-    assert fault == "command_not_in_force"
+    bench.change = lambda record, now: record._replace(pwm_command=0.01 * (now < gone))  # type: ignore[method-assign]
+    assert bench.refused(proofs.prove_lifetime, BridgeSettings(), words) == "command_not_in_force"
 
 
 # --- the motion stop --------------------------------------------------------------------------------------------
@@ -508,7 +560,9 @@ def test_a_duty_that_was_gone_before_the_press_proves_no_motion_stop(
     bench.change = lambda record, now: record._replace(  # type: ignore[method-assign]
         pwm_command=0.01 * (0.005 < now < gone), m_stop=now > 0.5
     )
-    fault = bench.refused(proofs.prove_m_stop, BridgeSettings(), r"duty 0\.01 when the motion stop was pressed; is the")
+    fault = bench.refused(
+        proofs.prove_m_stop, BridgeSettings(), r"when the motion stop was pressed; is the|acts on PWM 0"
+    )
     assert fault == "command_not_in_force"
 
 
@@ -553,19 +607,86 @@ def test_a_motion_stop_that_is_released_too_early_proves_nothing_and_gives_no_to
     assert bench.sent[-1] < 0.53
 
 
-def test_feedback_that_pauses_for_a_command_lifetime_proves_no_motion_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    for lost, proved in ((1, True), (3, False)):
-        bench = Bench(monkeypatch, press_at=0.5)
-        bench.change = lambda record, now, lost=lost: (  # type: ignore[method-assign, misc]
-            None if 0.525 <= now < 0.525 + 0.01 * lost else record
-        )
-        settings = BridgeSettings(command_lifetime=0.03)
-        if proved:
-            proofs.prove_m_stop(bench.port, settings, bench.person)
-        else:
-            bench.refused(
-                proofs.prove_m_stop, settings, r"no feedback for (39|4\d) ms while .* command lifetime, 30 ms"
-            )
+@pytest.mark.parametrize("stall", [0.02, 0.05, 0.1, 0.24, 0.26, 0.4])
+@pytest.mark.parametrize("at", [0.48, 0.5, 0.52])
+def test_a_computer_that_stalls_proves_no_motion_stop_that_does_nothing(
+    monkeypatch: pytest.MonkeyPatch, stall: float, at: float
+) -> None:
+    bench = Bench(monkeypatch)
+    bench.change = lambda record, now: record._replace(m_stop=now > 0.5)  # type: ignore[method-assign]
+    write, stalled = bench.port.write, list[float]()
+
+    def late_write(command: Command) -> Any:
+        if bench.now() >= at and not stalled:
+            stalled.append(bench.now())
+            bench.port.clock.wait_until(bench.port.now_ns() + round(stall * 1e9))
+        return write(command)
+
+    monkeypatch.setattr(bench.port, "write", late_write)
+    bench.refused(
+        proofs.prove_m_stop, BridgeSettings(), "Do not arm|passed between two commands|no feedback|late|acts on"
+    )
+    assert stalled
+
+
+def test_a_pause_between_two_commands_as_long_as_their_lifetime_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    port = emulator()
+    drive = proofs._GentleDrive(port, BridgeSettings(command_lifetime=0.05), None, None)
+    sent = iter([drive.begin_ns + 49_999_999, drive.begin_ns + 99_999_999])
+    monkeypatch.setattr(port, "write", lambda _: SimpleNamespace(sent_ns=next(sent)))
+    record = feedback_record(voltage=36.0)
+    drive.command(record)
+    assert drive.sent_ns == drive.begin_ns + 49_999_999
+    with pytest.raises(
+        ActuatorError, match="50 ms passed between two commands; expected less than the command"
+    ) as told:
+        drive.command(record)
+    assert told.value.fault == "host_stalled"
+
+
+@pytest.mark.parametrize("lost", [0.05, 0.1, 0.15])
+@pytest.mark.parametrize("begin", [0.4, 0.45, 0.48, 0.5])
+def test_commands_that_get_lost_prove_no_motion_stop_that_does_nothing(
+    monkeypatch: pytest.MonkeyPatch, lost: float, begin: float
+) -> None:
+    bench = Bench(monkeypatch)
+    bench.change = lambda record, now: record._replace(m_stop=now > 0.5)  # type: ignore[method-assign]
+    write = bench.port.write
+
+    def lossy_write(command: Command) -> Any:
+        if begin <= bench.now() < begin + lost:
+            return SimpleNamespace(sent_ns=bench.port.now_ns())
+        return write(command)
+
+    monkeypatch.setattr(bench.port, "write", lossy_write)
+    bench.refused(proofs.prove_m_stop, BridgeSettings(), "after the motion stop; expected at most 60 ms. Do not arm")
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.6, 3.0])
+@BOTH
+def test_a_motor_that_has_another_duty_than_it_was_sent_is_driven_no_further(
+    monkeypatch: pytest.MonkeyPatch, proof: Any, factor: float
+) -> None:
+    bench = Bench(monkeypatch, press_at=0.5)
+    bench.change = lambda record, now: record._replace(  # type: ignore[method-assign]
+        pwm_command=factor * record.pwm_command
+    )
+    assert bench.refused(proof, BridgeSettings(), "acts on PWM .* sent was 0.0100") == "command_not_in_force"
+    assert bench.now() < 0.2
+
+
+def test_a_record_that_comes_again_is_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    for proof in (proofs.prove_lifetime, proofs.prove_m_stop):
+        bench = Bench(monkeypatch, press_at=0.3 if proof is proofs.prove_m_stop else math.inf)
+        kept: list[Feedback] = []
+
+        def again(record: Feedback, now: float, kept: list[Feedback] = kept) -> Feedback:
+            if now >= 0.32:
+                kept.append(record)
+            return kept[0]._replace(stamp_ns=record.stamp_ns) if kept else record
+
+        bench.change = again  # type: ignore[method-assign]
+        assert bench.refused(proof, BridgeSettings(), "no feedback for 100 ms") == "feedback_lost"
 
 
 @pytest.mark.parametrize("action", [MStopAction.DISABLED, MStopAction.HOLD_POSITION])

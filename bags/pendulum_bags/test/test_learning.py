@@ -318,13 +318,10 @@ def test_a_checkpoint_that_lacks_an_array_or_holds_another_is_refused(tmp_path, 
 
 
 def test_ctrl_c_while_a_checkpoint_is_written_leaves_no_half_of_it(tmp_path, monkeypatch):
-    write = Path.write_bytes
-
-    def interrupted(path, data):
-        write(path, data[:100])
+    def interrupted(path, target):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Path, "write_bytes", interrupted)
+    monkeypatch.setattr(Path, "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         train(SMALL, tmp_path / "policy.npz")
     assert not list(tmp_path.iterdir())
@@ -332,16 +329,16 @@ def test_ctrl_c_while_a_checkpoint_is_written_leaves_no_half_of_it(tmp_path, mon
 
 def test_a_full_disk_leaves_the_checkpoint_before_it(tmp_path, monkeypatch):
     out = tmp_path / "policy.npz"
-    write = Path.write_bytes
+    replace = Path.replace
     kept: list[bytes] = []
 
-    def full(path, data):
+    def full(path, target):
         if kept:
             raise OSError(errno.ENOSPC, "No space left on device")
-        kept.append(bytes(data))
-        return write(path, data)
+        kept.append(path.read_bytes())
+        return replace(path, target)
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(DataError, match=r"checkpoint .* cannot be written: No space left on device; the one before"):
         train(SMALL, out)
     assert checkpoint_path(out).read_bytes() == kept[0]

@@ -157,6 +157,10 @@ class LabFile:
         """Return the lab with the result of a guided procedure."""
         return replace(self, proofs={**self.proofs, procedure: {"date": date, "result": result}})
 
+    def no_longer_proved(self, procedure: str) -> LabFile:
+        """Return the lab without the result of a guided procedure."""
+        return replace(self, proofs={name: proof for name, proof in self.proofs.items() if name != procedure})
+
     @property
     def emulated(self) -> bool:
         """Whether a pendulum is emulated behind it: an emulator, or HEBI's network with emulators on it."""
