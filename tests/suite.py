@@ -153,6 +153,7 @@ class Part:
         self._workers = min(workers, os.cpu_count() or 1)
         self._nice = nice
         self._looked_at: set[int] = set()
+        self._begun: dict[int, float] = {}
         self._popen: subprocess.Popen[bytes] | None = None
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the part)
 
@@ -201,19 +202,24 @@ class Part:
         every = set(psutil.pids())
         # A number that is free again may come back as another process.
         self._looked_at &= every
+        self._begun = {pid: begun for pid, begun in self._begun.items() if pid in every}
         for pid in every - self._looked_at:
             # Refused to who asks often without being root: the next look asks again.
             with contextlib.suppress(OSError, psutil.Error):
-                process = psutil.Process(pid)
-                ours = self._popen.pid in {pid, *(parent.pid for parent in process.parents())}
-                if ours and os.getsid(pid) == pid:
+                if pid not in self._begun and self._popen.pid != pid:
+                    process = psutil.Process(pid)
+                    if self._popen.pid not in {parent.pid for parent in process.parents()}:
+                        self._looked_at.add(pid)
+                        continue
+                    self._begun[pid] = process.create_time()
+                if os.getsid(pid) == pid:
                     group = Path(f"/proc/{pid}/autogroup")
                     # Who stepped further back by itself stays there; and whoever holds it further back may write at the
                     # same moment, and must not be the one who is overwritten for good.
                     if int(group.read_text(encoding="ascii").split()[-1]) < self._nice:
                         group.write_text(str(self._nice), encoding="ascii")
                         continue
-                elif ours and time.time() - process.create_time() < _YOUNG:
+                elif time.time() - self._begun[pid] < _YOUNG:
                     continue  # it may be about to begin a session
                 self._looked_at.add(pid)
 
