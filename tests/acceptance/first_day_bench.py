@@ -34,6 +34,7 @@ TRIES = 8
 _BUSY = re.compile(
     r"host_stalled|command_not_in_force|output_disagreement|tracking|feedback_late|feedback_lost|feedback_frozen"
     r"|too busy|is silent for|no feedback for|not answer|\bms (old|late)\b"
+    r"|passed between two commands|acts on PWM|did not have the duty|kept its duty"
     r"|NO │ (this computer keeps time|feedback |no feedback gets lost|acknowledgements )"
 )
 _MOMENT = re.compile("again: this computer was busy|more: records got lost")
