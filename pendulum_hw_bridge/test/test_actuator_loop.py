@@ -367,7 +367,7 @@ def test_an_error_in_a_cycle_releases_the_drive_and_is_told(running: Running) ->
     running.on_state = fail
     running.until(lambda: running.supervisor.mode is Mode.FAULT, "the fault")
     assert "exception: ValueError: a bug" in running.supervisor.reason
-    assert running.actuator.strategy is Strategy.OFF
+    running.until(lambda: running.actuator.strategy is Strategy.OFF, "the drive to be off")
     running.until(lambda: running.errors, "the report")
     # Of a cycle that broke, what was measured is what explains it.
     broken = running.states[len(running.outcomes)].stamp_ns
