@@ -143,7 +143,7 @@ def prove_m_stop(
     with afterwards(port.stop):
         dialogue.say("Press the motion stop NOW.")
         drive = _GentleDrive(port, settings, checks, drivetrain)
-        driven_ns = heard_ns = drive.begin_ns
+        driven_ns, heard_ns = None, drive.begin_ns
         record = drive.read(may_be_pressed=True)
         while not record.m_stop:
             heard_ns = record.stamp_ns
@@ -152,8 +152,8 @@ def prove_m_stop(
             driven_ns = heard_ns if _has_duty(record) else driven_ns
             drive.command(record)
             record = drive.read(may_be_pressed=True)
-        _expect_driven_until(record.stamp_ns, driven_ns if driven_ns > drive.begin_ns else None, heard_ns)
-        ended = _end_of_duty(_while_pressed(drive, record, settings), driven_ns, _ENDS_WITHIN)
+        since_ns = _expect_driven_until(record.stamp_ns, driven_ns, heard_ns)
+        ended = _end_of_duty(_while_pressed(drive, record, settings), since_ns, _ENDS_WITHIN)
         if ended > _ENDS_WITHIN:
             raise ActuatorError(
                 "m_stop",
@@ -263,8 +263,8 @@ def _has_duty(record: Feedback) -> bool:
     return abs(record.pwm_command) > 0.5 * PROOF_DUTY
 
 
-def _expect_driven_until(pressed_ns: int, driven_ns: int | None, heard_ns: int) -> None:
-    """Refuse a motion stop that was pressed when the motor had no duty to lose, or when nobody could see."""
+def _expect_driven_until(pressed_ns: int, driven_ns: int | None, heard_ns: int) -> int:
+    """Return when the motor last had its duty [ns]; refuse a stop pressed without one, or when nobody could see."""
     silence = (pressed_ns - heard_ns) / NANOSECONDS
     if driven_ns is not None and silence > _ENDS_WITHIN:
         raise ActuatorError(
@@ -278,6 +278,7 @@ def _expect_driven_until(pressed_ns: int, driven_ns: int | None, heard_ns: int) 
             f"motor did not have the duty {PROOF_DUTY:g} when the motion stop was pressed; is the motion stop pressed "
             "already?",
         )
+    return driven_ns
 
 
 def _end_of_duty(records: Iterator[Feedback], since_ns: int, limit: float) -> float:
