@@ -27,14 +27,16 @@ venv: $(VENV)/.linked $(INSTALLED) # Make or renew .venv with all layers of the 
 
 extras: $(VENV)/.linked $(VENV)/.extras # Install what every program needs: console, studies, MuJoCo, HEBI, ...
 
-# One stamp for each step, so that an interrupted one is done again and a finished one is not.
+# One stamp for each step, so that an interrupted one is done again and a finished one is not. The system's own Python
+# goes before another of its version: ROS runs on it, and it is built with profile-guided optimisation, which pyenv's are
+# not unless somebody asks: programs then take 1.3 times as long.
 $(VENV)/.made:
-	@for python in $(PYTHON) python3.12 python3.11 python3.10 python3 none; do \
-	  if $$python -c 'import sys; sys.exit(sys.implementation.name != "cpython" or not (3, 10) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null; \
+	@for python in $(PYTHON) $(foreach version,3.12 3.11 3.10,/usr/bin/python$(version) python$(version)) python3 none; do \
+	  if $$python -c 'import ensurepip, sys; sys.exit(sys.implementation.name != "cpython" or not (3, 10) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null; \
 	  then break; fi; \
 	done; \
-	if [ $$python = none ]; then echo "error: found no CPython 3.10, 3.11 or 3.12; install one, or name it with make PYTHON=/path/to/python3" >&2; exit 1; fi; \
-	echo "making $(VENV) with $$($$python --version)" && $$python -m venv $(VENV)
+	if [ $$python = none ]; then echo "error: found no CPython 3.10, 3.11 or 3.12 that can make a virtual environment; install one (Debian and Ubuntu: with python3-venv), or name it with make PYTHON=/path/to/python3" >&2; exit 1; fi; \
+	echo "making $(VENV) with $$($$python --version) ($$(command -v $$python))" && $$python -m venv $(VENV)
 	@touch $@
 
 # The lock is complete, so pip has nothing to resolve: faster, and the same on every version of pip. Modules are compiled

@@ -126,13 +126,7 @@ class Bridge:
 
         Modules that do not confirm it are asked again.
         """
-        # All of them first: what one of them says about it may wait.
-        errors = [(drive, error) for drive in self.drives if (error := drive.stop()) is not None]
-        self._stop_again_ns = self.now_ns() + _STOP_AGAIN_NS if errors else None
-        for drive, error in errors:
-            name = self._note(getattr(error, "fault", "exception"))
-            self.last_fault = self.last_fault or name
-            self.supervisor.fault(f"{name}: {drive.words(str(error))}", self.now_ns())
+        self._tell(self._stop_all())
 
     def insist(self) -> None:
         """Ask modules again that have not confirmed that they are off; never raises."""
@@ -141,8 +135,9 @@ class Bridge:
 
     def close(self) -> None:
         """Release and let go of all modules; never raises."""
+        errors = self._stop_all()
         self.supervisor.disarm(self.now_ns(), "bridge closes")
-        self.release()
+        self._tell(errors)
         for module in self.modules:
             try:
                 module.port.close()
@@ -225,14 +220,29 @@ class Bridge:
         """
         armed = self.supervisor.mode.armed
         if armed or self._driving:
+            # The supervisor may be held by whoever decides meanwhile: the drives do not wait for it.
+            errors = self._stop_all()
             self._note(name)
             self.last_fault = name
-            # Named first, so that a stop which fails on top of it does not hide it.
+            # Named before what a stop says that failed on top of it, which would hide it.
             if armed:
                 self.supervisor.fault(f"{name}: {message}", self.now_ns())
-            self.release()
+            self._tell(errors)
 
     # --- inside ---------------------------------------------------------------------------------------------
+
+    def _stop_all(self) -> list[tuple[DrivenModule, Exception]]:
+        """Stop all of them and return what some say about it, which may wait."""
+        errors = [(drive, error) for drive in self.drives if (error := drive.stop()) is not None]
+        self._stop_again_ns = self.now_ns() + _STOP_AGAIN_NS if errors else None
+        return errors
+
+    def _tell(self, errors: Sequence[tuple[DrivenModule, Exception]]) -> None:
+        """Put the plant into the fault state, since modules have not confirmed that they are off."""
+        for drive, error in errors:
+            name = self._note(getattr(error, "fault", "exception"))
+            self.last_fault = self.last_fault or name
+            self.supervisor.fault(f"{name}: {drive.words(str(error))}", self.now_ns())
 
     @property
     def stop_pending(self) -> bool:

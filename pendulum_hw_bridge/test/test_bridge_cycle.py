@@ -293,6 +293,23 @@ def test_a_stop_that_fails_on_top_of_a_fault_does_not_hide_it() -> None:
     assert rig.bridge.last_fault == "m_stop"
 
 
+@pytest.mark.parametrize(("tell", "told"), [("fault", "fail"), ("disarm", "close")])
+def test_the_drive_is_off_before_the_supervisor_is_told_which_may_have_to_be_waited_for(
+    tell: str, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig().armed()
+    seen: list[Strategy] = []
+
+    def held(*_: object) -> None:
+        seen.append(rig.port.strategy)
+        raise RuntimeError("held by another")
+
+    monkeypatch.setattr(type(rig.supervisor), tell, held)
+    with pytest.raises(RuntimeError, match="held by another"):
+        getattr(rig.bridge, told)(*(("m_stop", "pressed") if told == "fail" else ()))
+    assert seen == [Strategy.OFF]
+
+
 # --- observing -------------------------------------------------------------------------------------------------
 
 
