@@ -155,7 +155,13 @@ TARGETS: tuple[Target, ...] = (
             "_expect_allowed",
             "_expect_inside",
         ),
-        (f"{_BRIDGE}/test_proofs.py", f"{_BRIDGE}/test_guided_procedures.py"),
+        (
+            f"{_BRIDGE}/test_proof_drive.py",
+            f"{_BRIDGE}/test_proof_records.py",
+            f"{_BRIDGE}/test_lifetime_proof.py",
+            f"{_BRIDGE}/test_m_stop_proof.py",
+            f"{_BRIDGE}/test_guided_procedures.py",
+        ),
     ),
     Target(
         "pendulum_hw_bridge.nudge", ("watch_nudge", "hand_of", "Person", "EmulatedHand"), (f"{_BRIDGE}/test_nudge.py",)
