@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -20,6 +19,7 @@ from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.machine_checklist import run_machine_checklist
 from pendulum_hw_bridge.module import DrivenModule
 from pendulum_hw_bridge.nudge import hand_of
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 from pendulum_msgs_py.programs.executables import cli_main
@@ -101,7 +101,7 @@ def check(
     if as_json:
         items = [asdict(item) for item in found.items]
         document = {"ready": found.ready, "host_busy": found.host_busy, "items": items, "figures": found.figures}
-        print(json.dumps(document, indent=2))
+        print(json_text(document))
     else:
         _print(found)
     if found.ready:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +23,7 @@ from pendulum_hw_bridge.module import DrivenModule
 from pendulum_hw_bridge.nudge import hand_of
 from pendulum_hw_bridge.settings import expect_limits
 from pendulum_msgs_py.errors import ParameterError, PendulumError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.lab_file import LabFile, load_lab, write_lab
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.executables import cli_main
@@ -135,7 +135,7 @@ def show(file: File, as_json: Json = False) -> None:
     values = bridge_values([], {"lab_file": str(file)})
     lab = load_lab(file)
     if as_json:
-        print(json.dumps({"parameters": {name: values[name] for name in lab.values}, "proofs": lab.proofs}, indent=2))
+        print(json_text({"parameters": {name: values[name] for name in lab.values}, "proofs": lab.proofs}))
         return
     table = WholeTable("parameter", "value", title=f"{file}: {lab.name or lab.describe()}")
     for name in lab.values:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,7 @@ from pendulum_hw_bridge.backends.hebi_discovery import (
 )
 from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.lab_file import load_lab
 from pendulum_msgs_py.programs.executables import cli_main
@@ -83,7 +83,7 @@ def scan(
             "chosen": chosen and asdict(chosen),
             "reason": reason,
         }
-        print(json.dumps(found, indent=2))
+        print(json_text(found))
     else:
         _print(modules, chosen, reason)
     return 0 if chosen is not None else EXIT_NONE_CHOSEN

@@ -6,7 +6,6 @@ from __future__ import annotations
 import pendulum_msgs_py.programs.one_thread  # noqa: F401  # before anything that imports numpy
 # isort: on
 
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -34,6 +33,7 @@ from pendulum_lqr.time_figures import time_figures
 from pendulum_lqr.tracking_table import design_tracking, print_tracking, tracking_document
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, is_mechanism, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
@@ -146,7 +146,7 @@ def design(
             document["tracking"] = tracking_document(follower)
         if certified is not None:
             document["machine"] = certificate_document(*certified)
-        sys.stdout.write(json.dumps(document, indent=2) + "\n")
+        sys.stdout.write(json_text(document) + "\n")
     else:
         console = make_console(highlight=False)
         _print(console, parameters.name, model, weights, reports, chosen)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pendulum_lqr.design_tables import RowTable, pole_cell, time_cell
 from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.model import LinearModel
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -53,7 +53,7 @@ def design_mechanism(
             report = analyse(model, gain.K[0]) if gain.K.shape == (1, size) else None
             rows.append(_Row(weights, each, gain, report))
     if as_json:
-        sys.stdout.write(json.dumps(_document(plant, model, rows), indent=2) + "\n")
+        sys.stdout.write(json_text(_document(plant, model, rows)) + "\n")
     else:
         _print(plant, model, rows)
 

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["without_nan"]
+__all__ = ["json_text", "without_nan"]
+
+
+def json_text(content: Any) -> str:
+    """Return a result as a text of standard JSON, which every reader takes: ``null`` for NaN and infinity.
+
+    Numbers and arrays of numpy are written as those of Python, and what JSON has no type for, such as a path, as its
+    text.
+    """
+    return json.dumps(without_nan(content), indent=2, allow_nan=False, default=_plain)
 
 
 def without_nan(value: Any) -> Any:
@@ -18,3 +28,7 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [without_nan(item) for item in value]
     return value
+
+
+def _plain(value: Any) -> Any:
+    return without_nan(value.tolist()) if hasattr(value, "tolist") else str(value)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
+from pendulum_bags.experiments.experiment_cli import main
 from pendulum_bags.studies.chunks import cluster_client
 from pendulum_bags.studies.monte_carlo import MonteCarlo, sobol
 from pendulum_bags.studies.random_runs import draw_chunk, replay, run_chunk, run_monte_carlo
@@ -130,6 +131,18 @@ def test_a_cluster_that_loses_a_worker_mid_run_gives_the_same_bits(tmp_path: Pat
     assert here == cluster
     for file in (tmp_path / "here").glob("*.parquet"):
         assert file.read_bytes() == (tmp_path / "cluster" / file.name).read_bytes()
+
+
+def test_indices_of_what_does_not_vary_are_null_for_readers_of_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nothing = ["--uncertainty", "inertia=0", "--start", "0", "--amplitude", "0"]
+    short = ["--runs", "2", "--duration", "0.1", "--sobol", "2", "--workers", "0"]
+    assert main(["monte_carlo", *nothing, *short, "--out", str(tmp_path / "mc"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert told["sobol"]["indices"] == [
+        {"factor": "noise", "first": None, "first_confidence": None, "total": None, "total_confidence": None}
+    ]
 
 
 def test_sobol_indices_see_that_noise_rules_and_damping_comes_next() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from functools import partial
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.markup import escape
 
 from pendulum_bags.analyse.questions import QUESTIONS
 from pendulum_bags.figures.terminal_table import number_table
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counted_progress
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
@@ -77,7 +77,7 @@ def analyse(
     with counted_progress(console, "bags", len(pieces), out) as on_progress:
         table = analyse_bags(out, pieces, questions, connect=connect, on_progress=on_progress)
     if json_output:
-        print(json.dumps({"bags": table.bags, "runs": table.runs}, indent=2))
+        print(json_text({"bags": table.bags, "runs": table.runs}))
     else:
         _print(console, table, out, time.monotonic() - started)
     if table.failed:

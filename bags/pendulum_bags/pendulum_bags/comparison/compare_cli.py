@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
 
@@ -132,7 +132,7 @@ def compare(
     if out is not None:
         _write(out, results, content)
     if json_output:
-        print(json.dumps(content, indent=2, allow_nan=False))
+        print(json_text(content))
         return
     console = make_console()
     for name, result in results.items():

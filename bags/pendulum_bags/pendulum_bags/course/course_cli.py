@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.whole_file import writing
@@ -88,7 +89,7 @@ def solution(
 
     found = answers(draw_tasks(seed), draw_plant(seed))
     if as_json:
-        print(json.dumps(found, indent=2))
+        print(json_text(found))
         return
     table = WholeTable("exercise", "answer", title=f"Answers to the course of seed {seed}")
     for name, answer in found.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +9,7 @@ from typing import Annotated
 import typer
 
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.options import Json, RunningDomain, out_option
 
@@ -100,7 +100,7 @@ def excite(
             "peak_speed": float(abs(design.velocity).max()),
             "peak_angle": float(abs(design.position).max()),
         }
-        typer.echo(json.dumps(content, indent=2))
+        typer.echo(json_text(content))
     else:
         from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 import tempfile
@@ -39,6 +38,7 @@ from pendulum_bags.studies.monte_carlo_cli import Q, R, monte_carlo
 from pendulum_bags.studies.region_cli import region_of_attraction
 from pendulum_bags.studies.study_cli import add_commands as add_study_commands
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Domain, Json, Lab, Storage, Yes, out_option
@@ -225,7 +225,7 @@ def thesis(
             )
             comparison, answer, summary = _analyse(folder, settings, margins, budget, progress)
     if json_output:
-        print(json.dumps(summary, indent=2))
+        print(json_text(summary))
     else:
         _print_summary(console, summary)
         print_tests(console, comparison)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -13,6 +12,7 @@ import typer
 from rich.console import Console
 
 from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Domain, Json, Storage, out_option
 from pendulum_msgs_py.programs.terminal import make_console
@@ -187,7 +187,7 @@ def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output
             raise DataError(f"--out is {out}, a file; expected a folder")
         page = write_analysis(out, analysis)
     if json_output:
-        print(json.dumps(analysis.to_json(), indent=2, allow_nan=False))
+        print(json_text(analysis.to_json()))
         return
     for response in analysis.responses:
         facts = response.facts

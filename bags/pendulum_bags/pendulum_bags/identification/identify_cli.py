@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Collection, Sequence
@@ -12,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
-from pendulum_msgs_py.whole_file import write_whole
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.mechanism_result import MechanismResult
@@ -121,7 +121,7 @@ def identify(
         ]
         result = _thesis(recordings, experiment, skew, out, page)
         if as_json:
-            typer.echo(json.dumps(result.to_dict(), indent=2))
+            typer.echo(json_text(result.to_dict()))
         else:
             _print_thesis(result, verbose=verbose)
         return
@@ -148,7 +148,7 @@ def identify(
 
             write_page(result, out.with_suffix(""))
     if as_json:
-        typer.echo(json.dumps(result.to_dict(), indent=2))
+        typer.echo(json_text(result.to_dict()))
     else:
         _print_result(result, out)
     if result.refused or (result.geometry is not None and result.geometry.contradicts):
@@ -196,7 +196,7 @@ def _thesis(
     gravity = experiment == "gravity"
     result = fit_gravity(recordings) if gravity else fit_inertia_damping(recordings, skew=skew)
     if out is not None:
-        write_whole(out.with_suffix(".json"), json.dumps(result.to_dict(), indent=2) + "\n")
+        write_json(out.with_suffix(".json"), result.to_dict())
         if page:
             from pendulum_bags.identification.page import write_thesis_page
 
@@ -304,7 +304,7 @@ def _several_joints(
     if out is not None and not result.refused:
         result.write(out, name=name)
     if as_json:
-        typer.echo(json.dumps(result.to_dict(), indent=2))
+        typer.echo(json_text(result.to_dict()))
     else:
         _print_mechanism(result, out)
     if result.refused:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -28,9 +27,9 @@ from pendulum_bags.identification.mechanism_fit import (
 from pendulum_bags.identification.mechanism_model import DELAY, MechanismModel
 from pendulum_bags.identification.mechanism_notes import notes_of
 from pendulum_bags.identification.wording import Interval
+from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, write_mechanism
-from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["MechanismResult", "Score", "identify_mechanism"]
 
@@ -166,7 +165,7 @@ class MechanismResult:
             "remarks": self.sentences(),
         }
         write_mechanism(target, plant, provenance=provenance, intervals=intervals)
-        write_whole(target.with_suffix(".json"), json.dumps(self.to_dict(), indent=2) + "\n")
+        write_json(target.with_suffix(".json"), self.to_dict())
         return target
 
 

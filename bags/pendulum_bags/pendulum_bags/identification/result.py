@@ -31,10 +31,10 @@ from pendulum_bags.identification.window_score import WindowScore
 from pendulum_bags.identification.wording import Interval
 from pendulum_bags.runs.datasets import INPUT_KINDS, Recording, data_notes, distinct_names
 from pendulum_bags.runs.next_test import next_test_of, question_of
+from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
-from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["ALARMS", "IdentificationResult", "fingerprint", "load_fit_model"]
 
@@ -302,7 +302,7 @@ class IdentificationResult:
                 f"the best fit has friction {self.fit.chosen.friction}, which a plant file cannot hold; see the JSON",
             )
         write_plant(target, plant, provenance=provenance, intervals=intervals)
-        write_whole(target.with_suffix(".json"), json.dumps(self.to_dict(), indent=2) + "\n")
+        write_json(target.with_suffix(".json"), self.to_dict())
         return target
 
     def _file_intervals(self, plant: PlantParameters) -> tuple[dict[str, tuple[float, float]], list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,6 +13,7 @@ import typer
 from rich.progress import TextColumn, TimeRemainingColumn
 
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counting_bar
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main, typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
@@ -121,7 +121,7 @@ def train(
     figure = _write_curves(out, settings, curves)
     measured: Mapping[str, Any] = policy.provenance["evaluation"]
     if json_output:
-        print(json.dumps({"policy": str(out), "steps": settings.steps, **measured}, indent=2))
+        print(json_text({"policy": str(out), "steps": settings.steps, **measured}))
         return
     console.print(_sentence(measured))
     console.print(f"policy  {out}\ncurves  {figure}\n({time.monotonic() - began:.0f} s)", soft_wrap=True)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
@@ -55,7 +55,7 @@ def ranking(
         content = {**found.to_json(), "layer": same_choice(found).to_json()}
         if use:
             content["narrowed"] = {name: one.to_json() for name, one in narrowed.items()}
-        print(json.dumps(content, indent=2, allow_nan=False))
+        print(json_text(content))
         return
     console = make_console(highlight=False)
     print_ranking(console, found)

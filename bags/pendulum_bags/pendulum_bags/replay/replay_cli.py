@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pendulum_bags.identification.identify_cli import Hold
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
@@ -87,7 +87,7 @@ def replay(
     files = write_figures([result.figure()], folder)
     write_json(folder / "replay.json", content)
     if json_output:
-        print(json.dumps(content, indent=2, allow_nan=False))
+        print(json_text(content))
         return
     _print(result, content, chosen=bool(params))
     print(f"\nfigure  {files[0]}")

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_msgs_py.errors import BagError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = [
@@ -179,4 +180,4 @@ def git_revision() -> str:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON so that the file appears whole or not at all."""
-    write_whole(path, json.dumps(content, indent=2, allow_nan=False, default=str) + "\n")
+    write_whole(path, json_text(content) + "\n")

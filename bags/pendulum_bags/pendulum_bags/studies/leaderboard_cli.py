@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ import typer
 
 from pendulum_bags.figures.terminal_table import number_table
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import results_at_once
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
@@ -80,7 +80,7 @@ def leaderboard(
     page = write_page(out / "leaderboard.html", entries, duration)
     write_json(out / "leaderboard.json", to_json(entries))
     if json_output:
-        print(json.dumps(to_json(entries), indent=2))
+        print(json_text(to_json(entries)))
         return
     headings = ("plant", "controller", "up", "v1", "v2", "v3", "time \\[s]", "robustness \\[%]")
     table = number_table("Leaderboard", *headings, left=2)

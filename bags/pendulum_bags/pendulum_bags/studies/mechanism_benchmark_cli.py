@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -14,6 +13,7 @@ from rich.console import Console
 from rich.table import Column
 
 from pendulum_bags.figures.terminal_table import number_table
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import results_at_once
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
@@ -76,7 +76,7 @@ def benchmark(
     told = document(plant, seed, rows)
     write_json(out / f"{plant}.json", told)
     if json_output:
-        print(json.dumps(told, indent=2))
+        print(json_text(told))
         return
     _print(console, plant, rows, [row for row in PUBLISHED if row.plant == plant])
     console.print(f"figure  {picture}\nresults {out / f'{plant}.json'}", soft_wrap=True)

@@ -147,6 +147,7 @@ def sobol(settings: MonteCarlo, *, base: int = 4096) -> dict[str, Any]:
     columns, _ = settings.simulate(plant, drawn)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # SALib's own use of pandas
+        warnings.simplefilter("ignore", RuntimeWarning)  # what does not vary has no shares: they are NaN
         found = analysis.analyze(problem, columns["std_theta"], calc_second_order=False, seed=settings.seed)
     return {
         "output": "std_theta",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Collection, Mapping
 from functools import partial
@@ -14,6 +13,7 @@ from rich.console import Console
 
 from pendulum_bags.figures.terminal_table import number_table
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counted_progress
 from pendulum_msgs_py.programs.executables import typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
@@ -115,7 +115,7 @@ def monte_carlo(
         result["sobol"] = sobol_indices(settings, base=sobol)
     elapsed = time.monotonic() - started
     if json_output:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
         return
     if isinstance(settings, MonteCarlo):
         _print_one(console, result)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ import typer
 
 from pendulum_bags.studies.monte_carlo_cli import Plant, Q, R, Scheduler, Uncertain, Workers, options_of_several
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counted_progress
 from pendulum_msgs_py.programs.executables import typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
@@ -96,7 +96,7 @@ def region_of_attraction(
         result = run_map(folder, settings, connect=connect, on_progress=on_progress)
     picture = write_region_figure(folder / "region.png", result)
     if json_output:
-        print(json.dumps(result.to_json(), indent=2))
+        print(json_text(result.to_json()))
         return
     console.print(region_sentence(result))
     elapsed = time.monotonic() - started

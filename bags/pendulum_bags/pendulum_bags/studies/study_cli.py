@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import TextColumn
 
 from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counting_bar, resumable
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
@@ -212,7 +213,7 @@ def _study(
         raise FaultError(f"all {end.total} runs failed; {folder}/runs holds their logs")
     result, tell = _analyse(folder, found, records)
     if json_output:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
     else:
         tell(console)
         if found.analysis == "ranking":

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -15,6 +13,7 @@ import typer
 from rich.progress import TimeRemainingColumn
 
 from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counting_bar
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
@@ -167,8 +166,7 @@ def _run(
             on_progress=lambda share: bar.update(task, completed=round(share * _STEPS)),
         )
     if as_json:
-        json.dump(dataclasses.asdict(report), sys.stdout, default=str, indent=2)
-        print()
+        print(json_text(dataclasses.asdict(report)))
         return
     for sentence in report.damage:
         print(f"found: {sentence}")

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pendulum_msgs_py.json_values import without_nan
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
@@ -33,7 +33,7 @@ def info(
     statistics = bag_statistics(opened)
     if as_json:
         document = dataclasses.asdict(statistics) | {"metadata": opened.metadata, "notes": opened.notes}
-        print(json.dumps(without_nan(document), indent=2))
+        print(json_text(document))
         return 0
     _print(statistics, opened.metadata, opened.notes)
     return 0

@@ -5,7 +5,6 @@ The format is described at https://huggingface.co/docs/lerobot/lerobot-dataset-v
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.whole_file import writing
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.joint_table import JointTable
@@ -253,7 +253,7 @@ def export_lerobot(
         files += [path, tasks]
         for name, content in (("info.json", info), ("stats.json", statistics)):
             files.append(folder / "meta" / name)
-            files[-1].write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+            files[-1].write_text(json_text(content) + "\n", encoding="utf-8")
     return files
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_rosbag.repair.repair import repair_bag
@@ -33,9 +32,7 @@ def repair(
     """Save all whole messages of a broken bag to a sound one; the broken one is kept as BAG.broken."""
     report = repair_bag(bag, output, force=force)
     if as_json:
-        fields = dataclasses.asdict(report)
-        json.dump(fields, sys.stdout, default=str, indent=2)
-        print()
+        print(json_text(dataclasses.asdict(report)))
         return 0
     for sentence in report.damage:
         print(f"found: {sentence}")
