@@ -291,6 +291,16 @@ def test_a_stop_that_fails_on_top_of_a_fault_does_not_hide_it() -> None:
     rig.bridge.fail("m_stop", "pressed")
     assert rig.supervisor.reason == "m_stop: pressed"
     assert rig.bridge.last_fault == "m_stop"
+    assert rig.bridge.faults == {"m_stop": 1, "exception": 1}
+
+
+def test_a_bridge_that_closes_says_that_a_module_did_not_confirm_its_stop() -> None:
+    rig = Rig().armed()
+    rig.port.fails["stop"] = ActuatorError("stop_unacknowledged", "press the motion stop")
+    rig.bridge.close()
+    assert rig.supervisor.mode is Mode.FAULT
+    assert rig.supervisor.reason == "stop_unacknowledged: press the motion stop"
+    assert rig.bridge.faults == {"stop_unacknowledged": 1}
 
 
 @pytest.mark.parametrize(("tell", "told"), [("fault", "fail"), ("disarm", "close")])
