@@ -16,14 +16,14 @@ PROJECT = Path(__file__).resolve().parents[1]
 GATHERED = PROJECT / "build" / "docs"
 PACKAGES = ("pendulum_sim", "pendulum_hw_bridge", "pendulum_lqr", "pendulum_rosbag", "pendulum_bags")
 NODES = (
-    ("simulator", "pendulum_sim.simulator_node", ("SPECS",)),
-    ("adopt", "pendulum_sim.adopt_node", ("SPECS",)),
-    ("viewer", "pendulum_sim.viewer_node", ("SPECS",)),
-    ("markers", "pendulum_sim.markers_node", ("SPECS",)),
-    ("bridge", "pendulum_hw_bridge.node_specs", ("SPECS",)),
-    ("disturbance", "pendulum_lqr.disturbance_node", ("DISTURBANCE_SPECS", "NODE_SPECS")),
-    ("effort_adapter", "pendulum_lqr.effort_adapter_node", ("NODE_SPECS",)),
-    ("trajectory_action", "pendulum_lqr.trajectory_action_node", ("NODE_SPECS",)),
+    ("simulator", "pendulum_sim.simulator.simulator_node", ("SPECS",)),
+    ("adopt", "pendulum_sim.simulator.adopt_node", ("SPECS",)),
+    ("viewer", "pendulum_sim.pictures.viewer_node", ("SPECS",)),
+    ("markers", "pendulum_sim.pictures.markers_node", ("SPECS",)),
+    ("bridge", "pendulum_hw_bridge.bridge.node_specs", ("SPECS",)),
+    ("disturbance", "pendulum_lqr.disturbances.disturbance_node", ("DISTURBANCE_SPECS", "NODE_SPECS")),
+    ("effort_adapter", "pendulum_lqr.nodes.effort_adapter_node", ("NODE_SPECS",)),
+    ("trajectory_action", "pendulum_lqr.nodes.trajectory_action_node", ("NODE_SPECS",)),
     ("recorder", "pendulum_rosbag.recorder.recorder_node", ("SPECS",)),
     ("play", "pendulum_rosbag.player.player_node", ("SPECS",)),
 )
@@ -92,8 +92,8 @@ def for_the_site(text: str, page: str, gathered: set[str]) -> str:
 
 def reference() -> str:
     """Return the reference page, from the tables that the programs themselves read."""
-    from pendulum_lqr.bringup import ARGUMENTS
-    from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
+    from pendulum_lqr.laws.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
+    from pendulum_lqr.nodes.bringup import ARGUMENTS
     from pendulum_msgs_py.parameters import markdown_table
     from pendulum_msgs_py.programs.executables import summary
 
@@ -106,7 +106,7 @@ def reference() -> str:
     for name, module, tables in NODES:
         specs = [spec for table in tables for spec in getattr(importlib.import_module(module), table)]
         parts.append(f"### {name}\n\n{markdown_table(specs)}\n")
-    node = importlib.import_module("pendulum_lqr.controller_node").NODE_SPECS
+    node = importlib.import_module("pendulum_lqr.nodes.controller_node").NODE_SPECS
     parts.append(f"### controller\n\n{markdown_table([*node, *COMMON_PARAMETERS])}\n\n## Controllers\n")
     for name in CONTROLLERS:
         own = controller_class(name)

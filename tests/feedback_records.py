@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pendulum_hw_bridge.actuator import FEEDBACK_QUANTITIES, Feedback
+from pendulum_hw_bridge.port.actuator import FEEDBACK_QUANTITIES, Feedback
 
 __all__ = ["feedback_record"]
 

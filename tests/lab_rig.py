@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import Feedback
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.port.actuator import Feedback
+from pendulum_hw_bridge.port.clocks import SteppedClock
 
 __all__ = ["PARAMETERS", "Person", "changed", "emulator"]
 

@@ -14,12 +14,12 @@ from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
-from pendulum_sim.compiling import compile_tree
-from pendulum_sim.dry_friction import acceleration_with_friction, advance_dry, is_dry
-from pendulum_sim.integrators import get_integrator
-from pendulum_sim.plant import pack
-from pendulum_sim.plants import make_plant
-from pendulum_sim.sensors import Sensors
+from pendulum_sim.batches.compiling import compile_tree
+from pendulum_sim.stepping.dry_friction import acceleration_with_friction, advance_dry, is_dry
+from pendulum_sim.stepping.integrators import get_integrator
+from pendulum_sim.stepping.plant import pack
+from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.sensors import Sensors
 
 K = (33.345265, 0.158993)
 """Gain of the thesis's design [N m/rad, N m s/rad]."""

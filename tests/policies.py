@@ -8,8 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.policy import DEFAULT_SIGNALS, Network, Policy, coordinates_of, default_signals, sample_layout
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.policies.policy import (
+    DEFAULT_SIGNALS,
+    Network,
+    Policy,
+    coordinates_of,
+    default_signals,
+    sample_layout,
+)
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

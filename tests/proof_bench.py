@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge import proofs
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.lab import proofs
+from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     Command,
     Feedback,
     Strategy,
 )
-from pendulum_hw_bridge.emulation.faults import ActuatorFault
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from tests.lab_rig import Person, emulator
 
 __all__ = ["BOTH", "Bench", "keeps_its_lifetime"]

@@ -14,6 +14,8 @@ import sys
 import tempfile
 from collections.abc import Sequence
 
+from pendulum_msgs_py.programs.executables import tables_of
+
 __all__ = ["Refused", "not_refused"]
 
 Refused = tuple[tuple[str, str], Sequence[str], str]
@@ -50,7 +52,8 @@ def _ask(package: str, program: str, arguments: Sequence[str]) -> tuple[int, str
         try:
             for stream in kept:
                 os.dup2(said.fileno(), stream)
-            code = importlib.import_module(f"{package}.{program}_node").main(arguments)
+            module, _, function = tables_of(package)[program].partition(":")
+            code = getattr(importlib.import_module(module), function)(arguments)
         finally:
             sys.stdout.flush()
             sys.stderr.flush()

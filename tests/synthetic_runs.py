@@ -22,7 +22,7 @@ from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.storage import BagWriter
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.plants import make_plant
 
 K = (33.345265, 0.158993)
 STATE = "sensor_msgs/msg/JointState"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from pendulum_hw_bridge.actuator import Command, Strategy
-from pendulum_hw_bridge.fault_table import FAULTS
-from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.drive.fault_table import FAULTS
+from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.port.actuator import Command, Strategy
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 from tests.feedback_records import feedback_record
 

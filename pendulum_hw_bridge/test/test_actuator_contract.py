@@ -7,7 +7,15 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.backends.emulator import EmulatorBackend
+from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+from pendulum_hw_bridge.backends.hebi import HebiBackend
+from pendulum_hw_bridge.backends.hebi_emulated import EmulatedGroup
+from pendulum_hw_bridge.backends.replay import FeedbackRecording, ReplayBackend
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.emulation.server import EmulatorServer
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     ActuatorPort,
     Command,
@@ -15,17 +23,9 @@ from pendulum_hw_bridge.actuator import (
     HardwareLimits,
     Strategy,
 )
-from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
-from pendulum_hw_bridge.backends.hebi import HebiBackend
-from pendulum_hw_bridge.backends.hebi_emulated import EmulatedGroup
-from pendulum_hw_bridge.backends.replay import FeedbackRecording, ReplayBackend
-from pendulum_hw_bridge.clocks import SteppedClock
-from pendulum_hw_bridge.command_check import check_command
-from pendulum_hw_bridge.emulation.parameters import load_emulator
-from pendulum_hw_bridge.emulation.server import EmulatorServer
-from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.gains import DEFAULT_GAINS, differing_gain
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.command_check import check_command
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, differing_gain
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import ParameterError
 

@@ -9,20 +9,20 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge import actuator_loop
-from pendulum_hw_bridge.actuator import ActuatorError, Feedback, Strategy
-from pendulum_hw_bridge.actuator_loop import ActuatorLoop
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge import Bridge, Outcome
-from pendulum_hw_bridge.clocks import WallClock
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.bridge import actuator_loop
+from pendulum_hw_bridge.bridge.actuator_loop import ActuatorLoop
+from pendulum_hw_bridge.bridge.bridge import Bridge, Outcome
+from pendulum_hw_bridge.bridge.module import DrivenModule
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.gains import DEFAULT_GAINS
-from pendulum_hw_bridge.module import DrivenModule
-from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.port.actuator import ActuatorError, Feedback, Strategy
+from pendulum_hw_bridge.port.clocks import WallClock
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits
 from pendulum_msgs_py.contract.timing import LoopStatistics

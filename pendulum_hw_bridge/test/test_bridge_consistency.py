@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from pendulum_hw_bridge.backends import BACKENDS
-from pendulum_hw_bridge.bridge_consistency import check_consistency
-from pendulum_hw_bridge.bridge_parameters import (
+from pendulum_hw_bridge.bridge.bridge_consistency import check_consistency
+from pendulum_hw_bridge.bridge.bridge_parameters import (
     BRIDGE_SPECS,
     bridge_settings,
     effort_mapping,
@@ -17,9 +17,9 @@ from pendulum_hw_bridge.bridge_parameters import (
     supervisor_limits,
     trajectory_gains,
 )
+from pendulum_hw_bridge.bridge.node_specs import SPECS
 from pendulum_hw_bridge.emulation.parameters import load_emulator
-from pendulum_hw_bridge.gains import DEFAULT_GAINS
-from pendulum_hw_bridge.node_specs import SPECS
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Command, Feedback, HardwareLimits, Strategy
-from pendulum_hw_bridge.bridge import Bridge
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.module import DrivenModule
-from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.bridge.bridge import Bridge
+from pendulum_hw_bridge.bridge.module import DrivenModule
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, Feedback, HardwareLimits, Strategy
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import Drive, DriveKind
 from pendulum_msgs_py.contract.supervisor import Mode, PlantLimits, PlantSupervisor
 from tests.feedback_records import feedback_record

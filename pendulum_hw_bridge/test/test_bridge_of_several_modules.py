@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Feedback, Strategy
-from pendulum_hw_bridge.bridge import Bridge
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.module import DrivenModule, Module
-from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.bridge.bridge import Bridge
+from pendulum_hw_bridge.bridge.module import DrivenModule, Module
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.port.actuator import ActuatorError, Feedback, Strategy
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Mode, PlantLimits
 from pendulum_msgs_py.contract.supervisor import PlantSupervisor
 from pendulum_msgs_py.errors import ParameterError

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pendulum_hw_bridge.actuator import FEEDBACK_QUANTITIES
-from pendulum_hw_bridge.node_specs import SPECS
-from pendulum_hw_bridge.safety import FAULTS
+from pendulum_hw_bridge.bridge.node_specs import SPECS
+from pendulum_hw_bridge.drive.safety import FAULTS
+from pendulum_hw_bridge.port.actuator import FEEDBACK_QUANTITIES
 from pendulum_msgs_py.parameters import markdown_table
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")

@@ -4,19 +4,19 @@ import itertools
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, HardwareLimits, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge import Bridge
-from pendulum_hw_bridge.clocks import SteppedClock
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.bridge.bridge import Bridge
+from pendulum_hw_bridge.bridge.module import DrivenModule
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.motor_state import MotorState
+from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.gains import DEFAULT_GAINS
-from pendulum_hw_bridge.module import DrivenModule
-from pendulum_hw_bridge.motor_state import MotorState
-from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.port.actuator import ActuatorError, HardwareLimits, Strategy
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Input, Mode, PlantLimits

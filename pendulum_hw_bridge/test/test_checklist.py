@@ -9,19 +9,20 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_hw_bridge import bridge_node, check_cli
-from pendulum_hw_bridge.actuator import Feedback, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.check_item import HOST_ITEM, Checklist
-from pendulum_hw_bridge.checklist import run_checklist
-from pendulum_hw_bridge.clocks import SteppedClock, WallClock
+from pendulum_hw_bridge.checks import check_cli
+from pendulum_hw_bridge.checks.check_item import HOST_ITEM, Checklist
+from pendulum_hw_bridge.checks.checklist import run_checklist
+from pendulum_hw_bridge.checks.nudge import hand_of
+from pendulum_hw_bridge.drive.safety import SafetyLimits
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.gains import DEFAULT_GAINS
-from pendulum_hw_bridge.nudge import hand_of
-from pendulum_hw_bridge.safety import SafetyLimits
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.nodes import bridge_node
+from pendulum_hw_bridge.port.actuator import Feedback, Strategy
+from pendulum_hw_bridge.port.clocks import SteppedClock, WallClock
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.port.settings import BridgeSettings
 
 SETTINGS = BridgeSettings(gains=DEFAULT_GAINS[3])
 

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from pendulum_hw_bridge.actuator import MAX_COMMAND_LIFETIME, Command, HardwareLimits, Strategy
-from pendulum_hw_bridge.command_check import check_command, check_lifetime
+from pendulum_hw_bridge.port.actuator import MAX_COMMAND_LIFETIME, Command, HardwareLimits, Strategy
+from pendulum_hw_bridge.port.command_check import check_command, check_lifetime
 from pendulum_msgs_py.errors import ParameterError
 
 LIMITS = HardwareLimits(effort=2.0, velocity=1.5, position_min=-3.0, position_max=4.0, pwm=0.5)

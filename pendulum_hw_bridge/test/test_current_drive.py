@@ -6,14 +6,14 @@ import math
 
 import pytest
 
-from pendulum_hw_bridge.actuator import Command, Strategy
-from pendulum_hw_bridge.assembly import for_plant
-from pendulum_hw_bridge.current_drive import CurrentCheck, CurrentMapping
-from pendulum_hw_bridge.effort_mapping import EffortStrategy
+from pendulum_hw_bridge.bridge.assembly import for_plant
+from pendulum_hw_bridge.bridge.node_specs import SPECS
+from pendulum_hw_bridge.drive.current_drive import CurrentCheck, CurrentMapping
+from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
+from pendulum_hw_bridge.drive.motor_state import MotorState
 from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
-from pendulum_hw_bridge.gains import DEFAULT_GAINS
-from pendulum_hw_bridge.motor_state import MotorState
-from pendulum_hw_bridge.node_specs import SPECS
+from pendulum_hw_bridge.port.actuator import Command, Strategy
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_msgs_py.joints import Joint
 from tests.feedback_records import feedback_record
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pendulum_hw_bridge.derating import Derating
+from pendulum_hw_bridge.drive.derating import Derating
 from pendulum_msgs_py.errors import ParameterError
 
 

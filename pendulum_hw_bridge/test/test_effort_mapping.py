@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from pendulum_hw_bridge.actuator import Command, Strategy
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.gains import GainSet, PidGains
-from pendulum_hw_bridge.motor_state import MotorState
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.motor_state import MotorState
+from pendulum_hw_bridge.port.actuator import Command, Strategy
+from pendulum_hw_bridge.port.gains import GainSet, PidGains
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 

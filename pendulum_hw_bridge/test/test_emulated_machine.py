@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, ActuatorPort, Command, Feedback, Strategy
 from pendulum_hw_bridge.backends.emulated_machine import DrivePort, JointPort, machine_ports
-from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.machine import EmulatedMachine
 from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
+from pendulum_hw_bridge.port.actuator import ActuatorError, ActuatorPort, Command, Feedback, Strategy
+from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pendulum_hw_bridge.actuator import Command, CommandLock, HardwareLimits, Strategy, TemperatureState
 from pendulum_hw_bridge.emulation import kernel
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.firmware import gain_rows
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters, load_emulator
 from pendulum_hw_bridge.emulation.thermal import ThermalParameters
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.port.actuator import Command, CommandLock, HardwareLimits, Strategy, TemperatureState
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.loops.machine_code import NoMachineCodeError
 from pendulum_msgs_py.plants.plant_parameters import load_plant

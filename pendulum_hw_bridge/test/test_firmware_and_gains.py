@@ -17,7 +17,7 @@ from pendulum_hw_bridge.emulation.firmware import (
     new_loop_memory,
     pid_step,
 )
-from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, PidGains, load_gains, write_gains
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GainSet, PidGains, load_gains, write_gains
 from pendulum_msgs_py.errors import ParameterError
 
 OFF = math.nan

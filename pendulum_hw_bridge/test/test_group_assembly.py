@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.assembly import Assembly, assemble, for_plant
 from pendulum_hw_bridge.backends.hebi_group import GroupDrive, GroupEncoder
-from pendulum_hw_bridge.clocks import SteppedClock
-from pendulum_hw_bridge.module import DrivenModule
-from pendulum_hw_bridge.node_specs import SPECS
+from pendulum_hw_bridge.bridge.assembly import Assembly, assemble, for_plant
+from pendulum_hw_bridge.bridge.module import DrivenModule
+from pendulum_hw_bridge.bridge.node_specs import SPECS
+from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_msgs_py.errors import ParameterError
 
 

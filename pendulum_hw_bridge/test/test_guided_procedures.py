@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge import guided, lab_cli, proofs
-from pendulum_hw_bridge.actuator import ActuatorError, Command, HardwareLimits, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.checks.nudge import EmulatedHand, Person, watch_nudge
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.nudge import EmulatedHand, Person, watch_nudge
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.lab import guided, lab_cli, proofs
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, HardwareLimits, Strategy
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.plants.lab_file import LabFile, load_lab, write_lab
 
 
@@ -330,7 +330,7 @@ def test_a_lab_file_is_written_step_by_step_and_shown(
     assert load_lab(lab).values["voltage_window"] == [30.6, 41.4]
 
     rig = Rig("thesis")
-    monkeypatch.setattr("pendulum_hw_bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
+    monkeypatch.setattr("pendulum_hw_bridge.bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
     assert lab_cli.main(["backup", lab, "--out", str(tmp_path / "before")]) == 0
     assert "not what it was before us" not in capsys.readouterr().err
     for step in ("zero", "tare", "prove_lifetime"):
@@ -358,7 +358,7 @@ def test_a_step_that_fails_or_is_left_keeps_the_lab_file_as_it_was(
     before = lab.read_text()
     rig = Rig()
     rig.actuator.inject(ActuatorFault.EFFORT_OFFSET)
-    monkeypatch.setattr("pendulum_hw_bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
+    monkeypatch.setattr("pendulum_hw_bridge.bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
     assert lab_cli.main(["tare", str(lab), "--yes"]) == 2
     assert "something pulls" in capsys.readouterr().err
 
@@ -386,7 +386,7 @@ def test_a_machine_that_does_not_stand_a_proof_loses_an_older_one_and_a_person_t
         lab, LabFile({"backend": "emulator"}).proved("command_lifetime", "today", "ok").proved("m_stop", "1", "2")
     )
     rig = Rig()
-    monkeypatch.setattr("pendulum_hw_bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
+    monkeypatch.setattr("pendulum_hw_bridge.bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
 
     def left(*_: object, **__: object) -> float:
         raise KeyboardInterrupt
@@ -426,7 +426,7 @@ def test_the_module_is_let_go_of_on_every_way_out_of_a_step(
         raise KeyboardInterrupt if way == "left" else ActuatorError("module_lost", "no answer")
 
     monkeypatch.setattr(rig.port, "close", noted)
-    monkeypatch.setattr("pendulum_hw_bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
+    monkeypatch.setattr("pendulum_hw_bridge.bridge.bridge_parameters.make_port", lambda *_, **__: rig.port)
     if way == "not connected":
         monkeypatch.setattr(rig.port, "connect", break_off)
     elif way != "done":

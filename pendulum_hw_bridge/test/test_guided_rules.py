@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_hw_bridge import guided, lab_cli
-from pendulum_hw_bridge.actuator import ActuatorError, Command, Strategy
-from pendulum_hw_bridge.nudge import EmulatedHand
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.checks.nudge import EmulatedHand
+from pendulum_hw_bridge.lab import guided, lab_cli
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, Strategy
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.plants.lab_file import load_lab
 from tests.feedback_records import feedback_record
 from tests.lab_rig import PARAMETERS, Person, changed, emulator
@@ -81,7 +81,7 @@ def test_the_tare_reaches_the_lab_file(tmp_path: Path, monkeypatch: pytest.Monke
     lab.write_text("format: pendulum_lab/1\nmodule: {backend: emulator}\n", encoding="utf-8")
     port = emulator()
     changed(monkeypatch, port, lambda record: record._replace(position=0.0, effort=0.4))
-    monkeypatch.setattr("pendulum_hw_bridge.bridge_parameters.make_port", lambda *_, **__: port)
+    monkeypatch.setattr("pendulum_hw_bridge.bridge.bridge_parameters.make_port", lambda *_, **__: port)
     assert lab_cli.main(["tare", str(lab), "--yes"]) == 0
     assert load_lab(lab).values["effort_tare"] == pytest.approx(0.4)
     assert "+0.400 N m" in load_lab(lab).proofs["effort_tare"]["result"]

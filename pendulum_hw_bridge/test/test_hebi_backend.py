@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.backends.hebi import HebiBackend
+from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES
+from pendulum_hw_bridge.bridge.bridge import Bridge
+from pendulum_hw_bridge.bridge.module import DrivenModule
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     Command,
     CommandLock,
@@ -22,16 +29,9 @@ from pendulum_hw_bridge.actuator import (
     Strategy,
     TemperatureState,
 )
-from pendulum_hw_bridge.backends.hebi import HebiBackend
-from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES
-from pendulum_hw_bridge.bridge import Bridge
-from pendulum_hw_bridge.clocks import SteppedClock
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.emulation.parameters import load_emulator
-from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
-from pendulum_hw_bridge.module import DrivenModule
-from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, PlantLimits, PlantSupervisor
 
 hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Command, HardwareLimits, MStopAction, Strategy
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_hw_bridge.backends.hebi import HebiBackend, connect_group, open_lookup
@@ -21,8 +20,9 @@ from pendulum_hw_bridge.backends.hebi_emulated import EmulatedGroup
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.server import EmulatorIdentity, EmulatorServer
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.gains import DEFAULT_GAINS
-from pendulum_hw_bridge.module_files import backup_group, limits_of_group, restore_group
+from pendulum_hw_bridge.lab.module_files import backup_group, limits_of_group, restore_group
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, HardwareLimits, MStopAction, Strategy
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import ParameterError
 

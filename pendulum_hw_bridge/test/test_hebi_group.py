@@ -11,19 +11,19 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Command, CommandLock, Strategy
 from pendulum_hw_bridge.backends import hebi_group
 from pendulum_hw_bridge.backends.hebi_discovery import ModuleSelection, discover
 from pendulum_hw_bridge.backends.hebi_emulated import _holds, _Of
 from pendulum_hw_bridge.backends.hebi_group import GroupDrive, GroupEncoder, HebiGroup
 from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES
-from pendulum_hw_bridge.bridge import Bridge
-from pendulum_hw_bridge.clocks import SteppedClock
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS
-from pendulum_hw_bridge.module import DrivenModule, Module
-from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.bridge.bridge import Bridge
+from pendulum_hw_bridge.bridge.module import DrivenModule, Module
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, CommandLock, Strategy
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.gains import GAIN_FIELDS, LOOPS
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Mode, PlantLimits
 from pendulum_msgs_py.contract.supervisor import PlantSupervisor
 from pendulum_msgs_py.joints import Coordinates, Joint

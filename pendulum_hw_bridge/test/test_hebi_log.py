@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pendulum_hw_bridge import convert_cli
-from pendulum_hw_bridge.actuator import FEEDBACK_QUANTITIES, ActuatorError
 from pendulum_hw_bridge.backends.hebi import HebiBackend
 from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES, read_hebilog, to_joint
 from pendulum_hw_bridge.backends.replay import load_feedback
+from pendulum_hw_bridge.lab import convert_cli
+from pendulum_hw_bridge.port.actuator import FEEDBACK_QUANTITIES, ActuatorError
 from pendulum_msgs_py.errors import DataError
 
 hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")

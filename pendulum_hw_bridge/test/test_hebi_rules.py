@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Command, HardwareLimits, MStopAction, Strategy
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.hebi import HebiBackend, connect_group
 from pendulum_hw_bridge.backends.hebi_discovery import ModuleSelection
 from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES
 from pendulum_hw_bridge.backends.hebi_settings import fill_limits
-from pendulum_hw_bridge.clocks import SteppedClock
-from pendulum_hw_bridge.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, HardwareLimits, MStopAction, Strategy
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS
 from pendulum_msgs_py.errors import ParameterError
 
 hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge import proofs
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.lab import proofs
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from tests.proof_bench import Bench, keeps_its_lifetime
 
 

@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge import proofs
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.lab import proofs
+from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     Command,
     Feedback,
     HardwareLimits,
     MStopAction,
 )
-from pendulum_hw_bridge.emulation.faults import ActuatorFault
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from tests.feedback_records import feedback_record
 from tests.lab_rig import emulator
 from tests.proof_bench import BOTH, Bench

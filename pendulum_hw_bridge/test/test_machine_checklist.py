@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge import check_cli
-from pendulum_hw_bridge.actuator import ActuatorError, Strategy
-from pendulum_hw_bridge.assembly import assemble, for_plant
 from pendulum_hw_bridge.backends.emulated_machine import DrivePort, JointPort
-from pendulum_hw_bridge.check_item import HOST_ITEM, Checklist
-from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.bridge.assembly import assemble, for_plant
+from pendulum_hw_bridge.bridge.module import Module
+from pendulum_hw_bridge.bridge.node_specs import SPECS
+from pendulum_hw_bridge.checks import check_cli
+from pendulum_hw_bridge.checks.check_item import HOST_ITEM, Checklist
+from pendulum_hw_bridge.checks.machine_checklist import names_problem, run_machine_checklist
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
-from pendulum_hw_bridge.machine_checklist import names_problem, run_machine_checklist
-from pendulum_hw_bridge.module import Module
-from pendulum_hw_bridge.node_specs import SPECS
+from pendulum_hw_bridge.port.actuator import ActuatorError, Strategy
+from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 

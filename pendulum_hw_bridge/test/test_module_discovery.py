@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge import scan_cli
-from pendulum_hw_bridge.actuator import ActuatorError
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.hebi import connect_group
 from pendulum_hw_bridge.backends.hebi_discovery import ModuleRecord, ModuleSelection, discover, select_module
+from pendulum_hw_bridge.lab import scan_cli
+from pendulum_hw_bridge.port.actuator import ActuatorError
 
 hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
 lookup_module = pytest.importorskip("hebi._internal.lookup")

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, MStopAction
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.module_files import (
+from pendulum_hw_bridge.lab.module_files import (
     _set_open_ends,
     backup_emulator,
     backup_group,
     restore_emulator,
     restore_group,
 )
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.port.actuator import ActuatorError, MStopAction
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.errors import ParameterError
 
 
@@ -225,7 +225,7 @@ def test_a_backup_that_is_interrupted_leaves_nothing_that_could_be_restored(
         there.append(folder.exists())
         raise error
 
-    monkeypatch.setattr("pendulum_hw_bridge.module_files.limits_to_json", interrupted)
+    monkeypatch.setattr("pendulum_hw_bridge.lab.module_files.limits_to_json", interrupted)
     with pytest.raises((KeyboardInterrupt, SystemExit, ParameterError)):
         backup_emulator(port, folder)
     # Nor does the name exist while it is written, where the program could be killed.

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT, MotorState, MotorWatch
+from pendulum_hw_bridge.drive.motor_state import MOTOR_SPEED_LIMIT, MotorState, MotorWatch
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 from tests.feedback_records import feedback_record
 

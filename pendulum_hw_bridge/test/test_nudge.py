@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Feedback
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.checks.nudge import EmulatedHand, Person, hand_of, watch_nudge
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.feedback_stream import feedback_for
-from pendulum_hw_bridge.nudge import EmulatedHand, Person, hand_of, watch_nudge
+from pendulum_hw_bridge.port.actuator import ActuatorError, Feedback
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.feedback_stream import feedback_for
 
 
 class Scripted:

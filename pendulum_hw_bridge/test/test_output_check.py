@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import Command, Strategy
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.gains import GainSet, PidGains
-from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
-from pendulum_hw_bridge.output_check import OutputCheck
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.motor_state import MOTOR_SPEED_LIMIT
+from pendulum_hw_bridge.drive.output_check import OutputCheck
+from pendulum_hw_bridge.port.actuator import Command, Strategy
+from pendulum_hw_bridge.port.gains import GainSet, PidGains
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 from tests.feedback_records import feedback_record
 

@@ -9,8 +9,10 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge import proofs
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.lab import proofs
+from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     Command,
     Feedback,
@@ -18,9 +20,7 @@ from pendulum_hw_bridge.actuator import (
     Strategy,
     afterwards,
 )
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from tests.feedback_records import feedback_record
 from tests.lab_rig import PARAMETERS, Person, emulator
 from tests.proof_bench import BOTH, Bench

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from pendulum_hw_bridge import proofs
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.lab import proofs
+from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     Feedback,
 )
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from tests.feedback_records import feedback_record
 from tests.proof_bench import Bench
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from pendulum_hw_bridge.actuator import Command, Strategy
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
-from pendulum_hw_bridge.output_check import OutputCheck
-from pendulum_hw_bridge.safety import SafetyMonitor
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.output_check import OutputCheck
+from pendulum_hw_bridge.drive.safety import SafetyMonitor
+from pendulum_hw_bridge.port.actuator import Command, Strategy
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 from tests.watched_monitor import DRIVETRAIN, LIMITS, MILLISECOND, PERIOD, STEP, Watched
 

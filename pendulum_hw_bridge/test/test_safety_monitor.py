@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import CommandLock, LimitState, TemperatureState
-from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
+from pendulum_hw_bridge.drive.motor_state import MOTOR_SPEED_LIMIT
+from pendulum_hw_bridge.port.actuator import CommandLock, LimitState, TemperatureState
 from tests.feedback_records import feedback_record
 from tests.watched_monitor import DRIVETRAIN, MILLISECOND, PERIOD, STEP, TIMEOUT, Watched
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, HardwareLimits, MStopAction
-from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet
-from pendulum_hw_bridge.settings import BridgeSettings, write_settings
+from pendulum_hw_bridge.port.actuator import ActuatorError, HardwareLimits, MStopAction
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GainSet
+from pendulum_hw_bridge.port.settings import BridgeSettings, write_settings
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import PlantLimits
 from pendulum_msgs_py.contract.values import JointSample

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pendulum_hw_bridge.actuator import Command, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS as SPECS
-from pendulum_hw_bridge.bridge_parameters import make_port, told_plants
-from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.bridge.bridge_parameters import BRIDGE_SPECS as SPECS
+from pendulum_hw_bridge.bridge.bridge_parameters import make_port, told_plants
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.procedure import StaircaseTrial
-from pendulum_hw_bridge.procedures import HandMotion, hand_trials, staircase, staircase_angles
+from pendulum_hw_bridge.nodes.procedure import StaircaseTrial
+from pendulum_hw_bridge.nodes.procedures import HandMotion, hand_trials, staircase, staircase_angles
+from pendulum_hw_bridge.port.actuator import Command, Strategy
+from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate

@@ -8,16 +8,16 @@ from dataclasses import replace
 
 import pytest
 
-from pendulum_hw_bridge.actuator import ActuatorError, Command, HardwareLimits, Strategy
-from pendulum_hw_bridge.assembly import assemble, for_plant
-from pendulum_hw_bridge.clocks import WallClock
-from pendulum_hw_bridge.command_check import check_command
-from pendulum_hw_bridge.current_drive import CurrentMapping
-from pendulum_hw_bridge.effort_mapping import EffortStrategy
+from pendulum_hw_bridge.bridge.assembly import assemble, for_plant
+from pendulum_hw_bridge.bridge.module import DrivenModule
+from pendulum_hw_bridge.bridge.node_specs import SPECS
+from pendulum_hw_bridge.drive.current_drive import CurrentMapping
+from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
-from pendulum_hw_bridge.module import DrivenModule
-from pendulum_hw_bridge.node_specs import SPECS
-from pendulum_hw_bridge.settings import expect_limits
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, HardwareLimits, Strategy
+from pendulum_hw_bridge.port.clocks import WallClock
+from pendulum_hw_bridge.port.command_check import check_command
+from pendulum_hw_bridge.port.settings import expect_limits
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.contract.plant_specs import in_units_of
 from pendulum_msgs_py.errors import ParameterError

@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from pendulum_hw_bridge.actuator import Command, Feedback, HardwareLimits
 from pendulum_hw_bridge.backends.replay import FeedbackRecording, ReplayBackend, load_feedback
-from pendulum_hw_bridge.bridge_parameters import BRIDGE_SPECS, make_port
-from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.bridge.bridge_parameters import BRIDGE_SPECS, make_port
 from pendulum_hw_bridge.emulation import wire
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.server import EmulatorServer
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.feedback_message import QUANTITIES, encode_feedback
-from pendulum_hw_bridge.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.port.actuator import Command, Feedback, HardwareLimits
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.feedback_message import QUANTITIES, encode_feedback
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
 from pendulum_msgs_py.parameters import validate
 from tests.bag_messages import joint_state, write_bag

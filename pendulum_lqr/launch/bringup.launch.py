@@ -19,7 +19,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from pendulum_lqr.bringup import ARGUMENTS, SIDES, parameter_file, programs
+from pendulum_lqr.nodes.bringup import ARGUMENTS, SIDES, parameter_file, programs
 from pendulum_msgs_py.programs.graph import NodeProgram
 
 PLANTS = {"simulator", "bridge"}

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pendulum_lqr.disturbance import Disturbance
-from pendulum_lqr.interface import Controller
+from pendulum_lqr.disturbances.disturbance import Disturbance
+from pendulum_lqr.laws.interface import Controller
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
@@ -44,7 +44,7 @@ def run_closed_loop(
     period: float = 0.01,
     disturbance: Disturbance | None = None,
 ) -> Run:
-    from pendulum_sim.plants import make_plant
+    from pendulum_sim.stepping.plants import make_plant
 
     simulated = make_plant(plant, period)
     state = simulated.reset(theta, theta_dot)

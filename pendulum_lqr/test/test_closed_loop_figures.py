@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.analysis import loop_margins
-from pendulum_lqr.controller import make_controller
-from pendulum_lqr.design import output_lqr
-from pendulum_lqr.design_cli import main
-from pendulum_lqr.model import linearise
-from pendulum_lqr.parameter_box import ParameterBox, parse_box, worst_case
-from pendulum_lqr.time_figures import time_figures
+from pendulum_lqr.design_command.design_cli import main
+from pendulum_lqr.design_command.time_figures import time_figures
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.linear.analysis import loop_margins
+from pendulum_lqr.linear.design import output_lqr
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.parameter_box import ParameterBox, parse_box, worst_case
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, write_plant

@@ -9,8 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr import controller as registry
-from pendulum_lqr.controller import (
+from pendulum_lqr.controllers.nmpc import NonlinearMpc
+from pendulum_lqr.controllers.playback import Playback
+from pendulum_lqr.disturbances.disturbance import make_disturbance
+from pendulum_lqr.laws import controller as registry
+from pendulum_lqr.laws.controller import (
     COMMON_PARAMETERS,
     CONTROLLERS,
     BaseController,
@@ -19,10 +22,7 @@ from pendulum_lqr.controller import (
     make_controller,
     unwrapped,
 )
-from pendulum_lqr.controllers.nmpc import NonlinearMpc
-from pendulum_lqr.controllers.playback import Playback
-from pendulum_lqr.disturbance import make_disturbance
-from pendulum_lqr.policy_file import write_policy
+from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from tests.policies import random_policy
@@ -219,8 +219,8 @@ def test_pid_does_not_wind_up(simulate):
 
 @pytest.mark.parametrize("plant", [THESIS, DFKI], ids=lambda plant: plant.name)
 def test_numerical_tuning_finds_a_minimum_of_the_cost(plant):
-    from pendulum_lqr.model import linearise
-    from pendulum_lqr.tuning import PidGains, pid_cost, tune_numerically
+    from pendulum_lqr.linear.model import linearise
+    from pendulum_lqr.linear.tuning import PidGains, pid_cost, tune_numerically
 
     model = linearise(plant)
     arguments = (0.01, 0.02, (100.0, 0.01), 0.1)
@@ -239,8 +239,8 @@ def test_numerical_tuning_finds_a_minimum_of_the_cost(plant):
 
 
 def test_ziegler_nichols_starts_from_the_gain_at_which_the_sampled_loop_oscillates():
-    from pendulum_lqr.model import linearise
-    from pendulum_lqr.tuning import ultimate_gain, ziegler_nichols
+    from pendulum_lqr.linear.model import linearise
+    from pendulum_lqr.linear.tuning import ultimate_gain, ziegler_nichols
 
     gain, oscillation = ultimate_gain(linearise(DFKI), 0.01)
     gains = ziegler_nichols(linearise(DFKI), 0.01)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from pendulum_lqr.design_cli import main
+from pendulum_lqr.design_command.design_cli import main
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 
 

@@ -8,9 +8,9 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.disturbance import DISTURBANCE_SPECS, DISTURBANCES, from_bag, make_disturbance, torques
-from pendulum_lqr.disturbing import DisturbanceLoop
-from pendulum_lqr.multisine import multisine_harmonics
+from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, DISTURBANCES, from_bag, make_disturbance, torques
+from pendulum_lqr.disturbances.disturbing import DisturbanceLoop
+from pendulum_lqr.disturbances.multisine import multisine_harmonics
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import validate

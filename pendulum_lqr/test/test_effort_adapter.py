@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from pendulum_lqr.effort_adapter import EffortAdapter, effort_of_array, effort_of_joint
+from pendulum_lqr.nodes.effort_adapter import EffortAdapter, effort_of_array, effort_of_joint
 from pendulum_msgs_py.errors import DataError
 
 MS = 1_000_000

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pendulum_lqr.analysis import delayed_spectral_radius
-from pendulum_lqr.controller import make_controller
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.model import linearise
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.linear.analysis import delayed_spectral_radius
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant

@@ -9,9 +9,11 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.certificate import Certifier, is_stable
-from pendulum_lqr.design_cli import main as design
-from pendulum_lqr.gap_metric import (
+from pendulum_lqr.design_command.design_cli import main as design
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.sampled_design import discretise
+from pendulum_lqr.responses.certificate import Certifier, is_stable
+from pendulum_lqr.responses.gap_metric import (
     Scaling,
     chordal_distance,
     loop_distance,
@@ -19,11 +21,9 @@ from pendulum_lqr.gap_metric import (
     pointwise_margin,
     winding_number,
 )
-from pendulum_lqr.machine_response import Machine
-from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
-from pendulum_lqr.model import linearise
-from pendulum_lqr.sampled_design import discretise
-from pendulum_lqr.sampled_response import brought_to, model_response
+from pendulum_lqr.responses.machine_response import Machine
+from pendulum_lqr.responses.measured_response import MeasuredResponse, read_response, write_response
+from pendulum_lqr.responses.sampled_response import brought_to, model_response
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 

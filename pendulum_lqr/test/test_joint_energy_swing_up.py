@@ -9,16 +9,16 @@ import pytest
 
 from pendulum_bags.experiments.joint_run import stand_in_for
 from pendulum_lqr.controllers.joint_energy_swing_up import JointEnergySwingUp
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.energy_margin import EnergyMargin
-from pendulum_lqr.interface import JointController
-from pendulum_lqr.joint_controller import make_joint_controller
-from pendulum_lqr.mechanism_catch import make_mechanism_catch
-from pendulum_lqr.mechanism_pump import EnergyPump, pump_gains
+from pendulum_lqr.laws.interface import JointController
+from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.swing_up.energy_margin import EnergyMargin
+from pendulum_lqr.swing_up.mechanism_catch import make_mechanism_catch
+from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, pump_gains
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 PERIOD = 0.01
 
@@ -200,7 +200,9 @@ def test_a_period_that_is_measured_later_is_judged_without_another_design(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     controller = make_joint_controller(name, load_mechanism("cart_pole"), {})
-    monkeypatch.setattr("pendulum_lqr.mechanism_catch.sample_caught_region", lambda *_: pytest.fail("designed again"))
+    monkeypatch.setattr(
+        "pendulum_lqr.swing_up.mechanism_catch.sample_caught_region", lambda *_: pytest.fail("designed again")
+    )
     monkeypatch.setattr("pendulum_lqr.controllers.joint_lqr.mechanism_lqr", lambda *_: pytest.fail("designed again"))
     controller.check(0.01)
     with pytest.raises(ParameterError, match=rf"{name} asked every 0\.5 s does not settle on plant 'cart_pole'"):

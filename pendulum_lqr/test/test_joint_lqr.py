@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from pendulum_lqr.answering import AnswerLoop
-from pendulum_lqr.joint_controller import make_joint_controller
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.sampled_design import discretise
+from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.sampled_design import discretise
+from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from pendulum_lqr.controllers.joint_lqg import JointLqg
-from pendulum_lqr.design import DesignError, kalman_gain
-from pendulum_lqr.interface import JointController
-from pendulum_lqr.joint_controller import make_joint_controller
-from pendulum_lqr.mechanism_model import linearise_mechanism
-from pendulum_lqr.sampled_design import discretise
+from pendulum_lqr.laws.interface import JointController
+from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.linear.design import DesignError, kalman_gain
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism
+from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from tests.joint_plants import delayed_plant, near_upright
 
 PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")

@@ -12,15 +12,15 @@ import scipy.integrate
 import scipy.linalg
 import scipy.optimize
 
-from pendulum_lqr.answering import AnswerLoop
 from pendulum_lqr.controllers.joint_mpc import JointMpc
-from pendulum_lqr.joint_controller import make_joint_controller
-from pendulum_lqr.mechanism_model import linearise_mechanism
-from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism
+from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from tests.joint_plants import delayed_plant, near_upright
 
 PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")

@@ -5,9 +5,9 @@ import random
 import numpy as np
 import pytest
 
-from pendulum_lqr.controller import make_controller
-from pendulum_lqr.model import linearise
-from pendulum_lqr.sampled_design import discretise
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 

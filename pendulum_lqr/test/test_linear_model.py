@@ -8,18 +8,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.model import (
+from pendulum_lqr.linear.model import (
     LinearModel,
     equilibrium_effort,
     linearise,
     state_derivative,
 )
-from pendulum_lqr.sampled_design import discretise
+from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.equilibrium import fixed_points, overdamped_velocity, torque_gain
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.plants import make_plant
 
 PLANTS = st.builds(
     PlantParameters,

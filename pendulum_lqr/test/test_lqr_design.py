@@ -11,8 +11,8 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.analysis import analyse, delayed_spectral_radius, largest_stable_period, loop_margins
-from pendulum_lqr.design import (
+from pendulum_lqr.linear.analysis import analyse, delayed_spectral_radius, largest_stable_period, loop_margins
+from pendulum_lqr.linear.design import (
     DesignError,
     continuous_lqr,
     integral_lqr,
@@ -21,8 +21,8 @@ from pendulum_lqr.design import (
     require_controllable,
     require_observable,
 )
-from pendulum_lqr.model import LinearModel, linearise
-from pendulum_lqr.sampled_design import DiscreteModel, discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.linear.model import LinearModel, linearise
+from pendulum_lqr.linear.sampled_design import DiscreteModel, discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
 THESIS = load_plant("thesis")

@@ -19,8 +19,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-from pendulum_lqr.disturbance import make_disturbance
-from pendulum_lqr.policy_file import write_policy
+from pendulum_lqr.disturbances.disturbance import make_disturbance
+from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.programs.realtime import may_run_in_real_time

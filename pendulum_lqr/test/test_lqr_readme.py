@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_lqr.answering import StateRefusal
-from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class, make_controller
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.disturbance import DISTURBANCE_SPECS
-from pendulum_lqr.joint_controller import JOINT_CONTROLLERS, joint_controller_class
+from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
+from pendulum_lqr.laws.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class, make_controller
+from pendulum_lqr.laws.joint_controller import JOINT_CONTROLLERS, joint_controller_class
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.nodes.answering import StateRefusal
 from pendulum_msgs_py.parameters import markdown_table
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -40,7 +40,8 @@ def test_every_controller_of_several_joints_is_listed_with_its_parameters(name):
 
 def test_the_tables_of_the_nodes_are_those_of_the_code():
     pytest.importorskip("rclpy")
-    from pendulum_lqr import controller_node, disturbance_node, effort_adapter_node, trajectory_action_node
+    from pendulum_lqr.disturbances import disturbance_node
+    from pendulum_lqr.nodes import controller_node, effort_adapter_node, trajectory_action_node
 
     assert table("common") == markdown_table(COMMON_PARAMETERS)
     assert table("node") == markdown_table(controller_node.NODE_SPECS)

@@ -11,34 +11,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_lqr import mechanism_catch, swing_up_cli
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.joint_controller import make_joint_controller
-from pendulum_lqr.mechanism_catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
-from pendulum_lqr.mechanism_controllers import (
-    DifferencedVelocity,
-    default_catch,
-    make_mechanism_controller,
-    stored_trajectory,
-)
-from pendulum_lqr.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.mechanism_mpc import ITERATIONS, PATIENCE, PLAN, RETRIES, MechanismMpc
-from pendulum_lqr.mechanism_planned import PlannedSwingUp
-from pendulum_lqr.mechanism_search import PlanSettings
-from pendulum_lqr.mechanism_trajectory import (
+from pendulum_lqr.controllers.mechanism_controllers import DifferencedVelocity, make_mechanism_controller
+from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.swing_up import mechanism_catch, swing_up_cli
+from pendulum_lqr.swing_up.mechanism_catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
+from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
+from pendulum_lqr.swing_up.mechanism_mpc import ITERATIONS, PATIENCE, PLAN, RETRIES, MechanismMpc
+from pendulum_lqr.swing_up.mechanism_planned import PlannedSwingUp
+from pendulum_lqr.swing_up.mechanism_search import PlanSettings
+from pendulum_lqr.swing_up.mechanism_trajectory import (
     SwingUpSearch,
     cheapest_swing_up,
     load_trajectory,
     search_swing_up,
     write_trajectory,
 )
-from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
+from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
+from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajectory
 from pendulum_msgs_py.dynamics.runge_kutta import along_2, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from tests.joint_plants import delayed_plant
 
 DT = 0.002
@@ -431,7 +427,9 @@ def test_nothing_is_planned_from_a_state_that_is_no_number() -> None:
 def test_a_search_whose_file_cannot_be_written_ends_before_it_begins(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pendulum_lqr.mechanism_trajectory.search_swing_up", lambda *_: pytest.fail("searched"))
+    monkeypatch.setattr(
+        "pendulum_lqr.swing_up.mechanism_trajectory.search_swing_up", lambda *_: pytest.fail("searched")
+    )
     (tmp_path / "file").touch()
     assert swing_up_cli.main(["--guesses", "1", "--out", f"{tmp_path}/file/x.json"]) == 2
     assert "file/x.json cannot be written: " in capsys.readouterr().err

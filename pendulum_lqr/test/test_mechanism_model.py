@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import scipy.integrate
 
-from pendulum_lqr.analysis import analyse
-from pendulum_lqr.design import DesignError, continuous_lqr
-from pendulum_lqr.design_cli import main
-from pendulum_lqr.mechanism_model import holding_effort, linearise_mechanism, mechanism_lqr
-from pendulum_lqr.model import linearise
-from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.design_command.design_cli import main
+from pendulum_lqr.linear.analysis import analyse
+from pendulum_lqr.linear.design import DesignError, continuous_lqr
+from pendulum_lqr.linear.mechanism_model import holding_effort, linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant

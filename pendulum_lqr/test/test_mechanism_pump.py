@@ -10,10 +10,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from pendulum_lqr.controllers.joint_energy_swing_up import JointEnergySwingUp, _bounded
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.mechanism_catch import CaughtRegion, MechanismCatch
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.mechanism_pump import EnergyPump, PumpGains, pump_gains
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.swing_up.mechanism_catch import CaughtRegion, MechanismCatch
+from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, PumpGains, pump_gains
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from pendulum_lqr.controller import make_controller
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.disturbance import make_disturbance
-from pendulum_lqr.loop_check import growth
+from pendulum_lqr.disturbances.disturbance import make_disturbance
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.laws.loop_check import growth
+from pendulum_lqr.linear.design import DesignError
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant

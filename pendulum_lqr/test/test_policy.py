@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.controller import make_controller
 from pendulum_lqr.controllers.policy import LearnedPolicy
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.policy import Network, fingerprint
-from pendulum_lqr.policy_file import LARGEST_FILE, dumps_policy, load_policy, loads_policy, write_policy
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.policies.policy import Network, fingerprint
+from pendulum_lqr.policies.policy_file import LARGEST_FILE, dumps_policy, load_policy, loads_policy, write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from tests.policies import linear_policy, random_policy

@@ -23,13 +23,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.controller import make_controller
-from pendulum_lqr.convert_policy_cli import main
-from pendulum_lqr.onnx_file import dumps_onnx, observation_names
-from pendulum_lqr.policy_file import header_of, load_policy, write_policy
-from pendulum_lqr.policy_import import Told, policy_of_actor
-from pendulum_lqr.sb3_archive import LARGEST_ARCHIVE, load_actor
-from pendulum_lqr.torch_state import read_state
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.policies.convert_policy_cli import main
+from pendulum_lqr.policies.onnx_file import dumps_onnx, observation_names
+from pendulum_lqr.policies.policy_file import header_of, load_policy, write_policy
+from pendulum_lqr.policies.policy_import import Told, policy_of_actor
+from pendulum_lqr.policies.sb3_archive import LARGEST_ARCHIVE, load_actor
+from pendulum_lqr.policies.torch_state import read_state
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, write_plant
 from tests.policies import random_policy

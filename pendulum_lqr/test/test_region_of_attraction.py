@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pendulum_lqr.design import DesignError, continuous_lqr
-from pendulum_lqr.figures import phase_portrait_figure, region_to_show
-from pendulum_lqr.model import linearise
-from pendulum_lqr.roa import proven_level, region_of_attraction, rigid_rollout, sublevel_ellipse
+from pendulum_lqr.design_command.figures import phase_portrait_figure, region_to_show
+from pendulum_lqr.linear.design import DesignError, continuous_lqr
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.roa import proven_level, region_of_attraction, rigid_rollout, sublevel_ellipse
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 THESIS = load_plant("thesis")
@@ -103,7 +103,7 @@ def test_a_weak_motor_on_the_overdamped_plant_reaches_as_far_as_its_torque_holds
 
 
 def test_sampling_through_the_batch_engine_of_the_simulator_contains_the_proven_set():
-    from pendulum_sim.batch import simulate_batch
+    from pendulum_sim.batches.batch import simulate_batch
 
     smooth = DFKI.with_values(coulomb_friction=0.0, static_friction=0.0)
     gain = continuous_lqr(linearise(smooth), (10.0, 1.0), 1.0)

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from pendulum_lqr.answering import AnswerLoop
-from pendulum_lqr.controller import CONTROLLERS, controller_parameters, make_controller, unwrapped
+from pendulum_lqr.laws.controller import CONTROLLERS, controller_parameters, make_controller, unwrapped
+from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.plants import make_plant
 
 THESIS = load_plant("thesis")
 PERIOD = 0.01

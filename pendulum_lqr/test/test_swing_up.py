@@ -9,9 +9,9 @@ import math
 import numpy as np
 import pytest
 
-from pendulum_lqr.controller import make_controller
-from pendulum_lqr.minimum_time import minimum_time
-from pendulum_lqr.trajectory_optimisation import swing_up_trajectory
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.swing_up.minimum_time import minimum_time
+from pendulum_lqr.swing_up.trajectory_optimisation import swing_up_trajectory
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 
 DFKI = load_plant("dfki")
@@ -92,7 +92,7 @@ def test_swing_up_succeeds_from_any_start_and_with_a_wrong_model(name, starts, s
 
 
 def test_a_push_out_of_upright_is_answered_by_a_new_swing_up(simulate):
-    from pendulum_lqr.disturbance import make_disturbance
+    from pendulum_lqr.disturbances.disturbance import make_disturbance
 
     kick = make_disturbance(
         {

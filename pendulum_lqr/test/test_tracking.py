@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from pendulum_lqr.answering import AnswerLoop
-from pendulum_lqr.controller import make_controller
 from pendulum_lqr.controllers.lqr_tracking import LqrTracking
-from pendulum_lqr.design import DesignError, output_lqr
-from pendulum_lqr.loop_check import growth
-from pendulum_lqr.model import linearise
-from pendulum_lqr.reference import SHAPES, Reference
-from pendulum_lqr.scheduling import Schedule, scheduled_margins
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.laws.loop_check import growth
+from pendulum_lqr.linear.design import DesignError, output_lqr
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.reference import SHAPES, Reference
+from pendulum_lqr.linear.scheduling import Schedule, scheduled_margins
+from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError

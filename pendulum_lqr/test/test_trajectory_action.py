@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pendulum_lqr.trajectory_action import End, Outcome, PlantFollowing, goal_problem
+from pendulum_lqr.nodes.trajectory_action import End, Outcome, PlantFollowing, goal_problem
 from pendulum_msgs_py.contract.names import JOINT
 
 FOLLOWS = {"name": "plant_mode", "mode": "armed_position", "reason": "following a trajectory"}

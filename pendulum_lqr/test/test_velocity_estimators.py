@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pendulum_lqr.controller import make_controller
-from pendulum_lqr.velocity import VELOCITY_ESTIMATORS, KalmanVelocity, SavitzkyGolay
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.laws.velocity import VELOCITY_ESTIMATORS, KalmanVelocity, SavitzkyGolay
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.plants import make_plant
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")

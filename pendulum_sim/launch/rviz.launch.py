@@ -15,7 +15,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
-from pendulum_sim.model_files import any_urdf
+from pendulum_sim.exports.model_files import any_urdf
 
 
 def arguments() -> list[DeclareLaunchArgument]:

@@ -3,12 +3,12 @@
 __all__ = ["EXECUTABLES"]
 
 EXECUTABLES: dict[str, str] = {
-    "simulator": "pendulum_sim.simulator_node:main",
-    "mujoco": "pendulum_sim.mujoco_node:main",
-    "gymnasium": "pendulum_sim.gymnasium_node:main",
-    "adopt": "pendulum_sim.adopt_node:main",
-    "viewer": "pendulum_sim.viewer_node:main",
-    "markers": "pendulum_sim.markers_node:main",
-    "phase_plot": "pendulum_sim.phase_plot:main",
-    "export_model": "pendulum_sim.model_files:main",
+    "simulator": "pendulum_sim.simulator.simulator_node:main",
+    "mujoco": "pendulum_sim.simulator.mujoco_node:main",
+    "gymnasium": "pendulum_sim.simulator.gymnasium_node:main",
+    "adopt": "pendulum_sim.simulator.adopt_node:main",
+    "viewer": "pendulum_sim.pictures.viewer_node:main",
+    "markers": "pendulum_sim.pictures.markers_node:main",
+    "phase_plot": "pendulum_sim.pictures.phase_plot:main",
+    "export_model": "pendulum_sim.exports.model_files:main",
 }

@@ -12,10 +12,10 @@ from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import from_upright, wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim import vector_math
-from pendulum_sim.batch import simulate_batch
-from pendulum_sim.compiling import compile_tree
-from pendulum_sim.plant import RigidPlant
+from pendulum_sim.batches import vector_math
+from pendulum_sim.batches.batch import simulate_batch
+from pendulum_sim.batches.compiling import compile_tree
+from pendulum_sim.stepping.plant import RigidPlant
 
 THESIS_GAIN = (33.345265, 0.158993)
 _PLAIN = load_plant("dfki").with_values(coulomb_friction=0.0, static_friction=0.0, effort_limit=20.0)

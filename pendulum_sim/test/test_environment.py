@@ -16,10 +16,10 @@ from gymnasium.utils.env_checker import check_env
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim import drawing
-from pendulum_sim.environment import ENVIRONMENT_ID, PendulumEnv
-from pendulum_sim.plant import RigidPlant
-from pendulum_sim.vector_environment import PendulumVectorEnv
+from pendulum_sim.environments.environment import ENVIRONMENT_ID, PendulumEnv
+from pendulum_sim.environments.vector_environment import PendulumVectorEnv
+from pendulum_sim.pictures import drawing
+from pendulum_sim.stepping.plant import RigidPlant
 
 THESIS_GAIN = np.array([33.345265, 0.158993])
 
@@ -37,7 +37,7 @@ def test_gymnasium_checks_pass_for_every_plant(kwargs: dict) -> None:
 @pytest.mark.parametrize("dt", [2e-3, 5e-3, 0.01])
 @pytest.mark.parametrize("plant", ["thesis", "x5_9"])
 def test_it_registers_with_module_syntax_and_truncates_after_five_seconds_at_any_step(plant: str, dt: float) -> None:
-    env = gymnasium.make(f"pendulum_sim.environment:{ENVIRONMENT_ID}", dt=dt, plant=plant)
+    env = gymnasium.make(f"pendulum_sim.environments.environment:{ENVIRONMENT_ID}", dt=dt, plant=plant)
     action = np.zeros(1, dtype=np.float32)
     for _ in range(2):
         env.reset(seed=0)

@@ -13,10 +13,10 @@ import pytest
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.equilibrium import overdamped_velocity
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.drawing import PendulumPicture, rotation_matrix, save_gif, save_png
-from pendulum_sim.figures import overdamped_points
-from pendulum_sim.phase_plot import main
-from pendulum_sim.plants import make_plant
+from pendulum_sim.pictures.drawing import PendulumPicture, rotation_matrix, save_gif, save_png
+from pendulum_sim.pictures.figures import overdamped_points
+from pendulum_sim.pictures.phase_plot import main
+from pendulum_sim.stepping.plants import make_plant
 
 
 def test_the_thesis_has_a_stable_point_below_and_an_unstable_one_above() -> None:

@@ -12,12 +12,12 @@ import pytest
 
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.guarded_plant import GuardedPlant, PaceWatch, StallWatch
-from pendulum_sim.gymnasium_plant import load_gymnasium_plant
-from pendulum_sim.model_files import mjcf
-from pendulum_sim.mujoco_plant import load_mujoco_plant
-from pendulum_sim.plant import Plant, PlantState, RigidPlant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.exports.model_files import mjcf
+from pendulum_sim.foreign.guarded_plant import GuardedPlant, PaceWatch, StallWatch
+from pendulum_sim.foreign.gymnasium_plant import load_gymnasium_plant
+from pendulum_sim.foreign.mujoco_plant import load_mujoco_plant
+from pendulum_sim.stepping.plant import Plant, PlantState, RigidPlant
+from pendulum_sim.stepping.plants import make_plant
 
 
 class Broken(RigidPlant):

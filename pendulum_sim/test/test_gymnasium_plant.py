@@ -12,8 +12,8 @@ import pytest
 
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.gymnasium_plant import GymnasiumPlant, load_adapter, load_gymnasium_plant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.foreign.gymnasium_plant import GymnasiumPlant, load_adapter, load_gymnasium_plant
+from pendulum_sim.stepping.plants import make_plant
 
 
 class Lab(gymnasium.Env[Any, Any]):

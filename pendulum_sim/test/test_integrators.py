@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.integrators import INTEGRATORS, METHODS, get_integrator, phi_functions
-from pendulum_sim.plant import RigidPlant
+from pendulum_sim.stepping.integrators import INTEGRATORS, METHODS, get_integrator, phi_functions
+from pendulum_sim.stepping.plant import RigidPlant
 
 _SWINGING = PlantParameters(inertia=0.15, damping=0.1, gravity=3.0)
 _FIXED_STEP = [name for name in METHODS if name != "adaptive"]

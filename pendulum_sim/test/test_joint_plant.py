@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_sim.joint_plant import joint_plant, random_start
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.joint_plant import joint_plant, random_start
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 
 @pytest.mark.parametrize("stops", [(0.0, 1.0), (-0.02, 0.03), (0.4, 0.9), (-3.0, -2.0)])

@@ -19,8 +19,8 @@ import pytest
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.programs import kept_kernels
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
-from pendulum_sim import batch_kernels
-from pendulum_sim.batch import simulate_batch
+from pendulum_sim.batches import batch_kernels
+from pendulum_sim.batches.batch import simulate_batch
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import pytest
 from pendulum_msgs_py.contract.noise import scramble, stream_key, unit_interval
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.mechanism_batch import simulate_mechanisms
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 
 def _alone(

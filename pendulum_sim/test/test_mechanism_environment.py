@@ -13,9 +13,9 @@ from gymnasium.utils.env_checker import check_env
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_sim.mechanism_drawing import MechanismPicture
-from pendulum_sim.mechanism_environment import IDS, MechanismEnv, MechanismVectorEnv
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.environments.mechanism_environment import IDS, MechanismEnv, MechanismVectorEnv
+from pendulum_sim.pictures.mechanism_drawing import MechanismPicture
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from tests.joint_plants import without_friction
 
 

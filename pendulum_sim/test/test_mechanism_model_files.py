@@ -13,9 +13,9 @@ from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS
-from pendulum_sim.compiling import compile_tree
-from pendulum_sim.mechanism_files import mechanism_mjcf, mechanism_urdf
-from pendulum_sim.model_files import main
+from pendulum_sim.batches.compiling import compile_tree
+from pendulum_sim.exports.mechanism_files import mechanism_mjcf, mechanism_urdf
+from pendulum_sim.exports.model_files import main
 
 mujoco = pytest.importorskip("mujoco")
 _SMOOTH = ("cart_pole", "double_pendulum", "acrobot", "pendubot", "furuta")

@@ -11,9 +11,9 @@ import scipy.integrate
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.mechanism_files import mechanism_mjcf
-from pendulum_sim.mechanism_plant import MechanismPlant
-from pendulum_sim.plant import RigidPlant
+from pendulum_sim.exports.mechanism_files import mechanism_mjcf
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.plant import RigidPlant
 from tests.joint_plants import without_friction
 
 _PLANTS = ("cart_pole", "acrobot", "furuta")

@@ -11,8 +11,8 @@ import pytest
 
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.plants.plant_parameters import PRESETS, PlantParameters, load_plant
-from pendulum_sim.model_files import link_shape, main, mjcf, urdf
-from pendulum_sim.plants import make_plant
+from pendulum_sim.exports.model_files import link_shape, main, mjcf, urdf
+from pendulum_sim.stepping.plants import make_plant
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -10,11 +10,11 @@ import pytest
 
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.model_files import mjcf, urdf
-from pendulum_sim.mujoco_mapping import MujocoMapping, load_mujoco_mapping
-from pendulum_sim.mujoco_plant import MujocoPlant, load_mujoco_plant
-from pendulum_sim.plant import RigidPlant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.exports.model_files import mjcf, urdf
+from pendulum_sim.foreign.mujoco_mapping import MujocoMapping, load_mujoco_mapping
+from pendulum_sim.foreign.mujoco_plant import MujocoPlant, load_mujoco_plant
+from pendulum_sim.stepping.plant import RigidPlant
+from pendulum_sim.stepping.plants import make_plant
 
 pytest.importorskip("mujoco")
 

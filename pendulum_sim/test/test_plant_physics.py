@@ -16,10 +16,10 @@ from scipy.special import ellipk
 from pendulum_msgs_py.dynamics import rigid_acceleration
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.dry_friction import acceleration_with_friction
-from pendulum_sim.integrators import METHODS
-from pendulum_sim.plant import RigidPlant, pack, period_segments
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.dry_friction import acceleration_with_friction
+from pendulum_sim.stepping.integrators import METHODS
+from pendulum_sim.stepping.plant import RigidPlant, pack, period_segments
+from pendulum_sim.stepping.plants import make_plant
 
 _FREE = PlantParameters(inertia=0.15, damping=0.0, gravity=3.0)
 _DRY = PlantParameters(
@@ -165,7 +165,7 @@ def test_friction_that_grows_with_load_holds_a_steeper_pendulum() -> None:
 
 def test_accelerations_equal_those_of_mujoco_at_100_random_states() -> None:
     mujoco = pytest.importorskip("mujoco")
-    from pendulum_sim.model_files import mjcf
+    from pendulum_sim.exports.model_files import mjcf
 
     parameters = load_plant("dfki").with_values(coulomb_friction=0.0, static_friction=0.0)
     model = mujoco.MjModel.from_xml_string(mjcf(parameters))

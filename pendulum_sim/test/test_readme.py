@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from pendulum_msgs_py.parameters import markdown_table
-from pendulum_sim import adopt_node, engines, simulator_node, viewer_node
+from pendulum_sim.pictures import viewer_node
+from pendulum_sim.simulator import adopt_node, engines, simulator_node
 
 README = Path(__file__).parents[1] / "README.md"
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_sim.sensors import Sensors, quantise
+from pendulum_sim.stepping.sensors import Sensors, quantise
 
 
 def _measure(count: int = 20_000, **parameters: float) -> tuple[np.ndarray, Sensors]:

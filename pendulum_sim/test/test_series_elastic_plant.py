@@ -9,10 +9,10 @@ import pytest
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.plant import RigidPlant
-from pendulum_sim.plants import make_plant
-from pendulum_sim.series_elastic import SeriesElasticPlant
-from pendulum_sim.servo import PositionServo
+from pendulum_sim.stepping.plant import RigidPlant
+from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.series_elastic import SeriesElasticPlant
+from pendulum_sim.stepping.servo import PositionServo
 
 
 def test_back_emf_alone_makes_the_damping_of_the_thesis() -> None:

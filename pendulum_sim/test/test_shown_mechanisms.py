@@ -18,10 +18,10 @@ from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_differences import describe_plants
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS
 from pendulum_msgs_py.ros import qos
-from pendulum_sim.joint_frames import joint_frames
-from pendulum_sim.markers_node import arrow_points, joint_marker
-from pendulum_sim.mechanism_drawing import MechanismPicture
-from pendulum_sim.shown_plant import ShownPlant
+from pendulum_sim.pictures.joint_frames import joint_frames
+from pendulum_sim.pictures.markers_node import arrow_points, joint_marker
+from pendulum_sim.pictures.mechanism_drawing import MechanismPicture
+from pendulum_sim.pictures.shown_plant import ShownPlant
 from tests.graph_peer import GraphPeer
 
 _SIZE = (200, 200)

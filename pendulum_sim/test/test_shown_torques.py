@@ -6,7 +6,7 @@ import pytest
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.values import JointCommand
-from pendulum_sim.shown_torques import ShownTorques
+from pendulum_sim.pictures.shown_torques import ShownTorques
 
 _NOW = 10**18
 _MS = 1_000_000

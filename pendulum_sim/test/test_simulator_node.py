@@ -19,7 +19,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message
-from pendulum_sim.plant import RigidPlant
+from pendulum_sim.stepping.plant import RigidPlant
 from tests.graph_peer import GraphPeer
 from tests.refusals import Refused, not_refused
 

@@ -10,14 +10,14 @@ import pytest
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.batch import simulate_batch
-from pendulum_sim.environment import PendulumEnv
-from pendulum_sim.integrators import METHODS, get_integrator
-from pendulum_sim.plant import RigidPlant
-from pendulum_sim.plants import make_plant
-from pendulum_sim.series_elastic import SeriesElasticPlant
-from pendulum_sim.stability import MOST_GROWTH, growth_rate, stable_substeps
-from pendulum_sim.vector_environment import PendulumVectorEnv
+from pendulum_sim.batches.batch import simulate_batch
+from pendulum_sim.environments.environment import PendulumEnv
+from pendulum_sim.environments.vector_environment import PendulumVectorEnv
+from pendulum_sim.stepping.integrators import METHODS, get_integrator
+from pendulum_sim.stepping.plant import RigidPlant
+from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.series_elastic import SeriesElasticPlant
+from pendulum_sim.stepping.stability import MOST_GROWTH, growth_rate, stable_substeps
 
 _THESIS = load_plant("thesis")
 _PLANTS = {

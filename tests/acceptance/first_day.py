@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pendulum_bags.experiments.domain import reserve_domain
-from pendulum_hw_bridge.actuator import Strategy
+from pendulum_hw_bridge.port.actuator import Strategy
 from pendulum_msgs_py.plants.lab_file import load_lab, write_lab
 from tests.acceptance.first_day_bench import PATIENCE, TRIES, Button, Day
 from tests.acceptance.first_day_page import PAGE, Step, text_of, write_page

@@ -19,7 +19,7 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
-from pendulum_hw_bridge.nudge import EMULATED_NUDGE
+from pendulum_hw_bridge.checks.nudge import EMULATED_NUDGE
 from tests.acceptance.first_day_page import Step
 from tests.fixtures import wait_for
 from tests.processes import ProcessGroup, RunningProgram

@@ -282,7 +282,7 @@ def test_a_terminal_has_colours_and_only_the_library_that_leaves_them_out_if_ask
 
 
 def test_json_of_a_table_is_json(capsys: pytest.CaptureFixture[str]) -> None:
-    from pendulum_hw_bridge.emulator_cli import fault_main
+    from pendulum_hw_bridge.lab.emulator_cli import fault_main
 
     assert fault_main(["--json"]) == 0
     assert "m_stop" in json.loads(capsys.readouterr().out)["faults"]

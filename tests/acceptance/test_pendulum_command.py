@@ -53,7 +53,7 @@ def test_help_imports_no_library_and_no_program() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PROJECT)
     imported = set(done.stdout.splitlines())
     assert "pendulum_bags" in imported
-    assert not {"numpy", "scipy", "typer", "rich", "rclpy", "yaml", "pendulum_sim.simulator_node"} & imported
+    assert not {"numpy", "scipy", "typer", "rich", "rclpy", "yaml", "pendulum_sim.simulator.simulator_node"} & imported
 
 
 def test_arguments_are_handed_on_untouched(capfd: pytest.CaptureFixture[str]) -> None:

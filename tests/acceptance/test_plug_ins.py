@@ -29,7 +29,7 @@ PACKAGES = (
 
 FILES = {
     "pendulum_lqr/controllers/springy.py": """
-from pendulum_lqr.controller import BaseController
+from pendulum_lqr.laws.controller import BaseController
 from pendulum_msgs_py.parameters import ParameterSpec
 
 
@@ -75,7 +75,7 @@ def answer(path, plant):
 """Files of a stranger, beside ours."""
 
 FUNCTIONS = {
-    "pendulum_lqr/disturbance.py": (
+    "pendulum_lqr/disturbances/disturbance.py": (
         "DISTURBANCES",
         """
 def _square_wave(p, hold_ns):
@@ -119,7 +119,7 @@ LINES = {
             "drag_exponent": (2.0, Quantity("-", "How it grows with the speed.", positive=True)),
         }),""",
     ),
-    "pendulum_lqr/controller.py": ("CONTROLLERS", '"springy": "pendulum_lqr.controllers.springy:Springy",'),
+    "pendulum_lqr/laws/controller.py": ("CONTROLLERS", '"springy": "pendulum_lqr.controllers.springy:Springy",'),
     "pendulum_hw_bridge/backends/__init__.py": (
         "BACKENDS",
         '"toy": Backend("pendulum_hw_bridge.backends.toy:ToyBackend", _fixed("colour", "red", "`toy`: its colour.")),',
@@ -128,7 +128,7 @@ LINES = {
         "QUESTIONS",
         '"length": Question("pendulum_bags.analyse.questions.length"),',
     ),
-    "pendulum_lqr/disturbance.py": (
+    "pendulum_lqr/disturbances/disturbance.py": (
         "DISTURBANCES",
         '"square_wave": DisturbanceKind(_square_wave, parameters=(ParameterSpec("duty", 0.5, "-", "Its share."),)),',
     ),
@@ -164,26 +164,26 @@ from pendulum_bags.identification.identify_cli import main as identify
 from pendulum_bags.identification.kernel import PARAMETER_NAMES, _derivatives_of_terms
 from pendulum_bags.identification.model import from_plant, to_plant
 from pendulum_bags.report import write_report
-from pendulum_hw_bridge.actuator import HardwareLimits
-from pendulum_hw_bridge.bridge_node import main as bridge
-from pendulum_hw_bridge.bridge_consistency import check_consistency
-from pendulum_hw_bridge.bridge_parameters import make_port
-from pendulum_hw_bridge.clocks import SteppedClock
+from pendulum_hw_bridge.port.actuator import HardwareLimits
+from pendulum_hw_bridge.nodes.bridge_node import main as bridge
+from pendulum_hw_bridge.bridge.bridge_consistency import check_consistency
+from pendulum_hw_bridge.bridge.bridge_parameters import make_port
+from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_hw_bridge.emulation.kernel import STATES, STEP, advance
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
-from pendulum_hw_bridge.node_specs import SPECS
-from pendulum_lqr.controller import controller_parameters
-from pendulum_lqr.controller_node import main as controller
-from pendulum_lqr.disturbance import DISTURBANCE_SPECS
-from pendulum_lqr.disturbance_node import main as disturbance
+from pendulum_hw_bridge.bridge.node_specs import SPECS
+from pendulum_lqr.laws.controller import controller_parameters
+from pendulum_lqr.nodes.controller_node import main as controller
+from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
+from pendulum_lqr.disturbances.disturbance_node import main as disturbance
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import markdown_table, validate
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, load_plant
-from pendulum_sim.environment_kernel import is_smooth
-from pendulum_sim.plants import make_plant
-from pendulum_sim.series_elastic import pack_series_elastic, series_elastic_step
-from pendulum_sim.simulator_node import main as simulator
+from pendulum_sim.environments.environment_kernel import is_smooth
+from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.series_elastic import pack_series_elastic, series_elastic_step
+from pendulum_sim.simulator.simulator_node import main as simulator
 
 bag, run, out, dragged = sys.argv[1:]
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_hw_bridge.check_cli import EXIT_BUSY
+from pendulum_hw_bridge.checks.check_cli import EXIT_BUSY
 from tests.fixtures import PROJECT
 from tests.processes import ProcessGroup
 

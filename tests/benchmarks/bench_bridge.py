@@ -84,12 +84,12 @@ def _identification() -> Iterator[Row]:
 
 
 def _hand_trial(index: int) -> tuple[float, float]:
-    from pendulum_hw_bridge.actuator import Command, Strategy
     from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-    from pendulum_hw_bridge.clocks import SteppedClock
     from pendulum_hw_bridge.emulation.parameters import load_emulator
     from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-    from pendulum_hw_bridge.procedures import hand_trials
+    from pendulum_hw_bridge.nodes.procedures import hand_trials
+    from pendulum_hw_bridge.port.actuator import Command, Strategy
+    from pendulum_hw_bridge.port.clocks import SteppedClock
 
     motion = hand_trials(1)[index]
     port = EmulatorBackend(EmulatedX5(replace(load_emulator("thesis"), flat=True), seed=index), SteppedClock())
@@ -109,12 +109,12 @@ def _hand_trial(index: int) -> tuple[float, float]:
 
 
 def _staircase_trial(index: int) -> float:
-    from pendulum_hw_bridge.actuator import Command, Strategy
     from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-    from pendulum_hw_bridge.clocks import SteppedClock
     from pendulum_hw_bridge.emulation.parameters import load_emulator
     from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-    from pendulum_hw_bridge.procedures import staircase
+    from pendulum_hw_bridge.nodes.procedures import staircase
+    from pendulum_hw_bridge.port.actuator import Command, Strategy
+    from pendulum_hw_bridge.port.clocks import SteppedClock
 
     port = EmulatorBackend(EmulatedX5(load_emulator("thesis"), seed=100 + index), SteppedClock())
     port.connect()

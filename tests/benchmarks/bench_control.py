@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.controller import CONTROLLERS, make_controller
 from pendulum_lqr.controllers.playback import Playback
-from pendulum_lqr.design import continuous_lqr
-from pendulum_lqr.interface import Controller
-from pendulum_lqr.model import linearise
-from pendulum_lqr.trajectory_optimisation import swing_up_trajectory
+from pendulum_lqr.laws.controller import CONTROLLERS, make_controller
+from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.linear.design import continuous_lqr
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.swing_up.trajectory_optimisation import swing_up_trajectory
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.plants import make_plant
 from tests.benchmarks import Peer, Row, measured, peer
 
 __all__ = ["rows"]

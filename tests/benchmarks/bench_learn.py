@@ -29,8 +29,8 @@ from pendulum_bags.learning.task import VARIED, SwingUpTask, value_of
 from pendulum_bags.studies.leaderboard import evaluate
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_lqr.controllers.policy import START_TIME, LearnedPolicy
-from pendulum_lqr.policy import Policy
-from pendulum_lqr.policy_file import load_policy
+from pendulum_lqr.policies.policy import Policy
+from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import load_plant

@@ -14,7 +14,7 @@ from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.mechanism_files import mechanism_mjcf
+from pendulum_sim.exports.mechanism_files import mechanism_mjcf
 from tests.benchmarks import Peer, Row, measured, peer
 
 if TYPE_CHECKING:
@@ -63,8 +63,8 @@ def _batch() -> Iterator[Row]:
 
 def _check_batch() -> None:
     """Compare the trajectory of one pendulum of a batch with plant, controller and noise apart."""
-    from pendulum_sim.batch import simulate_batch
-    from pendulum_sim.plant import RigidPlant
+    from pendulum_sim.batches.batch import simulate_batch
+    from pendulum_sim.stepping.plant import RigidPlant
 
     parameters = load_plant("thesis")
     result = simulate_batch(
@@ -83,7 +83,7 @@ def _check_batch() -> None:
 
 
 def _batch_speed(method: str) -> float:
-    from pendulum_sim.batch import simulate_batch
+    from pendulum_sim.batches.batch import simulate_batch
 
     parameters, seeds = load_plant("thesis"), np.arange(PENDULUMS)
 
@@ -94,8 +94,8 @@ def _batch_speed(method: str) -> float:
 
 
 def _acrobot_speed() -> float:
-    from pendulum_sim.mechanism_batch import simulate_mechanisms
-    from pendulum_sim.mechanism_plant import MechanismPlant
+    from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
+    from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
     plant, seeds = load_mechanism(_ACROBOT), np.arange(PENDULUMS)
     gain = np.array([[-295.0, -124.0, -63.0, -28.5]])
@@ -135,7 +135,7 @@ def _mujoco_rollout(file: str | None = None, joints: int = 1) -> float:
     import mujoco
     from mujoco import rollout
 
-    from pendulum_sim.model_files import mjcf
+    from pendulum_sim.exports.model_files import mjcf
 
     model = mujoco.MjModel.from_xml_string(file or mjcf(load_plant("thesis")))
     data = [mujoco.MjData(model) for _ in range(2)]
@@ -153,7 +153,7 @@ def _mujoco_rollout(file: str | None = None, joints: int = 1) -> float:
 def _environments() -> Iterator[Row]:
     import gymnasium
 
-    import pendulum_sim.environment as _  # noqa: F401  (registers the environment)
+    import pendulum_sim.environments.environment as _  # noqa: F401  (registers the environment)
 
     ours = _env_speed("PendulumX59-v0")
     theirs = peer("Gymnasium Pendulum-v1", lambda: _env_speed("Pendulum-v1"))
@@ -213,7 +213,7 @@ def _envpool_speed() -> float:
 def _mujoco_single() -> float:
     import mujoco
 
-    from pendulum_sim.model_files import mjcf
+    from pendulum_sim.exports.model_files import mjcf
 
     model = mujoco.MjModel.from_xml_string(mjcf(load_plant("thesis")))
     data = mujoco.MjData(model)

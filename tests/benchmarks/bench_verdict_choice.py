@@ -15,8 +15,8 @@ from pendulum_bags.ranking.contender import Contender
 from pendulum_bags.ranking.present import REGRET_MARGIN, same_choice
 from pendulum_bags.ranking.ranking import rank
 from pendulum_bags.verdict import Mark
-from pendulum_lqr.model import linearise
-from pendulum_lqr.sampled_design import discretise
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from tests.benchmarks import Row, counted
 from tests.plant_pairs import K

@@ -25,15 +25,15 @@ from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, same_plant
 from pendulum_bags.frequency_response.record import record_of_arrays
 from pendulum_bags.verdict import Mark
-from pendulum_lqr.certificate import Certificate, Certifier, is_stable
-from pendulum_lqr.gap_metric import DEFAULT_SCALING, nu_gap
-from pendulum_lqr.machine_response import Machine
-from pendulum_lqr.measured_response import MeasuredResponse
-from pendulum_lqr.model import linearise
-from pendulum_lqr.sampled_design import DiscreteModel, discretise
-from pendulum_lqr.sampled_response import model_response
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.sampled_design import DiscreteModel, discretise
+from pendulum_lqr.responses.certificate import Certificate, Certifier, is_stable
+from pendulum_lqr.responses.gap_metric import DEFAULT_SCALING, nu_gap
+from pendulum_lqr.responses.machine_response import Machine
+from pendulum_lqr.responses.measured_response import MeasuredResponse
+from pendulum_lqr.responses.sampled_response import model_response
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.sensors import Sensors
+from pendulum_sim.stepping.sensors import Sensors
 from tests.benchmarks import Row, counted, measured
 from tests.plant_pairs import K as THESIS_GAIN
 

@@ -18,7 +18,7 @@ from sensor_msgs.msg import JointState
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.plant import RigidPlant
+from pendulum_sim.stepping.plant import RigidPlant
 
 
 class Plant(Node):

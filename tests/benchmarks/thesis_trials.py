@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from pendulum_bags.runs.datasets import Recording
-from pendulum_hw_bridge.actuator import Command, Feedback, Strategy
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.clocks import SteppedClock
 from pendulum_hw_bridge.emulation.parameters import TimingParameters, load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.procedures import hand_trials, staircase
+from pendulum_hw_bridge.nodes.procedures import hand_trials, staircase
+from pendulum_hw_bridge.port.actuator import Command, Feedback, Strategy
+from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["PERIOD", "hand_recording", "staircase_recording"]

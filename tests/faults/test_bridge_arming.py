@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import pytest
 
-from pendulum_hw_bridge.actuator import Feedback, HardwareLimits, MStopAction
-from pendulum_hw_bridge.effort_mapping import EffortStrategy
+from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
-from pendulum_hw_bridge.gains import GainSet
+from pendulum_hw_bridge.port.actuator import Feedback, HardwareLimits, MStopAction
+from pendulum_hw_bridge.port.gains import GainSet
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
 from tests.tools.faults.bridge_rig import MILLISECOND, Rig

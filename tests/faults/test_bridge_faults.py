@@ -13,9 +13,9 @@ from rclpy.serialization import serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pendulum_bags.experiments.domain import reserve_domain
-from pendulum_hw_bridge.bridge_node import BridgeNode
-from pendulum_hw_bridge.effort_mapping import EffortStrategy
+from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.nodes.bridge_node import BridgeNode
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand

@@ -10,16 +10,16 @@ from typing import Any
 
 import pytest
 
-from pendulum_hw_bridge.actuator import Strategy
-from pendulum_hw_bridge.assembly import assemble, for_plant
 from pendulum_hw_bridge.backends.emulated_machine import DrivePort, JointPort
-from pendulum_hw_bridge.bridge import Bridge, Outcome
-from pendulum_hw_bridge.bridge_node import BridgeNode
-from pendulum_hw_bridge.clocks import SteppedClock
-from pendulum_hw_bridge.derating import Derating
+from pendulum_hw_bridge.bridge.assembly import assemble, for_plant
+from pendulum_hw_bridge.bridge.bridge import Bridge, Outcome
+from pendulum_hw_bridge.bridge.node_specs import SPECS
+from pendulum_hw_bridge.drive.derating import Derating
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
-from pendulum_hw_bridge.node_specs import SPECS
-from pendulum_lqr.joint_controller import make_joint_controller
+from pendulum_hw_bridge.nodes.bridge_node import BridgeNode
+from pendulum_hw_bridge.port.actuator import Strategy
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_lqr.laws.joint_controller import make_joint_controller
 from pendulum_msgs_py.contract.commands import Refusal
 from pendulum_msgs_py.contract.supervisor import Input, Mode, PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import thesis_ramp

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_hw_bridge.actuator import Command, Strategy
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.truth_log import truth_log
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.port.actuator import Command, Strategy
 from pendulum_msgs_py.errors import PendulumError
 from tests.tools.faults.live import EFFORT_LIMIT
 from tests.tools.faults.motor import ROUNDING, Asked, Drive, ModuleTruth, Witness, beyond_asked, driving_torque

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_lqr.design import continuous_lqr
-from pendulum_lqr.model import linearise
+from pendulum_lqr.linear.design import continuous_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.plants import make_plant
 from tests.tools.faults.bag_property import COMMAND_LIFE, check_bag
 from tests.tools.faults.delay_margin import LIGHT, PERIOD, Q, R, predicted_margin
 from tests.tools.faults.network import PLANT_ADDRESS, cut_cable, two_machines, why_not

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_hw_bridge.node_specs import SPECS
-from pendulum_lqr.answering import AnswerLoop
-from pendulum_lqr.controller import make_controller
+from pendulum_hw_bridge.bridge.node_specs import SPECS
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
 from pendulum_msgs_py.plants.plant_parameters import load_plant

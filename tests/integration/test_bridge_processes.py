@@ -16,8 +16,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
 from pendulum_bags.experiments.domain import reserve_domain
-from pendulum_hw_bridge.actuator import Strategy
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
+from pendulum_hw_bridge.port.actuator import Strategy
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message

@@ -109,7 +109,7 @@ import sys
 from pathlib import Path
 from pendulum_msgs_py.ros import middleware
 middleware._LOOPBACK = Path({str(everywhere)!r})
-from pendulum_sim.simulator_node import main
+from pendulum_sim.simulator.simulator_node import main
 sys.exit(main(["--ros-args", "-r", "__ns:=/sim"]))
 """
     ended = subprocess.run(

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from pendulum_hw_bridge.e_stop_input_node import EStopInputServer
+from pendulum_hw_bridge.nodes.e_stop_input_node import EStopInputServer
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.ros.e_stop import EStopServer
 

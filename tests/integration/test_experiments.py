@@ -26,8 +26,8 @@ from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_bags.verdict import Layer, read_layers
-from pendulum_lqr.measured_response import read_response
-from pendulum_lqr.policy_file import write_policy
+from pendulum_lqr.policies.policy_file import write_policy
+from pendulum_lqr.responses.measured_response import read_response
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant

@@ -12,7 +12,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message
-from pendulum_sim.model_files import mjcf
+from pendulum_sim.exports.model_files import mjcf
 from tests.plant_peer import PlantPeer
 from tests.processes import ProcessGroup, RunningProgram
 

@@ -12,17 +12,19 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from pendulum_hw_bridge.node_specs import SPECS as BRIDGE_SPECS
-from pendulum_lqr.bringup import ARGUMENTS, SIDES, parameter_file, programs
-from pendulum_lqr.controller import COMMON_PARAMETERS, controller_parameters
-from pendulum_lqr.controller_node import NODE_SPECS as CONTROLLER_SPECS
-from pendulum_lqr.disturbance import DISTURBANCE_SPECS
-from pendulum_lqr.disturbance_node import NODE_SPECS as DISTURBANCE_NODE_SPECS
+from pendulum_hw_bridge.bridge.node_specs import SPECS as BRIDGE_SPECS
+from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
+from pendulum_lqr.disturbances.disturbance_node import NODE_SPECS as DISTURBANCE_NODE_SPECS
+from pendulum_lqr.laws.controller import COMMON_PARAMETERS, controller_parameters
+from pendulum_lqr.nodes.bringup import ARGUMENTS, SIDES, parameter_file, programs
+from pendulum_lqr.nodes.controller_node import NODE_SPECS as CONTROLLER_SPECS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import PRESETS, load_plant
 from pendulum_msgs_py.programs.graph import NodeProgram
-from pendulum_sim import markers_node, model_files, simulator_node, viewer_node
+from pendulum_sim.exports import model_files
+from pendulum_sim.pictures import markers_node, viewer_node
+from pendulum_sim.simulator import simulator_node
 from tests.fixtures import PROJECT
 
 LAUNCH_FILES = sorted(PROJECT.glob("pendulum_*/launch/*.launch.py"))

@@ -31,7 +31,7 @@ def destroy_node(node):
 Node.destroy_node = destroy_node
 """
 _SIMULATOR = """
-from pendulum_sim.simulator_node import main
+from pendulum_sim.simulator.simulator_node import main
 sys.exit(main([]))
 """
 _NESTED = """

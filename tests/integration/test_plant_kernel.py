@@ -30,8 +30,8 @@ from pendulum_msgs_py.loops.plant_record import (
 )
 from pendulum_msgs_py.loops.records import MESSAGE, expect_template, set_template, structure_of
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.loop_plant import BUILDER, LAYOUT, LoopPlant
-from pendulum_sim.plant import RigidPlant
+from pendulum_sim.simulator.loop_plant import BUILDER, LAYOUT, LoopPlant
+from pendulum_sim.stepping.plant import RigidPlant
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux" or platform.machine() != "x86_64", reason="loops are compiled on Linux for x86_64"

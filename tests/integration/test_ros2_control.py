@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.model_files import urdf
+from pendulum_sim.exports.model_files import urdf
 from tests.fixtures import PROJECT
 from tests.graph_peer import GraphPeer
 from tests.processes import ProcessGroup

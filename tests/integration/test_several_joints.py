@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 
-from pendulum_lqr.policy_file import write_policy
+from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.ros import qos

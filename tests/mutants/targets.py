@@ -60,7 +60,7 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target("pendulum_msgs_py.contract.drive", ("PlantLimits", "Mode"), _RULES),
     Target(
-        "pendulum_hw_bridge.settings",
+        "pendulum_hw_bridge.port.settings",
         ("write_settings", "write_limits", "expect_limits", "_expect"),
         (f"{_BRIDGE}/test_settings_read_back.py",),
     ),
@@ -74,28 +74,28 @@ TARGETS: tuple[Target, ...] = (
         ),
     ),
     Target(
-        "pendulum_hw_bridge.bridge_consistency",
+        "pendulum_hw_bridge.bridge.bridge_consistency",
         ("check_consistency", "_check_hardware"),
         (f"{_BRIDGE}/test_bridge_consistency.py",),
     ),
     Target(
-        "pendulum_hw_bridge.bridge_parameters",
+        "pendulum_hw_bridge.bridge.bridge_parameters",
         ("supervisor_limits", "bridge_settings", "effort_mapping", "safety_limits"),
         (f"{_BRIDGE}/test_bridge_consistency.py",),
     ),
     Target(
-        "pendulum_hw_bridge.safety",
+        "pendulum_hw_bridge.drive.safety",
         ("SafetyMonitor", "_or_zero", "_same"),
         (f"{_BRIDGE}/test_safety_monitor.py", f"{_BRIDGE}/test_safety_commands.py"),
     ),
-    Target("pendulum_hw_bridge.motor_state", ("MotorWatch",), (f"{_BRIDGE}/test_motor_state.py",)),
+    Target("pendulum_hw_bridge.drive.motor_state", ("MotorWatch",), (f"{_BRIDGE}/test_motor_state.py",)),
     Target(
-        "pendulum_hw_bridge.output_check",
+        "pendulum_hw_bridge.drive.output_check",
         ("OutputCheck", "_output", "_memoryless", "_clamped"),
         (f"{_BRIDGE}/test_output_check.py",),
     ),
     Target(
-        "pendulum_hw_bridge.effort_mapping",
+        "pendulum_hw_bridge.drive.effort_mapping",
         ("EffortMapping", "_clip"),
         (f"{_BRIDGE}/test_effort_mapping.py",),
     ),
@@ -122,28 +122,30 @@ TARGETS: tuple[Target, ...] = (
         (f"{_BRIDGE}/test_hebi_group.py",),
     ),
     Target(
-        "pendulum_hw_bridge.group_assembly",
+        "pendulum_hw_bridge.bridge.group_assembly",
         ("GroupAssembly", "refuse_slides", "_of_joint"),
         (f"{_BRIDGE}/test_group_assembly.py",),
     ),
-    Target("pendulum_hw_bridge.bridge", ("Bridge",), (*_CYCLE, f"{_BRIDGE}/test_hebi_group.py")),
-    Target("pendulum_hw_bridge.module", ("Module", "DrivenModule"), _CYCLE),
+    Target("pendulum_hw_bridge.bridge.bridge", ("Bridge",), (*_CYCLE, f"{_BRIDGE}/test_hebi_group.py")),
+    Target("pendulum_hw_bridge.bridge.module", ("Module", "DrivenModule"), _CYCLE),
     Target(
-        "pendulum_hw_bridge.current_drive", ("CurrentMapping", "CurrentCheck"), (f"{_BRIDGE}/test_current_drive.py",)
+        "pendulum_hw_bridge.drive.current_drive",
+        ("CurrentMapping", "CurrentCheck"),
+        (f"{_BRIDGE}/test_current_drive.py",),
     ),
-    Target("pendulum_hw_bridge.derating", ("Derating",), (f"{_BRIDGE}/test_derating.py",)),
+    Target("pendulum_hw_bridge.drive.derating", ("Derating",), (f"{_BRIDGE}/test_derating.py",)),
     Target(
-        "pendulum_hw_bridge.command_check",
+        "pendulum_hw_bridge.port.command_check",
         ("check_command", "check_lifetime", "_clip"),
         (f"{_BRIDGE}/test_command_check.py",),
     ),
     Target(
-        "pendulum_hw_bridge.guided",
+        "pendulum_hw_bridge.lab.guided",
         ("find_zero_and_sign", "measure_tare", "_turned", "_rest", "_listen", "expect_numbers"),
         (f"{_BRIDGE}/test_guided_rules.py", f"{_BRIDGE}/test_guided_procedures.py"),
     ),
     Target(
-        "pendulum_hw_bridge.proofs",
+        "pendulum_hw_bridge.lab.proofs",
         (
             "prove_lifetime",
             "prove_m_stop",
@@ -164,11 +166,13 @@ TARGETS: tuple[Target, ...] = (
         ),
     ),
     Target(
-        "pendulum_hw_bridge.nudge", ("watch_nudge", "hand_of", "Person", "EmulatedHand"), (f"{_BRIDGE}/test_nudge.py",)
+        "pendulum_hw_bridge.checks.nudge",
+        ("watch_nudge", "hand_of", "Person", "EmulatedHand"),
+        (f"{_BRIDGE}/test_nudge.py",),
     ),
-    Target("pendulum_hw_bridge.feedback_stream", ("feedback_for",), (f"{_BRIDGE}/test_nudge.py",)),
+    Target("pendulum_hw_bridge.port.feedback_stream", ("feedback_for",), (f"{_BRIDGE}/test_nudge.py",)),
     Target(
-        "pendulum_hw_bridge.module_files",
+        "pendulum_hw_bridge.lab.module_files",
         (
             "backup_group",
             "restore_group",
@@ -183,7 +187,7 @@ TARGETS: tuple[Target, ...] = (
         ),
         (f"{_BRIDGE}/test_module_files.py", f"{_BRIDGE}/test_hebi_emulated.py"),
     ),
-    Target("pendulum_hw_bridge.e_stop_input", ("EStopInput",), (f"{_BRIDGE}/test_e_stop_input.py",)),
+    Target("pendulum_hw_bridge.bridge.e_stop_input", ("EStopInput",), (f"{_BRIDGE}/test_e_stop_input.py",)),
 )
 
 

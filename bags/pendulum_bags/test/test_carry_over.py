@@ -17,11 +17,11 @@ from pendulum_bags.report import FIGURES
 from pendulum_bags.report.report_cli import main as report
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import write_layer
-from pendulum_lqr.gap_metric import Scaling
-from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
-from pendulum_lqr.model import linearise
-from pendulum_lqr.policy_file import write_policy
-from pendulum_lqr.sampled_response import model_response
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.policies.policy_file import write_policy
+from pendulum_lqr.responses.gap_metric import Scaling
+from pendulum_lqr.responses.measured_response import MeasuredResponse, read_response, write_response
+from pendulum_lqr.responses.sampled_response import model_response
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from tests.policies import linear_policy
 from tests.synthetic_runs import regulate, run_metadata, write_bag, write_run_folder

@@ -9,9 +9,9 @@ import pytest
 
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RAMP_SPEEDS, RegulationSettings
-from pendulum_hw_bridge.node_specs import SPECS
-from pendulum_lqr.controller import COMMON_PARAMETERS, CONTROLLERS, controller_parameters
-from pendulum_lqr.policy_file import write_policy
+from pendulum_hw_bridge.bridge.node_specs import SPECS
+from pendulum_lqr.laws.controller import COMMON_PARAMETERS, CONTROLLERS, controller_parameters
+from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.plant_specs import limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import PlantSupervisor
@@ -20,7 +20,7 @@ from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.plants import make_plant
 from tests.policies import linear_policy
 
 # Not those that need a file or a task of their own to be designed.

@@ -21,7 +21,7 @@ from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import plant_differences
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_rosbag.reader import read_bag
-from pendulum_sim.model_files import mjcf
+from pendulum_sim.exports.model_files import mjcf
 
 pytest.importorskip("mujoco")
 

@@ -19,13 +19,13 @@ from pendulum_bags.frequency_response.write import write_analysis
 from pendulum_bags.runs.run_data import RunData
 from pendulum_bags.runs.series import Series, Signal
 from pendulum_bags.verdict import Layer, Mark
-from pendulum_lqr.controller_response import controller_response
-from pendulum_lqr.measured_response import MeasuredResponse
-from pendulum_lqr.model import linearise
-from pendulum_lqr.sampled_response import model_response
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.responses.controller_response import controller_response
+from pendulum_lqr.responses.measured_response import MeasuredResponse
+from pendulum_lqr.responses.sampled_response import model_response
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.sensors import Sensors
+from pendulum_sim.stepping.sensors import Sensors
 
 THESIS = load_plant("thesis")
 MULTISINE = {

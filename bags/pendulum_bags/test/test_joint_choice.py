@@ -14,15 +14,15 @@ from pendulum_bags.ranking import joint_choice
 from pendulum_bags.ranking.joint_choice import joint_cost_parts, rank_joints, rankable
 from pendulum_bags.ranking.present import Words, same_choice
 from pendulum_bags.verdict import Mark
-from pendulum_lqr.joint_controller import make_joint_controller
-from pendulum_lqr.mechanism_model import linearise_mechanism
+from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 from pendulum_rosbag.storage import BagWriter
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 STATE = "sensor_msgs/msg/JointState"
 PERIOD = 0.01

@@ -24,7 +24,7 @@ from pendulum_bags.runs.run_data import joints_of, read_run
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_bags.verdict.answer import answer_of_joints, join_joints
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
-from pendulum_lqr.joint_controller import make_joint_controller
+from pendulum_lqr.laws.joint_controller import make_joint_controller
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.errors import DataError, ParameterError
@@ -34,7 +34,7 @@ from pendulum_rosbag.reader import bag as bag_module
 from pendulum_rosbag.reader.joint_table import JointTable, joint_table
 from pendulum_rosbag.reader.open_source import BagFolder
 from pendulum_rosbag.storage import BagWriter
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 STATE = "sensor_msgs/msg/JointState"
 EPOCH_NS = 1_700_000_000_000_000_000

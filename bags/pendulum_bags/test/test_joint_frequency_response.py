@@ -19,20 +19,20 @@ from pendulum_bags.frequency_response.joint_designs import certify_joint_designs
 from pendulum_bags.frequency_response.joint_experiment import JointMultisine
 from pendulum_bags.frequency_response.record import Record
 from pendulum_bags.verdict import Mark
-from pendulum_lqr.certificate import Certifier, is_stable
-from pendulum_lqr.disturbance import DISTURBANCE_SPECS, make_disturbance
-from pendulum_lqr.gap_metric import JointScaling
-from pendulum_lqr.machine_response import Machine
-from pendulum_lqr.measured_response import MeasuredResponse, read_response, write_response
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.model import LinearModel
-from pendulum_lqr.sampled_design import discretise
-from pendulum_lqr.sampled_response import model_response
+from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.linear.sampled_design import discretise
+from pendulum_lqr.responses.certificate import Certifier, is_stable
+from pendulum_lqr.responses.gap_metric import JointScaling
+from pendulum_lqr.responses.machine_response import Machine
+from pendulum_lqr.responses.measured_response import MeasuredResponse, read_response, write_response
+from pendulum_lqr.responses.sampled_response import model_response
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 PERIOD = 0.002
 DRIVEN_ALONE = ("cart_pole", "acrobot_frictionless", "furuta")

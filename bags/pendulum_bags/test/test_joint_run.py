@@ -23,10 +23,10 @@ from pendulum_bags.experiments.joint_run import (
 )
 from pendulum_bags.frequency_response.joint_experiment import JointMultisine
 from pendulum_bags.runs.run_record import RUN_RECORD
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 GIVEN = ("gravity", "gear_ratio", "elbow.effort_limit", "shoulder.stribeck_velocity")
 """What nobody has to identify."""

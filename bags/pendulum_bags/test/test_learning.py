@@ -20,11 +20,11 @@ from pendulum_bags.learning.ppo import Ppo, PpoSettings
 from pendulum_bags.learning.task import SwingUpTask, ranges_of
 from pendulum_bags.learning.train_cli import main
 from pendulum_bags.learning.training import Training, checkpoint_path, train
-from pendulum_lqr.policy_file import load_policy
+from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import DataError, FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.plants import make_plant
 from tests.policies import random_policy
 
 DFKI = load_plant("dfki")

@@ -16,9 +16,9 @@ from pendulum_bags.learning.ppo import PpoSettings
 from pendulum_bags.learning.task import SwingUpTask, ranges_of
 from pendulum_bags.learning.train_cli import main
 from pendulum_bags.learning.training import Training, checkpoint_path, train
-from pendulum_lqr.policy_file import load_policy
+from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
-from pendulum_sim.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from tests.policies import random_policy
 
 CART_POLE, DOUBLE = load_mechanism("cart_pole"), load_mechanism("double_pendulum")

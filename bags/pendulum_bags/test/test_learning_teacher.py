@@ -19,8 +19,8 @@ from pendulum_bags.learning.train_cli import main
 from pendulum_bags.learning.training import Training, checkpoint_path, train
 from pendulum_bags.studies.mechanism_benchmark import benchmark_plant
 from pendulum_bags.studies.mechanism_benchmark_runs import make_stepper, swing_up
-from pendulum_lqr.mechanism_catch import deviation_of
-from pendulum_lqr.policy_file import load_policy
+from pendulum_lqr.policies.policy_file import load_policy
+from pendulum_lqr.swing_up.mechanism_catch import deviation_of
 from tests.policies import random_policy
 
 PENDUBOT = benchmark_plant("pendubot")

@@ -23,9 +23,9 @@ from pendulum_bags.studies.mechanism_benchmark import (
     time_above_line,
 )
 from pendulum_bags.studies.mechanism_benchmark_runs import Disturbances, Trial, robustness_of, robustness_trials
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.mechanism_controllers import make_mechanism_controller
-from pendulum_lqr.policy_file import write_policy
+from pendulum_lqr.controllers.mechanism_controllers import make_mechanism_controller
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from tests.policies import random_policy

@@ -309,7 +309,7 @@ def test_a_hole_in_one_joints_column_leaves_its_row_out_for_all_joints(tmp_path)
 
 
 def test_a_bag_of_a_plant_is_identified_by_the_efforts_that_it_says_it_applied(tmp_path):
-    from pendulum_sim.mechanism_plant import MechanismPlant
+    from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
     plant = truth("cart_pole")
     model, rng = MechanismPlant(plant, PERIOD), np.random.default_rng(5)

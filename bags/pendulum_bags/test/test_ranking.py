@@ -20,7 +20,7 @@ from pendulum_bags.ranking.present import same_choice, write_ranking
 from pendulum_bags.ranking.ranking import Ranking, mmrv, rank
 from pendulum_bags.ranking.ranking_cli import main
 from pendulum_bags.verdict import Layer, Mark
-from pendulum_lqr.policy_file import write_policy
+from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader.mcap_source import McapSource

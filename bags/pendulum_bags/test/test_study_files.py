@@ -9,7 +9,7 @@ import pytest
 
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.studies.study_file import load_study, shipped_studies
-from pendulum_lqr.policy_file import write_policy
+from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from tests.policies import linear_policy

@@ -15,7 +15,7 @@ from pendulum_bags.studies.region_figure import region_sentence, write_region_fi
 from pendulum_bags.studies.region_map import RegionMap
 from pendulum_bags.studies.start_grid import run_map
 from pendulum_bags.studies.uncertain import Uncertainty
-from pendulum_lqr.roa import rigid_rollout
+from pendulum_lqr.linear.roa import rigid_rollout
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import BagError, FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant

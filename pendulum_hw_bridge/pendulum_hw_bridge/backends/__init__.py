@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pendulum_msgs_py.parameters import ParameterSpec
 
 if TYPE_CHECKING:
-    from pendulum_hw_bridge.actuator import ActuatorPort
-    from pendulum_hw_bridge.clocks import Clock
+    from pendulum_hw_bridge.port.actuator import ActuatorPort
+    from pendulum_hw_bridge.port.clocks import Clock
 
 __all__ = ["BACKENDS", "Backend"]
 

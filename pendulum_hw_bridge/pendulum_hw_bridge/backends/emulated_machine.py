@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, replace
 
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.emulation.machine import EmulatedMachine
+from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     ActuatorInfo,
     Applied,
@@ -14,11 +16,9 @@ from pendulum_hw_bridge.actuator import (
     HardwareLimits,
     Strategy,
 )
-from pendulum_hw_bridge.clocks import Clock
-from pendulum_hw_bridge.command_check import check_command
-from pendulum_hw_bridge.emulation.faults import ActuatorFault
-from pendulum_hw_bridge.emulation.machine import EmulatedMachine
-from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet
+from pendulum_hw_bridge.port.clocks import Clock
+from pendulum_hw_bridge.port.command_check import check_command
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["DrivePort", "JointPort", "machine_ports"]

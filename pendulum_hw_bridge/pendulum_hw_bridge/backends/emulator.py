@@ -9,7 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.emulation.parameters import TimingParameters, load_emulator
+from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     ActuatorInfo,
     Applied,
@@ -18,12 +21,9 @@ from pendulum_hw_bridge.actuator import (
     HardwareLimits,
     Strategy,
 )
-from pendulum_hw_bridge.clocks import Clock, WallClock
-from pendulum_hw_bridge.command_check import check_command, check_lifetime
-from pendulum_hw_bridge.emulation.faults import ActuatorFault
-from pendulum_hw_bridge.emulation.parameters import TimingParameters, load_emulator
-from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.gains import GainSet
+from pendulum_hw_bridge.port.clocks import Clock, WallClock
+from pendulum_hw_bridge.port.command_check import check_command, check_lifetime
+from pendulum_hw_bridge.port.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["EmulatorBackend"]

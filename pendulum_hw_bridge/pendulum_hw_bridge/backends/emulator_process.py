@@ -8,7 +8,8 @@ import socket
 from collections.abc import Mapping
 from typing import Any
 
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.emulation import wire
+from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     ActuatorInfo,
     Applied,
@@ -17,10 +18,9 @@ from pendulum_hw_bridge.actuator import (
     HardwareLimits,
     Strategy,
 )
-from pendulum_hw_bridge.clocks import Clock, WallClock
-from pendulum_hw_bridge.command_check import check_command, check_lifetime
-from pendulum_hw_bridge.emulation import wire
-from pendulum_hw_bridge.gains import GainSet
+from pendulum_hw_bridge.port.clocks import Clock, WallClock
+from pendulum_hw_bridge.port.command_check import check_command, check_lifetime
+from pendulum_hw_bridge.port.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["EmulatorProcessBackend"]

@@ -14,7 +14,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
+from pendulum_hw_bridge.backends.hebi_emulated import EmulatedLookup
+from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES, import_hebi, start_log, stop_log
+from pendulum_hw_bridge.backends.hebi_settings import fill_gains, fill_limits, gains_of, limits_of
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     ActuatorInfo,
     Applied,
@@ -26,14 +31,9 @@ from pendulum_hw_bridge.actuator import (
     Strategy,
     TemperatureState,
 )
-from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
-from pendulum_hw_bridge.backends.hebi_emulated import EmulatedLookup
-from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES, import_hebi, start_log, stop_log
-from pendulum_hw_bridge.backends.hebi_settings import fill_gains, fill_limits, gains_of, limits_of
-from pendulum_hw_bridge.clocks import Clock, WallClock
-from pendulum_hw_bridge.command_check import check_command, check_lifetime
-from pendulum_hw_bridge.emulation.parameters import load_emulator
-from pendulum_hw_bridge.gains import GainSet
+from pendulum_hw_bridge.port.clocks import Clock, WallClock
+from pendulum_hw_bridge.port.command_check import check_command, check_lifetime
+from pendulum_hw_bridge.port.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK

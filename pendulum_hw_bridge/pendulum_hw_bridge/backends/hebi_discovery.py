@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from pendulum_hw_bridge.actuator import ActuatorError
+from pendulum_hw_bridge.port.actuator import ActuatorError
 
 __all__ = ["LOOK_TIME", "ModuleRecord", "ModuleSelection", "discover", "select_module"]
 

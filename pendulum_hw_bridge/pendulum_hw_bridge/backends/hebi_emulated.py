@@ -18,12 +18,12 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-from pendulum_hw_bridge.actuator import ActuatorError, Command, Feedback, Strategy
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES
 from pendulum_hw_bridge.backends.hebi_settings import LIMIT_DISABLED, LIMIT_MOTOR_OFF, M_STOPS
 from pendulum_hw_bridge.emulation import wire
-from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, Feedback, Strategy
+from pendulum_hw_bridge.port.gains import GAIN_FIELDS, LOOPS
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
 

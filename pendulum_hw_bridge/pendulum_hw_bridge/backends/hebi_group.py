@@ -11,15 +11,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pendulum_hw_bridge.actuator import (
-    NO_SETPOINT,
-    ActuatorError,
-    ActuatorInfo,
-    Applied,
-    Command,
-    Feedback,
-    Strategy,
-)
 from pendulum_hw_bridge.backends.hebi import (
     ACKNOWLEDGE_MS,
     LOOKUP_TIMEOUT,
@@ -36,8 +27,17 @@ from pendulum_hw_bridge.backends.hebi_discovery import (
     select_module,
 )
 from pendulum_hw_bridge.backends.hebi_log import import_hebi, start_log, stop_log
-from pendulum_hw_bridge.clocks import Clock, WallClock
-from pendulum_hw_bridge.command_check import check_command
+from pendulum_hw_bridge.port.actuator import (
+    NO_SETPOINT,
+    ActuatorError,
+    ActuatorInfo,
+    Applied,
+    Command,
+    Feedback,
+    Strategy,
+)
+from pendulum_hw_bridge.port.clocks import Clock, WallClock
+from pendulum_hw_bridge.port.command_check import check_command
 from pendulum_msgs_py.programs.hang_guard import hang_guard
 
 __all__ = ["GroupDrive", "GroupEncoder", "HebiGroup"]

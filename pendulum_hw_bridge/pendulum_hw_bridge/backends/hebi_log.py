@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_hw_bridge.actuator import FEEDBACK_QUANTITIES, ActuatorError
+from pendulum_hw_bridge.port.actuator import FEEDBACK_QUANTITIES, ActuatorError
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_msgs_py.programs.hang_guard import guard_exit

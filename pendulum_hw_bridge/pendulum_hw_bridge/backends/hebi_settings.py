@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pendulum_hw_bridge.actuator import ActuatorError, HardwareLimits, MStopAction
-from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS, GainSet, PidGains
+from pendulum_hw_bridge.port.actuator import ActuatorError, HardwareLimits, MStopAction
+from pendulum_hw_bridge.port.gains import GAIN_FIELDS, LOOPS, GainSet, PidGains
 
 __all__ = ["LIMIT_DISABLED", "LIMIT_MOTOR_OFF", "M_STOPS", "fill_gains", "fill_limits", "gains_of", "limits_of"]
 

@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.backends.bag_feedback import read_bag_feedback
+from pendulum_hw_bridge.backends.hebi_log import read_hebilog
+from pendulum_hw_bridge.port.actuator import (
     FEEDBACK_QUANTITIES,
     ActuatorError,
     ActuatorInfo,
@@ -26,11 +28,9 @@ from pendulum_hw_bridge.actuator import (
     HardwareLimits,
     Strategy,
 )
-from pendulum_hw_bridge.backends.bag_feedback import read_bag_feedback
-from pendulum_hw_bridge.backends.hebi_log import read_hebilog
-from pendulum_hw_bridge.clocks import Clock, WallClock
-from pendulum_hw_bridge.command_check import check_command, check_lifetime
-from pendulum_hw_bridge.gains import GainSet
+from pendulum_hw_bridge.port.clocks import Clock, WallClock
+from pendulum_hw_bridge.port.command_check import check_command, check_lifetime
+from pendulum_hw_bridge.port.gains import GainSet
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError
 
@@ -47,7 +47,7 @@ class FeedbackRecording:
 
     Args:
         quantities: ``time`` [s], increasing, and quantities by their name in
-            :data:`pendulum_hw_bridge.actuator.FEEDBACK_QUANTITIES`, in SI units, all of one length. ``position``,
+            :data:`pendulum_hw_bridge.port.actuator.FEEDBACK_QUANTITIES`, in SI units, all of one length. ``position``,
             ``velocity`` and ``effort`` are required.
         where: Where it comes from, for messages.
 

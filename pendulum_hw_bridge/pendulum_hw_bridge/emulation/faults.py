@@ -6,7 +6,7 @@ import math
 from enum import Enum
 from typing import Any
 
-from pendulum_hw_bridge.actuator import Feedback, LimitState, TemperatureState
+from pendulum_hw_bridge.port.actuator import Feedback, LimitState, TemperatureState
 
 __all__ = ["ActuatorFault", "distort"]
 

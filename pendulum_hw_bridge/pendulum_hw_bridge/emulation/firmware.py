@@ -1,7 +1,7 @@
 """The X5-9's firmware: PID loops and control strategies 0 to 4, one cycle of 1 ms at a time.
 
 Plain scalar code on arrays of floats, which :mod:`.kernel` has compiled. Gains are rows of 14 numbers in the order
-of :data:`pendulum_hw_bridge.gains.GAIN_FIELDS`; the memory of a loop is a row of 5.
+of :data:`pendulum_hw_bridge.port.gains.GAIN_FIELDS`; the memory of a loop is a row of 5.
 
 Source: HEBI documentation, "Control strategies" and "Gains".
 """
@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS, GainSet
+from pendulum_hw_bridge.port.gains import GAIN_FIELDS, LOOPS, GainSet
 
 __all__ = [
     "CONTROL_PERIOD",

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pendulum_hw_bridge.actuator import HardwareLimits
+from pendulum_hw_bridge.drive.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES, EMULATOR_PRESETS
 from pendulum_hw_bridge.emulation.firmware import Array
 from pendulum_hw_bridge.emulation.kernel import CONSTANTS
 from pendulum_hw_bridge.emulation.thermal import ThermalParameters, torque_constant_at
-from pendulum_hw_bridge.motor_state import MOTOR_SPEED_LIMIT
+from pendulum_hw_bridge.port.actuator import HardwareLimits
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, terms_of

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from pendulum_hw_bridge.actuator import Feedback, HardwareLimits, LimitState, TemperatureState
 from pendulum_hw_bridge.emulation.firmware import Array
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
+from pendulum_hw_bridge.port.actuator import Feedback, HardwareLimits, LimitState, TemperatureState
 from pendulum_msgs_py.dynamics.series_elastic import spring_torque
 
 __all__ = ["measure"]

@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pendulum_hw_bridge.actuator import Strategy
 from pendulum_hw_bridge.emulation import wire
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
+from pendulum_hw_bridge.port.actuator import Strategy
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError, PendulumError

@@ -11,8 +11,8 @@ import math
 import struct
 from typing import Any
 
-from pendulum_hw_bridge.actuator import Command, Feedback, HardwareLimits, MStopAction
-from pendulum_hw_bridge.gains import GAIN_FIELDS, LOOPS, GainSet, PidGains
+from pendulum_hw_bridge.port.actuator import Command, Feedback, HardwareLimits, MStopAction
+from pendulum_hw_bridge.port.gains import GAIN_FIELDS, LOOPS, GainSet, PidGains
 from pendulum_msgs_py.errors import ParameterError
 
 __all__ = [

@@ -14,7 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pendulum_hw_bridge.actuator import (
+from pendulum_hw_bridge.emulation import kernel
+from pendulum_hw_bridge.emulation.faults import ActuatorFault, distort
+from pendulum_hw_bridge.emulation.firmware import gain_rows
+from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
+from pendulum_hw_bridge.emulation.sensing import measure
+from pendulum_hw_bridge.port.actuator import (
     NO_SETPOINT,
     Command,
     CommandLock,
@@ -23,13 +28,8 @@ from pendulum_hw_bridge.actuator import (
     MStopAction,
     Strategy,
 )
-from pendulum_hw_bridge.command_check import check_lifetime
-from pendulum_hw_bridge.emulation import kernel
-from pendulum_hw_bridge.emulation.faults import ActuatorFault, distort
-from pendulum_hw_bridge.emulation.firmware import gain_rows
-from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
-from pendulum_hw_bridge.emulation.sensing import measure
-from pendulum_hw_bridge.gains import DEFAULT_GAINS, GainSet, PidGains
+from pendulum_hw_bridge.port.command_check import check_lifetime
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GainSet, PidGains
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.series_elastic import spring_deflection
 from pendulum_msgs_py.errors import ParameterError

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controller import LawController
 from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, Q, R
-from pendulum_lqr.design import DesignError, Gain
-from pendulum_lqr.interface import Controller
-from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
-from pendulum_lqr.model import linearise
-from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.laws.controller import LawController
+from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
+from pendulum_lqr.linear.design import DesignError, Gain
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -31,7 +31,7 @@ _LAGGED, _PENDING = range(2)
 def discrete_lqr_law(
     _t: float, angle: float, velocity: float, memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return u* - K [x - x*; lagged; on their way] within the limit [N m]; see :data:`pendulum_lqr.law.Law`.
+    """Return u* - K [x - x*; lagged; on their way] within the limit [N m]; see :data:`pendulum_lqr.laws.law.Law`.
 
     It remembers the lagged torque and those on their way, oldest first, as deviations from the one that holds [N m].
     """

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from pendulum_lqr.catch import CatchingController
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.energy_margin import EnergyMargin
-from pendulum_lqr.interface import Controller
+from pendulum_lqr.laws.catch import CatchingController
+from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.swing_up.energy_margin import EnergyMargin
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

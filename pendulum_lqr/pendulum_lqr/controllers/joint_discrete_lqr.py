@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_lqr.controllers.joint_lqr import UprightController, gain_text
-from pendulum_lqr.interface import Controller, JointController
-from pendulum_lqr.mechanism_controller import within_limits
-from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
-from pendulum_lqr.sampling import require_period
+from pendulum_lqr.laws.interface import Controller, JointController
+from pendulum_lqr.laws.sampling import require_period
+from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, require_catching
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.energy_margin import EnergyMargin
-from pendulum_lqr.interface import Controller, JointController
-from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
-from pendulum_lqr.mechanism_pump import EnergyPump, pump_gains
+from pendulum_lqr.laws.interface import Controller, JointController
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.swing_up.energy_margin import EnergyMargin
+from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
+from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, pump_gains
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -25,8 +25,9 @@ _REST = 0.1
 
 
 class JointEnergySwingUp(JointController):
-    """Pumps energy into a pendulum by moving its hinge until the LQR can catch it; :mod:`pendulum_lqr.mechanism_pump`.
+    """Pumps energy into a pendulum by moving its hinge until the LQR can catch it.
 
+    The energy is that of :mod:`pendulum_lqr.swing_up.mechanism_pump`.
     Nothing is planned, and an answer takes microseconds: it begins from anywhere, and again wherever it is thrown to.
 
     Args:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.controllers.joint_discrete_lqr import JointDiscreteLqr
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, gain_text, joint_weights
-from pendulum_lqr.design import kalman_gain
-from pendulum_lqr.interface import Controller, JointController
-from pendulum_lqr.sampled_design import discretise
+from pendulum_lqr.laws.interface import Controller, JointController
+from pendulum_lqr.linear.design import kalman_gain
+from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters

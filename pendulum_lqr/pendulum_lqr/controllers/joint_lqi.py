@@ -16,11 +16,11 @@ from pendulum_lqr.controllers.joint_lqr import (
     joint_weights,
     require_settling,
 )
-from pendulum_lqr.interface import Controller, JointController
-from pendulum_lqr.mechanism_controller import within_limits
-from pendulum_lqr.mechanism_model import mechanism_lqr
-from pendulum_lqr.model import LinearModel
-from pendulum_lqr.sampling import require_period
+from pendulum_lqr.laws.interface import Controller, JointController
+from pendulum_lqr.laws.sampling import require_period
+from pendulum_lqr.linear.mechanism_model import mechanism_lqr
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.analysis import delayed_spectral_radius
-from pendulum_lqr.design import Gain
-from pendulum_lqr.interface import JointController
-from pendulum_lqr.mechanism_catch import MechanismCatch
-from pendulum_lqr.mechanism_controller import within_limits
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.model import LinearModel
+from pendulum_lqr.laws.interface import JointController
+from pendulum_lqr.linear.analysis import delayed_spectral_radius
+from pendulum_lqr.linear.design import Gain
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
+from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec

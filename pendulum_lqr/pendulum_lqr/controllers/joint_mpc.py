@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.condensed_mpc import CondensedMpc
 from pendulum_lqr.controllers.joint_discrete_lqr import JointDiscreteLqr
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, gain_text, joint_weights
+from pendulum_lqr.linear.condensed_mpc import CondensedMpc
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from pendulum_lqr.controllers.joint_swing_up import CaughtController
-from pendulum_lqr.mechanism_controllers import default_catch, refuse_passive_friction
-from pendulum_lqr.mechanism_mpc import PLAN, MechanismMpc
+from pendulum_lqr.swing_up.mechanism_mpc import PLAN, MechanismMpc
+from pendulum_lqr.swing_up.stored_swing_up import default_catch, refuse_passive_friction
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["JointNmpc"]

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits
-from pendulum_lqr.interface import Controller, JointController
-from pendulum_lqr.joint_controller import make_joint_controller
-from pendulum_lqr.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
-from pendulum_lqr.policy import Policy, require_plant
-from pendulum_lqr.policy_answers import (
+from pendulum_lqr.laws.interface import Controller, JointController
+from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.laws.policy_answers import (
     START_TIME,
     ZERO,
     PolicyAnswers,
@@ -18,7 +16,9 @@ from pendulum_lqr.policy_answers import (
     policy_specs,
     states_to_hold,
 )
-from pendulum_lqr.policy_file import load_policy
+from pendulum_lqr.policies.policy import Policy, require_plant
+from pendulum_lqr.policies.policy_file import load_policy
+from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec

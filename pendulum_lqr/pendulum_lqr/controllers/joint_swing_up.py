@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from pendulum_lqr.controllers.joint_lqr import require_catching
-from pendulum_lqr.interface import JointController
-from pendulum_lqr.mechanism_catch import MechanismCatch
-from pendulum_lqr.mechanism_controllers import default_catch, stored_trajectory
-from pendulum_lqr.mechanism_mpc import MechanismMpc
-from pendulum_lqr.mechanism_trajectory import MechanismTrajectory, load_trajectory
-from pendulum_lqr.mechanism_tvlqr import MechanismTvlqr
-from pendulum_lqr.sampling import require_period
+from pendulum_lqr.laws.interface import JointController
+from pendulum_lqr.laws.sampling import require_period
+from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
+from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
+from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory, load_trajectory
+from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
+from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajectory
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters

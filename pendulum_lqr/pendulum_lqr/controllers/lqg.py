@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, OFFSET_NOISE, Q, R
-from pendulum_lqr.design import Gain, Matrix
-from pendulum_lqr.interface import Controller
-from pendulum_lqr.model import LinearModel, linearise
-from pendulum_lqr.observer import Observer
-from pendulum_lqr.sampled_design import discrete_lqr, discretise, sampled_cost
+from pendulum_lqr.laws.controller import BaseController
+from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.linear.design import Gain, Matrix
+from pendulum_lqr.linear.model import LinearModel, linearise
+from pendulum_lqr.linear.observer import Observer
+from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any
 
-from pendulum_lqr.controller import LawController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
-from pendulum_lqr.design import Gain, integral_lqr
-from pendulum_lqr.interface import Controller
-from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
-from pendulum_lqr.model import linearise
+from pendulum_lqr.laws.controller import LawController
+from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
+from pendulum_lqr.linear.design import Gain, integral_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -24,7 +24,7 @@ _INTEGRAL = 0
 def lqi_law(
     _t: float, angle: float, velocity: float, memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return u* - K [x - x*; integral] within the limit [N m]; see :data:`pendulum_lqr.law.Law`.
+    """Return u* - K [x - x*; integral] within the limit [N m]; see :data:`pendulum_lqr.laws.law.Law`.
 
     It remembers the integral [rad s].
     """

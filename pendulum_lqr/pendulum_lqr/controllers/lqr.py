@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any, ClassVar
 
-from pendulum_lqr.controller import LawController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
-from pendulum_lqr.design import Gain, output_lqr
-from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
-from pendulum_lqr.model import linearise
+from pendulum_lqr.laws.controller import LawController
+from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
+from pendulum_lqr.linear.design import Gain, output_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -22,7 +22,7 @@ _HOLD, _K0, _K1 = range(OWN, OWN + 3)
 def lqr_law(
     _t: float, angle: float, velocity: float, _memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return u* - K (x - x*) within the limit [N m]; see :data:`pendulum_lqr.law.Law`."""
+    """Return u* - K (x - x*) within the limit [N m]; see :data:`pendulum_lqr.laws.law.Law`."""
     error = deviation(angle, numbers[SET_POINT])
     return clamped(numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity, numbers[EFFORT_LIMIT])
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.analysis import delayed_spectral_radius
-from pendulum_lqr.controller import LawController
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
-from pendulum_lqr.design import DesignError, Gain, output_lqr
-from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
-from pendulum_lqr.model import LinearModel, linearise
+from pendulum_lqr.laws.controller import LawController
+from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
+from pendulum_lqr.linear.analysis import delayed_spectral_radius
+from pendulum_lqr.linear.design import DesignError, Gain, output_lqr
+from pendulum_lqr.linear.model import LinearModel, linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.equilibrium import friction_effort
@@ -34,7 +34,7 @@ _LARGEST = 0.5
 def lqr_friction_law(
     _t: float, angle: float, velocity: float, _memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return the LQR's torque less that of a smooth sign, within the limit [N m]; see :data:`pendulum_lqr.law.Law`."""
+    """Return the LQR's torque less that of a smooth sign, within the limit [N m], as a :data:`.law.Law`."""
     error = deviation(angle, numbers[SET_POINT])
     against = numbers[_FRICTION] * math.tanh(error / numbers[_WIDTH])
     wanted = numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity - against

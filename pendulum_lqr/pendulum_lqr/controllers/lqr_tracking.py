@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pendulum_lqr.controller import BaseController
 from pendulum_lqr.controllers.specs import Q, R
-from pendulum_lqr.design import DesignError
-from pendulum_lqr.interface import Controller
-from pendulum_lqr.reference import SHAPES, Motion, Reference, Way
-from pendulum_lqr.scheduling import Schedule, ScheduledMargins, scheduled_margins
+from pendulum_lqr.laws.controller import BaseController
+from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.linear.reference import SHAPES, Motion, Reference, Way
+from pendulum_lqr.linear.scheduling import Schedule, ScheduledMargins, scheduled_margins
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec

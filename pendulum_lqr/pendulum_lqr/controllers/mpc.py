@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.condensed_mpc import CondensedMpc
 from pendulum_lqr.controllers.lqg import Lqg
 from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, OFFSET_NOISE, Q, R
-from pendulum_lqr.design import DesignError, Matrix
-from pendulum_lqr.model import LinearModel
-from pendulum_lqr.observer import Observer
+from pendulum_lqr.linear.condensed_mpc import CondensedMpc
+from pendulum_lqr.linear.design import DesignError, Matrix
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.linear.observer import Observer
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 

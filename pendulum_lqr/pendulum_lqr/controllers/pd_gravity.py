@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any
 
-from pendulum_lqr.controller import LawController
-from pendulum_lqr.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
-from pendulum_lqr.model import linearise, low_frequency
+from pendulum_lqr.laws.controller import LawController
+from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
+from pendulum_lqr.linear.model import linearise, low_frequency
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.equilibrium import torque_gain
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -21,7 +21,7 @@ _KP, _KD, _GRAVITY, _ANGLE_OFFSET, _OFFSET = range(OWN, OWN + 5)
 def pd_gravity_law(
     _t: float, angle: float, velocity: float, _memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return the weight's torque and that of the two gains within the limit [N m]; see :data:`pendulum_lqr.law.Law`."""
+    """Return the weight's torque and that of the two gains within the limit [N m], as a :data:`.law.Law`."""
     # sin(theta) = -sin(theta - pi)
     weight = -numbers[_GRAVITY] * math.sin(angle - numbers[_ANGLE_OFFSET]) - numbers[_OFFSET]
     error = deviation(angle, numbers[SET_POINT])

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pendulum_lqr.controller import BaseController, make_controller
-from pendulum_lqr.interface import Controller
-from pendulum_lqr.loop_check import require_stable
-from pendulum_lqr.policy import Policy, require_plant
-from pendulum_lqr.policy_answers import (
+from pendulum_lqr.laws.controller import BaseController, make_controller
+from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.laws.loop_check import require_stable
+from pendulum_lqr.laws.policy_answers import (
     START_TIME,
     ZERO,
     PolicyAnswers,
@@ -17,7 +16,8 @@ from pendulum_lqr.policy_answers import (
     policy_specs,
     states_to_hold,
 )
-from pendulum_lqr.policy_file import load_policy
+from pendulum_lqr.policies.policy import Policy, require_plant
+from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 

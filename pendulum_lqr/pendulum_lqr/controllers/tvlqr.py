@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.catch import CatchingController
 from pendulum_lqr.controllers.energy_swing_up import EnergySwingUp
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R
-from pendulum_lqr.design import cost_matrices
-from pendulum_lqr.interface import Controller
-from pendulum_lqr.model import linearise
-from pendulum_lqr.sampled_design import discretise
-from pendulum_lqr.trajectory_optimisation import swing_up_trajectory
+from pendulum_lqr.laws.catch import CatchingController
+from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.linear.design import cost_matrices
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.sampled_design import discretise
+from pendulum_lqr.swing_up.trajectory_optimisation import swing_up_trajectory
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

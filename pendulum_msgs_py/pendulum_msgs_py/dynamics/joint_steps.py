@@ -6,7 +6,7 @@ step. A resting joint is held while the effort that holds it lies within its dry
 presses it there); it is then exactly at rest, and the other joints move as if it were welded. A stop takes the whole
 velocity of its joint (a plastic impact), and the others get their share of the impulse through the mass matrix.
 
-It is the one-joint plant's rule (:mod:`pendulum_sim.dry_friction`) for several joints.
+It is the one-joint plant's rule (:mod:`pendulum_sim.stepping.dry_friction`) for several joints.
 
 Sources: D. Karnopp, "Computer simulation of stick-slip friction in mechanical dynamic systems", 1985, events located;
 F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, section 8 (impacts).

@@ -16,10 +16,10 @@ from pendulum_msgs_py.loops.machine_code import NoMachineCodeError, compile_loop
 __all__ = ["COMMON"]
 
 COMMON = (
-    ("pendulum_sim.loop_kernel:rigid_loop", "etd4"),
-    ("pendulum_sim.loop_kernel:rigid_loop", "euler"),
-    ("pendulum_lqr.controller_kernel:law_loop", "pendulum_lqr.controllers.lqr:lqr_law"),
-    ("pendulum_lqr.disturbance_kernel:uniform_loop",),
+    ("pendulum_sim.simulator.loop_kernel:rigid_loop", "etd4"),
+    ("pendulum_sim.simulator.loop_kernel:rigid_loop", "euler"),
+    ("pendulum_lqr.nodes.controller_kernel:law_loop", "pendulum_lqr.controllers.lqr:lqr_law"),
+    ("pendulum_lqr.disturbances.disturbance_kernel:uniform_loop",),
     ("pendulum_hw_bridge.emulation.kernel_loop:actuator_loop",),
 )
 """Those of the thesis's experiment: the plant by our integrator and by the thesis's, its controller, its noise, and the

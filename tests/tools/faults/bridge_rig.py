@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_hw_bridge.actuator import HardwareLimits
-from pendulum_hw_bridge.actuator_loop import ActuatorLoop
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge import Bridge, Outcome
-from pendulum_hw_bridge.clocks import SteppedClock
-from pendulum_hw_bridge.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.bridge.actuator_loop import ActuatorLoop
+from pendulum_hw_bridge.bridge.bridge import Bridge, Outcome
+from pendulum_hw_bridge.bridge.module import DrivenModule
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5, LinkState
-from pendulum_hw_bridge.module import DrivenModule
-from pendulum_hw_bridge.safety import SafetyLimits, SafetyMonitor
-from pendulum_hw_bridge.settings import BridgeSettings
+from pendulum_hw_bridge.port.actuator import HardwareLimits
+from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.supervisor import Input, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.timing import LoopStatistics

@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from pendulum_hw_bridge.actuator import Strategy
-from pendulum_hw_bridge.effort_mapping import EffortStrategy
+from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.port.actuator import Strategy
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
 from tests.tools.faults.bridge_rig import MILLISECOND, Rig

@@ -22,10 +22,10 @@ from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_lqr.answering import AnswerLoop
-from pendulum_lqr.controller import make_controller
-from pendulum_lqr.disturbance import DISTURBANCE_SPECS, make_disturbance
-from pendulum_lqr.disturbing import DisturbanceLoop
+from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
+from pendulum_lqr.disturbances.disturbing import DisturbanceLoop
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, limits_from_parameters
@@ -41,7 +41,7 @@ from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.ros.plant_loop import LockstepLoop
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_rosbag.reader import read_bag
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.plants import make_plant
 from tests.tools.faults.live import NAMESPACE, LiveSystem
 from tests.tools.faults.outcome import Outcome, Trial
 

@@ -26,10 +26,10 @@ from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from pendulum_lqr.answering import AnswerLoop
-from pendulum_lqr.compiled_controller import CompiledController
-from pendulum_lqr.controller import make_controller
-from pendulum_lqr.sampling import PeriodWatch
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.laws.sampling import PeriodWatch
+from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.compiled_controller import CompiledController
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.plants.plant_parameters import load_plant

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from pendulum_bags.experiments.processes import ProcessSet, start_recorder
 from pendulum_bags.runs.run_folder import write_json
-from pendulum_lqr.analysis import delayed_spectral_radius, loop_margins
-from pendulum_lqr.design import continuous_lqr
-from pendulum_lqr.model import linearise
+from pendulum_lqr.linear.analysis import delayed_spectral_radius, loop_margins
+from pendulum_lqr.linear.design import continuous_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import FaultError

@@ -19,9 +19,9 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
-from pendulum_hw_bridge.bridge_node import BridgeNode
-from pendulum_hw_bridge.clocks import Clock, SteppedClock
-from pendulum_hw_bridge.effort_mapping import EffortStrategy
+from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
+from pendulum_hw_bridge.nodes.bridge_node import BridgeNode
+from pendulum_hw_bridge.port.clocks import Clock, SteppedClock
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.contract.supervisor import Input

@@ -21,7 +21,7 @@ from pendulum_bags.runs.csv_mapping import read_csv
 from pendulum_bags.runs.read_recording import read_servo_log
 from pendulum_bags.studies.study_file import load_study
 from pendulum_hw_bridge.backends.replay import load_feedback
-from pendulum_hw_bridge.gains import DEFAULT_GAINS, load_gains, write_gains
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, load_gains, write_gains
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant

@@ -12,10 +12,10 @@ import numpy as np
 
 from pendulum_bags.course.tasks import HOLD_STEP, Tasks
 from pendulum_bags.runs.run_data import find_prefix
-from pendulum_lqr.analysis import closed_loop_poles, delayed_spectral_radius, loop_margins
-from pendulum_lqr.design import continuous_lqr
-from pendulum_lqr.model import LinearModel, linearise
-from pendulum_lqr.sampled_design import discretise
+from pendulum_lqr.linear.analysis import closed_loop_poles, delayed_spectral_radius, loop_margins
+from pendulum_lqr.linear.design import continuous_lqr
+from pendulum_lqr.linear.model import LinearModel, linearise
+from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError, ParameterError

@@ -109,7 +109,7 @@ def gains(
     Example: python -m pendulum_bags course check gains --q 100,0.01 --r 0.1
     """
     from pendulum_bags.course.checks import check_gains
-    from pendulum_lqr.design_cli import read_diagonal
+    from pendulum_lqr.design_command.design_cli import read_diagonal
 
     return _told(check_gains(_tasks(course), read_diagonal(q), r), as_json=as_json)
 

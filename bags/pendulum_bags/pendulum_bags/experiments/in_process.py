@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_lqr.answering import AnswerLoop
-from pendulum_lqr.controller import make_controller
-from pendulum_lqr.disturbance import DISTURBANCE_SPECS, make_disturbance
-from pendulum_lqr.disturbing import DisturbanceLoop
+from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
+from pendulum_lqr.disturbances.disturbing import DisturbanceLoop
+from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.plant import Plant
-from pendulum_sim.plants import make_plant
-from pendulum_sim.sensors import Sensors
+from pendulum_sim.stepping.plant import Plant
+from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.sensors import Sensors
 
 __all__ = ["RunArrays", "simulate", "simulate_plant"]
 

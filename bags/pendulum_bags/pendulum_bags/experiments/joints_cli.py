@@ -115,7 +115,7 @@ def joints(
     from pendulum_bags.ranking.joint_choice import FOLDER as RANKING
     from pendulum_bags.ranking.present import Words, same_choice, write_ranking
     from pendulum_bags.verdict import write_layer
-    from pendulum_lqr.mechanism_model import linearise_mechanism
+    from pendulum_lqr.linear.mechanism_model import linearise_mechanism
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 
     settings = JointSettings(plant, joint, amplitude, hold_time, duration, seed, storage=storage, controller=controller)

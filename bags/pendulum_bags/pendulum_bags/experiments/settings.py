@@ -14,8 +14,8 @@ from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE, THESIS_METHOD,
 from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
-from pendulum_lqr.controller import controller_parameters
-from pendulum_lqr.policy_file import POLICY_SUFFIX, load_policy, policy_record
+from pendulum_lqr.laws.controller import controller_parameters
+from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy, policy_record
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.trajectory import (
     MAX_RAMP_VELOCITY,
@@ -28,7 +28,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import require_one_joint
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
-from pendulum_sim.engines import GYMNASIUM_PREFIX
+from pendulum_sim.simulator.engines import GYMNASIUM_PREFIX
 
 __all__ = [
     "HARDWARE",

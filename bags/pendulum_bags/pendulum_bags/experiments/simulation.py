@@ -11,8 +11,8 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_differences import describe_plants
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
-from pendulum_sim.engines import find_engine, open_simulation
-from pendulum_sim.plant import Plant
+from pendulum_sim.simulator.engines import find_engine, open_simulation
+from pendulum_sim.stepping.plant import Plant
 
 __all__ = ["ForeignSimulation"]
 

@@ -18,12 +18,12 @@ from pendulum_bags.frequency_response.record import Record, record_of_joints, re
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import LayerResult
-from pendulum_lqr.certificate import Certifier
-from pendulum_lqr.gap_metric import DEFAULT_SCALING, JointScaling, Scaling, SignalScaling
-from pendulum_lqr.machine_response import Machine
-from pendulum_lqr.measured_response import MeasuredResponse, read_response
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.model import linearise
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.responses.certificate import Certifier
+from pendulum_lqr.responses.gap_metric import DEFAULT_SCALING, JointScaling, Scaling, SignalScaling
+from pendulum_lqr.responses.machine_response import Machine
+from pendulum_lqr.responses.measured_response import MeasuredResponse, read_response
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant

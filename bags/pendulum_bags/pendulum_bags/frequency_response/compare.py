@@ -9,11 +9,11 @@ import numpy as np
 
 from pendulum_bags.arrays import Array, Complex
 from pendulum_bags.distributions import Interval, f_quantile, f_tail
-from pendulum_lqr.gap_metric import DEFAULT_SCALING, SignalScaling, chordal_distance, nu_gap
-from pendulum_lqr.machine_response import Machine
-from pendulum_lqr.measured_response import MeasuredResponse
-from pendulum_lqr.model import LinearModel
-from pendulum_lqr.sampled_response import brought_to
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.responses.gap_metric import DEFAULT_SCALING, SignalScaling, chordal_distance, nu_gap
+from pendulum_lqr.responses.machine_response import Machine
+from pendulum_lqr.responses.measured_response import MeasuredResponse
+from pendulum_lqr.responses.sampled_response import brought_to
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["SMALLEST", "Difference", "compare_responses", "continuous"]

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.certificate import Certificate, Certifier
-from pendulum_lqr.controller_response import controller_response
-from pendulum_lqr.design import output_lqr
-from pendulum_lqr.design_cli import THESIS_WEIGHTS
-from pendulum_lqr.model import LinearModel
-from pendulum_lqr.policy_file import POLICY_SUFFIX, load_policy
+from pendulum_lqr.design_command.design_cli import THESIS_WEIGHTS
+from pendulum_lqr.linear.design import output_lqr
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy
+from pendulum_lqr.responses.certificate import Certificate, Certifier
+from pendulum_lqr.responses.controller_response import controller_response
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.terminal import WholeTable

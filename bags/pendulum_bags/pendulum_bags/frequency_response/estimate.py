@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array, Complex
 from pendulum_bags.frequency_response.record import Record
-from pendulum_lqr.disturbance import DISTURBANCE_SPECS
-from pendulum_lqr.measured_response import MeasuredResponse
-from pendulum_lqr.multisine import multisine_harmonics
+from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
+from pendulum_lqr.disturbances.multisine import multisine_harmonics
+from pendulum_lqr.responses.measured_response import MeasuredResponse
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import validate
 

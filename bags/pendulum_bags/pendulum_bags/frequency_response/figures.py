@@ -12,12 +12,12 @@ from pendulum_bags.figures.figure import Figure, Mark, Panel, Trace
 from pendulum_bags.frequency_response.compare import SMALLEST, Difference, continuous
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_bags.frequency_response.result import Analysis
-from pendulum_lqr.certificate import Certifier
-from pendulum_lqr.design import DesignError, output_lqr
-from pendulum_lqr.gap_metric import JointScaling, SignalScaling
-from pendulum_lqr.measured_response import MeasuredResponse
-from pendulum_lqr.model import LinearModel
-from pendulum_lqr.sampled_response import model_response
+from pendulum_lqr.linear.design import DesignError, output_lqr
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.responses.certificate import Certifier
+from pendulum_lqr.responses.gap_metric import JointScaling, SignalScaling
+from pendulum_lqr.responses.measured_response import MeasuredResponse
+from pendulum_lqr.responses.sampled_response import model_response
 
 __all__ = ["certified_gains_figure", "certified_weights_figure", "gap_figure", "response_figures"]
 

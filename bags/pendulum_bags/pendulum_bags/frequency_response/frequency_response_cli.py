@@ -64,7 +64,7 @@ def frequency_response(
         python -m pendulum_bags frequency_response bags/runs/today --design "q=100,0.01 r=0.1" --design pid
     """
     from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
-    from pendulum_lqr.gap_metric import Scaling
+    from pendulum_lqr.responses.gap_metric import Scaling
 
     scaling = Scaling(angle, velocity, torque)
     responses, told, ran = read_responses(bags)
@@ -122,9 +122,9 @@ def experiment(
     from pendulum_bags.experiments.progress import PhaseProgress
     from pendulum_bags.experiments.run_spec import RunSpec
     from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
-    from pendulum_lqr.controller_response import require_time_invariant
-    from pendulum_lqr.gap_metric import Scaling
-    from pendulum_lqr.policy_file import named_controller
+    from pendulum_lqr.policies.policy_file import named_controller
+    from pendulum_lqr.responses.controller_response import require_time_invariant
+    from pendulum_lqr.responses.gap_metric import Scaling
     from pendulum_msgs_py.plants.plant_parameters import require_one_joint
 
     require_one_joint(plant, f"python -m pendulum_bags experiment joints --plant {plant}, which measures it, too")

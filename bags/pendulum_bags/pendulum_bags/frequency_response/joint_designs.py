@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.frequency_response.designs import DesignResult
-from pendulum_lqr.certificate import Certifier
-from pendulum_lqr.mechanism_model import mechanism_lqr
-from pendulum_lqr.model import LinearModel
+from pendulum_lqr.linear.mechanism_model import mechanism_lqr
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.responses.certificate import Certifier
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pendulum_bags.frequency_response.compare import SMALLEST, Difference
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark
-from pendulum_lqr.certificate import Certifier
-from pendulum_lqr.measured_response import MeasuredResponse
+from pendulum_lqr.responses.certificate import Certifier
+from pendulum_lqr.responses.measured_response import MeasuredResponse
 
 __all__ = ["GAP_MARGIN", "LONGER", "same_plant", "which_controllers"]
 

@@ -9,10 +9,10 @@ from typing import Any
 from pendulum_bags.frequency_response.compare import Difference
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_bags.verdict import LayerResult
-from pendulum_lqr.certificate import Certifier
-from pendulum_lqr.gap_metric import DEFAULT_SCALING, SignalScaling
-from pendulum_lqr.measured_response import MeasuredResponse
-from pendulum_lqr.model import LinearModel
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.responses.certificate import Certifier
+from pendulum_lqr.responses.gap_metric import DEFAULT_SCALING, SignalScaling
+from pendulum_lqr.responses.measured_response import MeasuredResponse
 
 __all__ = ["Analysis"]
 

@@ -16,7 +16,7 @@ from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.report.layer_page import write_layer_page
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import write_layer
-from pendulum_lqr.measured_response import write_response
+from pendulum_lqr.responses.measured_response import write_response
 
 __all__ = ["write_analysis"]
 

@@ -1,6 +1,6 @@
 """What moves in a training: its parameters as rows of numbers, and one period of it, compiled.
 
-The equations are the simulator's own: :mod:`pendulum_sim.dry_friction` for the pendulum, and
+The equations are the simulator's own: :mod:`pendulum_sim.stepping.dry_friction` for the pendulum, and
 :mod:`pendulum_msgs_py.dynamics.joint_steps` for mechanisms, Runge-Kutta of order four both.
 """
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.learning.task import VARIED
-from pendulum_lqr.policy import coordinates_of
+from pendulum_lqr.policies.policy import coordinates_of
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.joint_steps import (
     COULOMB,
@@ -38,11 +38,11 @@ from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, co
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.kept_kernels import keep_kernel
-from pendulum_sim.compiling import WITHIN, compile_to_tell, compile_tree, tuple_loader
-from pendulum_sim.dry_friction import LAG as LAG_OF_ONE
-from pendulum_sim.dry_friction import PACKED, acceleration_with_friction, advance_dry
-from pendulum_sim.integrators import get_integrator
-from pendulum_sim.plant import pack
+from pendulum_sim.batches.compiling import WITHIN, compile_to_tell, compile_tree, tuple_loader
+from pendulum_sim.stepping.dry_friction import LAG as LAG_OF_ONE
+from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_friction, advance_dry
+from pendulum_sim.stepping.integrators import get_integrator
+from pendulum_sim.stepping.plant import pack
 
 __all__ = ["Body", "body_of", "can_exist", "kicks_of", "start_spread", "travel_of", "velocity_scales"]
 

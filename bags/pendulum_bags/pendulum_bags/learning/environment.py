@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pendulum_bags.arrays import Array, Floats
 from pendulum_bags.learning.body import body_of, start_spread, travel_of, velocity_scales
 from pendulum_bags.learning.task import SwingUpTask
-from pendulum_lqr.policy import default_signals, sample_layout
+from pendulum_lqr.policies.policy import default_signals, sample_layout
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 

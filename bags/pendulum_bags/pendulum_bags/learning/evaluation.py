@@ -15,16 +15,16 @@ from pendulum_bags.learning.body import can_exist, kicks_of, start_spread
 from pendulum_bags.learning.task import SwingUpTask, value_of
 from pendulum_lqr.controllers.joint_policy import JointPolicy
 from pendulum_lqr.controllers.policy import LearnedPolicy
-from pendulum_lqr.policy import Policy
-from pendulum_lqr.policy_answers import START_TIME
+from pendulum_lqr.laws.policy_answers import START_TIME
+from pendulum_lqr.policies.policy import Policy
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
-from pendulum_sim.joint_plant import JointPlant, joint_plant
-from pendulum_sim.mechanism_plant import MechanismPlant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.joint_plant import JointPlant, joint_plant
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.plants import make_plant
 
 __all__ = ["HOLD", "UP", "Trial", "gymnasium_return", "is_up", "measured_success", "run_trial", "trials_of"]
 

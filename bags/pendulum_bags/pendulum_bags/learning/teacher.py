@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
-from pendulum_lqr.mechanism_controllers import tracked_swing_up
+from pendulum_lqr.swing_up.stored_swing_up import tracked_swing_up
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 

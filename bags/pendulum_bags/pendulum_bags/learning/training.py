@@ -24,8 +24,8 @@ from pendulum_bags.learning.ppo import Ppo, PpoSettings
 from pendulum_bags.learning.task import SwingUpTask, ranges_of
 from pendulum_bags.learning.teacher import Teacher
 from pendulum_bags.runs.run_folder import provenance
-from pendulum_lqr.policy import Network, Policy, coordinates_of, default_signals
-from pendulum_lqr.policy_file import write_policy
+from pendulum_lqr.policies.policy import Network, Policy, coordinates_of, default_signals
+from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_differences import AnyPlant, describe_plants

@@ -18,8 +18,8 @@ from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.plant import Plant
-from pendulum_sim.plants import make_plant
+from pendulum_sim.stepping.plant import Plant
+from pendulum_sim.stepping.plants import make_plant
 
 __all__ = ["replay_input", "replay_recording"]
 

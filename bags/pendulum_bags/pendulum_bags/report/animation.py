@@ -13,7 +13,7 @@ from pendulum_bags.report.data import ReportData
 from pendulum_bags.runs.series import uniform_times
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.mechanism_drawing import seen_from_the_side
+from pendulum_sim.pictures.mechanism_drawing import seen_from_the_side
 
 __all__ = ["animation_of", "joint_animation"]
 

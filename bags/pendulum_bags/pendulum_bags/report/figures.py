@@ -14,7 +14,7 @@ from pendulum_bags.identification import thesis_figures
 from pendulum_bags.identification.thesis_figures import TrialSet
 from pendulum_bags.report import analysis_figures, model_figures, motion_figures
 from pendulum_bags.report.data import ReportData
-from pendulum_lqr.certificate import Certifier
+from pendulum_lqr.responses.certificate import Certifier
 
 __all__ = ["FIGURES", "comparison_figures", "make_figures"]
 

@@ -16,9 +16,9 @@ from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.layer_page import evidence_table
 from pendulum_bags.verdict import Layer, LayerResult, Mark
 from pendulum_bags.verdict.same_run import seen_note
-from pendulum_lqr.design import output_lqr
-from pendulum_lqr.design_cli import THESIS_WEIGHTS
-from pendulum_lqr.model import linearise, sort_poles
+from pendulum_lqr.design_command.design_cli import THESIS_WEIGHTS
+from pendulum_lqr.linear.design import output_lqr
+from pendulum_lqr.linear.model import linearise, sort_poles
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 

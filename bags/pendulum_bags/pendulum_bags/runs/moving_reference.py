@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.runs.run_record import record_named, run_record
-from pendulum_lqr.reference import Reference
+from pendulum_lqr.linear.reference import Reference
 
 __all__ = ["follows_reference", "recorded_reference"]
 

@@ -18,10 +18,10 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.joint_run import LIMIT_PER_NOISE, design_for, identified_names
 from pendulum_bags.studies.random_runs import Columns, RandomRuns, figures_of_runs, replay
 from pendulum_bags.studies.uncertain import share_of_interval
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism, load_mechanism_file
-from pendulum_sim.mechanism_batch import simulate_mechanisms
+from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
 
 __all__ = ["JointMonteCarlo", "joint_shares", "scatter"]
 

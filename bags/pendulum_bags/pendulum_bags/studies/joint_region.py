@@ -21,13 +21,13 @@ from pendulum_bags.studies.chunks import chunk_path, read_columns
 from pendulum_bags.studies.joint_monte_carlo import scatter
 from pendulum_bags.studies.random_runs import Columns
 from pendulum_bags.studies.start_grid import StartGrid, inside_ellipse, share_inside
-from pendulum_lqr.design import DesignError, Gain
-from pendulum_lqr.mechanism_catch import CaughtRegion, sample_caught_region
-from pendulum_lqr.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.roa import sublevel_ellipse
+from pendulum_lqr.linear.design import DesignError, Gain
+from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.roa import sublevel_ellipse
+from pendulum_lqr.swing_up.mechanism_catch import CaughtRegion, sample_caught_region
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.mechanism_batch import simulate_mechanisms
+from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
 
 __all__ = ["Axis", "JointRegion", "JointRegionResult"]
 

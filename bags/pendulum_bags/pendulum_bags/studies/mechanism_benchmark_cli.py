@@ -55,7 +55,7 @@ def benchmark(
     from pendulum_bags.studies.mechanism_benchmark_figure import write_swing_up_figure
     from pendulum_bags.studies.mechanism_benchmark_runs import robustness_trials
     from pendulum_bags.studies.mechanism_benchmark_table import Bench, document, prepare, run_job, score_rows
-    from pendulum_lqr.mechanism_controllers import mechanism_controller_names
+    from pendulum_lqr.controllers.mechanism_controllers import mechanism_controller_names
 
     model = benchmark_plant(plant)
     names = [each.strip() for each in controller.split(",") if each.strip()] or list(mechanism_controller_names())

@@ -17,12 +17,12 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.studies.random_runs import Columns, RandomRuns, figures_of_runs, replay
 from pendulum_bags.studies.uncertain import THESIS_UNCERTAINTY, VARIED, Uncertainty, batch_variations
-from pendulum_lqr.design import output_lqr
-from pendulum_lqr.model import linearise
+from pendulum_lqr.linear.design import output_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.batch import simulate_batch
+from pendulum_sim.batches.batch import simulate_batch
 
 __all__ = ["COLUMNS", "MonteCarlo", "sobol"]
 

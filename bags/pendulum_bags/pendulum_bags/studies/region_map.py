@@ -20,13 +20,13 @@ from pendulum_bags.studies.chunks import chunk_path, read_columns
 from pendulum_bags.studies.random_runs import Columns
 from pendulum_bags.studies.start_grid import StartGrid, inside_ellipse, share_inside
 from pendulum_bags.studies.uncertain import THESIS_UNCERTAINTY, VARIED, Uncertainty, batch_variations
-from pendulum_lqr.design import Gain, output_lqr
-from pendulum_lqr.model import linearise
-from pendulum_lqr.roa import proven_level, sublevel_ellipse
+from pendulum_lqr.linear.design import Gain, output_lqr
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.linear.roa import proven_level, sublevel_ellipse
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.batch import simulate_batch
+from pendulum_sim.batches.batch import simulate_batch
 
 __all__ = ["COLUMNS", "RegionMap", "RegionResult"]
 

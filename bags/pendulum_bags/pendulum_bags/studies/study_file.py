@@ -16,7 +16,7 @@ from typing import Any
 from pendulum_bags.experiments.run_spec import CLOCKS, PERIODS, RunSpec
 from pendulum_bags.experiments.settings import TIME_BESIDE_NOISE
 from pendulum_bags.studies.located import LocatedMapping
-from pendulum_lqr.policy_file import load_policy
+from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import DataError, ParameterError

@@ -1,0 +1,301 @@
+"""What the bridge's parameters make: the modules of a plant, its limits, and what the node tells of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pendulum_hw_bridge.backends import BACKENDS
+from pendulum_hw_bridge.backends.emulated_machine import TORQUE_LOOP, DrivePort, machine_ports
+from pendulum_hw_bridge.bridge import bridge_parameters
+from pendulum_hw_bridge.bridge.bridge_consistency import check_consistency
+from pendulum_hw_bridge.bridge.group_assembly import OF_GROUPS, GroupAssembly, refuse_slides
+from pendulum_hw_bridge.bridge.module import DrivenModule, Module
+from pendulum_hw_bridge.drive.current_drive import CurrentCheck, CurrentMapping
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
+from pendulum_hw_bridge.emulation.machine import EmulatedMachine
+from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
+from pendulum_hw_bridge.port.actuator import HardwareLimits, MStopAction
+from pendulum_hw_bridge.port.clocks import Clock
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
+from pendulum_hw_bridge.port.settings import BridgeSettings
+from pendulum_msgs_py.contract.drive import PlantLimits
+from pendulum_msgs_py.contract.plant_specs import in_units_of
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, load_mechanism
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, is_mechanism
+
+__all__ = ["CURRENT_LOOP", "Assembly", "assemble", "for_plant"]
+
+CURRENT_LOOP = "current_loop"
+"""How drives with a current loop make a torque, as told beside the values of ``effort_strategy``."""
+_MEASURED_SHARE = 1.2
+"""Measured effort that is no fault yet, as a multiple of the effort limit [-]."""
+_DISAGREEMENT = 0.05
+"""Largest disagreement of position and velocity of a joint that turns ten times as fast as an X5-9 [rad or m]."""
+_FASTEST = 30.0
+"""Velocity at which the armed machine faults, where nobody says another [rad/s or m/s]."""
+_RATE = 500.0
+"""Feedback rate where nobody says another: links of several joints fall faster than one alone [Hz]."""
+_OF_ONE_MODULE = (
+    "lab_file",
+    "effort_strategy",
+    "effort_efficiency",
+    "gains_file",
+    "joint_offset",
+    "effort_tare",
+    "joint_sign",
+    "initial_position",
+    "flat",
+    "family",
+    "name",
+    "mac_address",
+    "serial",
+    "interface",
+    "hebi_log",
+    "back_emf_compensation",
+    "emulator_address",
+    "replay_file",
+    "drivetrain",
+    *OF_GROUPS,
+)
+"""Parameters that mean nothing to an emulated machine of several joints: most are about the only module."""
+_OF_EVERY_GROUP = (
+    "effort_strategy",
+    "effort_efficiency",
+    "gains_file",
+    "interface",
+    "hebi_log",
+    "back_emf_compensation",
+    "drivetrain",
+    *OF_GROUPS,
+)
+"""Those of them that a group of HEBI modules has."""
+_SLOWEST_DRIVE = 0.1
+"""Longest delay, and longest time constant, of a drive that can be watched [s]."""
+_LEAD_NS = 500_000
+"""In lockstep, feedback is measured this long before the state that shows it [ns]."""
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """The modules of one plant.
+
+    Attributes:
+        coordinates: Joints, and which of them are driven.
+        limits: Limits of the supervisor.
+        told: What the plant is known to be; empty where nobody says.
+        hardware: What it is, in a few words.
+        effort_strategy: How a torque becomes a setpoint.
+        mapping: That of the first drive.
+        modules: Makes the modules on a host clock, not connected yet.
+    """
+
+    coordinates: Coordinates
+    limits: PlantLimits
+    told: list[AnyPlant]
+    hardware: str
+    effort_strategy: str
+    mapping: EffortMapping
+    modules: Callable[[Clock], list[Module]]
+
+
+def for_plant(specs: tuple[ParameterSpec, ...], plant: str, backend: str = "emulator") -> tuple[ParameterSpec, ...]:
+    """Return the bridge's parameters with the defaults that a plant of several joints needs.
+
+    Args:
+        specs: The parameters, with the defaults of an X5-9.
+        plant: Preset or file, as given.
+        backend: What stands behind the actuator port.
+
+    Raises:
+        ParameterError: There is no such plant.
+    """
+    if not is_mechanism(plant):
+        return specs
+    mechanism = load_mechanism(plant)
+    of_one = next(spec.default for spec in specs if spec.name == "position_window")
+    assert isinstance(of_one, list)
+    # A real joint has a window in any case, as one alone has; a joint of X5-9s is as slow as one alone, too.
+    real = backend in BACKENDS and BACKENDS[backend].is_machine
+    free = of_one if real else [0.0, 0.0]
+    ends = [end for low, high in mechanism.stops for end in ((low, high) if math.isfinite(low + high) else free)]
+    specs = in_units_of(specs, mechanism.coordinates)
+    defaults: dict[str, Any] = {"position_window": ends}
+    if not real:
+        defaults |= {"velocity_limit": _FASTEST, "feedback_rate": _RATE}
+    return tuple(replace(spec, default=defaults.get(spec.name, spec.default)) for spec in specs)
+
+
+def assemble(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, lockstep: bool = False) -> Assembly:
+    """Return what parameters make.
+
+    Args:
+        values: Parameters of the bridge.
+        specs: Their table.
+        lockstep: Whether time is simulated.
+
+    Raises:
+        ParameterError: They contradict each other or the plant.
+    """
+    if is_mechanism(values["plant"]):
+        return _several(values, specs, lockstep=lockstep)
+    if values["initial_positions"] != [0.0]:
+        raise ParameterError("initial_positions is for several joints; expected initial_position for one")
+    defaults = {spec.name: spec.default for spec in specs}
+    for several, one in OF_GROUPS.items():
+        if values[several] != defaults[several]:
+            raise ParameterError(f"{several} is for several joints; expected {one} for one")
+    return _one(values, lockstep=lockstep)
+
+
+def _one(values: Mapping[str, Any], *, lockstep: bool) -> Assembly:
+    plant = bridge_parameters.plant_of(values)
+    gains = bridge_parameters.trajectory_gains(values)
+    limits = bridge_parameters.supervisor_limits(values, (plant.effort_limit,), lockstep=lockstep)
+    check_consistency(values, limits)
+    mapping = bridge_parameters.effort_mapping(values, plant, gains, limits)
+    settings = bridge_parameters.bridge_settings(
+        values,
+        effort=limits.effort[0],
+        velocity=mapping.velocity_limit,
+        gains=gains,
+        window=(limits.position_min[0], limits.position_max[0]),
+    )
+    safety = bridge_parameters.safety_limits(values, limits.effort[0])
+    period = round(NANOSECONDS / values["feedback_rate"]) / NANOSECONDS
+
+    def modules(clock: Clock) -> list[Module]:
+        port = bridge_parameters.make_port(values, clock, lockstep=lockstep)
+        return [DrivenModule(port, mapping, SafetyMonitor(safety, period, plant.drivetrain), settings)]
+
+    told = list(bridge_parameters.told_plants(values))
+    return Assembly(
+        ONE_JOINT, limits, [*told], f"X5-9, {values['backend']}", values["effort_strategy"], mapping, modules
+    )
+
+
+def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, lockstep: bool) -> Assembly:
+    plant = load_mechanism(values["plant"])
+    coordinates = plant.coordinates
+    names = ", ".join(coordinates.names)
+    real = values["backend"] == "hebi"
+    if not real and values["backend"] != "emulator":
+        raise ParameterError(
+            f"backend {values['backend']!r} has one module, and plant {plant.name!r} has the joints {names}; expected "
+            "backend 'emulator' or 'hebi'"
+        )
+    if real:
+        refuse_slides(coordinates)
+    if not coordinates.driven:
+        raise ParameterError(f"plant {plant.name!r} has no driven joint; expected an actuator at one of {names}")
+    defaults = {spec.name: spec.default for spec in specs}
+    for name in _OF_ONE_MODULE:
+        if values[name] != defaults[name] and not (real and name in _OF_EVERY_GROUP):
+            kind = "backend 'hebi'" if name in {"drivetrain", *OF_GROUPS} else "one module"
+            raise ParameterError(
+                f"{name} is {values[name]!r}, which is for {kind}, and plant {plant.name!r} has the joints "
+                f"{names}; expected it left out"
+            )
+    limits = bridge_parameters.supervisor_limits(
+        values, plant.effort_limits, coordinates=coordinates, lockstep=lockstep
+    )
+    check_consistency(values, limits)
+    if real:
+        return _group(values, plant, limits, lockstep=lockstep)
+    hardware, gains = QuasiDirectDrive(), DEFAULT_GAINS[TORQUE_LOOP]
+    period_ns = round(NANOSECONDS / values["feedback_rate"])
+    start = plant.coordinates.for_each("initial_positions", values["initial_positions"])
+    delay = common_delay(plant)
+    slowest = max(actuator.time_constant for actuator in plant.actuators)
+    for name, value in (("transport_delay", delay), ("time_constant", slowest)):
+        if value > _SLOWEST_DRIVE:
+            raise ParameterError(
+                f"{name} of plant {plant.name!r} is {value:g} s; expected at most {_SLOWEST_DRIVE:g} s: for so long a "
+                "torque that is no longer commanded may still be measured"
+            )
+    mappings = [
+        CurrentMapping(
+            EffortStrategy.EFFORT_LOOP,
+            hardware.constants(coordinates.joints[index], actuator.effort_limit),
+            gains=gains,
+            effort_limit=limit,
+            joint=coordinates.joints[index],
+            # Beyond the delay, what is left of an older torque falls to a twentieth within three time constants.
+            late=math.ceil((delay + 3.0 * actuator.time_constant) * values["feedback_rate"]),
+        )
+        for index, actuator, limit in zip(coordinates.driven, plant.actuators, limits.effort, strict=True)
+    ]
+
+    def modules(clock: Clock) -> list[Module]:
+        start_ns = clock.now_ns()
+        if lockstep:
+            start_ns -= period_ns + min(_LEAD_NS, period_ns // 2)
+        machine = EmulatedMachine(
+            plant, hardware, seed=values["seed"], position=start, start_ns=start_ns, rate=values["feedback_rate"]
+        )
+        made: list[Module] = []
+        for index, port in enumerate(machine_ports(machine, clock)):
+            joint = coordinates.joints[index].name
+            driven = coordinates.driven.index(index) if isinstance(port, DrivePort) else None
+            effort = limits.effort[driven] if driven is not None else max(limits.effort)
+            monitor = SafetyMonitor(
+                _safety(values, effort),
+                period_ns / NANOSECONDS,
+                mappings[driven].drivetrain if driven is not None else None,
+                coordinates.joints[index],
+            )
+            settings = BridgeSettings(
+                feedback_rate=values["feedback_rate"],
+                command_lifetime=values["command_lifetime"],
+                limits=HardwareLimits(
+                    effort=effort,
+                    position_min=limits.position_min[index],
+                    position_max=limits.position_max[index],
+                    m_stop=MStopAction(values["m_stop_action"]),
+                    joint=coordinates.joints[index],
+                ),
+                gains=gains,
+            )
+            if driven is None:
+                made.append(Module(port, monitor, settings, joint=joint))
+                continue
+            assert isinstance(port, DrivePort)
+            made.append(DrivenModule(port, mappings[driven], monitor, settings, joint=joint, check=CurrentCheck))
+        return made
+
+    return Assembly(coordinates, limits, [plant], f"emulated machine {plant.name}", CURRENT_LOOP, mappings[0], modules)
+
+
+def _group(values: Mapping[str, Any], plant: MechanismParameters, limits: PlantLimits, *, lockstep: bool) -> Assembly:
+    bridge_parameters.require_real_time(values, lockstep=lockstep)
+    if values["initial_positions"] != [0.0]:
+        raise ParameterError("initial_positions is for the emulator; expected it left out with backend 'hebi'")
+    group = GroupAssembly(values, plant.coordinates, limits)
+    # A preset is no measurement of the machine that stands here.
+    told: list[AnyPlant] = [] if values["plant"] in MECHANISM_PRESETS else [plant]
+    return Assembly(
+        plant.coordinates,
+        limits,
+        told,
+        f"group of X5-9, {values['backend']}",
+        values["effort_strategy"],
+        group.mappings[0],
+        group.modules,
+    )
+
+
+def _safety(values: Mapping[str, Any], effort: float) -> SafetyLimits:
+    of_one = bridge_parameters.safety_limits(values, effort)
+    return replace(
+        of_one,
+        measured_effort=values["measured_effort_limit"] or _MEASURED_SHARE * effort,
+        position_disagreement=_DISAGREEMENT,
+    )

@@ -1,0 +1,27 @@
+"""All parameters of the bridge's node: its own, and those of every plant with the defaults that a machine needs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from pendulum_hw_bridge.bridge.bridge_parameters import BRIDGE_SPECS
+from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOOP_SPECS
+from pendulum_msgs_py.parameters import ParameterSpec, ParameterValue
+
+__all__ = ["SPECS"]
+
+_HARDWARE_DEFAULTS: dict[str, ParameterValue] = {
+    "velocity_limit": 1.5,
+    "position_window": [-4.0, 4.0],
+    "effort_slew_limit": 2000.0,
+    "start_effort_limit": 2.0,
+    "starvation_limit": 30.0,
+}
+"""Limits that a simulated plant can do without and a real one cannot."""
+
+SPECS: tuple[ParameterSpec, ...] = (
+    *BRIDGE_SPECS,
+    *LOOP_SPECS,
+    *(dataclasses.replace(spec, default=_HARDWARE_DEFAULTS.get(spec.name, spec.default)) for spec in LIMIT_SPECS),
+)
+"""In the order of the README."""

@@ -1,0 +1,67 @@
+"""A line of the checklist, and the list of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from pendulum_hw_bridge.port.actuator import ActuatorError
+from pendulum_msgs_py.errors import PendulumError
+
+__all__ = ["HOST_ITEM", "CheckItem", "Checklist", "error_item"]
+
+HOST_ITEM = "this computer keeps time"
+"""Name of the line that is not about the actuator."""
+
+
+@dataclass(frozen=True)
+class CheckItem:
+    """One line of the checklist.
+
+    Attributes:
+        name: What was checked.
+        passed: Whether it is as it should be; None where it could not be judged, or was not tried.
+        seen: What was seen, with unit.
+        expected: What should be.
+        hint: What to do about it where it has not passed, a sentence or nothing.
+    """
+
+    name: str
+    passed: bool | None
+    seen: str
+    expected: str
+    hint: str = ""
+
+
+def error_item(error: PendulumError) -> CheckItem:
+    """Return the line of an error that ended the check of a module."""
+    return CheckItem(error.fault if isinstance(error, ActuatorError) else "parameter", False, str(error), "no error")
+
+
+@dataclass
+class Checklist:
+    """The checklist, gone through.
+
+    Attributes:
+        items: The lines.
+        figures: Rate [Hz], jitter, latencies and loss, by name with unit.
+        host_busy: Whether this computer was too busy to judge the actuator's timing.
+    """
+
+    items: list[CheckItem] = field(default_factory=list)
+    figures: dict[str, float] = field(default_factory=dict)
+    host_busy: bool = False
+
+    @property
+    def ready(self) -> bool:
+        """Whether nothing speaks against arming."""
+        return not self.host_busy and not self.refused
+
+    @property
+    def refused(self) -> bool:
+        """Whether something is wrong that is not this computer's being busy."""
+        return any(item.passed is False and item.name != HOST_ITEM for item in self.items)
+
+    @property
+    def untried(self) -> list[str]:
+        """Lines that were not tried."""
+        return [item.name for item in self.items if item.passed is None]

@@ -1,0 +1,230 @@
+"""What a module was set to before us: gains, safety parameters and M-stop action, kept in files and given back.
+
+The files are HEBI's own XML, written and read by hebi-py, so that HEBI Scope reads them too. An emulator keeps its
+gains in the same format and its limits in JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from pendulum_hw_bridge.backends.hebi_settings import limits_of
+from pendulum_hw_bridge.emulation.wire import limits_from_json, limits_to_json
+from pendulum_hw_bridge.port.actuator import ActuatorError, ActuatorPort, HardwareLimits
+from pendulum_hw_bridge.port.gains import load_gains, write_gains
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import read_text
+
+__all__ = ["backup_emulator", "backup_group", "limits_of_group", "restore_emulator", "restore_group"]
+
+GAINS = "gains.xml"
+SAFETY = "safety.xml"
+LIMITS = "limits.json"
+ENDS = "position_limit_strategies.json"
+"""What happens at either end of the position limits: hebi-py's file has one entry for both."""
+_END_NAMES = ("min_position_limit_strategy", "max_position_limit_strategy")
+_ANSWER_MS = 500
+_ATTEMPTS = 3
+_HALF = ".unfinished"
+"""End of the name of a folder that is not whole yet."""
+
+
+def backup_group(group: Any, folder: Path) -> list[Path]:
+    """Write gains, safety parameters and M-stop action of a HEBI module; return the files.
+
+    Args:
+        group: hebi-py's group of the one module.
+        folder: Where; it must be new, so that an older state is never lost.
+
+    Raises:
+        ActuatorError: The module does not answer.
+        ParameterError: The folder is there already, or cannot be made.
+    """
+    info = _info(group)
+    names = (GAINS, SAFETY, ENDS)
+    with _new(folder) as half:
+        info.write_gains(str(half / GAINS))
+        info.write_safety_params(str(half / SAFETY))
+        (half / ENDS).write_text(json.dumps(_ends_of(info)) + "\n", encoding="utf-8")
+        # hebi-py says nothing where a disk is full.
+        if not all((half / name).is_file() and (half / name).stat().st_size for name in names):
+            raise OSError(errno.ENOSPC, "not all of it was written: is the disk full?")
+    return [folder / name for name in names]
+
+
+def restore_group(group: Any, folder: Path, make_command: Callable[[], Any], say: Callable[[str], None]) -> None:
+    """Send a module the gains, safety parameters and M-stop action of :func:`backup_group`, and read them back.
+
+    No setpoint is sent, so nothing moves.
+
+    Args:
+        group: hebi-py's group of the one module.
+        folder: Where they are.
+        make_command: Makes an empty ``GroupCommand`` for one module.
+        say: Shows a sentence, where it is broken off with some of it in force.
+
+    Raises:
+        ActuatorError: The module does not acknowledge, or other values read back.
+        ParameterError: A file is missing or not understood; nothing was sent then.
+    """
+    _expect_whole(folder)
+    ends = _read_ends(folder / ENDS)
+    commands = []
+    for name, read in ((GAINS, "read_gains"), (SAFETY, "read_safety_params")):
+        read_text(folder / name, "backup")
+        command = make_command()
+        try:
+            getattr(command, read)(str(folder / name))
+        except Exception as error:
+            raise ParameterError(f"backup {folder / name} is not understood: {error}") from error
+        if name == SAFETY:
+            _set_open_ends(command, folder / name)
+            for end, strategy in ends.items():
+                setattr(command, end, strategy)
+        # An empty command of hebi-py reads as position 0; said to be none, nothing can be taken for a wish to move.
+        command.position = command.velocity = command.effort = math.nan
+        commands.append((name, command))
+    with _told_if_broken_off(folder, say):
+        for name, command in commands:
+            if not any(group.send_command_with_acknowledgement(command, _ANSWER_MS) for _ in range(_ATTEMPTS)):
+                raise ActuatorError(
+                    "no_acknowledgement", f"HEBI module did not acknowledge {name} within {_ANSWER_MS} ms"
+                )
+        _expect_group(_info(group), folder, ends)
+
+
+def limits_of_group(group: Any, wanted: HardwareLimits) -> HardwareLimits:
+    """Return the limits that a HEBI module tells; ``wanted`` says at which ends it should switch off.
+
+    Raises:
+        ActuatorError: The module does not answer, or does otherwise at an end.
+    """
+    return limits_of(_info(group), wanted)
+
+
+def _expect_group(info: Any, folder: Path, ends: dict[str, int]) -> None:
+    # Not beside the backup, which may lie on a medium that is full or read-only.
+    with tempfile.TemporaryDirectory(prefix="pendulum_module_") as temporary:
+        for name, write in ((GAINS, "write_gains"), (SAFETY, "write_safety_params")):
+            now = Path(temporary, name)
+            getattr(info, write)(str(now))
+            if now.read_text(encoding="utf-8") != (folder / name).read_text(encoding="utf-8"):
+                raise ActuatorError(
+                    "no_acknowledgement", f"HEBI module reads back other values than those of {folder / name}"
+                )
+    if ends and _ends_of(info) != ends:
+        raise ActuatorError("no_acknowledgement", f"HEBI module reads back {_ends_of(info)}; expected {ends}")
+
+
+def backup_emulator(port: ActuatorPort, folder: Path) -> list[Path]:
+    """Write gains and limits of an emulator; return the files."""
+    info = port.connect()
+    if info.gains is None:
+        raise ActuatorError("not_connected", f"{info.backend} does not tell its gains; expected hebi or an emulator")
+    with _new(folder) as half:
+        write_gains(half / GAINS, info.gains)
+        (half / LIMITS).write_text(json.dumps(limits_to_json(info.limits)) + "\n", encoding="utf-8")
+    return [folder / GAINS, folder / LIMITS]
+
+
+def restore_emulator(port: ActuatorPort, folder: Path, say: Callable[[str], None]) -> None:
+    """Give a connected emulator what :func:`backup_emulator` kept, and read it back; ``say`` as for a group."""
+    _expect_whole(folder)
+    gains = load_gains(folder / GAINS)
+    try:
+        limits = limits_from_json(json.loads(read_text(folder / LIMITS, "backup")))
+    except ValueError as error:
+        raise ParameterError(f"backup {folder / LIMITS} is not understood: {error}") from error
+    with _told_if_broken_off(folder, say):
+        if port.set_gains(gains) != gains or port.set_limits(limits) != limits:
+            raise ActuatorError("no_acknowledgement", f"emulator reads back other values than those of {folder}")
+
+
+@contextlib.contextmanager
+def _told_if_broken_off(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Say what a module may be left with, whether it or the person (Ctrl-C) broke off: half of two sets is neither."""
+    try:
+        yield
+    except BaseException:
+        say(
+            f"Broken off: the module may hold some settings of {folder} and some that it had before. Do not arm it; "
+            "restore again."
+        )
+        raise
+
+
+def _set_open_ends(command: Any, path: Path) -> None:
+    """Set position limits that a file has as infinite: hebi-py reads them as no number, and would send that."""
+    try:
+        position = ElementTree.parse(path).getroot().find("position")
+        ends = {} if position is None else {end: position.findtext(f"{end}_limit") for end in ("min", "max")}
+        limits = {end: float(text) for end, text in ends.items() if text is not None}
+    except (ElementTree.ParseError, ValueError) as error:
+        raise ParameterError(f"backup {path} is not understood: {error}") from error
+    for end, limit in limits.items():
+        if math.isnan(limit):
+            raise ParameterError(f"backup {path}: {end}_limit of the position is no number; expected one, or inf")
+        if math.isinf(limit):
+            setattr(command, f"position_limit_{end}", limit)
+
+
+def _ends_of(info: Any) -> dict[str, int]:
+    return {name: int(getattr(info, name)[0]) for name in _END_NAMES}
+
+
+def _read_ends(path: Path) -> dict[str, int]:
+    if not path.exists():
+        # Kept before there was such a file: one strategy for both ends, in the file of safety parameters. No backup
+        # that broke off looks like it, for a folder bears its name once it is whole.
+        return {}
+    try:
+        content = json.loads(read_text(path, "backup"))
+        return {name: int(content[name]) for name in _END_NAMES}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ParameterError(f"backup {path} is not understood: {error}") from error
+
+
+def _info(group: Any) -> Any:
+    for _ in range(_ATTEMPTS):
+        info = group.request_info(_ANSWER_MS)
+        if info is not None:
+            return info
+    raise ActuatorError("module_lost", f"HEBI module did not tell its settings within {_ANSWER_MS} ms")
+
+
+@contextlib.contextmanager
+def _new(folder: Path) -> Iterator[Path]:
+    """Make a folder beside that of a backup, which gets its name when it is whole; half of one is taken away."""
+    if folder.exists():
+        raise ParameterError(f"backup {folder} is there already; expected a new folder")
+    # Absolute, for "." has no name.
+    whole = folder.absolute()
+    half = whole.with_name(whole.name + _HALF)
+    try:
+        # A program that was killed can leave one; it was never a backup.
+        shutil.rmtree(half, ignore_errors=True)
+        half.mkdir(parents=True)
+    except OSError as error:
+        raise ParameterError(f"backup {folder} cannot be made: {error.strerror}") from error
+    try:
+        yield half
+        half.rename(whole)
+    except (OSError, RuntimeError, ParameterError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise ParameterError(f"backup {folder} cannot be written: {why}") from error
+    finally:
+        shutil.rmtree(half, ignore_errors=True)
+
+
+def _expect_whole(folder: Path) -> None:
+    if folder.absolute().name.endswith(_HALF):
+        raise ParameterError(f"backup {folder} was interrupted and is not whole; expected one that lab backup finished")

@@ -1,0 +1,1 @@
+"""The bridge's node, the e-stop's, and that of the thesis's two experiments."""

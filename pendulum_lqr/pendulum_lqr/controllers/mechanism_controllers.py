@@ -1,0 +1,119 @@
+"""The controllers of plants of several joints, by name: each written once for any mechanism."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pendulum_lqr.controllers.joint_policy import JointPolicy
+from pendulum_lqr.laws.interface import JointController
+from pendulum_lqr.laws.policy_answers import check_policy_period, states_to_hold
+from pendulum_lqr.policies.policy import require_plant
+from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy
+from pendulum_lqr.swing_up.mechanism_catch import make_mechanism_catch
+from pendulum_lqr.swing_up.mechanism_controller import MechanismController
+from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
+from pendulum_lqr.swing_up.mechanism_planned import PlannedSwingUp
+from pendulum_lqr.swing_up.stored_swing_up import CALM_WEIGHTS, default_catch, tracked_swing_up
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["DifferencedVelocity", "make_mechanism_controller", "mechanism_controller_names"]
+
+_CATCH_SUFFIX = "+lqr"
+"""What the name of a policy file ends with where an LQR takes over near upright."""
+
+
+class DifferencedVelocity:
+    """Gives a controller velocities from the last two positions in the place of the measured ones.
+
+    The slope between two positions is the velocity in their middle; half a period of the model's acceleration brings
+    it to the end. That is exact to the period's square, and as good as the positions are: an encoder's steps over the
+    period come through as noise.
+    """
+
+    def __init__(self, plant: MechanismParameters, controller: MechanismController) -> None:
+        self.plant, self.controller = plant, controller
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last position; the first velocity is the measured one."""
+        self.controller.reset()
+        self._last: tuple[float, Vector] | None = None
+        self._effort = (0.0,) * len(self.plant.effort_limits)
+
+    def command(self, t: float, x: Vector) -> Vector:
+        """Return the controller's efforts [N m or N]."""
+        n = len(self.plant.joints)
+        q, v = x[:n], x[n:]
+        if self._last is not None and t > self._last[0]:
+            before, old = self._last
+            h = t - before
+            slope = tuple((new - was) / h for new, was in zip(q, old, strict=True))
+            a = self.plant.acceleration(q, slope, self.plant.coordinates.spread(self._effort))
+            v = tuple(middle + 0.5 * h * each for middle, each in zip(slope, a, strict=True))
+        self._last = (t, q)
+        self._effort = self.controller.command(t, (*q, *v))
+        return self._effort
+
+
+class _WholeStates:
+    """A controller of the graph as one that is asked for whole states."""
+
+    def __init__(self, inner: JointController, joints: int) -> None:
+        self._inner, self._joints = inner, joints
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._inner.reset()
+
+    def command(self, t: float, x: Vector) -> Vector:
+        """Return m efforts [N m or N]."""
+        return self._inner.command(t, x[: self._joints], x[self._joints :])
+
+
+def _tvlqr_mpc(plant: MechanismParameters, period: float) -> MechanismController:
+    return DifferencedVelocity(plant, tracked_swing_up(plant, period, recovers=True))
+
+
+_CONTROLLERS: dict[str, Callable[[MechanismParameters, float], MechanismController]] = {
+    "tvlqr": tracked_swing_up,
+    "ilqr": lambda plant, period: PlannedSwingUp(period, default_catch(plant)),
+    "mpc": lambda plant, period: DifferencedVelocity(plant, MechanismMpc(period, default_catch(plant))),
+    "tvlqr_mpc": _tvlqr_mpc,
+}
+
+
+def mechanism_controller_names() -> tuple[str, ...]:
+    """Return the names of all controllers of plants of several joints."""
+    return tuple(_CONTROLLERS)
+
+
+def make_mechanism_controller(name: str, plant: MechanismParameters, period: float) -> MechanismController:
+    """Design a controller; ilqr and mpc compile for some ten seconds the first time.
+
+    Args:
+        name: Of :func:`mechanism_controller_names`, or the path of a policy file, ``FILE.npz``; of ``FILE.npz+lqr``
+            an LQR takes over near upright.
+        plant: The plant that it believes in.
+        period: Sampling period [s].
+
+    Raises:
+        ParameterError: No controller has this name, or it does not go with this plant.
+        DataError: A policy file is refused.
+    """
+    file = name.removesuffix(_CATCH_SUFFIX)
+    if file.endswith(POLICY_SUFFIX):
+        policy = load_policy(file)
+        require_plant(policy, plant)
+        check_policy_period(policy, period)
+        catch = make_mechanism_catch(plant, *CALM_WEIGHTS) if file != name else None
+        hold = states_to_hold(policy, period)
+        # It has all of its effort from the start.
+        inner = JointPolicy(policy, hold, plant.effort_limits, start_time=0.0, catch=catch)
+        return _WholeStates(inner, len(plant.joints))
+    if name not in _CONTROLLERS:
+        raise ParameterError(
+            f"controller {name!r} is unknown; expected one of {', '.join(_CONTROLLERS)}, or a policy file (.npz)"
+        )
+    return _CONTROLLERS[name](plant, period)

@@ -1,0 +1,1 @@
+"""The command ``design``: its tables and figures."""

@@ -1,0 +1,88 @@
+"""What ``design --machine`` says: which rows of a design table are certified for a measured machine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from pendulum_lqr.design_command.design_tables import RowTable
+from pendulum_lqr.linear.design import Gain
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.responses.certificate import Certificate, Certifier
+from pendulum_lqr.responses.machine_response import Machine
+from pendulum_lqr.responses.measured_response import read_response
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.errors import ParameterError
+
+__all__ = ["certificate_document", "certify_rows", "print_certificates"]
+
+
+def certify_rows(path: Path, model: LinearModel, gains: Sequence[Gain]) -> tuple[Certifier, list[Certificate]]:
+    """Return the certificates of a table's gains.
+
+    Args:
+        path: Measured response, or the folder of a run that holds one.
+        model: Model of the designs, upright.
+        gains: On angle and velocity.
+
+    Raises:
+        ParameterError: The designs are not for upright.
+        DataError: The file holds no response.
+    """
+    if model.theta != UPRIGHT:
+        raise ParameterError(
+            f"--machine was measured upright and the design is for theta = {model.theta:.4f} rad; expected pi"
+        )
+    certifier = Certifier(model, Machine.of(read_response(path)))
+    return certifier, [certifier.gain(gain.K) for gain in gains]
+
+
+def print_certificates(console: Console, certifier: Certifier, found: Sequence[Certificate], chosen: int) -> None:
+    """Print one line a row, from row 1, the chosen one marked, and what the certificates mean."""
+    profile, machine = certifier.profile, certifier.machine
+    headings = ("#", "margin b", "loop distance", "modulus there", "certified")
+    table = RowTable("Certified for this machine", headings)
+    for index, one in enumerate(found, start=1):
+        how = "by its margin" if one.by_gap else "by frequency"
+        table.add(
+            index,
+            f"{one.margin:.3f}",
+            f"{one.distance:.3f} at {one.at:.2g} Hz" if one.stable_on_model else "unstable on the model",
+            f"{one.worst_modulus:.3f}",
+            f"yes, {how}" if one.certified else "measure longer" if one.undecided else "no",
+            chosen=chosen,
+        )
+    console.print(table)
+    console.print(
+        f"The nu-gap between model and machine is {profile.value:.3f}, at most {profile.value_upper:.3f} with "
+        f"{100.0 * machine.confidence:g} % confidence, largest at {profile.at:.2g} Hz: a margin b above it, or a loop "
+        f"distance below 1 at each frequency, stabilises the machine at its {1.0 / machine.period:g} Hz. "
+        f"{profile.scaling.sentence()} Torque limits and dry friction at rest are outside the certificate."
+    )
+
+
+def certificate_document(certifier: Certifier, found: Sequence[Certificate]) -> dict[str, Any]:
+    """Return the certificates as JSON values."""
+    profile = certifier.profile
+    return {
+        "nu_gap": profile.value,
+        "nu_gap_upper": profile.value_upper,
+        "at_hz": profile.at,
+        "scaling": profile.scaling.to_json(),
+        "rows": [
+            {
+                "combination": index,
+                "certified": one.certified,
+                "by_gap": one.by_gap,
+                "by_frequency": one.by_frequency,
+                "margin": one.margin,
+                "loop_distance": one.distance,
+                "loop_distance_at_hz": one.at,
+                "worst_modulus": one.worst_modulus,
+            }
+            for index, one in enumerate(found, start=1)
+        ],
+    }

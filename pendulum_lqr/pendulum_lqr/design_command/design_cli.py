@@ -1,0 +1,327 @@
+"""``python -m pendulum_lqr design``: design gains for lists of weights, and draw the figures of one."""
+
+from __future__ import annotations
+
+# isort: off
+import pendulum_msgs_py.programs.one_thread  # noqa: F401  # before anything that imports numpy
+# isort: on
+
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from pendulum_lqr.design_command.certificate_table import certificate_document, certify_rows, print_certificates
+from pendulum_lqr.design_command.design_tables import (
+    RowTable,
+    margin_cells,
+    pole_cell,
+    print_time_figures,
+    print_worst_cases,
+    time_cell,
+)
+from pendulum_lqr.design_command.mechanism_design import design_mechanism
+from pendulum_lqr.design_command.time_figures import time_figures
+from pendulum_lqr.design_command.tracking_table import design_tracking, print_tracking, tracking_document
+from pendulum_lqr.linear.analysis import LoopReport, analyse
+from pendulum_lqr.linear.design import Gain, output_lqr
+from pendulum_lqr.linear.model import LinearModel, linearise
+from pendulum_lqr.linear.parameter_box import UNCERTAIN, parse_box, worst_case
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import json_text
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, is_mechanism, load_plant
+from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.options import Json
+from pendulum_msgs_py.programs.terminal import make_console
+from pendulum_msgs_py.whole_file import writing
+
+__all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main", "read_diagonal"]
+
+THESIS_WEIGHTS: tuple[tuple[tuple[float, float], float], ...] = (
+    ((1.0, 0.01), 0.1),
+    ((1.0, 0.1), 0.1),
+    ((100.0, 0.01), 0.1),
+    ((100.0, 0.1), 0.1),
+)
+"""Combinations 1 to 4 of the thesis: (q11, q22) and r."""
+THESIS_CHOICE = 3
+"""The combination that the thesis runs on its hardware."""
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command()
+def design(
+    preset: Annotated[
+        str, typer.Option(help=f"Plant: {PRESET_NAMES}; of several joints: {', '.join(MECHANISM_PRESETS)}.")
+    ] = "thesis",
+    plant: Annotated[Path | None, typer.Option(help="Plant file, instead of a preset.")] = None,
+    q: Annotated[
+        list[str] | None, typer.Option(help="Diagonal of Q, as 100,0.01; may be given again for more rows.")
+    ] = None,
+    r: Annotated[list[float] | None, typer.Option(help="R; may be given again. Every Q meets every R.")] = None,
+    theta: Annotated[float, typer.Option(help="Angle of the fixed point, 0 hanging down [rad].")] = UPRIGHT,
+    effort_limit: Annotated[float, typer.Option(help="Torque limit [N m]; 0 for the plant's.")] = 0.0,
+    figures: Annotated[Path | None, typer.Option(help="Folder for the figures (PNG).")] = None,
+    row: Annotated[int, typer.Option(help="Row that the figures show; 0 for the thesis's choice or the last.")] = 0,
+    machine: Annotated[
+        Path | None,
+        typer.Option(
+            help="Measured response of a machine (hw_response.json of experiment frequency_response, or its folder): "
+            "say which rows are certified for it."
+        ),
+    ] = None,
+    uncertainty: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Worst margins over plants that are possible: inertia=10%, or transport_delay=0:0.01 (lowest and "
+            f"highest value); may be given again ({', '.join(UNCERTAIN)}). Or identified: intervals of the plant file."
+        ),
+    ] = None,
+    tracking: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Say what lqr_tracking does with the weights of the row that --row chooses: one of its parameters as "
+            "amplitude=0.3, or period=0.002 (of the loop, 0.01 s without it); may be given again."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Design LQR gains: eigenvalues, K, margins, largest stable sampling period, figures in time, worst case.
+
+    The model is that of the plant as simulated: motor, spring and lag have states, and the margins count the delay.
+    K acts on angle and velocity, which are what is measured. Without --q and --r the four combinations of the thesis
+    are designed. Example:
+
+        python -m pendulum_lqr design --preset dfki --q 10,1 --q 100,1 --r 1 --figures build/design
+
+        python -m pendulum_lqr design --plant identified.yaml --uncertainty identified
+
+        python -m pendulum_lqr design --preset dfki --tracking reference=sine --tracking frequency=0.3
+
+    Of a plant of several joints Q has a weight for each joint and then for each velocity:
+
+        python -m pendulum_lqr design --preset cart_pole --q 10,100,1,1 --r 0.1
+    """
+    chosen_plant = str(plant) if plant is not None else preset
+    if is_mechanism(chosen_plant):
+        if any((figures, machine, theta != UPRIGHT, effort_limit, row, uncertainty, tracking)):
+            raise ParameterError(
+                f"plant {chosen_plant!r} has several joints; expected --q, --r and --json alone: figures, --machine, "
+                "--uncertainty, --tracking, --theta, --effort-limit and --row are for one joint"
+            )
+        design_mechanism(load_mechanism(chosen_plant), q, r, as_json=as_json)
+        return
+    parameters = load_plant(chosen_plant)
+    limit = _limit(effort_limit, parameters.effort_limit)
+    model = linearise(parameters, theta)
+    weights = _weights(q, r)
+    gains = [output_lqr(model, diagonal, cost) for diagonal, cost in weights]
+    reports = [analyse(model, None), *(analyse(model, gain.K) for gain in gains)]
+    chosen = _chosen_row(row, len(weights), default=THESIS_CHOICE if not (q or r) else len(weights))
+    certified = certify_rows(machine, model, gains) if machine is not None else None
+    follower = design_tracking(tracking, parameters, weights[chosen - 1], limit) if tracking else None
+    in_time = [time_figures(model, gain.K, parameters) for gain in gains]
+    box = parse_box(uncertainty, parameters, plant) if uncertainty else None
+    worst = []
+    if box is not None:
+        possible = box.plants(parameters)
+        print(f"asking {len(possible)} plants with {len(gains)} gains ...", file=sys.stderr)
+        worst = [worst_case(possible, gain.K, theta, tuple(box.bounds)) for gain in gains]
+    if as_json:
+        document = _document(parameters.name, model, weights, reports)
+        for line, figure in zip(document["rows"][1:], in_time, strict=True):
+            line["time"] = None if figure is None else figure.to_dict()
+        if box is not None:
+            document["uncertainty"] = {"source": box.source, "bounds": {n: list(b) for n, b in box.bounds.items()}}
+            for line, case in zip(document["rows"][1:], worst, strict=True):
+                line["worst_case"] = case.to_dict()
+        if follower is not None:
+            document["tracking"] = tracking_document(follower)
+        if certified is not None:
+            document["machine"] = certificate_document(*certified)
+        sys.stdout.write(json_text(document) + "\n")
+    else:
+        console = make_console(highlight=False)
+        _print(console, parameters.name, model, weights, reports, chosen)
+        print_time_figures(console, in_time, chosen, limit)
+        if box is not None:
+            print_worst_cases(console, box, worst, chosen)
+        if follower is not None:
+            print_tracking(console, follower, chosen)
+        if certified is not None:
+            print_certificates(console, *certified, chosen)
+    if figures is not None:
+        for path in _save(parameters, model, weights, gains, chosen, limit, figures):
+            print(path, file=sys.stderr if as_json else sys.stdout)
+
+
+def _limit(given: float, plants_own: float) -> float:
+    if not (math.isfinite(given) and given >= 0.0):
+        raise ParameterError(f"--effort-limit is {given} N m; expected a finite number > 0, or 0 for the plant's")
+    return given or plants_own
+
+
+def _weights(q: Sequence[str] | None, r: Sequence[float] | None) -> list[tuple[tuple[float, ...], float]]:
+    if not q and not r:
+        return [*THESIS_WEIGHTS]
+    diagonals = [read_diagonal(text) for text in q] if q else sorted({weights for weights, _ in THESIS_WEIGHTS})
+    costs = list(r) if r else [0.1]
+    return [(diagonal, cost) for diagonal in diagonals for cost in costs]
+
+
+def read_diagonal(text: str) -> tuple[float, float]:
+    """Return the diagonal of Q that a command line names as ``100,0.01`` [1/rad^2, s^2/rad^2].
+
+    Raises:
+        ParameterError: The text is something else.
+    """
+    try:
+        q_11, q_22 = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise ParameterError(f"--q is {text!r}; expected two numbers, as 100,0.01") from error
+    return q_11, q_22
+
+
+def _chosen_row(row: int, count: int, default: int) -> int:
+    if row < 0 or row > count:
+        raise ParameterError(f"--row is {row}; expected 1 to {count}, or 0 for the default")
+    return row or default
+
+
+def _print(
+    console: Console,
+    name: str,
+    model: LinearModel,
+    weights: Sequence[tuple[tuple[float, ...], float]],
+    reports: Sequence[LoopReport],
+    chosen: int,
+) -> None:
+    for line in _plant_lines(name, model):
+        console.print(line)
+    poles = "eigenvalues \\[1/s]"
+    table = RowTable(
+        "Eigenvalues and gains",
+        ("#", "q11", "q22", "r", poles, "computed", "K", "tau \\[s]", "damping"),
+        left={poles},
+        no_wrap=True,
+    )
+    margins_table = RowTable(
+        "Robustness of the loop",
+        ("#", "gain up", "gain down", "phase margin", "delay margin", "modulus", "largest period"),
+    )
+    for index, report in enumerate(reports):
+        (q11, q22), cost = weights[index - 1] if index else ((math.nan, math.nan), math.nan)
+        cells = [f"{value:g}" if index else "\u2013" for value in (q11, q22, cost)]
+        stable = math.isfinite(report.time_constant) and report.stable
+        table.add(
+            index,
+            *cells,
+            pole_cell(report.poles),
+            pole_cell(report.poles, 6),
+            ", ".join(f"{value:.6f}" for value in report.K) if index else "\u2013",
+            f"{report.time_constant:.4f}" if stable else "unstable",
+            f"{report.damping_ratio:.3f}",
+            chosen=chosen,
+        )
+        margins = report.margins
+        if margins is not None:
+            period = "none" if report.largest_period is None else time_cell(report.largest_period)
+            margins_table.add(index, *margin_cells(margins), period, chosen=chosen)
+    console.print(table)
+    console.print(margins_table)
+    K = ", ".join(f"{value:.3f}" for value in reports[chosen].K)
+    slowest = reports[chosen].poles[0].real
+    tau = reports[chosen].time_constant
+    console.print(
+        f"combination {chosen}: K = \\[{K}], tau = {tau:.4f} s; from the rounded eigenvalue "
+        f"1/{-slowest:.2f} = {1.0 / round(-slowest, 2):.4f} s"
+        if slowest < -0.005
+        else f"combination {chosen}: K = \\[{K}], tau = {tau:.4f} s"
+    )
+
+
+def _plant_lines(name: str, model: LinearModel) -> list[str]:
+    """Return what the design was made for, in sentences."""
+    at = f"plant {name} at theta = {model.theta:.4f} rad"
+    if not model.hidden:
+        lines = [
+            (
+                f"{at}: A = [[0, 1], [{model.A[1, 0]:.2f}, {model.A[1, 1]:.2f}]], B = [0, {model.B[1, 0]:.2f}], "
+                f"u* = {model.effort:.4g} N m"
+            )
+        ]
+    else:
+        lines = [
+            f"{at}: states {', '.join(model.states)}; u* = {model.effort:.4g} N m",
+            (
+                f"{' and '.join(model.hidden)} not measured: K is the best gain on angle and velocity alone, without "
+                "the margins that an LQR on the whole state guarantees; the controller lqg estimates the rest"
+            ),
+        ]
+    if model.delay > 0.0:
+        lines.append(f"transport delay {model.delay:g} s: counted in margins and periods, not in the eigenvalues")
+    return lines
+
+
+def _document(
+    name: str,
+    model: LinearModel,
+    weights: Sequence[tuple[tuple[float, ...], float]],
+    reports: Sequence[LoopReport],
+) -> dict[str, Any]:
+    rows = []
+    for index, report in enumerate(reports):
+        row: dict[str, Any] = {"combination": index, "q": None, "r": None, **report.to_dict()}
+        if index:
+            row["q"], row["r"] = list(weights[index - 1][0]), weights[index - 1][1]
+        rows.append(row)
+    return {
+        "plant": name,
+        "theta": model.theta,
+        "effort": model.effort,
+        "states": list(model.states),
+        "delay": model.delay,
+        "A": model.A.tolist(),
+        "B": model.B.tolist(),
+        "C": model.C.tolist(),
+        "E": model.E.tolist(),
+        "rows": rows,
+    }
+
+
+def _save(
+    plant: Any,
+    model: LinearModel,
+    weights: Sequence[tuple[tuple[float, ...], float]],
+    gains: Sequence[Gain],
+    chosen: int,
+    effort_limit: float,
+    folder: Path,
+) -> list[Path]:
+    # Imported late: without --figures nobody waits for matplotlib.
+    from pendulum_lqr.design_command.figures import design_figures
+
+    rows = [
+        (f"{index}: Q = ({diagonal[0]:g}, {diagonal[1]:g}), R = {cost:g}", gain)
+        for index, ((diagonal, cost), gain) in enumerate(zip(weights, gains, strict=True), start=1)
+    ]
+    paths = []
+    with writing(f"figures in {folder}", ParameterError):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, figure in design_figures(plant, model, rows, chosen - 1, effort_limit).items():
+            path = folder / f"{name}.png"
+            figure.savefig(path)
+            paths.append(path)
+    return paths
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the design command and return the exit code."""
+    return cli_main(app, argv, name="python -m pendulum_lqr design")

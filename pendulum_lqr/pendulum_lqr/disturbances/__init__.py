@@ -1,0 +1,1 @@
+"""Disturbance torques and their node."""

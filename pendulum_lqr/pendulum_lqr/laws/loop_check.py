@@ -1,0 +1,107 @@
+"""Does a controller hold the plant that it was designed for, at the rate at which it will run?
+
+The controller itself, filters and estimators included, closes the loop around the sampled linear model, motor, lag and
+delay included. What grows there is refused before it moves a machine.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.linear.model import RigidPlant, linearise
+from pendulum_lqr.linear.sampled_design import discretise
+from pendulum_msgs_py.contract.angles import UPRIGHT
+
+if TYPE_CHECKING:
+    from pendulum_lqr.laws.interface import Controller
+
+__all__ = ["growth", "require_stable", "settles"]
+
+_START = 1e-5
+"""Deviation from which the loop is released [rad]; a hundred times as much is still far from every limit."""
+_WINDOW = 100
+"""Samples whose spread is compared with that of the windows before."""
+_WINDOWS = 100
+_DEAD, _FALLEN = 0.2, 100.0 * _START
+"""A spread below this share of the largest one has died out; beyond this deviation [rad] it never will."""
+_MOST_GROWTH = 1.05
+"""Growth up to which a loop counts as one that settles."""
+
+
+def growth(controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> float:
+    """Return by how much motion grows after a release: below 1 it dies out, inf if it has grown a hundredfold.
+
+    The loop is followed until its motion has died out, for 10 000 samples at most.
+
+    Args:
+        controller: Any controller; one that predicts has to feed forward the torque that holds. It is reset before
+            and after.
+        plant: The plant that it meets.
+        period: The period at which it will be asked [s].
+        set_point: The angle that it holds, from upright [rad].
+    """
+    model = linearise(plant, UPRIGHT + set_point)
+    sampled = discretise(model, period)
+    n = model.A.shape[0]
+    z = np.zeros(n + sampled.pending)
+    z[0] = _START
+    if "motor_angle" in model.states:
+        z[model.states.index("motor_angle")] = _START
+    A, B = sampled.A, sampled.B[:, 0]
+    controller.reset()
+    # A prediction has to be told the truth; whoever makes none may rest wherever its first answer says.
+    law = controller
+    while (inner := getattr(law, "inner", None)) is not None:
+        law = inner
+    predicts = getattr(law, "PREDICTS", False)
+    hold = model.effort if predicts else controller.command(0.0, (set_point, 0.0))
+    controller.reset()
+    spreads: list[float] = []
+    for window in range(_WINDOWS):
+        angles = np.zeros(_WINDOW)
+        for k in range(_WINDOW):
+            angles[k] = z[0]
+            if not abs(z[0]) < _FALLEN:
+                controller.reset()
+                return math.inf
+            x = (set_point + float(z[0]), float(z[1]))
+            effort = controller.command((window * _WINDOW + k) * period, x)
+            z = A @ z + B * (effort - hold)
+        spreads.append(max(float(np.ptp(angles)), 1e-6 * _START))
+        if window and spreads[-1] < _DEAD * max(spreads) and spreads[-1] < spreads[-2]:
+            break
+    controller.reset()
+    return spreads[-1] / spreads[-2]
+
+
+def settles(controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> bool:
+    """Tell whether a balancing controller settles on the linear model of its plant; arguments as of :func:`growth`."""
+    return growth(controller, plant, period, set_point) <= _MOST_GROWTH
+
+
+def require_stable(name: str, controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> None:
+    """Refuse a controller whose loop with its own plant is unstable.
+
+    Args:
+        name: Of the controller.
+        controller: The controller.
+        plant: The plant that it was designed for.
+        period: Sampling period [s].
+        set_point: The angle that it holds, from upright [rad].
+
+    Raises:
+        DesignError: The loop grows.
+    """
+    if settles(controller, plant, period, set_point):
+        return
+    model = linearise(plant, UPRIGHT + set_point)
+    late = f", a delay of {model.delay:g} s" if model.delay > 0.0 else ""
+    hidden = f", states that are not measured ({', '.join(model.hidden)})" if model.hidden else ""
+    raise DesignError(
+        f"{name} makes the loop unstable with a period of {period:g} s{late}{hidden}; expected a shorter period or "
+        "smaller gains (larger r, smaller bandwidth), or lqg, which reckons with delay and hidden states"
+    )

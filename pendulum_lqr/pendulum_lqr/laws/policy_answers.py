@@ -1,0 +1,238 @@
+"""What a policy answers to one state after another: samples, network, rate limit, soft start, and where it gives up.
+
+Nothing here knows how many joints there are: the controllers of one joint and of several share it.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from pendulum_lqr.laws.controller import soft_start
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.policies.policy import Policy
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.parameters import ParameterSpec
+
+__all__ = ["START_TIME", "ZERO", "PolicyAnswers", "check_policy_period", "policy_specs", "states_to_hold"]
+
+START_TIME = 0.2
+"""Time from the first state until a policy has all of its effort, by default [s]."""
+ZERO = "zero"
+_SAME_PERIOD = 0.05
+"""Share by which a period may differ from a whole part of the policy's."""
+_LATE = 0.2
+_INTERVALS = 15
+"""Intervals between states whose median may be off by this share at most while it runs."""
+
+
+def policy_specs(fallbacks: Sequence[str]) -> tuple[ParameterSpec, ...]:
+    """Return the parameters of a controller that answers with a policy file.
+
+    Args:
+        fallbacks: Who may answer where it gives up, ``ZERO`` first.
+    """
+    return (
+        ParameterSpec("policy", "", "", "Policy file (.npz)."),
+        ParameterSpec("fallback", ZERO, "", "Who answers where the policy gives up: zero torque, or a controller at "
+                      "its defaults.", choices=tuple(fallbacks)),
+        ParameterSpec("start_time", START_TIME, "s", "Time in which the torque that it may ask for rises from zero to "
+                      "its limit, after the first state; 0 for at once.", minimum=0.0, maximum=5.0),
+    )  # fmt: skip
+
+
+def states_to_hold(policy: Policy, period: float) -> int:
+    """Return for how many states an answer of a policy holds, where they come at a period [s]."""
+    return max(1, round(policy.period / period))
+
+
+def check_policy_period(policy: Policy, period: float) -> None:
+    """Refuse a period of the states that the policy's is no whole multiple of [s]."""
+    parts = policy.period / period
+    if abs(parts / max(1, round(parts)) - 1.0) > _SAME_PERIOD:
+        raise DesignError(
+            f"policy {policy.name!r} was trained for a period of {policy.period:g} s and states come every "
+            f"{period:g} s; expected {policy.period:g} s or a whole part of it"
+        )
+
+
+class PolicyAnswers:
+    """The answers of a policy to states of n joints, m efforts each, until it gives up.
+
+    Args:
+        policy: The policy.
+        hold: States for which an answer holds.
+        limits: Largest effort of each driven joint [N m or N].
+        start_time: Time from the first state until it has all of its effort [s].
+
+    Attributes:
+        notice: Why it gave up; empty as long as it did not.
+    """
+
+    def __init__(self, policy: Policy, hold: int, limits: Vector, start_time: float) -> None:
+        self.policy = policy
+        self.hold = hold
+        self.start_time = start_time
+        self.limits = tuple(min(limit, own) for limit, own in zip(limits, policy.effort_limit, strict=True))
+        self._layers = tuple(zip(policy.network.weights, policy.network.biases, strict=True))
+        self._relu, self._squash = policy.network.activation == "relu", policy.network.output == "tanh"
+        self._steps = tuple(rate * policy.period for rate in policy.effort_rate)
+        driven = {joint: k for k, joint in enumerate(policy.coordinates.driven)}
+        self._layout = tuple(
+            (signal, driven[joint] if signal == "effort" else joint) for signal, joint in policy.layout
+        )
+        self._units = tuple((joint.unit, joint.velocity_unit) for joint in policy.coordinates.joints)
+        self._still = (0.0,) * len(policy.effort_limit)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past, and that it gave up."""
+        self.notice = ""
+        self._observation: Any = None
+        self._effort: Vector = self._still
+        self._wait = 0
+        self._times: list[float] = []
+
+    def answer(self, t: float, x: Vector, v: Vector) -> Vector | None:
+        """Return the efforts of the driven joints, or None where it gives up or has given up [N m or N].
+
+        Args:
+            t: Time since the start [s].
+            x: Deviation of each joint from upright, wrapped where it turns [rad or m].
+            v: Velocities [rad/s or m/s].
+        """
+        if not self.notice:
+            self._watch_period(t)
+        if not self.notice:
+            self._watch_box(t, x, v)
+        if self.notice:
+            return None
+        if self._wait > 0:
+            self._wait -= 1
+            return self._effort
+        self._wait = self.hold - 1
+        answers = self._network(x, v)
+        for each in answers:
+            if not math.isfinite(each):
+                self._give_up(t, f"its network answered {each}")
+                return None
+        wanted = []
+        for answer, scale, before, step in zip(
+            answers, self.policy.effort_limit, self._effort, self._steps, strict=True
+        ):
+            wanted.append(before + min(step, max(-step, scale * answer - before)))
+        self._effort = self.begun(t, wanted)
+        return self._effort
+
+    def follow(self, efforts: Vector) -> None:
+        """Take note of efforts that another controller applied in place of the last answer [N m or N]."""
+        self._effort = efforts
+
+    def fall_back(self, t: float, state: Sequence[float], answer: Callable[[], Sequence[float]] | None) -> Vector:
+        """Return the efforts of a fallback, softly begun; none without one, or where the state or they are no numbers.
+
+        Args:
+            t: Time since the start [s].
+            state: What the fallback answers: limits would make a full effort of what is no number.
+            answer: Asks the fallback.
+        """
+        if answer is None or not all(map(math.isfinite, state)):
+            return self._still
+        efforts = answer()
+        return self.begun(t, efforts) if all(map(math.isfinite, efforts)) else self._still
+
+    def begun(self, t: float, efforts: Sequence[float]) -> Vector:
+        """Return efforts within what they may be so long after the start [N m or N]."""
+        return tuple(
+            soft_start(effort, limit, t, self.start_time) for effort, limit in zip(efforts, self.limits, strict=True)
+        )
+
+    def describe(self, after: str) -> str:
+        """Return which policy it is, and whether it gave up; ``after`` says who answers then."""
+        policy = self.policy
+        sizes = "-".join(str(size) for size in policy.network.sizes)
+        told = f"{policy.name} ({policy.task}, {sizes}) every {policy.period:g} s, fallback {after}"
+        return f"{told}; {self.notice}" if self.notice else told
+
+    def take_over(self, previous: PolicyAnswers) -> None:
+        """Take over samples and efforts from the answers of the same kind of policy, and that it gave up."""
+        self.notice = previous.notice
+        own, other = self.policy, previous.policy
+        if (own.layout, own.history, own.velocity_scale, own.effort_limit) == (
+            other.layout,
+            other.history,
+            other.velocity_scale,
+            other.effort_limit,
+        ):
+            self._observation = None if previous._observation is None else previous._observation.copy()
+            self._effort = tuple(
+                min(limit, max(-limit, effort)) for effort, limit in zip(previous._effort, self.limits, strict=True)
+            )
+            self._wait = min(previous._wait, self.hold - 1)
+
+    def _network(self, x: Vector, v: Vector) -> list[float]:
+        """Return the network's answers to the samples up to this one, within [-1, 1]."""
+        policy = self.policy
+        sample = []
+        for signal, k in self._layout:
+            if signal == "cos":
+                sample.append(math.cos(x[k]))
+            elif signal == "sin":
+                sample.append(math.sin(x[k]))
+            elif signal == "velocity":
+                sample.append(v[k] / policy.velocity_scale[k])
+            elif signal == "effort":
+                sample.append(self._effort[k] / policy.effort_limit[k])
+            elif signal == "position":
+                sample.append(x[k] / policy.angle_box[k])
+            else:
+                sample.append(x[k])
+        size = len(sample)
+        if self._observation is None:
+            self._observation = np.array(sample * policy.history, dtype=np.float32)
+        else:
+            self._observation[:-size] = self._observation[size:]
+            self._observation[-size:] = sample
+        y = self._observation
+        last = len(self._layers) - 1
+        for number, (weight, bias) in enumerate(self._layers):
+            y = weight.dot(y) + bias
+            if number < last:
+                y = np.maximum(y, 0.0) if self._relu else np.tanh(y)
+        return [self._bounded(each) for each in y.tolist()]
+
+    def _bounded(self, answer: float) -> float:
+        if not math.isfinite(answer):
+            return answer
+        return math.tanh(answer) if self._squash else min(1.0, max(-1.0, answer))
+
+    def _watch_box(self, t: float, x: Vector, v: Vector) -> None:
+        boxes = zip(x, v, self.policy.angle_box, self.policy.velocity_box, strict=True)
+        for k, (position, velocity, reach, fastest) in enumerate(boxes):
+            if not (abs(velocity) <= fastest and abs(position) <= reach):
+                unit, speed = self._units[k]
+                what = "angle" if unit == "rad" else "position"
+                which = "" if len(x) == 1 else f" of {self.policy.joints[k]}"
+                seen = f"{what}{which} {position:.3g} {unit}, velocity {velocity:.3g} {speed}"
+                box = f"(+-{reach:.3g} {unit}, +-{fastest:.3g} {speed})"
+                self._give_up(t, f"{seen} is outside of what it was trained for {box}")
+                return
+
+    def _watch_period(self, t: float) -> None:
+        """Give up where states come at another rate, whatever was said of it: the network knows no other time."""
+        self._times.append(t)
+        if len(self._times) <= _INTERVALS:
+            return
+        median = statistics.median(later - earlier for earlier, later in pairwise(self._times))
+        self._times = [t]
+        if not abs(median * self.hold / self.policy.period - 1.0) <= _LATE:
+            own = self.policy.period / self.hold
+            self._give_up(t, f"states come every {median:.3g} s; it answers for every {own:.3g} s")
+
+    def _give_up(self, t: float, reason: str) -> None:
+        self.notice = f"gave up after {t:.3f} s: {reason}"

@@ -1,0 +1,163 @@
+"""The rate at which states come, measured, and whether a controller bears it."""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.laws.loop_check import settles
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+
+__all__ = [
+    "ASSUMED_PERIOD",
+    "PeriodWatch",
+    "differs",
+    "goes_on",
+    "rate_problem",
+    "require_period",
+    "uses_period",
+]
+
+ASSUMED_PERIOD = 0.01
+"""Period of a design whose states nobody has heard yet [s]: that of the thesis's loop."""
+TOLERANCE = 0.2
+"""Share by which the measured period may differ from that of the design: a late state now and then is no other rate."""
+_WINDOW = 15
+_ENOUGH = 9
+_GAP_NS = NANOSECONDS
+_IGNORE_PERIOD = frozenset({"lqr", "pd_gravity", "sliding_mode", "energy_swing_up", "playback"})
+_BALANCING = frozenset(
+    {"lqr", "lqi", "lqg", "lqr_friction", "discrete_lqr", "pid", "pd_gravity", "mpc", "sliding_mode"}
+)
+_FAST_PERIOD = 2e-3
+"""Up to this period a design in continuous time is taken at its word [s]."""
+
+
+class PeriodWatch:
+    """Measures the period of states by their stamps: the median of the last intervals.
+
+    A state that was lost on the way doubles one interval, two states that a stall has brought together shorten one;
+    neither moves the median.
+
+    Args:
+        exact: Stamps are simulated time, where one interval says it all and nothing may wait for more.
+    """
+
+    def __init__(self, *, exact: bool = False) -> None:
+        self._exact = exact
+        self.newest_ns: int | None = None
+        """Stamp of the newest state [ns]; None before the first."""
+        self._intervals_ns: deque[int] = deque(maxlen=1 if exact else _WINDOW)
+
+    def add(self, stamp_ns: int) -> bool:
+        """Take the stamp of a state [ns]; return whether the plant began anew, so that what was measured is void."""
+        newest, self.newest_ns = self.newest_ns, stamp_ns
+        if newest is None or stamp_ns == newest:
+            return False
+        interval = stamp_ns - newest
+        if goes_on(interval):
+            self._intervals_ns.append(interval)
+            return False
+        self._intervals_ns.clear()
+        return True
+
+    def extend(self, stamps_ns: Sequence[int]) -> None:
+        """Take the stamps of states that went on from each other, the oldest first [ns]."""
+        most = self._intervals_ns.maxlen
+        assert most is not None
+        newest = stamps_ns[-most - 1 :]
+        if len(newest) < len(stamps_ns):
+            self.newest_ns = newest[0]
+        for stamp_ns in newest:
+            self.add(stamp_ns)
+
+    @property
+    def only_interval_ns(self) -> int | None:
+        """The one interval that says it all in simulated time [ns]; None in real time, or before it is known."""
+        return self._intervals_ns[0] if self._exact and self._intervals_ns else None
+
+    @property
+    def period(self) -> float | None:
+        """The period [s], to three digits; None before it is known."""
+        if len(self._intervals_ns) < (1 if self._exact else _ENOUGH):
+            return None
+        return float(f"{statistics.median(self._intervals_ns) / NANOSECONDS:.3g}")
+
+
+def goes_on(interval_ns: int) -> bool:
+    """Tell whether a state so long after another goes on from it [ns], and is not that of a plant that began anew."""
+    return 0 < interval_ns < _GAP_NS
+
+
+def differs(measured: float, designed: float) -> bool:
+    """Tell whether states come at another rate than a design counts on; both are periods [s]."""
+    return abs(measured / designed - 1.0) > TOLERANCE
+
+
+def uses_period(kind: str, velocity: str = "measured") -> bool:
+    """Tell whether a controller's answers depend on the sampling period that it was designed for.
+
+    Args:
+        kind: Name of the controller; one that is not known here counts as if they did.
+        velocity: Where it takes the velocity from; every estimator depends on it.
+    """
+    return kind not in _IGNORE_PERIOD or velocity != "measured"
+
+
+def require_period(what: str, designed: float, period: float) -> None:
+    """Refuse states at another period than that of the design.
+
+    Args:
+        what: What is done at each state, such as ``the trajectory is followed``.
+        designed: The period of the design [s].
+        period: That of the states [s].
+
+    Raises:
+        ParameterError: They differ.
+    """
+    if differs(period, designed):
+        raise ParameterError(f"{what} every {designed:g} s; expected states at that period")
+
+
+def rate_problem(
+    make: Callable[[], Controller],
+    kind: str,
+    plant: PlantParameters,
+    designed: float,
+    measured: float,
+    *,
+    uses: bool,
+    set_point: float = 0.0,
+) -> str:
+    """Return why a controller must not answer states that come at another rate than it was designed for, or nothing.
+
+    Refused is what would settle at its own rate and does not at theirs: a controller that never does, such as one of
+    zero torque, is somebody's intention.
+
+    Args:
+        make: Designs the controller.
+        kind: Its name.
+        plant: The plant that it was designed for.
+        designed: Period of the design [s].
+        measured: Period of the states [s].
+        uses: Whether its answers depend on the period, see :func:`uses_period`.
+        set_point: Angle to hold, from upright [rad].
+    """
+    own = designed if uses else _FAST_PERIOD
+    if kind not in _BALANCING or not differs(measured, own) or (not uses and measured < own):
+        return ""
+    if settles(make(), plant, measured, set_point) or not settles(make(), plant, own, set_point):
+        return ""
+    if uses:
+        return (
+            f"period is {designed:g} s, but states come every {measured:g} s, at which {kind} designed for the former "
+            f"does not settle; expected period:={measured:g}, or 0 to take it from the states"
+        )
+    return (
+        f"states come every {measured:g} s, at which {kind} does not settle on plant {plant.name!r}; expected a faster "
+        "plant, or a controller that is designed for its period, such as discrete_lqr"
+    )

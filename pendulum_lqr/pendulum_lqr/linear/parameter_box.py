@@ -1,0 +1,227 @@
+"""How a gain fares on every plant that the identification leaves possible: worst margins over a box or an ellipsoid."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from pendulum_lqr.linear.analysis import Margins, bears_its_delay, closed_loop_poles, loop_margins
+from pendulum_lqr.linear.model import linearise
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.json_values import without_nan
+from pendulum_msgs_py.parameters import suggestion
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant_file
+
+__all__ = ["IDENTIFIED", "UNCERTAIN", "ParameterBox", "WorstCase", "parse_box", "worst_case"]
+
+UNCERTAIN = ("inertia", "damping", "gravity", "angle_offset", "actuator_time_constant", "transport_delay")
+"""Parameters of the linear model that may be uncertain."""
+IDENTIFIED = "identified"
+"""Asks for the intervals of the plant file, with the correlation of its identification where that lies beside it."""
+
+_INSIDE = 48
+"""Plants drawn within a box, beside its corners, or on an ellipsoid."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ParameterBox:
+    """Between which values the parameters of a plant lie.
+
+    Attributes:
+        bounds: Lowest and highest value by parameter, in its unit.
+        correlation: Of the errors, in the order of ``bounds``, shape (k, k); None takes every corner for possible.
+        source: Where this comes from, in words.
+    """
+
+    bounds: Mapping[str, tuple[float, float]]
+    correlation: Array | None = None
+    source: str = "given"
+
+    def plants(self, plant: PlantParameters) -> list[PlantParameters]:
+        """Return the plant itself and others that are possible: corners and inside, or the edge of the ellipsoid.
+
+        Without correlation every corner of the box is there. With it, the plants lie on the ellipsoid that holds 95 %
+        of all outcomes of such an identification, all parameters together.
+
+        Source:
+            Johnson and Wichern, Applied Multivariate Statistical Analysis, 6th ed., 2007, section 5.4 (ellipsoid).
+        """
+        rng = np.random.default_rng(0)
+        low, high = (np.array([pair[i] for pair in self.bounds.values()]) for i in (0, 1))
+        if self.correlation is None:
+            corners = np.array(list(itertools.product(*self.bounds.values())))
+            values = np.vstack([corners, rng.uniform(low, high, (_INSIDE, low.size))])
+        else:
+            # Standard errors from 95 % intervals of single parameters; the joint region reaches further.
+            half = 0.5 * (high - low) / float(scipy.special.ndtri(0.975))
+            weights, axes = np.linalg.eigh(self.correlation)
+            factor = axes * np.sqrt(np.maximum(weights, 0.0))
+            ball = rng.standard_normal((2 * _INSIDE, low.size))
+            ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+            # Along each axis too: there the ellipsoid reaches furthest, and a draw hardly ever hits it.
+            ball = np.vstack([ball, np.eye(low.size), -np.eye(low.size)])
+            reach = math.sqrt(float(scipy.special.chdtri(low.size, 0.05)))
+            centre = np.array([getattr(plant, name) for name in self.bounds])
+            values = centre + reach * (ball @ factor.T) * half
+        found = [plant]
+        for row in values:
+            changes = dict(zip(self.bounds, map(float, row), strict=True))
+            for name, value in changes.items():
+                if name != "angle_offset":
+                    # No plant has less; an inertia of nothing is none.
+                    changes[name] = max(value, 1e-3 * plant.inertia if name == "inertia" else 0.0)
+            found.append(plant.with_values(**changes))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class WorstCase:
+    """A gain over many plants.
+
+    Attributes:
+        plants: How many were asked.
+        unstable: How many of them the gain does not hold.
+        margins: The worst of each margin over the plants; None if it holds none of them.
+        where: Parameters of the plant with the smallest modulus margin, or of the first that is not held.
+    """
+
+    plants: int
+    unstable: int
+    margins: Margins | None
+    where: Mapping[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON; infinities as None."""
+        return without_nan(asdict(self))
+
+
+def worst_case(plants: Sequence[PlantParameters], K: ArrayLike, theta: float, names: Sequence[str]) -> WorstCase:
+    """Return the worst margins of one gain over several plants, each linearised at the same measured angle.
+
+    Args:
+        plants: At least one, of one structure.
+        K: Gain on angle and velocity, shape (2,).
+        theta: Measured angle that is held, 0 hanging down [rad].
+        names: Parameters to tell of the worst plant.
+    """
+    unstable, found = 0, []
+    lost: PlantParameters | None = None
+    for plant in plants:
+        model = linearise(plant, theta)
+        held = float(closed_loop_poles(model, K)[0].real) < 0.0
+        margins = loop_margins(model, K) if held else None
+        if margins is None or (model.delay > 0.0 and not bears_its_delay(model, K)):
+            unstable += 1
+            lost = lost or plant
+        else:
+            found.append((margins, plant))
+    worst = lost or min(found, key=lambda pair: pair[0].modulus)[1]
+    where = {name: float(getattr(worst, name)) for name in names}
+    if not found:
+        return WorstCase(len(plants), unstable, None, where)
+    every = [margins for margins, _ in found]
+    phases = [m for m in every if math.isfinite(m.phase)]
+    least = min(phases, key=lambda m: abs(m.phase)) if phases else every[0]
+    return WorstCase(
+        len(plants),
+        unstable,
+        Margins(
+            gain_up=min(m.gain_up for m in every),
+            gain_down=max(m.gain_down for m in every),
+            phase=least.phase,
+            crossover=least.crossover,
+            delay=min(m.delay for m in every),
+            modulus=min(m.modulus for m in every),
+        ),
+        where,
+    )
+
+
+def parse_box(texts: Sequence[str], plant: PlantParameters, path: Path | None = None) -> ParameterBox:
+    """Return the box that texts such as ``inertia=10%`` or ``transport_delay=0:0.01`` name.
+
+    Args:
+        texts: One a parameter: a share in percent to either side, or lowest and highest value in the parameter's unit;
+            or ``identified`` alone, for the intervals of the plant file.
+        plant: The plant that is believed in.
+        path: Its file; None for a preset.
+
+    Raises:
+        ParameterError: A text that is none of these, or a plant file without intervals.
+    """
+    if IDENTIFIED in texts:
+        if len(texts) > 1:
+            raise ParameterError(
+                f"--uncertainty is {IDENTIFIED} and {len(texts) - 1} more; expected {IDENTIFIED} alone"
+            )
+        return _identified(path)
+    bounds: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if name not in UNCERTAIN:
+            raise ParameterError(f"--uncertainty names {name!r}; {suggestion(name, (*UNCERTAIN, IDENTIFIED))}")
+        if name in bounds:
+            raise ParameterError(f"--uncertainty names {name} twice; expected each parameter once")
+        bounds[name] = _bounds(text, value, float(getattr(plant, name)))
+        low, high = bounds[name]
+        if name != "angle_offset" and (low < 0.0 or (name == "inertia" and low <= 0.0)):
+            least = "> 0" if name == "inertia" else ">= 0"
+            raise ParameterError(f"--uncertainty {text} reaches from {low:g} to {high:g}; expected values {least}")
+    return ParameterBox(bounds)
+
+
+def _bounds(text: str, value: str, own: float) -> tuple[float, float]:
+    try:
+        if value.endswith("%"):
+            share = abs(own) * float(value[:-1]) / 100.0
+            low, high = own - share, own + share
+            if share < 0.0:
+                low = math.nan
+        else:
+            low, high = (float(part) for part in value.split(":"))
+    except ValueError:
+        low = high = math.nan
+    if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+        raise ParameterError(f"--uncertainty is {text!r}; expected as inertia=10% or transport_delay=0:0.01")
+    if own == 0.0 and value.endswith("%"):
+        raise ParameterError(
+            f"--uncertainty {text} is a share of 0, the plant's own value; expected lowest and highest value, such as "
+            "transport_delay=0:0.01"
+        )
+    return low, high
+
+
+def _identified(path: Path | None) -> ParameterBox:
+    if path is None:
+        raise ParameterError(f"--uncertainty {IDENTIFIED} needs --plant, a plant file that identify wrote")
+    intervals = load_plant_file(path)[1].get("intervals", {})
+    bounds = {name: (float(intervals[name][0]), float(intervals[name][1])) for name in UNCERTAIN if name in intervals}
+    if not bounds:
+        raise ParameterError(f"plant file {path} has no interval of {', '.join(UNCERTAIN)}; expected one of identify")
+    correlation = _correlation(path.with_suffix(".json"), tuple(bounds))
+    how = "correlated as in the identification" if correlation is not None else "each by itself"
+    return ParameterBox(bounds, correlation, f"95 % intervals of {path.name}, {how}")
+
+
+def _correlation(path: Path, names: Sequence[str]) -> Array | None:
+    """Return the correlation of some parameters in an identification's JSON file, None where there is none."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        order = list(document["covariance"]["names"])
+        index = [order.index(name) for name in names]
+        found = np.array(document["correlation"], dtype=np.float64)[np.ix_(index, index)]
+    except (OSError, ValueError, KeyError, TypeError, IndexError):
+        return None
+    plausible = np.all(np.isfinite(found)) and np.all(np.abs(found) <= 1.0 + 1e-9)
+    return found if plausible and np.allclose(found, found.T, atol=1e-9) else None

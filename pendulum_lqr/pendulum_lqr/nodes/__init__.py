@@ -1,0 +1,1 @@
+"""The programs on the graph, and what they do without ROS."""

@@ -1,0 +1,278 @@
+"""Which states a controller answers, and what its diagnostics say: the controller node without ROS."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
+from typing import Any, cast
+
+from pendulum_lqr.laws.interface import Controller, JointController
+from pendulum_lqr.nodes.answer_rules import (
+    DUPLICATE,
+    FROM_FUTURE,
+    LONGEST,
+    NEW,
+    OUT_OF_ORDER,
+    STALE,
+    is_saturated,
+    judge_state,
+)
+from pendulum_msgs_py.contract.angles import deviation_from_upright
+from pendulum_msgs_py.contract.rules import NEVER
+from pendulum_msgs_py.contract.timing import RingOfTimes
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample, Vector, written
+
+__all__ = ["AnswerLoop", "StateRefusal"]
+
+
+class StateRefusal(str, Enum):
+    """Why a state was not answered; the value is the key in diagnostics."""
+
+    MALFORMED = "malformed"
+    NOT_FINITE = "not_finite"
+    STALE = "stale"
+    FROM_FUTURE = "from_future"
+    OUT_OF_ORDER = "out_of_order"
+    DUPLICATE = "duplicate"
+    NO_ANSWER = "no_answer"
+
+
+_REFUSALS = {
+    STALE: StateRefusal.STALE,
+    FROM_FUTURE: StateRefusal.FROM_FUTURE,
+    DUPLICATE: StateRefusal.DUPLICATE,
+    OUT_OF_ORDER: StateRefusal.OUT_OF_ORDER,
+}
+
+
+class AnswerLoop:
+    """Answers each new state once and keeps count.
+
+    Args:
+        controller: The controller.
+        state_timeout: Age beyond which a state is not answered [s]; inf for any age.
+        simulated_time: Stamps are those of a simulator, so that their age says nothing and they may start anew.
+        send: Called with a state and the efforts that answer it [N m or N], before anything is counted.
+        monotonic: Clock for the compute time [ns].
+
+    Attributes:
+        controller: The controller.
+        simulated_time: Whether stamps are those of a simulator.
+        newest: The newest state that was answered, or could not be; None before the first.
+        kept_answer: The efforts that answered it [N m or N], or None.
+        start_ns: Stamp of the first state since a restart [ns]; None before it.
+        timeout_ns: Age beyond which a state is not answered [ns].
+        age: Ages of the states that were answered [ns].
+        compute_time: Times in which they were [ns].
+    """
+
+    def __init__(
+        self,
+        controller: Controller | JointController,
+        state_timeout: float,
+        *,
+        simulated_time: bool = False,
+        send: Callable[[JointSample, Vector], None] = lambda sample, effort: None,
+        monotonic: Callable[[], int] = time.perf_counter_ns,
+    ) -> None:
+        self.controller = controller
+        self.simulated_time = simulated_time
+        self.refused: Counter[StateRefusal] = Counter()
+        self.answered = 0
+        self.saturated = 0
+        self.restarts = 0
+        self._take(controller)
+        self.last_effort = self._nothing
+        self.last_reason = ""
+        self.age = RingOfTimes()
+        self.compute_time = RingOfTimes()
+        self.newest: JointSample | None = None
+        self.kept_answer: Vector | None = None
+        self._send = send
+        self._monotonic = monotonic
+        self._timeout = state_timeout
+        # Whole nanoseconds, as ages are.
+        self.timeout_ns = math.floor(min(LONGEST, state_timeout * NANOSECONDS))
+        self.start_ns: int | None = None
+        self._window = (0, 0, 0)
+
+    @property
+    def newest_stamp_ns(self) -> int | None:
+        """Stamp of the newest state that was answered, or could not be [ns]; None before the first."""
+        return None if self.newest is None else self.newest.stamp_ns
+
+    def restart(self) -> None:
+        """Forget the past: the next state is the first one."""
+        self.controller.reset()
+        self.newest = None
+        self.start_ns = None
+        self.last_effort = self._nothing
+
+    def replace(self, controller: Controller | JointController) -> None:
+        """Swap the controller between two states; integrals and filters are carried over."""
+        # All controllers of one loop are for the same joints, so both are of one kind.
+        controller.carry_over(cast("Any", self.controller))
+        self.controller = controller
+        self._take(controller)
+
+    def _take(self, controller: Controller | JointController) -> None:
+        """Bind what answers a state: a controller of several joints, or one that sees [angle from upright, speed]."""
+        self._command: Callable[[float, JointSample], Vector]
+        if isinstance(controller, JointController):
+            several = controller.command
+            self._limits = controller.effort_limits
+            self._command = lambda t, sample: several(t, sample.position, sample.velocity)
+        else:
+            one = controller.command
+            self._limits = (controller.effort_limit,)
+            self._command = lambda t, sample: (
+                one(t, (deviation_from_upright(sample.position[0]), sample.velocity[0])),
+            )
+        self._nothing = (0.0,) * len(self._limits)
+
+    def answer(self, sample: JointSample | None, now_ns: int, problem: str = "") -> Vector | None:
+        """Send the efforts that answer a state and return them, or None where the state is refused [N m or N].
+
+        Args:
+            sample: The state; None for a message that carries none of our joints.
+            now_ns: Time of arrival on the clock of the stamps [ns]; not used in simulated time.
+            problem: What is wrong with a message that carries no state.
+        """
+        refusal = self._judge(sample, now_ns)
+        if refusal is not None:
+            self.refused[refusal] += 1
+            self.last_reason = problem if sample is None else self._problem(refusal, sample, now_ns)
+            # A plant in lockstep repeats a state when the answer did not reach it: the same answer again, if any.
+            if sample is None or refusal is not StateRefusal.DUPLICATE or not self.simulated_time:
+                return None
+            if self.kept_answer is not None:
+                self._send(sample, self.kept_answer)
+            return self.kept_answer
+        assert sample is not None
+        if self.start_ns is None:
+            self.start_ns = sample.stamp_ns
+        self.newest, self.kept_answer = sample, None
+        began = self._monotonic()
+        reason = ""
+        try:
+            effort = self._command((sample.stamp_ns - self.start_ns) / NANOSECONDS, sample)
+        except (ArithmeticError, ValueError, RuntimeError) as error:
+            # A solver that gives up must not end the node: without an answer the plant's timeout makes it zero.
+            effort, reason = (math.nan,), f"{type(error).__name__}: {error}"
+        if not all(map(math.isfinite, effort)):
+            unit = " N m" if len(sample.position) == 1 else ""  # of several joints, each has its own
+            self.last_reason = reason or f"controller answered {written(effort)}{unit}"
+            self.refused[StateRefusal.NO_ANSWER] += 1
+            return None
+        ended = self._monotonic()
+        self.last_effort = self.kept_answer = effort
+        # Somebody waits for it, and in a process that has just woken up counting takes several times as long as later.
+        self._send(sample, effort)
+        self.compute_time.add(ended - began)
+        if not self.simulated_time:
+            self.age.add(now_ns - sample.stamp_ns)
+        self.answered += 1
+        for value, limit in zip(effort, self._limits, strict=True):
+            if is_saturated(value, limit):
+                self.saturated += 1
+                break
+        return effort
+
+    def count(
+        self,
+        sample: JointSample,
+        effort: Vector,
+        *,
+        answered: int,
+        saturated: int,
+        ages_ns: Sequence[int],
+        compute_times_ns: Sequence[int],
+    ) -> None:
+        """Count answers that went out already.
+
+        Args:
+            sample: The newest state that was answered.
+            effort: Its answer [N m or N].
+            answered: How many were answered.
+            saturated: How many of the answers were at a limit.
+            ages_ns: Their states' ages [ns].
+            compute_times_ns: Times that they took [ns].
+        """
+        self.newest, self.kept_answer, self.last_effort = sample, effort, effort
+        self.answered += answered
+        self.saturated += saturated
+        self.compute_time.extend(compute_times_ns)
+        if not self.simulated_time:
+            self.age.extend(ages_ns)
+
+    def summary(self, now_ns: int) -> Mapping[str, object]:
+        """Return the figures for diagnostics; rate and saturation are those since the last summary.
+
+        Args:
+            now_ns: Monotonic time [ns].
+        """
+        before_ns, before_answered, before_saturated = self._window
+        answers = self.answered - before_answered
+        elapsed = (now_ns - before_ns) / NANOSECONDS
+        age = self.age.percentiles_us(50, 99, 100)
+        compute = self.compute_time.percentiles_us(50, 99, 100)
+        values: dict[str, object] = {
+            "answered": self.answered,
+            "answer_rate_hz": answers / elapsed if before_ns and elapsed > 0.0 else math.nan,
+            "saturation_share": (self.saturated - before_saturated) / answers if answers else 0.0,
+            "state_age_p50_us": age[0],
+            "state_age_p99_us": age[1],
+            "state_age_max_us": age[2],
+            "compute_time_p50_us": compute[0],
+            "compute_time_p99_us": compute[1],
+            "compute_time_max_us": compute[2],
+            "effort": self.last_effort[0] if len(self.last_effort) == 1 else written(self.last_effort, ".6g"),
+            "restarts": self.restarts,
+        }
+        for refusal in StateRefusal:
+            if self.refused[refusal]:
+                values[f"refused.{refusal.value}"] = self.refused[refusal]
+        if self.last_reason:
+            values["reason"] = self.last_reason
+        self._window = (now_ns, self.answered, self.saturated)
+        return values
+
+    def _judge(self, sample: JointSample | None, now_ns: int) -> StateRefusal | None:
+        if sample is None:
+            return StateRefusal.MALFORMED
+        if not all(map(math.isfinite, sample.position + sample.velocity)):
+            return StateRefusal.NOT_FINITE
+        newest = self.newest
+        found = judge_state(
+            sample.stamp_ns,
+            sample.stamp_ns if self.simulated_time else now_ns,
+            self.timeout_ns,
+            NEVER if newest is None else newest.stamp_ns,
+        )
+        if found == NEW:
+            return None
+        # Angle and velocity alone: what the torque sensor shows is no part of the state.
+        if self.simulated_time and newest is not None and sample[:3] != newest[:3]:
+            # One writer's messages never overtake each other, so simulated time that goes back, or another state under
+            # the same stamp, is a simulation that began anew, however short the one before it was.
+            self.restarts += 1
+            self.restart()
+            return None
+        return _REFUSALS[found]
+
+    def _problem(self, refusal: StateRefusal, sample: JointSample, now_ns: int) -> str:
+        age = (now_ns - sample.stamp_ns) / NANOSECONDS
+        limit = f"expected at most {self._timeout:g} s"
+        if refusal is StateRefusal.NOT_FINITE:
+            where, speed = written(sample.position), written(sample.velocity)
+            if len(sample.position) > 1:  # each in its own unit
+                return f"position is {where}, velocity {speed}; expected finite numbers"
+            return f"position is {where} rad, velocity {speed} rad/s; expected finite numbers"
+        if refusal is StateRefusal.STALE:
+            return f"header.stamp is {age:.6g} s old; {limit}"
+        if refusal is StateRefusal.FROM_FUTURE:
+            return f"header.stamp is {-age:.6g} s ahead of this clock; {limit}"
+        return f"header.stamp is {sample.stamp_ns} ns; the newest was {self.newest_stamp_ns} ns"

@@ -1,0 +1,1 @@
+"""Learned policies: what they are, their files, and what other libraries trained."""

@@ -1,0 +1,1 @@
+"""Frequency responses: of controllers, of measured machines, and what they certify."""

@@ -1,0 +1,200 @@
+"""A measured machine on a dense grid of frequencies: between its lines, and below the lowest of them.
+
+A plant is smooth between two lines where its closed loop need not be: a loop with little damping turns quickly just
+where it is about to fail. So the plant is interpolated, and loops are judged on the interpolated plant. What is
+interpolated is its inverse, torque for an angle: (-stiffness + inertia, damping times frequency) for a joint, which
+hardly bends. Of several joints each output has zeros of its own, and its inverse poles: there it is the ratio to the
+response of a model that is interpolated, 1 where the model is right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.responses.measured_response import MeasuredResponse
+from pendulum_lqr.responses.sampled_response import model_response
+
+__all__ = ["Machine"]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_BELOW = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
+"""Frequencies below the lowest line at which the response is continued, as shares of that line."""
+_NEARLY_ZERO = 0.01
+"""The lowest of these for several joints: a plant that can roll away has no response at 0."""
+_FIT_UP_TO = 4.0
+"""Lines up to this multiple of the lowest serve the continuation."""
+_LEAST_FIT = 4
+_NEAR_NYQUIST = 0.9
+"""Share of the Nyquist frequency above which a highest line counts as reaching it."""
+_RATIO = 1.012
+"""Largest ratio of neighbouring frequencies of the grid."""
+_LEFT_OUT = 0.25
+"""Share of the error at lines left out that is counted at points between lines, half as far from their neighbours: a
+cubic spline errs by the fourth power of the distance, so a sixteenth would do for a smooth plant."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A measured plant on a dense grid.
+
+    Attributes:
+        frequency: Shape (n,), from 0 [Hz], or of several joints from nearly 0.
+        response: Sampled plant from torque to angle and velocity, shape (outputs, n).
+        radius: Radius of the joint confidence discs, interpolation included, shape (outputs, n).
+        period: Sampling period [s].
+        lowest: Lowest measured line [Hz].
+        confidence: Of the discs.
+    """
+
+    frequency: Array
+    response: Complex
+    radius: Array
+    period: float
+    lowest: float
+    confidence: float = 0.95
+
+    @property
+    def up_to_nyquist(self) -> bool:
+        """Whether the highest line lies so near the Nyquist frequency that little is left to happen beyond it."""
+        return 2.0 * self.period * float(self.frequency[-1]) >= _NEAR_NYQUIST
+
+    @classmethod
+    def of(cls, measured: MeasuredResponse) -> Machine:
+        """Return the machine of a measurement."""
+        radius = measured.radius()
+        lines = measured.frequency
+        inside, response, discs = _between(measured, radius)
+        low = lines[0] * _BELOW
+        near = np.flatnonzero(lines <= _FIT_UP_TO * lines[0])
+        if near.size < _LEAST_FIT:
+            near = np.arange(min(_LEAST_FIT, lines.size))
+        inverse = 1.0 / measured.response[0, near]
+        spread = radius[0, near] / np.abs(measured.response[0, near]) ** 2
+        omega = 2.0 * np.pi * low
+        below = _continued(2.0 * np.pi * lines[near], inverse, spread, omega)
+        if below is not None:
+            values, error = below
+            angle = 1.0 / values
+            disc, hold = error * np.abs(angle) ** 2, omega * measured.period * np.abs(angle)
+            inside = np.concatenate([low, inside])
+            # At low frequency the measured velocity is the derivative of the angle, but for the hold.
+            response = np.hstack([np.vstack([angle, 1j * omega * angle]), response])
+            discs = np.hstack([np.vstack([disc, omega * (disc + hold)]), discs])
+        return cls(inside, response, discs, measured.period, float(lines[0]))
+
+    @classmethod
+    def beside(cls, measured: MeasuredResponse, model: LinearModel) -> Machine:
+        """Return the machine of a measurement of several joints, interpolated beside a model.
+
+        Args:
+            measured: The measurement.
+            model: A model of the plant, with the same outputs.
+        """
+        lines, period = measured.frequency, measured.period
+        own = model_response(model, lines, period)
+        ratio, spread = measured.response / own, measured.radius() / np.abs(own)
+        below = lines[0] * np.concatenate([[_NEARLY_ZERO], _BELOW[1:]])
+        whole = np.concatenate([below, _grid(lines)])
+        on_line = np.isin(whole, lines)
+        # A response at -f is the conjugate of that at f: below the lowest line there are lines on either side, too.
+        mirrored = np.concatenate([-lines[::-1], lines])
+        # What a spline makes of errors within these radii, however they lie.
+        weights = np.abs(scipy.interpolate.CubicSpline(mirrored, np.eye(mirrored.size))(whole))
+        # Towards 0, where friction begins to count, half the distance does not make the error that much smaller.
+        near_zero = np.where(whole < lines[1], 1.0 / _LEFT_OUT, 1.0)
+        rows, discs = [], []
+        for curve, radius in zip(ratio, spread, strict=True):
+            values, error = _splined(mirrored, np.concatenate([np.conj(curve[::-1]), curve]), whole)
+            between = np.abs(values) * near_zero * _larger_neighbour(mirrored, error, whole)
+            disc = weights @ np.concatenate([radius[::-1], radius]) + np.where(on_line, 0.0, between)
+            values[on_line], disc[on_line] = curve, radius
+            rows.append(values)
+            discs.append(disc)
+        on_grid = model_response(model, whole, period)
+        return cls(whole, np.array(rows) * on_grid, np.array(discs) * np.abs(on_grid), period, float(lines[0]))
+
+
+def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex, Array]:
+    """Return grid, response and discs from the lowest to the highest line."""
+    lines = measured.frequency
+    if lines.size < 5:
+        return lines, measured.response, radius
+    grid = _grid(lines)
+    inverse = 1.0 / measured.response[0]
+    ratio = measured.response[1] / measured.response[0]
+    relative = radius / np.abs(measured.response)
+    values, errors = [], []
+    for curve in (inverse, ratio):
+        spline, error = _splined(lines, curve, grid)
+        values.append(spline)
+        errors.append(error)
+    on_line = np.isin(grid, lines)
+    angle = 1.0 / values[0]
+    response = np.vstack([angle, values[1] * angle])
+    bend = [_larger_neighbour(lines, error, grid) for error in errors]
+    share = np.vstack([bend[0], bend[0] + bend[1]])
+    noise = np.vstack([_larger_neighbour(lines, row, grid) for row in relative])
+    discs = np.abs(response) * (noise + np.where(on_line, 0.0, share))
+    response[:, on_line], discs[:, on_line] = measured.response, radius
+    return grid, response, discs
+
+
+def _grid(lines: Array) -> Array:
+    """Return the dense grid from the lowest to the highest line; the lines themselves are on it."""
+    pieces = [
+        np.geomspace(a, b, max(2, int(np.ceil(np.log(b / a) / np.log(_RATIO))) + 1))[:-1] for a, b in pairwise(lines)
+    ]
+    return np.concatenate([*pieces, lines[-1:]])
+
+
+def _splined(lines: Array, curve: Complex, grid: Array) -> tuple[Complex, Array]:
+    """Return a curve on the grid, and the error between lines as a share of it: what each tells of one left out.
+
+    Of lines that are mirrored at 0 the mirror image is left out with its line: it is no measurement of its own.
+    """
+    left_out = np.zeros(lines.size)
+    for i in range(1, lines.size - 1):
+        others = np.flatnonzero(np.abs(lines) != abs(lines[i]))
+        left_out[i] = abs(scipy.interpolate.CubicSpline(lines[others], curve[others])(lines[i]) / curve[i] - 1.0)
+    left_out[0], left_out[-1] = left_out[1], left_out[-2]
+    return np.asarray(scipy.interpolate.CubicSpline(lines, curve)(grid)), _LEFT_OUT * left_out
+
+
+def _larger_neighbour(lines: Array, values: Array, grid: Array) -> Array:
+    """Return at each point the larger of the values at the lines beside it."""
+    right = np.clip(np.searchsorted(lines, grid, side="left"), 1, lines.size - 1)
+    return np.asarray(np.maximum(values[right - 1], values[right]), dtype=np.float64)
+
+
+def _continued(x: Array, inverse: Complex, spread: Array, wanted: Array) -> tuple[Complex, Array] | None:
+    """Continue 1/P = (k + m w^2) + j w (b + c w^2) towards 0 by weighted least squares; values and error radii."""
+    if x.size < 3:
+        return None
+    weight = 1.0 / np.maximum(spread, 1e-9 * float(np.abs(inverse).max()))
+    even, odd = np.stack([np.ones_like(x), x**2], axis=1), np.stack([x, x**3], axis=1)
+    target_even, target_odd = (
+        np.stack([np.ones_like(wanted), wanted**2], axis=1),
+        np.stack([wanted, wanted**3], axis=1),
+    )
+    values = np.zeros(wanted.size, dtype=np.complex128)
+    error = np.zeros(wanted.size)
+    for design, target, part, unit in (
+        (even, target_even, inverse.real, 1.0),
+        (odd, target_odd, inverse.imag, 1j),
+    ):
+        scaled = design * weight[:, None]
+        solver = np.linalg.pinv(scaled)
+        coefficients = solver @ (part * weight)
+        misfit = float(np.sqrt(np.mean((scaled @ coefficients - part * weight) ** 2)))
+        values += unit * (target @ coefficients)
+        # Discs of the lines count as they are, and a misfit beyond them as much more.
+        error += np.linalg.norm(target @ solver, axis=1) * max(1.0, misfit)
+    return values, error

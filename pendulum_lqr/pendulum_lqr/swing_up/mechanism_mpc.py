@@ -1,0 +1,104 @@
+"""Nonlinear MPC for any mechanism by iterative LQR, warm-started, with fresh guesses where the plan leads nowhere."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
+from pendulum_lqr.swing_up.mechanism_controller import within_limits
+from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrWeights
+from pendulum_lqr.swing_up.mechanism_search import PlanSearch, PlanSettings
+from pendulum_msgs_py.joints import Vector
+
+__all__ = ["ITERATIONS", "PATIENCE", "PLAN", "RETRIES", "MechanismMpc"]
+
+Array = NDArray[np.float64]
+_HURRY = IlqrWeights(1.0, 0.0, 0.004, 2e-5, 5e-3, 10.0)
+PLAN = PlanSettings(_HURRY, step=0.02, nodes=70, guesses=32, iterations=20)
+"""Of the plans, and of fresh guesses where there is no plan; its step is also the time from plan to plan."""
+ITERATIONS = 3
+"""Of iterative LQR from plan to plan."""
+PATIENCE, RETRIES = 8, 2
+"""Plans after which some guesses are tried again where the plan does not end upright, and how many."""
+
+
+class MechanismMpc:
+    """Follows the first interval of a plan, plans anew from where it is, and hands over to the LQR near upright.
+
+    Args:
+        period: Sampling period [s].
+        catch: LQR with its region; the plant is its own.
+    """
+
+    def __init__(self, period: float, catch: MechanismCatch) -> None:
+        self.plant, self.period, self.catch = catch.plant, period, catch
+        self.search = PlanSearch(catch, PLAN)
+        self._limits = self.plant.effort_limits
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the plan."""
+        self.catch.active = False
+        self.search.reset()
+        self._plan: IlqrPlan | None = None
+        self._planned = 0.0
+        self._age = 0
+        self._before = (0.0,) * len(self._limits)
+
+    def command(self, t: float, x: Vector) -> Vector:
+        """Return the efforts [N m or N]."""
+        step = PLAN.step
+        deviation = deviation_of(self.plant.coordinates, x)
+        if self.catch.holds(deviation):
+            self._plan = None
+            self._before = self.catch.command(deviation)
+            return self._before
+        if self._plan is None:
+            self._plan = self._best(x, None, PLAN.guesses)
+            self._planned, self._age = t, 0
+        elif t - self._planned > 2.0 * step:
+            # A plan that nobody followed for a while begins elsewhere. In real time that is one whose search took too
+            # long for its answer to be applied: it is a better start than none, and another search would be as late.
+            late = self.search.solve(x, self._before, self._plan.efforts, PLAN.iterations)
+            self._plan = self._best(x, late, RETRIES)
+            self._planned, self._age = t, 0
+        elif t - self._planned >= step - 0.5 * self.period:
+            self._plan_again(t, x)
+        plan = self._plan
+        if not math.isfinite(plan.cost):
+            # From far beyond a machine's speeds every plan runs away from all numbers: there is none to follow.
+            self._plan, self._before = None, (0.0,) * len(self._limits)
+            return self._before
+        share = min(1.0, (t + 0.5 * self.period - self._planned) / step)
+        n = len(self.plant.joints)
+        first = plan.states[0, 2 * n :]
+        self._before = within_limits(first + share * (plan.efforts[0] - first), self._limits)
+        return self._before
+
+    def _plan_again(self, t: float, x: Vector) -> None:
+        assert self._plan is not None
+        self._before = tuple(float(u) for u in self._plan.efforts[0])
+        guess, around = _shifted(self._plan)
+        plan = self.search.solve(x, self._before, guess, ITERATIONS, around)
+        self._age += 1
+        if self._age % PATIENCE == 0 and not self.search.arrives(plan):
+            plan = self._best(x, plan, RETRIES)
+        if math.isfinite(plan.cost):
+            self._plan, self._planned = plan, t
+        # Else a single wild state, such as an encoder's glitch: the plan before it is the better one.
+
+    def _best(self, x: Vector, plan: IlqrPlan | None, count: int) -> IlqrPlan:
+        """Return the cheapest of a plan and what fresh guesses become."""
+        found = self.search.guessed(x, self._before, count)
+        return min(found if plan is None else [plan, *found], key=lambda each: each.cost)
+
+
+def _shifted(plan: IlqrPlan) -> tuple[Array, IlqrPlan]:
+    """Return the efforts of a plan one interval later, ended by none, and the plan that its feedback follows there."""
+    states = np.vstack([plan.states[1:], plan.states[-1:]])
+    efforts = np.vstack([plan.efforts[1:], np.zeros((1, plan.efforts.shape[1]))])
+    gains = np.concatenate([plan.gains[1:], np.zeros((1, *plan.gains.shape[1:]))])
+    return efforts, plan._replace(states=states, efforts=efforts, gains=gains)

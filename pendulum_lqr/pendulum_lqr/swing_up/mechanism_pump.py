@@ -1,0 +1,230 @@
+"""Swing-up by energy for plants whose one motor moves the hinge of a pendulum that has none.
+
+::
+
+    M_aa q_a'' + M_ap q_p'' + ... = u          a: the driven joint (cart, arm, shoulder), at q_a = q_a* to be
+    M_pa q_a'' + M_pp q_p'' + ... = 0          p: the pendulum
+
+With the driven joint at its goal, E = M_pp v_p^2 / 2 + U(q_a*, q_p) is the pendulum's energy, and what is done to it is
+E' = -M_pa q_a'' v_p. So the driven joint is accelerated by
+
+    q_a'' = k (E / E* - 1) M_pa v_p - w^2 (q_a - q_a*) - 2 d w q_a'
+
+where E* is the energy of upright: the first part pumps, the rest brings the joint back. The motor's effort for this
+acceleration follows from the mechanism's own equations, which are affine in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pendulum_lqr.linear.design import DesignError
+from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["PUMPS", "EnergyPump", "PumpGains", "pump_gains"]
+
+_BRAKES = 0.6
+"""Share of the motor's limit that is counted on to stop before the end of the way; the rest holds the pendulum."""
+_AT_STOPS = 0.9
+"""Share of the way to an end stop that is used."""
+_HANGING = 0.05
+"""Share of E* below which a pendulum at rest hangs, and is pushed whatever its velocity."""
+_PUSH = 0.05
+"""That push, as a share of the acceleration w_0^2 of the pendulum's own frequency."""
+_LEAST_COUPLING = 0.3
+"""Share of the coupling of hanging below which friction is not made up for: a level pole feels nothing of its cart."""
+_MOST_FRICTION = 0.015
+"""Largest dry friction of the pendulum, by the torque of its level weight. The LQR that catches knows none, and with
+more it does not bring every mechanism to rest (pendubot: 5 of 5 at 0.015, none at 0.02)."""
+_ANGLES = 32
+
+
+@dataclass(frozen=True)
+class PumpGains:
+    """Gains without units: one set suits all sizes of a mechanism.
+
+    Attributes:
+        gain: k, by the pendulum's frequency and by M_pp / M_pa of hanging [-].
+        servo: Frequency at which the driven joint comes back, as a multiple of the pendulum's [-].
+        damping: Its damping ratio [-].
+        margin: Energy aimed at beyond that of upright, relative [-].
+        reach: Farthest that the driven joint may go from its goal [rad or m], at most nine tenths of the way to its
+            stops; 0 for these.
+        carried: Turn of the pendulum per turn of the driven joint, where it carries the pendulum's frame along [-].
+    """
+
+    gain: float
+    servo: float
+    damping: float
+    margin: float = 0.0
+    reach: float = 0.0
+    carried: float = 0.0
+
+
+PUMPS: dict[tuple[str, str], PumpGains] = {
+    ("cart_pole", "cart"): PumpGains(1.8, 0.26, 0.5),
+    ("furuta", "arm"): PumpGains(3.0, 0.3, 0.8, reach=2.0),
+    ("double_pendulum", "shoulder"): PumpGains(0.5, 0.5, 0.5, reach=1.2, carried=1.0),
+}
+"""Which mechanisms can be swung up so, with which joint driven, and by which gains."""
+
+
+def pump_gains(plant: MechanismParameters) -> PumpGains:
+    """Return the default gains of a plant.
+
+    Raises:
+        DesignError: The plant is none of those that can be swung up so.
+    """
+    driven = plant.coordinates.driven_names
+    key = (plant.mechanism.name, driven[0] if len(driven) == 1 else "")
+    if key not in PUMPS:
+        known = ", ".join(f"{name} with a motor at the {joint} alone" for name, joint in PUMPS)
+        motors = f"motors at {', '.join(driven)}" if driven else "no motor"
+        raise DesignError(
+            f"energy_swing_up moves the hinge of a pendulum, and plant {plant.name!r} is a {plant.mechanism.name} with "
+            f"{motors}; expected {known}, or another controller: ilqr, nmpc"
+        )
+    return PUMPS[key]
+
+
+class EnergyPump:
+    """The law above, for one plant.
+
+    Args:
+        plant: The plant.
+        gains: Its gains.
+        limit: Largest effort of the motor [N m or N].
+
+    Attributes:
+        limit: Largest effort of the motor [N m or N].
+        reach: Farthest that the driven joint may go from its goal, infinite where nothing bounds it [rad or m].
+
+    Raises:
+        DesignError: The plant cannot be swung up so: no gravity, the driven joint does not move the pendulum, or dry
+            friction would keep the LQR from holding it.
+
+    Source:
+        Astrom and Furuta, Swinging up a pendulum by energy control, Automatica 36(2), 2000; Spong, Energy based control
+        of a class of underactuated mechanical systems, IFAC World Congress, 1996, for the partial linearisation.
+    """
+
+    def __init__(self, plant: MechanismParameters, gains: PumpGains, limit: float) -> None:
+        pump_gains(plant)
+        (self._a,) = plant.coordinates.driven
+        self._p = 1 - self._a
+        self._goal = plant.coordinates.goal
+        self.limit = limit
+        self._packed = plant.packed
+        self._forward: Callable[..., Vector] = plant.mechanism.forward
+        self._mass = plant.mechanism.mass
+        self._potential = plant.mechanism.potential
+        self._deviation = plant.coordinates.deviation
+        hanging = self._at(self._goal[self._p] + math.pi)
+        self._lowest = self._potential(hanging, self._packed)
+        self._top = self._potential(self._goal, self._packed) - self._lowest
+        rows = self._mass(hanging, self._packed)
+        inertia = rows[self._p][self._p]
+        coupling = rows[self._p][self._a] - gains.carried * inertia
+        if not (self._top > 0.0 and abs(coupling) > 1e-9 * inertia):
+            names = plant.coordinates.names
+            raise DesignError(
+                f"{names[self._p]} of plant {plant.name!r} cannot be swung up by {names[self._a]}: its weight lifts "
+                f"{self._top:.4g} J, its coupling is {coupling:.4g}; expected both other than 0"
+            )
+        weight, stuck = 0.5 * self._top, plant.joints[self._p].breakaway
+        if stuck > _MOST_FRICTION * weight:
+            name, unit = plant.coordinates.names[self._p], plant.coordinates.joints[self._p].effort_unit
+            raise DesignError(
+                f"energy_swing_up ends with an LQR that knows no dry friction, and {name} of plant {plant.name!r} is "
+                f"passive with {stuck:g} {unit}; expected at most {_MOST_FRICTION * weight:.3g} {unit}, as of a "
+                "preset's frictionless twin"
+            )
+        frequency = math.sqrt(weight / inertia)
+        self._ratio = inertia / abs(coupling)
+        self._carried = gains.carried
+        self._gain = gains.gain * frequency * self._ratio / abs(coupling)
+        self._stiffness = (gains.servo * frequency) ** 2
+        self._damping = 2.0 * gains.damping * gains.servo * frequency
+        self._lost = plant.joints[self._p].damping, plant.joints[self._p].coulomb_friction
+        self._least_coupling = _LEAST_COUPLING * abs(coupling)
+        self._coulomb = plant.joints[self._a].coulomb_friction
+        self._push = _PUSH * frequency**2 * self._ratio + 2.0 * stuck / abs(coupling)
+        self._rest = 0.01 * frequency
+        self._slow = 0.05 * frequency
+        self._brakes = _BRAKES * limit * self._least_answer()
+        low, high = plant.stops[self._a]
+        goal = self._goal[self._a]
+        self.reach = min(gains.reach or math.inf, _AT_STOPS * min(goal - low, high - goal))
+
+    def swing(self, position: Vector, velocity: Vector) -> tuple[float, float]:
+        """Return the pendulum's angle from upright, wrapped [rad], and its velocity [rad/s]."""
+        deviation = self._deviation(position)
+        angle = wrap(deviation[self._p] + self._carried * deviation[self._a])
+        return angle, velocity[self._p] + self._carried * velocity[self._a]
+
+    def share(self, position: Vector, velocity: Vector) -> float:
+        """Return the pendulum's energy as a share of that of upright [-]."""
+        turned = position[self._a] - self._goal[self._a]
+        q = self._at(position[self._p] + self._carried * turned)
+        speed = velocity[self._p] + self._carried * velocity[self._a]
+        kinetic = 0.5 * self._mass(q, self._packed)[self._p][self._p] * speed**2
+        return float((kinetic + self._potential(q, self._packed) - self._lowest) / self._top)
+
+    def effort(self, position: Vector, velocity: Vector, margin: float) -> float:
+        """Return the limited effort that pumps [N m or N].
+
+        Args:
+            position: Both positions [rad or m].
+            velocity: Both velocities.
+            margin: Energy aimed at beyond that of upright, as a share of it [-].
+        """
+        a, p = self._a, self._p
+        error, speed = self._deviation(position)[a], velocity[a]
+        rows = self._mass(position, self._packed)
+        coupling = rows[p][a] - self._carried * rows[p][p]
+        swing = velocity[p] + self._carried * speed
+        share = self.share(position, velocity)
+        wanted = self._gain * (share - 1.0 - margin) * coupling * swing
+        wanted -= self._friction(velocity[p]) * coupling / max(coupling**2, self._least_coupling**2)
+        if share < _HANGING and abs(swing) < self._rest:
+            # Where it hangs still no velocity says which way to push: either will do.
+            wanted -= math.copysign(self._push, coupling * swing)
+        wanted -= self._stiffness * error + self._damping * speed
+        wanted = self._within_reach(wanted, error, speed)
+        still = self._forward(position, velocity, (0.0, 0.0), self._packed)[a]
+        pushed = self._forward(position, velocity, (1.0, 0.0) if a == 0 else (0.0, 1.0), self._packed)[a]
+        effort = (wanted - still) / (pushed - still)
+        if self._coulomb:
+            # In the way that it goes, or, as long as it stands, in the way that it should.
+            effort += math.copysign(self._coulomb, speed if abs(speed) > 1e-3 else wanted)
+        return self.limit if effort > self.limit else max(effort, -self.limit)
+
+    def _friction(self, speed: float) -> float:
+        """Return what friction takes from the pendulum, smooth about rest [N m]."""
+        damping, coulomb = self._lost
+        return damping * speed + coulomb * max(-1.0, min(1.0, speed / self._slow))
+
+    def _within_reach(self, wanted: float, error: float, speed: float) -> float:
+        """Return an acceleration that does not lead beyond the reach: it brakes as soon as it must."""
+        room = self.reach - (error if speed > 0.0 else -error)
+        if 0.5 * speed * speed < self._brakes * room:
+            return wanted
+        brake = self._brakes if room <= 0.0 else max(self._brakes, 0.5 * speed * speed / room)
+        return min(wanted, -brake) if speed > 0.0 else max(wanted, brake)
+
+    def _at(self, position: float) -> Vector:
+        """Return both positions with the driven joint at its goal."""
+        return (self._goal[0], position) if self._a == 0 else (position, self._goal[1])
+
+    def _least_answer(self) -> float:
+        """Return the smallest acceleration of the driven joint by one unit of effort."""
+        smallest = math.inf
+        for index in range(_ANGLES):
+            rows = self._mass(self._at(2.0 * math.pi * index / _ANGLES), self._packed)
+            determinant = rows[0][0] * rows[1][1] - rows[0][1] * rows[1][0]
+            smallest = min(smallest, rows[self._p][self._p] / determinant)
+        return smallest

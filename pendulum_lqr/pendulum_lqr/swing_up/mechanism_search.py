@@ -1,0 +1,100 @@
+"""Plans from anywhere to upright: what iterative LQR makes of random guesses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
+from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
+from pendulum_msgs_py.joints import Vector
+
+__all__ = ["PlanSearch", "PlanSettings"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """Settings of a search.
+
+    Attributes:
+        weights: Of the cost; dominated by being away from upright, so that it hurries.
+        step: Distance of the plan's nodes [s].
+        nodes: Intervals of the horizon.
+        guesses: Random guesses.
+        iterations: Largest number of iterations for each of them.
+    """
+
+    weights: IlqrWeights
+    step: float
+    nodes: int
+    guesses: int
+    iterations: int
+
+
+class PlanSearch:
+    """Searches plans for one plant.
+
+    Args:
+        catch: LQR with its region, where a plan should end; the plant is its own.
+        settings: Horizon, weights, guesses.
+    """
+
+    def __init__(self, catch: MechanismCatch, settings: PlanSettings) -> None:
+        self.catch, self.settings = catch, settings
+        self._problem = IlqrProblem(catch.plant, settings.step, settings.weights, catch.terminal)
+        self.reset()
+
+    def reset(self) -> None:
+        """Draw the same guesses again."""
+        self._rng = np.random.default_rng(0)
+
+    def solve(
+        self, x: Vector, before: Vector, guess: Array, iterations: int, around: IlqrPlan | None = None
+    ) -> IlqrPlan:
+        """Return what iterations make of a guess.
+
+        Args:
+            x: State to start from, [q, v].
+            before: Efforts until then, m values.
+            guess: Efforts, shape (nodes, m).
+            iterations: Largest number of them.
+            around: A plan whose feedback follows the guess.
+        """
+        n = len(x) // 2
+        return self._problem.solve(x[:n], x[n:], before, guess, iterations, around)
+
+    def guessed(self, x: Vector, before: Vector, count: int) -> list[IlqrPlan]:
+        """Return what becomes of fresh guesses; the first one is no effort at all."""
+        return [self.solve(x, before, guess, self.settings.iterations) for guess in self._guesses(count)]
+
+    def arrives(self, plan: IlqrPlan) -> bool:
+        """Tell whether a plan ends where the LQR catches."""
+        coordinates = self.catch.plant.coordinates
+        end = tuple(float(value) for value in plan.states[-1, : 2 * len(coordinates.names)])
+        return self.catch.share(deviation_of(coordinates, end)) <= 1.0
+
+    def _guesses(self, count: int) -> Sequence[Array]:
+        limits = np.array(self.catch.plant.effort_limits)
+        nodes, m = self.settings.nodes, len(limits)
+        t = np.arange(nodes) * self.settings.step
+        guesses = [np.zeros((nodes, m))]
+        for index in range(count - 1):
+            if index % 2:
+                # Full effort one way, then another: what hurries.
+                switches = np.cumsum(self._rng.uniform(0.05, 0.5, 6))
+                levels = limits * self._rng.uniform(-0.8, 0.8, (7, m))
+                levels[3:] *= 0.2
+                guesses.append(levels[np.searchsorted(switches, t)])
+                continue
+            phase, period = self._rng.random(m), self._rng.uniform(0.3, 1.6, m)
+            height = 0.7 * limits * self._rng.random(m)
+            # It dies away: what is pumped to the end spins.
+            fade = np.exp(-2.0 * t / t[-1])[:, None]
+            guesses.append(fade * height * np.sin(2.0 * math.pi * (t[:, None] / period + phase)))
+        return guesses

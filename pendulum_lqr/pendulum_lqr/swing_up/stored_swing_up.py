@@ -1,0 +1,80 @@
+"""What follows a stored swing-up of several joints, and the LQR that catches it: made for a plant."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, make_mechanism_catch
+from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
+from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory, load_trajectory
+from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = [
+    "CALM_WEIGHTS",
+    "default_catch",
+    "refuse_passive_friction",
+    "stored_trajectory",
+    "tracked_swing_up",
+]
+
+CALM_WEIGHTS = ((1.0, 1.0, 1.0, 1.0), 10.0)
+"""Weights of catch and tracking behind a swing-up, for two joints: of gains as low as still catch from far."""
+_TUBE = 10.0
+"""Width of the tube about a swing-up: beyond it, planning anew is better than tracking."""
+
+
+def stored_trajectory(plant: MechanismParameters) -> MechanismTrajectory:
+    """Return the swing-up that comes with the project for a preset.
+
+    Raises:
+        ParameterError: There is none for this plant.
+    """
+    folder = Path(str(resources.files("pendulum_lqr"))) / "trajectories"
+    path = folder / f"{plant.name}.json"
+    if not path.is_file():
+        names = ", ".join(sorted(each.stem for each in folder.glob("*.json")))
+        raise ParameterError(f"no swing-up is stored for plant {plant.name!r}; expected one of {names}")
+    return load_trajectory(path)
+
+
+def default_catch(plant: MechanismParameters) -> MechanismCatch:
+    """Return the LQR that catches, with its sampled region."""
+    return make_mechanism_catch(plant, *plant.mechanism.weights)
+
+
+def refuse_passive_friction(controller: str, plant: MechanismParameters) -> None:
+    """Refuse a plant for a controller that plans without dry friction, if no effort can make up for it where it is.
+
+    Raises:
+        ParameterError: A passive joint has some.
+    """
+    coordinates = plant.coordinates
+    for index, (name, joint) in enumerate(zip(coordinates.names, plant.joints, strict=True)):
+        if index not in coordinates.driven and joint.breakaway > 0.0:
+            raise ParameterError(
+                f"{controller} plans without dry friction, and {name} of plant {plant.name!r} is passive with "
+                f"{joint.breakaway:g} {coordinates.joints[index].effort_unit}; "
+                "expected 0, as of a preset's frictionless twin"
+            )
+
+
+def tracked_swing_up(plant: MechanismParameters, period: float, *, recovers: bool = False) -> MechanismTvlqr:
+    """Return the controller that follows the stored swing-up of a plant by time-varying LQR.
+
+    Args:
+        plant: The plant.
+        period: Sampling period [s].
+        recovers: Whether it plans anew where it is thrown off; otherwise it goes on following.
+
+    Raises:
+        ParameterError: There is none for this plant.
+    """
+    # Without a swing-up no region need be sampled, which takes a second.
+    swing_up = stored_trajectory(plant)
+    q, r = CALM_WEIGHTS
+    catch = make_mechanism_catch(plant, q, r)
+    recover = MechanismMpc(period, catch) if recovers else None
+    return MechanismTvlqr(period, swing_up, catch, q=q, r=r, recover=recover, tube=_TUBE)

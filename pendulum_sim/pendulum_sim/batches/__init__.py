@@ -1,0 +1,1 @@
+"""Many plants at once, compiled."""

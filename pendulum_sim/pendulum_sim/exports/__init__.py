@@ -1,0 +1,1 @@
+"""Plants as URDF and MJCF."""

@@ -1,0 +1,1 @@
+"""Simulations that somebody else wrote, as plants."""

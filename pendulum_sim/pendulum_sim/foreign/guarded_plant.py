@@ -1,0 +1,134 @@
+"""What may go wrong with a simulation that somebody else wrote, each named in one sentence."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from pendulum_msgs_py.errors import FaultError, PendulumError
+from pendulum_sim.stepping.plant import Plant, PlantState
+
+__all__ = ["GuardedPlant", "PaceWatch", "StallWatch"]
+
+_LATEST = 0.5
+"""Distance behind the wall's time at which a simulation that is too slow is given up [s]."""
+_LARGEST_STEP = 10.0
+"""Periods that one step counts for at most: one pause of the machine says nothing about the simulation."""
+_MEMORY = 0.02
+"""Weight of the newest step in the mean."""
+
+
+class GuardedPlant:
+    """A plant of which no exception and no value that is not a number gets out."""
+
+    def __init__(self, plant: Plant, name: str) -> None:
+        self._plant = plant
+        self._name = name
+        self.parameters = plant.parameters
+        self.dt = plant.dt
+
+    @property
+    def state(self) -> PlantState:
+        """The present state."""
+        return self._plant.state
+
+    def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
+        """Start anew.
+
+        Raises:
+            FaultError: The simulation cannot, or starts with values that are not finite.
+        """
+        return self._try("reset", self._plant.reset, theta, theta_dot)
+
+    def step(self, effort: float, push: float = 0.0) -> PlantState:
+        """Advance by one period.
+
+        Raises:
+            FaultError: The simulation ended with an exception, or its state is not finite.
+        """
+        return self._try("step", self._plant.step, effort, push)
+
+    def _try(self, what: str, function: Callable[..., PlantState], *arguments: float) -> PlantState:
+        try:
+            state = function(*arguments)
+        except PendulumError as error:
+            raise FaultError(f"simulation {self._name}: {error}") from error
+        except Exception as error:
+            raise FaultError(f"simulation {self._name} failed in {what}: {_in_one_line(error)}") from error
+        if not (math.isfinite(state.theta) and math.isfinite(state.theta_dot) and math.isfinite(state.effort)):
+            raise FaultError(
+                f"simulation {self._name} is at {state.theta} rad, {state.theta_dot} rad/s, {state.effort} N m "
+                f"after {state.time:.3f} s; expected finite numbers"
+            )
+        return state
+
+
+class PaceWatch:
+    """Tells a simulation that is too slow for the wall's time from a machine that paused once.
+
+    Args:
+        period: Time that a step simulates [s].
+    """
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self._mean = 0.0
+
+    def problem(self, duration: float, behind: float) -> str:
+        """Take note of a step; return in words why the simulation cannot keep the wall's time, or nothing.
+
+        Args:
+            duration: Wall time that the step took [s].
+            behind: How far the plant's time is behind the wall's now [s].
+        """
+        self._mean += _MEMORY * (min(duration, _LARGEST_STEP * self._period) - self._mean)
+        if behind <= _LATEST or self._mean <= self._period:
+            return ""
+        return (
+            f"the simulation needs {self._mean * 1e3:.2g} ms for a period of {self._period * 1e3:.3g} ms and is "
+            f"{behind:.1f} s behind; expected it faster than real time, or clock:=lockstep"
+        )
+
+
+class StallWatch:
+    """Notices from a thread of its own that a step does not come back.
+
+    Args:
+        timeout: Time that a step may take [s].
+        on_stall: Called once, in that thread.
+    """
+
+    def __init__(self, timeout: float, on_stall: Callable[[], Any]) -> None:
+        self._timeout = timeout
+        self._on_stall = on_stall
+        self._since: float | None = None
+        self._ended = threading.Event()
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def __enter__(self) -> StallWatch:
+        """Begin a step."""
+        self._since = time.monotonic()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End a step."""
+        self._since = None
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ended.set()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(0.25 * self._timeout):
+            since = self._since
+            if since is not None and time.monotonic() - since > self._timeout:
+                self._on_stall()
+                return
+
+
+def _in_one_line(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -1,0 +1,339 @@
+"""An environment of Gymnasium as a plant: Pendulum-v1, our own, and any whose adapter file says what is what.
+
+An adapter file::
+
+    format: pendulum_simulation/1
+    make: {g: 9.81}                        # arguments of gymnasium.make
+    set: {dt: 0.002, max_torque: 13.0}     # attributes of the environment
+    angle: {index: 0, unit: rad, sign: 1, zero: 3.14159}  # of the observation; or {cos: 0, sin: 1, ...}
+    velocity: {index: 1, unit: rad/s}
+    torque: {index: 0, scale: 1.0, sign: 1}  # entry of the action, and N m for 1 of it
+    read: state                            # attribute with angle and velocity; by default the observation
+    start: state       # attribute that is set to start; or {options: state} or {options: [theta, theta_dot]} of reset
+    period: dt                             # attribute, or {value: 0.05, unit: s}
+    effort_limit: max_torque               # attribute, or {value: 2.0, unit: N m}; by default the action's bounds
+    equation: plant.yaml                   # plant file; by default it is found by trying the environment out
+
+What a file leaves out is as for a known environment, if it is one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.programs.extras import how_to_install
+from pendulum_sim.foreign.mujoco_mapping import FORMAT
+from pendulum_sim.stepping.plant import PlantState, check_start, command_within
+
+__all__ = ["KNOWN", "GymnasiumPlant", "load_adapter", "load_gymnasium_plant"]
+
+Adapter = Mapping[str, Any]
+
+KNOWN: dict[str, Adapter] = {
+    "Pendulum-v1": {
+        "angle": {"index": 0, "zero": math.pi},
+        "velocity": {"index": 1},
+        "torque": {"index": 0},
+        "read": "state",
+        "start": "state",
+        "period": "dt",
+        "effort_limit": "max_torque",
+    },
+    "PendulumX59-v0": {
+        "make": {"episode_time": math.inf},
+        "angle": {"index": 0, "zero": -math.pi},
+        "velocity": {"index": 1},
+        "torque": {"index": 0},
+        "start": {"options": "state"},
+        "period": "dt",
+    },
+}
+"""Adapters of the environments that need no file."""
+_KEYS = ("make", "set", "angle", "velocity", "torque", "read", "start", "period", "effort_limit", "equation")
+_ENTRIES = {
+    "angle": ("index", "cos", "sin", "unit", "sign", "zero"),
+    "velocity": ("index", "unit", "sign"),
+    "torque": ("index", "scale", "sign"),
+}
+_UNITS = {"angle": {"rad": 1.0, "deg": math.pi / 180.0}, "velocity": {"rad/s": 1.0, "deg/s": math.pi / 180.0}}
+_QUANTITIES = {"period": "s", "effort_limit": "N m"}
+_PROBES = 64
+_NO_PENDULUM = 0.01
+"""Share of the change of velocity that a pendulum's equation may miss before it is said."""
+
+
+def load_adapter(path: str | Path) -> Adapter:
+    """Return what an adapter file says.
+
+    Raises:
+        ParameterError: The file is refused; the message names file and entry.
+    """
+    document = load_yaml(path, "adapter file")
+    reject_unknown(document, ("format", *_KEYS), where=str(path))
+    if document.pop("format", None) != FORMAT:
+        raise ParameterError(f"{path}: format is missing or another; expected {FORMAT!r}")
+    for name, allowed in _ENTRIES.items():
+        if name in document:
+            reject_unknown(require_mapping(document[name], f"{path}: {name}"), allowed, where=f"{path}: {name}")
+    for name in ("make", "set"):
+        require_mapping(document.get(name, {}), f"{path}: {name}")
+    if "equation" in document:
+        equation = str(document["equation"])
+        beside = Path(path).parent / equation
+        document["equation"] = str(beside) if beside.is_file() else equation
+    return document
+
+
+def load_gymnasium_plant(
+    env_id: str, adapter: Adapter | None = None, *, seed: int = 0, effort_limit: float = 0.0
+) -> GymnasiumPlant:
+    """Return an environment as a plant.
+
+    Args:
+        env_id: Identifier for ``gymnasium.make``; ``module:ID`` imports the module that registers it first.
+        adapter: What the environment does not say.
+        seed: Seed of every reset.
+        effort_limit: Largest torque where nothing else says one; 0 for none [N m].
+
+    Raises:
+        ParameterError: Gymnasium is missing, or environment and adapter do not fit.
+    """
+    # Late: who runs no environment needs no Gymnasium.
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise ParameterError(how_to_install(error) or f"Gymnasium cannot be imported: {error}") from error
+    if env_id == "PendulumX59-v0":
+        import pendulum_sim.environments.environment  # noqa: F401  # registers it
+    told = {**KNOWN.get(env_id.rpartition(":")[2], {}), **(adapter or {})}
+    try:
+        env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **told.get("make", {}))
+    except Exception as error:
+        raise ParameterError(f"Gymnasium refuses environment {env_id!r}: {' '.join(str(error).split())}") from error
+    return GymnasiumPlant(env, env_id, told, seed, effort_limit)
+
+
+class GymnasiumPlant:
+    """An environment as a plant; see :func:`load_gymnasium_plant`. A push adds to the action: it has no other input.
+
+    Attributes:
+        parameters: The equation of a pendulum that comes closest.
+        dt: Time between two states [s].
+        remarks: What was chosen, in words.
+    """
+
+    description = "gymnasium"
+
+    def __init__(self, env: Any, env_id: str, adapter: Adapter, seed: int, effort_limit: float) -> None:
+        self._env, self._id, self._adapter, self._seed = env, env_id, adapter, seed
+        for name, value in adapter.get("set", {}).items():
+            if not hasattr(env.unwrapped, name):
+                raise self._error(f"set names {name!r}, which the environment has not")
+            setattr(env.unwrapped, name, value)
+        missing = [name for name in ("angle", "velocity", "torque") if name not in adapter]
+        if missing:
+            raise self._error(f"nothing says what is {' and '.join(missing)}; expected an adapter file")
+        self._angle = self._reader("angle")
+        self._velocity = self._reader("velocity")
+        torque = adapter["torque"]
+        self._per_torque = _sign(torque, self._error) / self._number(torque.get("scale", 1.0), "torque.scale")
+        space = env.action_space
+        if not hasattr(space, "low"):
+            raise self._error(f"its actions are {space}; expected a continuous action")
+        self._action = np.zeros(space.shape, dtype=space.dtype)
+        self._index = self._whole(torque.get("index", 0), "torque.index")
+        if not 0 <= self._index < self._action.size:
+            raise self._error(f"torque.index is {self._index}, an action has {self._action.size} entries")
+        self.dt = self._quantity("period", "dt")
+        bound = min(abs(float(space.low.flat[self._index])), abs(float(space.high.flat[self._index])))
+        self._limit = (
+            self._quantity("effort_limit") if "effort_limit" in adapter else bound / abs(self._per_torque)
+        ) or effort_limit
+        if not math.isfinite(self._limit):
+            self._limit = effort_limit
+        if not self._limit > 0.0:
+            raise self._error("nothing bounds its torque; expected effort_limit")
+        self._steps, self._applied = 0, 0.0
+        self._theta = self._theta_dot = 0.0
+        self._read(self._reset_env({}), fresh=True)
+        self.remarks: list[str] = [f"period {self.dt * 1e3:g} ms, at most {self._limit:g} N m"]
+        self.parameters = self._find_equation()
+        self.reset()
+
+    @property
+    def state(self) -> PlantState:
+        """The present state; the effort is what was asked for, as an environment measures none."""
+        return PlantState(self._steps * self.dt, self._theta, self._theta_dot, self._applied)
+
+    def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
+        """Start anew with the seed, at an angle [rad] and a velocity [rad/s].
+
+        Raises:
+            ParameterError: Nothing says how the environment is put there.
+        """
+        check_start(theta, theta_dot)
+        start = self._adapter.get("start")
+        if start is None:
+            raise self._error(
+                "nothing says how it starts at an angle; expected start: an attribute, or options of reset"
+            )
+        wanted = [self._theirs("angle", theta), self._theirs("velocity", theta_dot)]
+        if isinstance(start, Mapping):
+            options = start.get("options")
+            if isinstance(options, str):
+                observation = self._reset_env({options: wanted})
+            elif isinstance(options, list) and len(options) == 2:
+                observation = self._reset_env(dict(zip(map(str, options), wanted, strict=True)))
+            else:
+                raise self._error(f"start is {dict(start)}; expected options: NAME, or options: [ANGLE, VELOCITY]")
+        else:
+            observation = self._reset_env({})
+            held = np.array(getattr(self._env.unwrapped, str(start)), dtype=float)
+            for name, value in zip(("angle", "velocity"), wanted, strict=True):
+                held[self._whole(self._adapter[name].get("index"), f"{name}.index")] = value
+            setattr(self._env.unwrapped, str(start), held)
+        self._steps, self._applied = 0, 0.0
+        if isinstance(start, str) and self._adapter.get("read") is None:
+            # The observation is older than the start; it is set anew by the first step.
+            self._theta, self._theta_dot = float(theta), float(theta_dot)
+        else:
+            self._read(observation, fresh=True)
+            # Whole turns are nobody's business but ours.
+            self._theta += 2.0 * math.pi * round((theta - self._theta) / (2.0 * math.pi))
+        return self.state
+
+    def step(self, effort: float, push: float = 0.0) -> PlantState:
+        """Advance by one period under a commanded torque and a push [N m].
+
+        Raises:
+            FaultError: The environment ended its episode.
+            ParameterError: A torque is not finite (nothing moves then).
+        """
+        command = command_within(self._limit, effort, push)
+        self._action.flat[self._index] = (command + push) * self._per_torque
+        observation, _, terminated, _, _ = self._env.step(self._action)
+        self._steps += 1
+        self._applied = command
+        self._read(observation)
+        if terminated:
+            raise FaultError(
+                f"the environment ended its episode at {self._theta:.4g} rad after {self._steps * self.dt:.3f} s"
+            )
+        return self.state
+
+    # --- what the adapter says -----------------------------------------------------------------------------
+
+    def _error(self, text: str) -> ParameterError:
+        return ParameterError(f"environment {self._id}: {text}")
+
+    def _number(self, value: object, name: str) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value == 0:
+            raise self._error(f"{name} is {value!r}; expected a number, not 0")
+        return float(value)
+
+    def _whole(self, value: object, name: str) -> int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise self._error(f"{name} is {value!r}; expected the number of an entry")
+        return value
+
+    def _quantity(self, name: str, attribute: str = "") -> float:
+        told = self._adapter.get(name, attribute)
+        if isinstance(told, str):
+            value = getattr(self._env.unwrapped, told, None)
+            if value is None:
+                raise self._error(
+                    f"it has no attribute {told!r}; expected {name}: {{value: ..., unit: {_QUANTITIES[name]}}}"
+                )
+        else:
+            mapping = require_mapping(told, f"environment {self._id}: {name}")
+            if mapping.get("unit") != _QUANTITIES[name]:
+                raise self._error(f"{name}: unit is {mapping.get('unit')!r}; expected {_QUANTITIES[name]!r}")
+            value = mapping.get("value")
+        number = self._number(value, name)
+        if number < 0.0:
+            raise self._error(f"{name} is {number} {_QUANTITIES[name]}; expected > 0")
+        return number
+
+    def _reader(self, name: str) -> Callable[[Any], float]:
+        entry = self._adapter[name]
+        unit = entry.get("unit", next(iter(_UNITS[name])))
+        if unit not in _UNITS[name]:
+            raise self._error(f"{name}: unit is {unit!r}; expected {' or '.join(_UNITS[name])}")
+        scale, sign = _UNITS[name][unit], _sign(entry, self._error)
+        zero = float(entry.get("zero", 0.0))
+        if "cos" in entry or "sin" in entry:
+            cos, sin = (self._whole(entry.get(part), f"{name}.{part}") for part in ("cos", "sin"))
+            return lambda values: sign * (math.atan2(float(values[sin]), float(values[cos])) - zero)
+        index = self._whole(entry.get("index"), f"{name}.index")
+        return lambda values: sign * scale * (float(values[index]) - zero)
+
+    def _theirs(self, name: str, value: float) -> float:
+        entry = self._adapter[name]
+        unit = _UNITS[name][entry.get("unit", next(iter(_UNITS[name])))]
+        return _sign(entry, self._error) * value / unit + float(entry.get("zero", 0.0))
+
+    # --- the environment -----------------------------------------------------------------------------------
+
+    def _reset_env(self, options: dict[str, Any]) -> Any:
+        observation, _ = self._env.reset(seed=self._seed, options=options or None)
+        return observation
+
+    def _read(self, observation: Any, *, fresh: bool = False) -> None:
+        source = self._adapter.get("read")
+        values = observation if source is None else getattr(self._env.unwrapped, str(source))
+        try:
+            theta, theta_dot = self._angle(values), self._velocity(values)
+        except (IndexError, KeyError, TypeError) as error:
+            raise self._error(f"angle and velocity are not where the adapter says: {error}") from error
+        if not fresh and math.isfinite(theta):
+            # Observations are wrapped; our angles are not.
+            theta = self._theta + wrap(theta - self._theta)
+        self._theta, self._theta_dot = theta, theta_dot
+
+    def _find_equation(self) -> PlantParameters:
+        if "equation" in self._adapter:
+            found = load_plant(self._adapter["equation"])
+            return found.with_values(effort_limit=self._limit, name=self._id)
+        # One step from here and there: v' = a v + c u - d sin(theta), of which a and c tell inertia and damping.
+        generator = np.random.default_rng(0)
+        rows, after = np.empty((_PROBES, 3)), np.empty(_PROBES)
+        for i in range(_PROBES):
+            theta, theta_dot = generator.uniform(-math.pi, math.pi), generator.uniform(-1.0, 1.0)
+            effort = generator.uniform(-self._limit, self._limit)
+            self.reset(theta, theta_dot)
+            rows[i] = theta_dot, effort, -math.sin(theta)
+            after[i] = self.step(effort).theta_dot
+        (a, c, d), *_ = np.linalg.lstsq(rows, after, rcond=None)
+        change = after - rows[:, 0]
+        missed = float(np.max(np.abs(after - rows @ (a, c, d))) / max(np.max(np.abs(change)), 1e-12))
+        if not c > 0.0:
+            raise self._error(
+                "a positive torque does not speed it up; expected torque.sign or angle.sign the other way"
+            )
+        if missed > _NO_PENDULUM:
+            self.remarks.append(f"it is no pendulum of one link: {100.0 * missed:.0f} % of its motion are left over")
+        slowing = 1.0 - float(a)
+        if slowing > 1e-9:
+            damping = slowing / float(c)
+            inertia = -damping * self.dt / math.log(float(a)) if a > 0.0 else self.dt / float(c)
+        else:
+            damping, inertia = 0.0, self.dt / float(c)
+        return PlantParameters(
+            inertia=inertia, damping=damping, gravity=max(0.0, float(d / c)), effort_limit=self._limit, name=self._id
+        )
+
+
+def _sign(entry: Mapping[str, Any], error: Callable[[str], ParameterError]) -> float:
+    sign = entry.get("sign", 1)
+    if isinstance(sign, bool) or sign not in {1, -1}:
+        raise error(f"sign is {sign!r}; expected 1 or -1")
+    return float(sign)

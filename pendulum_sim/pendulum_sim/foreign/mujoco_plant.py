@@ -1,0 +1,361 @@
+"""A model of MuJoCo as a plant: any MJCF or URDF with one hinge to drive.
+
+Actuators, friction, integrator and timestep are those of the file; a mapping file says what the file does not. A file
+of ``export_model`` needs none: a joint with the contract's name has its zero and its sign, and an actuator ``effort``
+on it takes the contract's command as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.errors import FaultError, ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.programs.extras import how_to_install
+from pendulum_sim.foreign.mujoco_mapping import NO_ACTUATOR, MujocoMapping
+from pendulum_sim.stepping.plant import PlantState, check_start, command_within
+
+__all__ = ["MujocoPlant", "load_mujoco_plant"]
+
+CONTRACT_ACTUATOR = "effort"
+PERIOD = 0.002
+"""Time between two states, unless the timestep is longer [s]."""
+_NO_PENDULUM = 0.01
+"""Share of the weight's torque that a sine may miss before it is said."""
+_ANGLES = 24
+_ROUNDING = 1e-12
+
+
+def load_mujoco_plant(
+    path: str | Path, mapping: MujocoMapping | None = None, *, rate_hz: float = 0.0, effort_limit: float = 0.0
+) -> MujocoPlant:
+    """Return the plant that a model file describes.
+
+    Args:
+        path: MJCF or URDF.
+        mapping: What the file does not say.
+        rate_hz: Rate of states; 0 for 500 Hz, or one of the file's timestep where that is longer [Hz].
+        effort_limit: Largest torque where neither file nor mapping has one; 0 for none [N m].
+
+    Raises:
+        ParameterError: MuJoCo is missing or refuses the file, or the file has no hinge that can be driven.
+    """
+    mujoco = _import_mujoco()
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise ParameterError(f"model {path} does not exist; expected an MJCF or URDF file")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ParameterError(f"MuJoCo refuses model {path}: {' '.join(str(error).split())}") from error
+    return MujocoPlant(mujoco, model, mapping or MujocoMapping(), str(path), rate_hz, effort_limit)
+
+
+def _import_mujoco() -> Any:
+    # Late: nobody who has no such model should need 60 MB of it.
+    try:
+        import mujoco
+    except ImportError as error:
+        raise ParameterError(how_to_install(error) or f"MuJoCo cannot be imported: {error}") from error
+    # It would write its warnings to a file of its own in the working folder; what they say is raised here.
+    mujoco.set_mju_user_warning(lambda _text: None)
+    return mujoco
+
+
+class MujocoPlant:
+    """A hinge of a MuJoCo model as a plant; see :func:`load_mujoco_plant`.
+
+    Attributes:
+        parameters: The equation of a pendulum that comes closest, read off the model in commanded torque.
+        dt: Time between two states [s].
+        remarks: What was chosen, in words.
+    """
+
+    def __init__(
+        self, mujoco: Any, model: Any, mapping: MujocoMapping, path: str, rate_hz: float, effort_limit: float
+    ) -> None:
+        self._mujoco, self._model, self._path = mujoco, model, path
+        self._data = mujoco.MjData(model)
+        # A reset of MuJoCo's own would hide that the simulation blew up.
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        if mapping.timestep is not None:
+            model.opt.timestep = mapping.timestep
+        self.dt, self._substeps = self._choose_period(float(model.opt.timestep), rate_hz)
+        joint = self._choose_joint(mapping.joint)
+        self._qpos, self._dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        name = self._name("joint", joint)
+        self._actuator = self._choose_actuator(mapping.actuator, joint)
+        self._driven = self._dof if self._actuator is None else self._driven_dof(self._actuator)
+        self._driven_qpos = self._qpos if self._driven == self._dof else self._qpos_of(self._driven)
+        self._sign = mapping.sign
+        per_control = 1.0 if self._actuator is None else self._torque_per_control(self._actuator)
+        of_contract = (
+            name == JOINT and self._actuator is not None and self._name("actuator", self._actuator) == CONTRACT_ACTUATOR
+        )
+        self._control_per_torque = mapping.control_per_torque or (1.0 if of_contract else 1.0 / per_control)
+        gain = per_control * self._control_per_torque
+        weight, hanging, missed = self._weight()
+        # Rounding of the fit is no angle, and no half turn the other way round.
+        hanging = 0.0 if abs(hanging) < _ROUNDING else hanging
+        hanging = math.pi if abs(abs(hanging) - math.pi) < _ROUNDING else hanging
+        if mapping.zero is not None:
+            self._zero = mapping.zero
+        else:
+            self._zero = 0.0 if name == JOINT else hanging
+        limit = self._limit(mapping.effort_limit, effort_limit, joint)
+        self.parameters = self._describe(weight, hanging, gain, limit)
+        driven = (
+            "the joint itself" if self._actuator is None else f"actuator {self._name('actuator', self._actuator)!r}"
+        )
+        turned = ", turned round" if self._sign < 0 else ""
+        angles = f"its {self._zero:.6g} rad are our 0{turned}; it hangs at {hanging:.6g} rad"
+        self.remarks = [
+            f"joint {name!r} through {driven}, at most {limit:g} N m; {angles}",
+            f"timestep {model.opt.timestep * 1e3:g} ms, {self._substeps} in a period",
+        ]
+        if missed > _NO_PENDULUM:
+            self.remarks.append(f"its weight is no sine of the angle: {100.0 * missed:.0f} % of it are left over")
+        self._steps = 0
+        self.reset()
+
+    @property
+    def description(self) -> str:
+        """Engine and integrator, in words."""
+        integrator = self._mujoco.mjtIntegrator(self._model.opt.integrator).name.removeprefix("mjINT_").lower()
+        return f"mujoco {self._mujoco.__version__}, {integrator}"
+
+    @property
+    def state(self) -> PlantState:
+        """The present state."""
+        data = self._data
+        theta = self._sign * (float(data.qpos[self._qpos]) - self._zero)
+        if self._driven != self._dof:
+            # Of a motor behind a spring the spring is what a sensor at the joint feels.
+            effort = float(data.qfrc_spring[self._dof])
+        elif self._actuator is None:
+            effort = float(data.qfrc_applied[self._dof]) - self._sign * self._push
+        else:
+            effort = float(data.qfrc_actuator[self._dof])
+        return PlantState(self._steps * self.dt, theta, self._sign * float(data.qvel[self._dof]), self._sign * effort)
+
+    def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
+        """Start anew as the file does, but for the joint's angle [rad] and velocity [rad/s]; a motor moves with it."""
+        check_start(theta, theta_dot)
+        model, data = self._model, self._data
+        self._mujoco.mj_resetData(model, data)
+        angle = self._zero + self._sign * theta
+        data.qpos[self._qpos] = angle
+        data.qvel[self._dof] = self._sign * theta_dot
+        if self._driven != self._dof:
+            data.qpos[self._driven_qpos] += angle - model.qpos0[self._qpos]
+            data.qvel[self._driven] = self._sign * theta_dot
+        self._steps = 0
+        self._push = 0.0
+        self._mujoco.mj_forward(model, data)
+        return self.state
+
+    def step(self, effort: float, push: float = 0.0) -> PlantState:
+        """Advance by one period.
+
+        Args:
+            effort: Commanded torque, held over the period; clamped to the limit [N m].
+            push: Torque on the link itself [N m].
+
+        Raises:
+            FaultError: MuJoCo met values that are not finite, or too large.
+            ParameterError: A torque is not finite (nothing moves then).
+        """
+        data = self._data
+        command = command_within(self.parameters.effort_limit, effort, push)
+        self._push = push
+        applied = push
+        if self._actuator is None:
+            applied += command
+        else:
+            data.ctrl[self._actuator] = self._sign * command * self._control_per_torque
+        data.qfrc_applied[self._dof] = self._sign * applied
+        self._mujoco.mj_step(self._model, data, self._substeps)
+        self._steps += 1
+        for warning in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL"):
+            if data.warning[int(getattr(self._mujoco.mjtWarning, f"mjWARN_{warning}"))].number:
+                raise FaultError(
+                    f"MuJoCo met a value that is not finite or too large ({warning}) after "
+                    f"{self._steps * self.dt:.3f} s; is a timestep of {self._model.opt.timestep * 1e3:g} ms too long?"
+                )
+        return self.state
+
+    # --- what the file says --------------------------------------------------------------------------------
+
+    def _name(self, kind: str, index: int) -> str:
+        return str(getattr(self._model, kind)(index).name) or f"number {index}"
+
+    def _choose_period(self, timestep: float, rate_hz: float) -> tuple[float, int]:
+        if not rate_hz:
+            substeps = max(1, math.floor(PERIOD / timestep + 1e-9))
+            return substeps * timestep, substeps
+        steps = 1.0 / rate_hz / timestep
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
+            raise ParameterError(
+                f"rate_hz is {rate_hz:g} Hz, a period of {1e3 / rate_hz:.6g} ms; expected whole timesteps of "
+                f"{self._path}, {timestep * 1e3:g} ms each: {1.0 / timestep:.6g} Hz or a part of it, or timestep in a "
+                "mapping file"
+            )
+        return 1.0 / rate_hz, round(steps)
+
+    def _choose_joint(self, wanted: str) -> int:
+        hinge = int(self._mujoco.mjtJoint.mjJNT_HINGE)
+        hinges = [i for i in range(self._model.njnt) if self._model.jnt_type[i] == hinge]
+        names = {self._name("joint", i): i for i in hinges}
+        listed = ", ".join(names) or "none"
+        if wanted:
+            if wanted not in names:
+                raise ParameterError(f"{self._path} has no hinge {wanted!r}; expected one of its hinges: {listed}")
+            return names[wanted]
+        if JOINT in names:
+            return names[JOINT]
+        if len(hinges) != 1:
+            raise ParameterError(
+                f"{self._path} has {len(hinges)} hinges ({listed}); expected one, or joint in a mapping file"
+            )
+        return hinges[0]
+
+    def _choose_actuator(self, wanted: str, joint: int) -> int | None:
+        model = self._model
+        if wanted == NO_ACTUATOR:
+            return None
+        names = {self._name("actuator", i): i for i in range(model.nu)}
+        if wanted:
+            if wanted not in names:
+                listed = ", ".join(names) or "none"
+                raise ParameterError(f"{self._path} has no actuator {wanted!r}; expected none or one of: {listed}")
+            return names[wanted]
+        joints = {int(self._mujoco.mjtTrn.mjTRN_JOINT), int(self._mujoco.mjtTrn.mjTRN_JOINTINPARENT)}
+        on_joint = [
+            i for i in range(model.nu) if model.actuator_trntype[i] in joints and model.actuator_trnid[i, 0] == joint
+        ]
+        if not on_joint and self._name("joint", joint) == JOINT and CONTRACT_ACTUATOR in names:
+            # Our own export of a motor behind a spring.
+            return names[CONTRACT_ACTUATOR]
+        if len(on_joint) == 1 or not names:
+            return on_joint[0] if on_joint else None
+        there = f"{len(on_joint)} actuators on" if on_joint else "no actuator on"
+        raise ParameterError(
+            f"{self._path} has {there} joint {self._name('joint', joint)!r}; expected actuator in a mapping file: "
+            f"none, or one of {', '.join(names)}"
+        )
+
+    def _driven_dof(self, actuator: int) -> int:
+        kinds = {int(self._mujoco.mjtTrn.mjTRN_JOINT), int(self._mujoco.mjtTrn.mjTRN_JOINTINPARENT)}
+        joint = int(self._model.actuator_trnid[actuator, 0])
+        hinge = int(self._mujoco.mjtJoint.mjJNT_HINGE)
+        if self._model.actuator_trntype[actuator] not in kinds or self._model.jnt_type[joint] != hinge:
+            raise ParameterError(
+                f"actuator {self._name('actuator', actuator)!r} of {self._path} drives no hinge; expected one that "
+                "does, or actuator: none in a mapping file"
+            )
+        return int(self._model.jnt_dofadr[joint])
+
+    def _qpos_of(self, dof: int) -> int:
+        return int(self._model.jnt_qposadr[self._model.dof_jntid[dof]])
+
+    def _torque_per_control(self, actuator: int) -> float:
+        model, mujoco = self._model, self._mujoco
+        torque = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
+        lags = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+        makes_torque = (
+            model.actuator_gaintype[actuator] == int(mujoco.mjtGain.mjGAIN_FIXED)
+            and not np.any(model.actuator_biasprm[actuator])
+            and model.actuator_dyntype[actuator] in {int(lag) for lag in lags}
+            and torque != 0.0
+        )
+        if not makes_torque:
+            raise ParameterError(
+                f"actuator {self._name('actuator', actuator)!r} of {self._path} is no source of torque (a servo, a "
+                "muscle?); expected a motor, or actuator: none in a mapping file"
+            )
+        return torque
+
+    def _limit(self, of_mapping: float | None, of_user: float, joint: int) -> float:
+        model, actuator = self._model, self._actuator
+        limits = []
+        if actuator is not None:
+            gear = abs(float(model.actuator_gear[actuator, 0]))
+            if model.actuator_ctrllimited[actuator]:
+                limits.append(_smaller(model.actuator_ctrlrange[actuator]) / abs(self._control_per_torque))
+            if model.actuator_forcelimited[actuator]:
+                per_control = self._torque_per_control(actuator) * abs(self._control_per_torque)
+                limits.append(_smaller(model.actuator_forcerange[actuator]) * gear / abs(per_control))
+        if self._driven == self._dof and model.jnt_actfrclimited[joint] and (actuator is not None or not of_mapping):
+            limits.append(_smaller(model.jnt_actfrcrange[joint]))
+        known = min(limits, default=math.inf)
+        if of_mapping is not None and of_mapping > known:
+            raise ParameterError(
+                f"effort_limit is {of_mapping:g} N m, the actuator of {self._path} gives {known:g} N m; expected at "
+                "most that, or actuator: none for torque on the joint itself"
+            )
+        limit = min(known, of_mapping or of_user or known)
+        if not (math.isfinite(limit) and limit > 0.0):
+            raise ParameterError(
+                f"{self._path} has no limit of torque at its joint; expected effort_limit as a parameter or in a "
+                "mapping file"
+            )
+        return limit
+
+    def _weight(self) -> tuple[float, float, float]:
+        """Return G of a weight G sin(q - q_0), q_0 in the file's angle, and the share of it that this leaves over."""
+        model, data = self._model, self._data
+        angles = np.linspace(-math.pi, math.pi, _ANGLES, endpoint=False)
+        torques = np.empty(_ANGLES)
+        for i, angle in enumerate(angles):
+            self._mujoco.mj_resetData(model, data)
+            data.qpos[self._qpos] = angle
+            if self._driven != self._dof:
+                data.qpos[self._driven_qpos] += angle - model.qpos0[self._qpos]
+            self._mujoco.mj_forward(model, data)
+            torques[i] = data.qfrc_bias[self._dof] - data.qfrc_spring[self._dof]
+        basis = np.stack([np.sin(angles), np.cos(angles)], axis=1)
+        (a, b), *_ = np.linalg.lstsq(basis, torques, rcond=None)
+        weight = float(math.hypot(a, b))
+        largest = float(np.max(np.abs(torques)))
+        if largest < 1e-9:
+            return 0.0, float(model.qpos0[self._qpos]), 0.0
+        missed = float(np.max(np.abs(torques - basis @ (a, b)))) / largest
+        return weight, math.atan2(-b, a), missed
+
+    def _describe(self, weight: float, hanging: float, gain: float, limit: float) -> PlantParameters:
+        model, data, mujoco = self._model, self._data, self._mujoco
+        mujoco.mj_resetData(model, data)
+        data.qpos[self._qpos] = hanging
+        mujoco.mj_forward(model, data)
+        # A motor behind a spring moves with the link, where motion is slow.
+        dofs = sorted({self._dof, self._driven})
+        inertia = 0.0
+        for dof in dofs:
+            one, masses = np.zeros(model.nv), np.zeros(model.nv)
+            one[dof] = 1.0
+            mujoco.mj_mulM(model, data, masses, one)
+            inertia += float(masses[dof])
+        lag = 0.0
+        if self._actuator is not None and model.actuator_dyntype[self._actuator] != int(mujoco.mjtDyn.mjDYN_NONE):
+            lag = float(model.actuator_dynprm[self._actuator, 0])
+        gain = abs(gain)
+        return PlantParameters(
+            inertia=inertia / gain,
+            damping=sum(float(np.ravel(model.dof_damping[i])[0]) for i in dofs) / gain,
+            gravity=weight / gain,
+            coulomb_friction=sum(float(model.dof_frictionloss[i]) for i in dofs) / gain,
+            angle_offset=wrap(self._sign * (hanging - self._zero)),
+            effort_limit=limit,
+            actuator_time_constant=lag,
+            name=Path(self._path).stem,
+        )
+
+
+def _smaller(bounds: Any) -> float:
+    return float(min(abs(bounds[0]), abs(bounds[1])))

@@ -1,0 +1,1 @@
+"""Pictures of plants: for windows, markers, environments and pages."""

@@ -1,0 +1,247 @@
+"""The simulations that the simulator's node can run: ours, or somebody else's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, is_mechanism
+from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
+from pendulum_sim.foreign.guarded_plant import GuardedPlant
+from pendulum_sim.foreign.gymnasium_plant import load_adapter, load_gymnasium_plant
+from pendulum_sim.foreign.mujoco_mapping import MujocoMapping, load_mujoco_mapping
+from pendulum_sim.foreign.mujoco_plant import load_mujoco_plant
+from pendulum_sim.stepping.integrators import METHODS
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.plant import Plant
+from pendulum_sim.stepping.plants import make_plant
+
+__all__ = ["GYMNASIUM", "GYMNASIUM_PREFIX", "MUJOCO", "OWN", "Engine", "Simulation", "find_engine", "open_simulation"]
+
+
+class Simulation(NamedTuple):
+    """A simulation, ready to run.
+
+    Attributes:
+        plant: What is stepped, once in a period.
+        name: Preset, file or identifier that was asked for.
+        method: How it is integrated, in words.
+        remarks: What the user should know of what was chosen, one line each.
+        sealed: Whether its parameters are nobody's business.
+    """
+
+    plant: Plant | MechanismPlant
+    name: str
+    method: str
+    remarks: tuple[str, ...] = ()
+    sealed: bool = False
+
+    @property
+    def pendulum(self) -> Plant:
+        """The plant, where it has one joint.
+
+        Raises:
+            ParameterError: It has several.
+        """
+        if isinstance(self.plant, MechanismPlant):
+            raise ParameterError(f"simulation {self.name} has several joints; expected one")
+        return self.plant
+
+
+@dataclass(frozen=True)
+class Engine:
+    """One way to simulate a pendulum.
+
+    Attributes:
+        program: Name of the executable.
+        description: What it does, one sentence.
+        specs: The parameters that are its own.
+        make: Makes the simulation that the values of its parameters describe.
+        foreign: Whether somebody else wrote it: nothing it returns is believed, and its steps are timed.
+        example: A command line.
+    """
+
+    program: str
+    description: str
+    specs: tuple[ParameterSpec, ...]
+    make: Callable[[Mapping[str, Any]], Simulation]
+    foreign: bool
+    example: str
+
+
+_RATE = ParameterSpec(
+    "rate_hz", 500.0, "Hz", "Rate of states and commands.", minimum=50.0, maximum=2000.0, read_only=True
+)
+_FOREIGN_SPECS = (
+    ParameterSpec(
+        "step_timeout",
+        2.0,
+        "s",
+        "Time that one step of the simulation may take; one that takes longer ends the program.",
+        minimum=0.1,
+        read_only=True,
+    ),
+)
+
+
+def _make_own(values: Mapping[str, Any]) -> Simulation:
+    dt = round(NANOSECONDS / values["rate_hz"]) / NANOSECONDS
+    if is_mechanism(values["plant"]):
+        return _make_mechanism(values, dt)
+    parameters, sealed = load_plant_to_run(values["plant"])
+    plant = make_plant(parameters, dt, method=values["method"], substeps=values["substeps"] or None)
+    return Simulation(plant, values["plant"], values["method"], sealed=sealed)
+
+
+def _make_mechanism(values: Mapping[str, Any], dt: float) -> Simulation:
+    if values["method"] != "auto":
+        raise ParameterError(
+            f"method is {values['method']!r}; expected auto: plant {values['plant']!r} has several joints, which are "
+            "integrated by Runge-Kutta of order four"
+        )
+    parameters = load_mechanism(values["plant"])
+    plant = MechanismPlant(parameters, dt, substeps=values["substeps"] or 1)
+    joints = ", ".join(parameters.coordinates.names)
+    driven = ", ".join(parameters.coordinates.driven_names) or "none"
+    return Simulation(plant, values["plant"], "rk4", (f"joints {joints}; driven: {driven}",))
+
+
+def _make_mujoco(values: Mapping[str, Any]) -> Simulation:
+    model, mapping = values["model"], values["mapping"]
+    if not model:
+        raise ParameterError("model is missing; expected -p model:=FILE, an MJCF or URDF file")
+    plant = load_mujoco_plant(
+        model,
+        load_mujoco_mapping(mapping) if mapping else MujocoMapping(),
+        rate_hz=values["rate_hz"],
+        effort_limit=values["effort_limit"],
+    )
+    return Simulation(GuardedPlant(plant, Path(model).name), model, plant.description, tuple(plant.remarks))
+
+
+def _make_gymnasium(values: Mapping[str, Any]) -> Simulation:
+    env, mapping = values["env"], values["mapping"]
+    if not env:
+        raise ParameterError("env is missing; expected -p env:=ID, such as Pendulum-v1")
+    plant = load_gymnasium_plant(
+        env, load_adapter(mapping) if mapping else None, seed=values["seed"], effort_limit=values["effort_limit"]
+    )
+    return Simulation(GuardedPlant(plant, env), env, plant.description, tuple(plant.remarks))
+
+
+OWN = Engine(
+    program="simulator",
+    description="Simulated pendulum behind the interface that simulator and hardware share.",
+    specs=(
+        ParameterSpec(
+            "plant",
+            "thesis",
+            "",
+            f"Preset ({PRESET_NAMES}; of several joints: {', '.join(MECHANISM_PRESETS)}) or path of a plant file.",
+            read_only=True,
+        ),
+        ParameterSpec(
+            "method",
+            "auto",
+            "",
+            "Integrator; auto is etd4 for a rigid plant, semi_implicit for a series-elastic one, rk4 for several "
+            "joints.",
+            choices=("auto", *METHODS),
+            read_only=True,
+        ),
+        _RATE,
+        ParameterSpec(
+            "substeps",
+            0,
+            "-",
+            "Integration steps in a period; 0 chooses by the plant.",
+            minimum=0,
+            read_only=True,
+        ),
+        ParameterSpec(
+            "initial_position",
+            [0.0],
+            "rad or m",
+            "Of several joints: where each is at a given start; one value stands for all.",
+        ),
+        ParameterSpec(
+            "initial_velocity", [0.0], "rad/s or m/s", "Of several joints: how fast each is at a given start."
+        ),
+    ),
+    make=_make_own,
+    foreign=False,
+    example="python -m pendulum_sim simulator --ros-args -r __ns:=/sim -p plant:=x5_9",
+)
+
+MUJOCO = Engine(
+    program="mujoco",
+    description="A hinge of a MuJoCo model (MJCF or URDF) behind the interface that simulator and hardware share.",
+    specs=(
+        ParameterSpec("model", "", "", "MJCF or URDF file.", read_only=True),
+        ParameterSpec(
+            "mapping", "", "", "Mapping file: joint, actuator, sign, zero, limit; empty for none.", read_only=True
+        ),
+        replace(
+            _RATE,
+            default=0.0,
+            minimum=0.0,
+            description="Rate of states and commands; 0 for 500, or one of the file's timestep where that is longer.",
+        ),
+        *_FOREIGN_SPECS,
+    ),
+    make=_make_mujoco,
+    foreign=True,
+    example="python -m pendulum_sim mujoco --ros-args -r __ns:=/sim -p model:=pendulum.xml",
+)
+
+GYMNASIUM = Engine(
+    program="gymnasium",
+    description="An environment of Gymnasium behind the interface that simulator and hardware share.",
+    specs=(
+        ParameterSpec("env", "", "", "Identifier, such as Pendulum-v1 or my_module:MyPendulum-v0.", read_only=True),
+        ParameterSpec(
+            "mapping",
+            "",
+            "",
+            "Adapter file: what is angle, velocity, torque, start; empty for a known environment.",
+            read_only=True,
+        ),
+        *_FOREIGN_SPECS,
+    ),
+    make=_make_gymnasium,
+    foreign=True,
+    example="python -m pendulum_sim gymnasium --ros-args -r __ns:=/sim -p env:=Pendulum-v1",
+)
+GYMNASIUM_PREFIX = "gymnasium:"
+
+
+def find_engine(simulation: str) -> tuple[Engine, dict[str, str]]:
+    """Return who runs a simulation of others, and the parameters that name it.
+
+    Args:
+        simulation: Path of a model file, or ``gymnasium:ID``.
+    """
+    if simulation.startswith(GYMNASIUM_PREFIX):
+        return GYMNASIUM, {"env": simulation.removeprefix(GYMNASIUM_PREFIX)}
+    return MUJOCO, {"model": str(Path(simulation).expanduser().resolve())}
+
+
+def open_simulation(simulation: str, mapping: str = "") -> Simulation:
+    """Return a simulation of others in this process, as its node would run it.
+
+    Args:
+        simulation: As in :func:`find_engine`.
+        mapping: Path of its mapping file; empty for none.
+
+    Raises:
+        ParameterError: It is refused.
+    """
+    engine, named = find_engine(simulation)
+    defaults = {spec.name: spec.default for spec in engine.specs}
+    return engine.make({**defaults, "seed": 0, "effort_limit": 0.0, **named, "mapping": mapping})

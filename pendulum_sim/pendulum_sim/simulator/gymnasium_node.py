@@ -1,0 +1,15 @@
+"""``gymnasium``: run a Gymnasium environment in place of the simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pendulum_sim.simulator.engines import GYMNASIUM
+from pendulum_sim.simulator.simulator_node import run_engine
+
+__all__ = ["main"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run an environment of Gymnasium in the simulator's place."""
+    return run_engine(GYMNASIUM, argv)

@@ -1,0 +1,15 @@
+"""``mujoco``: run a hinge of a MuJoCo model in place of the simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pendulum_sim.simulator.engines import MUJOCO
+from pendulum_sim.simulator.simulator_node import run_engine
+
+__all__ = ["main"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a MuJoCo model in the simulator's place."""
+    return run_engine(MUJOCO, argv)

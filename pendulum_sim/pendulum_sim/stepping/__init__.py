@@ -1,0 +1,1 @@
+"""Plants as they are stepped: integrators, friction, springs, sensors, position control."""

@@ -1,0 +1,194 @@
+"""A rigid link with dry friction and true stiction: when it sticks, when and which way it slips.
+
+::
+
+    M_c theta'' + b_c theta' + F sgn(theta') + G_c sin(theta - theta_0) = tau + tau_0 + push
+    F = tau_C' + (tau_S' - tau_C') exp(-(theta' / v_s)^2),   tau' = tau + a(|theta'|, |G_c sin(theta - theta_0)|)
+
+a is the sum of the friction terms of :mod:`pendulum_msgs_py.plants.friction_terms`.
+
+Between events the direction of friction is fixed and the equation smooth, so each integrator keeps its
+order. A zero crossing of the velocity inside a step is located, and there the link sticks if friction can
+hold the other torques (|net| <= tau_S'), and is then exactly at rest: theta does not change by a bit until
+they exceed it.
+
+Source: D. Karnopp, "Computer simulation of stick-slip friction in mechanical dynamic systems", 1985, with
+the events located instead of a velocity band, which would creep.
+"""
+
+from __future__ import annotations
+
+from pendulum_msgs_py.dynamics import friction_magnitude, gravity_torque, rigid_acceleration
+from pendulum_msgs_py.dynamics.steps import actuator_torque, narrowed
+from pendulum_msgs_py.plants.friction_terms import STRENGTHS, TERM_PARAMETERS, added_friction
+from pendulum_sim.stepping.integrators import Acceleration, Coefficients, PlantTuple, Step
+
+__all__ = [
+    "DRY",
+    "LAG",
+    "PACKED",
+    "acceleration_with_friction",
+    "advance_dry",
+    "is_dry",
+    "static_friction_balance",
+]
+
+PACKED = (
+    "inertia",
+    "damping",
+    "gravity",
+    "coulomb_friction",
+    "static_friction",
+    "stribeck_velocity",
+    "torque_offset",
+    "angle_offset",
+    "actuator_time_constant",
+    *TERM_PARAMETERS,
+)
+"""Order of the values in a ``PlantTuple``."""
+_INERTIA, _DAMPING, _GRAVITY, _COULOMB, _STATIC, _STRIBECK, _OFFSET, _ANGLE, LAG, _TERMS = range(10)
+"""Where they stand in it; ``LAG`` is the actuator's time constant, the values of the friction terms are the last."""
+_added_friction = added_friction(PACKED)
+DRY = (_STATIC, *(_TERMS + index for index in STRENGTHS))
+"""Where the values stand that are all 0 where there is no dry friction."""
+
+_MAX_EVENTS = 8
+_MAX_ROOT_STEPS = 60
+
+
+def acceleration_with_friction(
+    theta: float, theta_dot: float, torque: float, direction: float, plant: PlantTuple
+) -> float:
+    """Return theta'' with friction acting against ``direction`` (-1, 0 for none, or 1) [rad/s^2].
+
+    Args:
+        theta: Measured angle [rad].
+        theta_dot: Velocity [rad/s].
+        torque: Torque of actuator and push [N m].
+        direction: Sign of the velocity during this step.
+        plant: Parameters, packed.
+    """
+    # By index: a slice would cost an interpreted plant a tenth of its time.
+    gravity = plant[_GRAVITY]
+    angle = theta - plant[_ANGLE]
+    friction = 0.0
+    if direction != 0.0:
+        added = _added_friction(abs(theta_dot), abs(gravity_torque(angle, gravity)), plant)
+        friction = direction * friction_magnitude(
+            theta_dot, plant[_COULOMB] + added, plant[_STATIC] + added, plant[_STRIBECK]
+        )
+    torque = torque + plant[_OFFSET] - friction
+    return rigid_acceleration(angle, theta_dot, torque, plant[_INERTIA], plant[_DAMPING], gravity)
+
+
+def static_friction_balance(theta: float, torque: float, plant: PlantTuple) -> tuple[float, float]:
+    """Return the net torque on a link at rest and the friction that can hold it, tau_S' [N m].
+
+    Args: as in :func:`acceleration_with_friction`.
+    """
+    weight = gravity_torque(theta - plant[_ANGLE], plant[_GRAVITY])
+    return torque + plant[_OFFSET] - weight, plant[_STATIC] + _added_friction(0.0, abs(weight), plant)
+
+
+def is_dry(plant: PlantTuple) -> bool:
+    """Tell whether a plant has dry friction or any friction term: else its equation is smooth."""
+    dry = False
+    for index in DRY:
+        dry = dry or plant[index] > 0.0
+    return dry
+
+
+def advance_dry(
+    step: Step,
+    coefficients_of: object,
+    acceleration: Acceleration,
+    theta: float,
+    theta_dot: float,
+    torque: float,
+    command: float,
+    push: float,
+    h: float,
+    c: Coefficients,
+    plant: PlantTuple,
+) -> tuple[float, float]:
+    """Return (theta, theta_dot) after h, sticking and slipping as often as that takes.
+
+    Args:
+        step: Step function of the integrator.
+        coefficients_of: Its coefficient function, for steps cut short by an event.
+        acceleration: :func:`acceleration_with_friction` (compiled or not).
+        theta: Angle [rad].
+        theta_dot: Velocity [rad/s].
+        torque: Actuator torque at the start [N m].
+        command: Commanded torque during the step [N m].
+        push: Torque on the link itself [N m].
+        h: Step [s].
+        c: Coefficients for h.
+        plant: Parameters, packed.
+    """
+    time_constant = plant[LAG]
+    rate = plant[_DAMPING] / plant[_INERTIA]
+    left = h
+    for _ in range(_MAX_EVENTS):
+        if theta_dot == 0.0:
+            net, hold = static_friction_balance(
+                theta, actuator_torque(torque, command, h - left, time_constant) + push, plant
+            )
+            if abs(net) <= hold:
+                # Held now; a lagging torque may still outgrow friction within this step, and slips from the
+                # next on.
+                return theta, 0.0
+            direction = 1.0 if net > 0.0 else -1.0
+        else:
+            direction = 1.0 if theta_dot > 0.0 else -1.0
+        start = h - left
+        if start > 0.0:
+            c = coefficients_of(rate, left)  # type: ignore[operator]
+        theta_1, v_1 = step(
+            acceleration,
+            theta,
+            theta_dot,
+            actuator_torque(torque, command, start, time_constant) + push,
+            actuator_torque(torque, command, start + 0.5 * left, time_constant) + push,
+            actuator_torque(torque, command, h, time_constant) + push,
+            direction,
+            left,
+            c,
+            plant,
+        )
+        if v_1 * direction >= 0.0:
+            return theta_1, v_1
+        if theta_dot == 0.0:
+            # It broke away against the net torque: an artefact of a step far too long. Keep it where it is.
+            return theta, 0.0
+        low, v_low, high, v_high = 0.0, theta_dot, left, v_1
+        side = 0
+        root = left
+        theta_root = theta_1
+        for _ in range(_MAX_ROOT_STEPS):
+            root = (low * v_high - high * v_low) / (v_high - v_low)
+            if not low < root < high:
+                break
+            theta_root, v_root = step(
+                acceleration,
+                theta,
+                theta_dot,
+                actuator_torque(torque, command, start, time_constant) + push,
+                actuator_torque(torque, command, start + 0.5 * root, time_constant) + push,
+                actuator_torque(torque, command, start + root, time_constant) + push,
+                direction,
+                root,
+                coefficients_of(rate, root),  # type: ignore[operator]
+                plant,
+            )
+            if abs(v_root) <= 1e-14 * (abs(theta_dot) + abs(v_1)):
+                break
+            low, v_low, high, v_high, side = narrowed(
+                low, v_low, high, v_high, side, root, v_root, v_root * direction > 0.0
+            )
+        theta = theta_root
+        theta_dot = 0.0
+        left -= root
+        if left <= 1e-12 * h:
+            return theta, 0.0
+    return theta, theta_dot

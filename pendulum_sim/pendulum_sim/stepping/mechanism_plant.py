@@ -1,0 +1,212 @@
+"""A plant of several joints, stepped under held commands.
+
+What happens to a command on its way, in this order, as in :mod:`pendulum_sim.stepping.plant`: it is clamped to the
+joint's effort limit, waits for the transport delay, passes the first-order lag, and adds to gravity, friction and
+``push``, the effort on the joints themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+
+from pendulum_msgs_py.dynamics.joint_steps import LAG, advance_joints, joint_functions
+from pendulum_msgs_py.dynamics.runge_kutta import rk4_joints
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.joints import Coordinates, Vector
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
+from pendulum_sim.stepping.plant import DelayLine, check_step, period_segments
+
+__all__ = [
+    "MechanismPlant",
+    "MechanismState",
+    "check_decay",
+    "check_stable_step",
+    "is_smooth_mechanism",
+]
+
+_RK4_STABLE = 2.78
+"""Largest damping rate times step at which Runge-Kutta of order four decays."""
+
+
+class MechanismState(NamedTuple):
+    """What a plant of several joints is doing at one instant.
+
+    Attributes:
+        time: Time since the reset [s].
+        position: n positions, not wrapped [rad or m].
+        velocity: n velocities [rad/s or m/s].
+        effort: n efforts of the actuators, 0 at passive joints [N m or N].
+    """
+
+    time: float
+    position: Vector
+    velocity: Vector
+    effort: Vector
+
+
+class MechanismPlant:
+    """One plant of several joints.
+
+    Args:
+        parameters: The plant.
+        dt: Period over which commands are held [s], > 0.
+        substeps: Integration steps in a period, >= 1.
+
+    Raises:
+        ParameterError: An argument is outside its domain, the integrator would be unstable, or actuators have different
+            transport delays.
+    """
+
+    def __init__(self, parameters: MechanismParameters, dt: float, *, substeps: int = 1) -> None:
+        check_step(dt, substeps)
+        check_stable_step(parameters, dt / substeps)
+        self.parameters = parameters
+        self.dt = dt
+        self._p = parameters.packed
+        self._table = pack_joints(parameters)
+        self._forward = parameters.mechanism.forward
+        self._along, self._put, self._lag = joint_functions(len(parameters.joints))
+        self._plain = not _has_events(parameters)
+        self._limits = parameters.effort_limits
+        self._spread = parameters.coordinates.spread
+        delay = common_delay(parameters)
+        self._delays = [DelayLine(delay, dt) for _ in self._limits]
+        fraction = self._delays[0].fraction if self._delays else 0.0
+        self._segments = period_segments(dt, fraction, substeps)
+        self._still = (0.0,) * len(parameters.joints)
+        self._position = self._velocity = self._effort = self._still
+        self._steps = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the plant."""
+        return self.parameters.name
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """Its joints, and which of them are driven."""
+        return self.parameters.coordinates
+
+    @property
+    def stops(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest position of each joint, infinite where nothing stops it [rad or m]."""
+        return self.parameters.stops
+
+    @property
+    def effort_limits(self) -> Vector:
+        """Largest effort of each driven joint [N m or N]."""
+        return self._limits
+
+    @property
+    def state(self) -> MechanismState:
+        """The present state."""
+        return MechanismState(self._steps * self.dt, self._position, self._velocity, self._effort)
+
+    def reset(self, position: Vector | None = None, velocity: Vector | None = None) -> MechanismState:
+        """Start anew, the actuators without effort and no command on its way.
+
+        Args:
+            position: n positions; None for hanging at 0 [rad or m].
+            velocity: n velocities; None for rest.
+
+        Raises:
+            ParameterError: They have another length, are not finite, or lie beyond an end stop.
+        """
+        self._position = self.parameters.check_start(self._still if position is None else position)
+        velocity = self._still if velocity is None else tuple(float(value) for value in velocity)
+        if len(velocity) != len(self._still) or not all(math.isfinite(value) for value in velocity):
+            raise ParameterError(f"initial velocity is {list(velocity)}; expected {len(self._still)} finite numbers")
+        self._velocity = velocity
+        self._effort = self._still
+        self._steps = 0
+        for line in self._delays:
+            line.clear()
+        return self.state
+
+    def step(self, effort: Vector, push: Vector | None = None) -> MechanismState:
+        """Advance by one period.
+
+        Args:
+            effort: m commanded efforts, held over the period; clamped to the effort limits [N m or N].
+            push: n efforts on the joints themselves, neither clamped nor delayed; None for none.
+
+        Raises:
+            ParameterError: There are more or fewer than m, or n, or one is not finite (nothing moves then).
+        """
+        if len(effort) != len(self._limits):
+            self._spread(effort)
+        if push is None:
+            push = self._still
+        elif len(push) != len(self._still):
+            raise ParameterError(f"push has {len(push)} values; expected {len(self._still)}, one per joint")
+        # Clamping would make the full effort of a command that is no number.
+        if not all(map(math.isfinite, (*effort, *push))):
+            raise ParameterError(f"effort is {list(effort)} and push {list(push)}; expected finite numbers")
+        ends = [
+            line.push(min(limit, max(-limit, value)))
+            for line, limit, value in zip(self._delays, self._limits, effort, strict=True)
+        ]
+        older = self._spread(tuple(pair[0] for pair in ends))
+        newer = self._spread(tuple(pair[1] for pair in ends))
+        q, v, torque = self._position, self._velocity, self._effort
+        for is_newer, h in self._segments:
+            command = newer if is_newer else older
+            if self._plain:
+                total = self._along(command, 1.0, push)
+                q, v = rk4_joints(self._forward, self._along, q, v, total, total, total, h, self._p)
+                torque = command
+                continue
+            q, v = advance_joints(
+                self._forward, self._along, self._put, self._lag, q, v, torque, command, push, h, self._p, self._table
+            )
+            torque = self._lag(torque, command, h, self._table[LAG])
+        self._position, self._velocity, self._effort = q, v, torque
+        self._steps += 1
+        return MechanismState(self._steps * self.dt, q, v, torque)
+
+    @property
+    def energy(self) -> float:
+        """Kinetic and potential energy, 0 at rest hanging down [J]."""
+        return self.parameters.energy(self._position, self._velocity)
+
+
+def is_smooth_mechanism(parameters: MechanismParameters) -> bool:
+    """Tell whether a plant is free of dry friction, end stops, lag and delay."""
+    return not _has_events(parameters) and not any(actuator.transport_delay for actuator in parameters.actuators)
+
+
+def check_stable_step(parameters: MechanismParameters, h: float) -> None:
+    """Refuse a step at which damping alone would make the integrator unstable.
+
+    Raises:
+        ParameterError: Names the largest step that would do.
+    """
+    damping = np.diag([joint.damping for joint in parameters.joints])
+    n = len(parameters.joints)
+    rate = 0.0
+    for angle in np.linspace(0.0, np.pi, 9):
+        rows = np.array(parameters.mechanism.mass((float(angle),) * n, parameters.packed))
+        rate = max(rate, float(np.max(np.linalg.eigvals(np.linalg.solve(rows, damping)).real)))
+    check_decay(rate, h, f"plant {parameters.name!r}")
+
+
+def check_decay(rate: float, h: float, whose: str) -> None:
+    """Refuse a step that is too long for a rate of decay [1/s].
+
+    Raises:
+        ParameterError: Names the largest step that would do.
+    """
+    if rate * h > _RK4_STABLE:
+        raise ParameterError(
+            f"step is {h} s on {whose}, whose damping decays at {rate:.4g} 1/s; expected at most "
+            f"{_RK4_STABLE / rate:.3g} s: more substeps"
+        )
+
+
+def _has_events(parameters: MechanismParameters) -> bool:
+    lagging = any(actuator.time_constant > 0.0 for actuator in parameters.actuators)
+    return parameters.has_dry_friction or lagging or any(map(math.isfinite, chain(*parameters.stops)))

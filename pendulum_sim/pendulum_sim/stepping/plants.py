@@ -1,0 +1,37 @@
+"""The plant that a parameter file describes: rigid or series elastic."""
+
+from __future__ import annotations
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_sim.stepping.plant import Plant, RigidPlant
+from pendulum_sim.stepping.series_elastic import SeriesElasticPlant
+
+__all__ = ["make_plant"]
+
+
+def make_plant(parameters: PlantParameters, dt: float, *, method: str = "auto", substeps: int | None = None) -> Plant:
+    """Return the plant that the parameters describe.
+
+    Args:
+        parameters: Parameters, with a drivetrain for a series-elastic plant.
+        dt: Period over which a command is held [s].
+        method: One of ``integrators.METHODS``; ``auto`` is ``etd4`` for a rigid plant and ``semi_implicit``
+            for a series-elastic one, which has no other.
+        substeps: Integration steps in a period; None for 1 (rigid), or as many as 0.25 ms asks for.
+
+    Raises:
+        ParameterError: The method does not go with the plant, or an argument is outside its domain.
+    """
+    if parameters.drivetrain is None:
+        return RigidPlant(
+            parameters,
+            dt,
+            method="etd4" if method == "auto" else method,
+            substeps=1 if substeps is None else substeps,
+        )
+    if method not in {"auto", "semi_implicit"}:
+        raise ParameterError(
+            f"method is {method!r}; expected semi_implicit or auto, since plant {parameters.name!r} is series elastic"
+        )
+    return SeriesElasticPlant(parameters, dt, substeps=substeps)

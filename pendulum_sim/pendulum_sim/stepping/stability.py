@@ -1,0 +1,144 @@
+"""Whether an integrator is stable on a plant at a step: judged on its own map of the linear model.
+
+Near its two equilibria a rigid pendulum is ``theta'' = tau / M_c - lambda theta' -+ omega^2 theta`` with
+lambda = b_c / M_c and omega^2 = |G_c| / M_c. A step of an integrator maps such a state linearly; the eigenvalues of the
+map are what is left of the plant's poles. Hanging, both poles decay, so both eigenvalues must; upright one pole grows,
+and one eigenvalue may. So no stability function has to be known: the very step that simulates is asked.
+
+Source: Hairer and Wanner, "Solving Ordinary Differential Equations II", IV.2 (stability of one-step methods).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_sim.stepping.integrators import Integrator, PlantTuple, get_integrator
+
+__all__ = ["MOST_GROWTH", "check_stability", "growth_of_map", "growth_rate", "stable_substeps"]
+
+Array = NDArray[np.float64]
+MOST_GROWTH = 0.1
+"""Growth that counts as stable [1/s]: some methods let an undamped pendulum gain energy, far more slowly than this."""
+_MOST_SUBSTEPS = 10_000
+_DIFFERENCE = 1e-5
+"""Half the distance of the points that a slope is taken from [rad, rad/s]."""
+
+
+def growth_rate(
+    integrator: Integrator,
+    damping_rates: ArrayLike,
+    stiffness_rates: ArrayLike,
+    h: float,
+    coefficients: Sequence[Array],
+) -> Array:
+    """Return how fast a decaying motion of the plant grows when it is integrated, below 0 where it decays [1/s].
+
+    Args:
+        integrator: The method; not ``adaptive``, which chooses its steps itself.
+        damping_rates: lambda, scalar or (B,) [1/s].
+        stiffness_rates: omega^2, scalar or (B,) [1/s^2].
+        h: Step [s].
+        coefficients: The method's coefficients for that step, each scalar or (B,).
+    """
+    rates = np.asarray(damping_rates, dtype=np.float64)
+    stiffness = np.abs(np.asarray(stiffness_rates, dtype=np.float64))
+    worst = np.full(np.broadcast_shapes(rates.shape, stiffness.shape), -np.inf)
+    with np.errstate(all="ignore"):
+        for sign, which in ((1.0, -1), (-1.0, 0)):
+            sizes = _eigenvalue_sizes(integrator, rates, sign * stiffness, h, coefficients)
+            # Hanging, the larger of the two must not grow; upright, the smaller.
+            size = sizes[which]
+            worst = np.fmax(worst, np.where(np.isfinite(size), np.log(size) / h, np.inf))
+    return worst
+
+
+def _eigenvalue_sizes(
+    integrator: Integrator, rates: Array, stiffness: Array, h: float, coefficients: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Return the absolute values of the eigenvalues of one step, the smaller first."""
+
+    def linear(theta: float, theta_dot: float, torque: float, direction: float, plant: PlantTuple) -> float:  # noqa: ARG001
+        return -rates * theta_dot - stiffness * theta  # type: ignore[return-value]  # whole arrays at once
+
+    def step(theta: float, theta_dot: float) -> tuple[Array, Array]:
+        x, v = integrator.step(linear, theta, theta_dot, 0.0, 0.0, 0.0, 0.0, h, tuple(coefficients), ())  # type: ignore[arg-type]
+        return np.asarray(x), np.asarray(v)
+
+    (a, c), (b, d) = step(1.0, 0.0), step(0.0, 1.0)
+    half_trace = 0.5 * (a + d)
+    root = np.sqrt(np.asarray(half_trace * half_trace - (a * d - b * c), dtype=np.complex128))
+    sizes = np.abs(half_trace - root), np.abs(half_trace + root)
+    return np.minimum(*sizes), np.maximum(*sizes)
+
+
+def check_stability(
+    integrator: Integrator, parameters: PlantParameters, dt: float, substeps: int, longest_step: float
+) -> None:
+    """Refuse a method that blows up on a plant.
+
+    Args:
+        integrator: The method.
+        parameters: The plant, a rigid one.
+        dt: Period [s].
+        substeps: Sub-steps of a period.
+        longest_step: The longest of them, where a delay cuts the period [s].
+
+    Raises:
+        ParameterError: It is unstable at that step; the message says what would not be.
+    """
+    if integrator.name == "adaptive" or _is_stable(integrator, parameters, longest_step):
+        return
+    enough = stable_substeps(integrator, parameters, dt)
+    etd4 = get_integrator("etd4")
+    ways = [f"substeps >= {enough}"] if enough else []
+    ways += ["method etd4"] if integrator is not etd4 and _is_stable(etd4, parameters, longest_step) else []
+    raise ParameterError(
+        f"method {integrator.name!r} is unstable on plant {parameters.name!r} (damping "
+        f"{parameters.damping / parameters.inertia:.4g} 1/s) at a step of {longest_step * 1e3:.4g} ms "
+        f"(dt {dt * 1e3:.4g} ms, substeps {substeps}); expected {' or '.join(ways) or 'a shorter dt'}"
+    )
+
+
+def growth_of_map(step: Callable[[Array], Array], x: Array, h: float, growing: int = 0) -> float:
+    """Return how fast what should decay grows under a map that is nearly linear around a state [1/s].
+
+    Args:
+        step: Maps a state to that after the step.
+        x: The state, shape (n,).
+        h: Step [s].
+        growing: Poles of the plant that truly grow there.
+    """
+    n = len(x)
+    jacobian = np.empty((n, n))
+    with np.errstate(all="ignore"):
+        for k in range(n):
+            shift = _DIFFERENCE * np.eye(n)[k]
+            jacobian[:, k] = (step(x + shift) - step(x - shift)) / (2.0 * _DIFFERENCE)
+        if not np.isfinite(jacobian).all():
+            return math.inf
+        sizes = np.sort(np.abs(np.linalg.eigvals(jacobian)))
+    size = float(sizes[-1 - growing])
+    return math.log(size) / h if size > 0.0 else -math.inf
+
+
+def stable_substeps(integrator: Integrator, parameters: PlantParameters, dt: float) -> int:
+    """Return the least number of sub-steps of a period at which a method is stable; 0 if none up to 10 000 is."""
+    count = 1
+    while count <= _MOST_SUBSTEPS and not _is_stable(integrator, parameters, dt / count):
+        count = max(count + 1, math.ceil(1.02 * count))
+    while count > 1 and count <= _MOST_SUBSTEPS and _is_stable(integrator, parameters, dt / (count - 1)):
+        count -= 1
+    return count if count <= _MOST_SUBSTEPS else 0
+
+
+def _is_stable(integrator: Integrator, parameters: PlantParameters, h: float) -> bool:
+    rate = parameters.damping / parameters.inertia
+    coefficients = [np.float64(value) for value in integrator.coefficients(rate, h)]
+    stiffness = parameters.gravity / parameters.inertia
+    return bool(growth_rate(integrator, rate, stiffness, h, coefficients) <= MOST_GROWTH)  # type: ignore[arg-type]
