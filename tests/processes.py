@@ -206,7 +206,7 @@ class ProcessGroup:
         ours = {program.pid for program in self._programs}
         return [other for other in psutil.process_iter() if other.pid not in ours and self._is_marked(other)]
 
-    def close(self, patience: float = 10.0) -> list[str]:
+    def close(self, patience: float = 30.0) -> list[str]:
         """End everything: SIGINT as a user would, then SIGKILL.
 
         Args:
@@ -227,9 +227,8 @@ class ProcessGroup:
                 complaints.append(f"{program.name} (pid {popen.pid}) ran {patience:g} s after SIGINT")
                 _signal_group(popen, signal.SIGKILL)
                 popen.wait()
-        # What a program leaves behind may be about to end: half a second is long for an exit and short for a
-        # test.
-        _, alive = psutil.wait_procs(self.leftovers(), timeout=0.5)
+        # What a program leaves behind may be about to end, and on a busy machine that takes a while.
+        _, alive = psutil.wait_procs(self.leftovers(), timeout=5.0)
         for process in alive:
             complaints.append(f"pid {process.pid} outlived its starter: {_command_line(process)}")
             process.kill()
