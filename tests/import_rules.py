@@ -12,7 +12,7 @@ from fnmatch import fnmatch
 from grimp import ImportGraph
 from importlinter import Contract, ContractCheck, fields, output
 
-__all__ = ["NoCirclesContract", "RosShellsContract"]
+__all__ = ["NoCirclesContract", "RoomsContract", "RosShellsContract"]
 
 
 class RosShellsContract(Contract):
@@ -73,6 +73,50 @@ class NoCirclesContract(Contract):
         for line in check.metadata["circle"]:
             output.print_error(line, bold=False)
         output.print_error("expected: imports that go one way; move what both need into a module of its own")
+
+
+class RoomsContract(Contract):
+    """Forbid imports in a circle between the rooms of a package, the folders right below it.
+
+    A command line joins what stands beside it with what stands above, and may.
+    """
+
+    type_name = "rooms"
+
+    packages = fields.SetField(subfield=fields.StringField())
+    commands = fields.SetField(subfield=fields.StringField())
+
+    def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
+        """Leave out, again and again, rooms that import none of the rest or that none imports; the rest is a circle."""
+        rooms = {
+            room for package in self.packages for room in graph.find_children(package) if graph.find_children(room)
+        }
+        imports = [
+            (importer, imported)
+            for importer in graph.modules
+            if not graph.is_module_squashed(importer) and not _matches(importer, self.commands)
+            for imported in graph.find_modules_directly_imported_by(importer)
+        ]
+        between: dict[str, dict[str, str]] = {room: {} for room in rooms}
+        for importer, imported in sorted(imports):
+            at, to = (".".join(module.split(".")[:2]) for module in (importer, imported))
+            if at != to and {at, to} <= rooms:
+                between[at].setdefault(to, f"{importer} imports {imported}")
+        left = set(rooms)
+        while gone := {
+            room
+            for room in left
+            if not between[room].keys() & left or not any(room in between[other] for other in left)
+        }:
+            left -= gone
+        circle = [told for room in sorted(left) for to, told in between[room].items() if to in left]
+        return ContractCheck(kept=not left, metadata={"circle": circle})
+
+    def render_broken_contract(self, check: ContractCheck) -> None:
+        """Name one import for each pair of rooms on a circle."""
+        for line in check.metadata["circle"]:
+            output.print_error(line, bold=False)
+        output.print_error("expected: rooms that import each other one way; move what both need into one below them")
 
 
 def _matches(module: str, patterns: set[str]) -> bool:

@@ -13,9 +13,9 @@ from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.port.actuator import ActuatorError, Feedback, Strategy
 from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Mode, PlantLimits
+from pendulum_msgs_py.contract.joints import Coordinates, Joint
 from pendulum_msgs_py.contract.supervisor import PlantSupervisor
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Coordinates, Joint
 from tests.feedback_records import feedback_record
 from tests.scripted_port import DRIVETRAIN, PERIOD, STEP, Port
 

@@ -14,7 +14,7 @@ from pendulum_hw_bridge.drive.motor_state import MotorState
 from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
 from pendulum_hw_bridge.port.actuator import Command, Strategy
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
-from pendulum_msgs_py.joints import Joint
+from pendulum_msgs_py.contract.joints import Joint
 from tests.feedback_records import feedback_record
 
 MOTOR = MotorState(24.0)

@@ -13,8 +13,8 @@ from pendulum_hw_bridge.emulation.machine import EmulatedMachine
 from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
 from pendulum_hw_bridge.port.actuator import ActuatorError, ActuatorPort, Command, Feedback, Strategy
 from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from tests.joint_plants import without_friction
 

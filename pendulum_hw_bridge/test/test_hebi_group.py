@@ -25,8 +25,8 @@ from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_hw_bridge.port.gains import GAIN_FIELDS, LOOPS
 from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Mode, PlantLimits
+from pendulum_msgs_py.contract.joints import Coordinates, Joint
 from pendulum_msgs_py.contract.supervisor import PlantSupervisor
-from pendulum_msgs_py.joints import Coordinates, Joint
 from tests.scripted_port import DRIVETRAIN, PERIOD, STEP
 
 hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")

@@ -19,9 +19,9 @@ from pendulum_hw_bridge.port.clocks import WallClock
 from pendulum_hw_bridge.port.command_check import check_command
 from pendulum_hw_bridge.port.settings import expect_limits
 from pendulum_msgs_py.contract.drive import PlantLimits
+from pendulum_msgs_py.contract.joints import ONE_JOINT
 from pendulum_msgs_py.contract.plant_specs import in_units_of
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import ONE_JOINT
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from tests.feedback_records import feedback_record

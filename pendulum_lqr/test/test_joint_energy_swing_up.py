@@ -15,8 +15,8 @@ from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.swing_up.energy_margin import EnergyMargin
 from pendulum_lqr.swing_up.mechanism_catch import make_mechanism_catch
 from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, pump_gains
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 

@@ -30,9 +30,9 @@ from pendulum_lqr.swing_up.mechanism_trajectory import (
 )
 from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
 from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajectory
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.runge_kutta import along_2, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from tests.joint_plants import delayed_plant

@@ -15,7 +15,7 @@ from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_l
 from pendulum_lqr.swing_up.mechanism_catch import CaughtRegion, MechanismCatch
 from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, PumpGains, pump_gains
 from pendulum_msgs_py.contract.angles import wrap
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 
 NAMES = ("cart_pole", "furuta", "pendubot_frictionless")

@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 
+from pendulum_msgs_py.contract.joints import Coordinates, Joint
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.dynamics.rigid import rigid_acceleration
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Coordinates, Joint
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 

@@ -9,10 +9,10 @@ import pytest
 from pendulum_msgs_py.contract import cdr
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joints
 from pendulum_msgs_py.contract.commands import CommandGate, Refusal
+from pendulum_msgs_py.contract.joints import Coordinates, Joint
 from pendulum_msgs_py.contract.supervisor import DriveKind, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Coordinates, Joint
 from tests.trajectories import from_points
 
 serialization = pytest.importorskip("rclpy.serialization")

@@ -187,7 +187,7 @@ def test_the_figures_of_the_thesis_are_drawn(tmp_path):
         "static_phase",
         "effort_over_sine",
     }
-    assert re.search(r"<td>gravity</td><td>[\d.]+</td><td>[^<]+</td><td>N m</td>", page.read_text())
+    assert re.search(r">gravity</th><td[^>]*>[\d.]+</td><td[^>]*>[^<]+</td><td[^>]*>N m</td>", page.read_text())
 
 
 def test_what_the_regressions_need_is_asked_for():

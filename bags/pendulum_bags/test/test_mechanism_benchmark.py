@@ -26,8 +26,8 @@ from pendulum_bags.studies.mechanism_benchmark_runs import Disturbances, Trial, 
 from pendulum_lqr.controllers.mechanism_controllers import make_mechanism_controller
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.policies.policy_file import write_policy
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from tests.policies import random_policy
 
 T = 0.002 * np.arange(5000)

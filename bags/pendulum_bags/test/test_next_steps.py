@@ -18,7 +18,7 @@ from pendulum_bags.identification.identify import identify
 from pendulum_bags.identification.identify_cli import main
 from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.residual_tests import _stretches, _told
-from pendulum_bags.report.terms import Terms
+from pendulum_bags.pages.terms import Terms
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.next_test import next_test_of, question_of
 from pendulum_bags.verdict.same_run import same_run_layer

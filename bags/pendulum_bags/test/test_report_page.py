@@ -23,6 +23,7 @@ from pendulum_bags.figures.figure import ROLES, Figure, Panel, Trace, thinned
 from pendulum_bags.figures.numbers import quantity, ratio_in_words
 from pendulum_bags.figures.render_plotly import graphs_of
 from pendulum_bags.figures.table import Table
+from pendulum_bags.pages.terms import Terms
 from pendulum_bags.report import FIGURES, write_report
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figures import comparison_figures, make_figures
@@ -30,7 +31,6 @@ from pendulum_bags.report.page import page_of
 from pendulum_bags.report.provenance import emulator_table, provenance_table, settings_table
 from pendulum_bags.report.report_cli import main
 from pendulum_bags.report.tables import make_tables
-from pendulum_bags.report.terms import Terms
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.report.write import title_of
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer

@@ -23,10 +23,10 @@ from pendulum_hw_bridge.port.clocks import Clock
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import PlantLimits
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.contract.plant_specs import in_units_of
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, load_mechanism
 from pendulum_msgs_py.plants.plant_differences import AnyPlant

@@ -17,10 +17,10 @@ from pendulum_hw_bridge.port.clocks import Clock
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GainSet, load_gains
 from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import PlantLimits
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.contract.plant_specs import limits_from_parameters
 from pendulum_msgs_py.contract.values import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import (
     PRESETS,

@@ -15,9 +15,9 @@ from pendulum_hw_bridge.drive.safety import SafetyMonitor
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.port.clocks import Clock
 from pendulum_msgs_py.contract.drive import PlantLimits
+from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Coordinates
 
 __all__ = ["OF_GROUPS", "GroupAssembly", "refuse_slides"]
 

@@ -29,9 +29,9 @@ from pendulum_hw_bridge.port.actuator import (
     TemperatureState,
 )
 from pendulum_hw_bridge.port.settings import BridgeSettings
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [

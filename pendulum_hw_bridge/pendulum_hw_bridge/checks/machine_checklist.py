@@ -26,8 +26,8 @@ from pendulum_hw_bridge.checks.checklist import (
 )
 from pendulum_hw_bridge.drive.safety import SafetyMonitor
 from pendulum_hw_bridge.port.actuator import Feedback
+from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.joints import Joint
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["names_problem", "run_machine_checklist"]

@@ -23,8 +23,8 @@ from enum import Enum
 from pendulum_hw_bridge.drive.motor_state import MotorState
 from pendulum_hw_bridge.port.actuator import PEAK_EFFORT, Command, Strategy
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GainSet, limit_output
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 
 __all__ = ["EffortMapping", "EffortStrategy"]

@@ -22,9 +22,9 @@ from pendulum_hw_bridge.port.actuator import (
     TemperatureState,
     state_name,
 )
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.series_elastic import winding_current, winding_resistance_at
-from pendulum_msgs_py.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 
 __all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]

@@ -16,11 +16,11 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault, distort
 from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
 from pendulum_hw_bridge.port.actuator import CommandLock, Feedback
 from pendulum_hw_bridge.port.command_check import check_lifetime
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.joint_steps import LAG, advance_joints, joint_functions
 from pendulum_msgs_py.dynamics.series_elastic import winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
 
 __all__ = ["EmulatedMachine"]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from pendulum_msgs_py.joints import Joint
+from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
 
 __all__ = ["QuasiDirectDrive"]

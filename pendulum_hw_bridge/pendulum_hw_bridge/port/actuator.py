@@ -14,8 +14,8 @@ from enum import Enum, IntEnum
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from pendulum_hw_bridge.port.gains import GainSet
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.errors import FaultError, ParameterError
-from pendulum_msgs_py.joints import ONE_JOINT, Joint
 
 __all__ = [
     "FEEDBACK_QUANTITIES",

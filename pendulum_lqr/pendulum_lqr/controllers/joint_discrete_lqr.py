@@ -14,7 +14,7 @@ from pendulum_lqr.laws.interface import Controller, JointController
 from pendulum_lqr.laws.sampling import require_period
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_lqr.swing_up.mechanism_controller import within_limits
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["JointDiscreteLqr"]

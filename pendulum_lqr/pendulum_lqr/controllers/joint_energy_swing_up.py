@@ -14,7 +14,7 @@ from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.swing_up.energy_margin import EnergyMargin
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, pump_gains
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 

@@ -14,7 +14,7 @@ from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, gain_text, joint_wei
 from pendulum_lqr.laws.interface import Controller, JointController
 from pendulum_lqr.linear.design import kalman_gain
 from pendulum_lqr.linear.sampled_design import discretise
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 

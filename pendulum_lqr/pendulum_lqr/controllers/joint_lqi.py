@@ -21,7 +21,7 @@ from pendulum_lqr.laws.sampling import require_period
 from pendulum_lqr.linear.mechanism_model import mechanism_lqr
 from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.swing_up.mechanism_controller import within_limits
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 

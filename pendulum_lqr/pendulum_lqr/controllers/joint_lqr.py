@@ -15,8 +15,8 @@ from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_l
 from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
 from pendulum_lqr.swing_up.mechanism_controller import within_limits
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 

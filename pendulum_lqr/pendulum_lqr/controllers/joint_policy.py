@@ -19,8 +19,8 @@ from pendulum_lqr.laws.policy_answers import (
 from pendulum_lqr.policies.policy import Policy, require_plant
 from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 

@@ -14,7 +14,7 @@ from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
 from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
 from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajectory
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 

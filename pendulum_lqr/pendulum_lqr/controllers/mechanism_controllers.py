@@ -14,8 +14,8 @@ from pendulum_lqr.swing_up.mechanism_controller import MechanismController
 from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
 from pendulum_lqr.swing_up.mechanism_planned import PlannedSwingUp
 from pendulum_lqr.swing_up.stored_swing_up import CALM_WEIGHTS, default_catch, tracked_swing_up
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["DifferencedVelocity", "make_mechanism_controller", "mechanism_controller_names"]

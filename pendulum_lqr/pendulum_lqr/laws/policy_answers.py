@@ -16,7 +16,7 @@ import numpy as np
 from pendulum_lqr.laws.controller import soft_start
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.policies.policy import Policy
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 
 __all__ = ["START_TIME", "ZERO", "PolicyAnswers", "check_policy_period", "policy_specs", "states_to_hold"]

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 
 from pendulum_lqr.linear.design import DesignError, Gain, cost_matrices, riccati_gain
 from pendulum_lqr.linear.model import LinearModel
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["holding_effort", "linearise_mechanism", "mechanism_lqr"]

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.dynamics.rigid import rigid_acceleration
 from pendulum_msgs_py.dynamics.series_elastic import (
@@ -31,7 +32,6 @@ from pendulum_msgs_py.dynamics.series_elastic import (
     winding_current,
 )
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.equilibrium import (
     RigidPlant,
     command_pwm,

@@ -36,11 +36,11 @@ from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_lqr.nodes.compiled_controller import CompiledController
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joints
+from pendulum_msgs_py.contract.joints import ONE_JOINT
 from pendulum_msgs_py.contract.plant_specs import COMPILED, REALTIME_PRIORITY
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import JointSample, Vector
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.joints import ONE_JOINT
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import (

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates, Joint
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Joint
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_differences import AnyPlant, describe_plants
 from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS, PlantParameters

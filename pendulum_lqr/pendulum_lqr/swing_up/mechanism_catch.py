@@ -13,9 +13,9 @@ from pendulum_lqr.linear.design import DesignError, Gain
 from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.contract.joints import Coordinates, Vector
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
-from pendulum_msgs_py.joints import Coordinates, Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["CaughtRegion", "MechanismCatch", "deviation_of", "make_mechanism_catch", "sample_caught_region"]

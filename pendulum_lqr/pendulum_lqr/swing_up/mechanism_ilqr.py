@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.swing_up.ilqr_functions import cost_functions, step_functions
 from pendulum_lqr.swing_up.small_matrices import copy, eliminate, newton, product
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.contract.values import written
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.loops.trees import WITHIN
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters

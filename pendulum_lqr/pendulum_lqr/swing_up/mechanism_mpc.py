@@ -11,7 +11,7 @@ from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
 from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrWeights
 from pendulum_lqr.swing_up.mechanism_search import PlanSearch, PlanSettings
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 
 __all__ = ["ITERATIONS", "PATIENCE", "PLAN", "RETRIES", "MechanismMpc"]
 

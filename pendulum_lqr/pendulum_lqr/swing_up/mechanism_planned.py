@@ -11,7 +11,7 @@ from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrWeights
 from pendulum_lqr.swing_up.mechanism_search import PlanSearch, PlanSettings
 from pendulum_lqr.swing_up.mechanism_trajectory import trajectory_of
 from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr, whole_turns
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 
 __all__ = ["PlannedSwingUp"]
 

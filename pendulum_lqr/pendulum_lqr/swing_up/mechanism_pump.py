@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 from pendulum_lqr.linear.design import DesignError
 from pendulum_msgs_py.contract.angles import wrap
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["PUMPS", "EnergyPump", "PumpGains", "pump_gains"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
 from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 
 __all__ = ["PlanSearch", "PlanSettings"]
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
 from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.parameters import read_text
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.whole_file import write_whole, writing

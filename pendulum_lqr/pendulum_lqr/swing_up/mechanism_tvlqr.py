@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
 from pendulum_lqr.swing_up.mechanism_controller import MechanismController, within_limits
 from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["MechanismTvlqr", "tracking_gains", "whole_turns"]

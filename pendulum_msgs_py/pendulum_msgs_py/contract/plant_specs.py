@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from pendulum_msgs_py.contract.drive import Input, PlantLimits
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.contract.values import NANOSECONDS, Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.parameters import ParameterSpec
 
 __all__ = [

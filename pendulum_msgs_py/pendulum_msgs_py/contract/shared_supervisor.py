@@ -9,10 +9,10 @@ from collections import deque
 from collections.abc import Callable, Iterator
 
 from pendulum_msgs_py.contract.commands import Refusal
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.contract.supervisor import Drive, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import JointCommand, JointSample, Vector
-from pendulum_msgs_py.joints import ONE_JOINT, Coordinates
 
 __all__ = ["SharedSupervisor"]
 

@@ -19,10 +19,10 @@ from operator import add
 from pendulum_msgs_py.contract.commands import CommandGate, Refusal
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Input, Mode, PlantLimits
 from pendulum_msgs_py.contract.handover import Handover
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates, Joint
 from pendulum_msgs_py.contract.rules import age_of, has_lapsed, is_inside, rise_within, within
 from pendulum_msgs_py.contract.trajectory import MAX_RAMP_VELOCITY, Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample, Vector, written
-from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Joint
 
 __all__ = ["PUSH_LIMIT_FACTOR", "Drive", "DriveKind", "Input", "Mode", "PlantLimits", "PlantSupervisor"]
 

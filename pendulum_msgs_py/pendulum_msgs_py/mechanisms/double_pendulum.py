@@ -19,7 +19,7 @@ import math
 from typing import Any
 
 from pendulum_msgs_py.contract.angles import UPRIGHT
-from pendulum_msgs_py.joints import Joint
+from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.mechanisms.mechanism import Body, Mechanism, Point, Rotor, gravity_spec, positive
 from pendulum_msgs_py.parameters import ParameterSpec
 

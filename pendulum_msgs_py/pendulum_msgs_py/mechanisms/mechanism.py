@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from pendulum_msgs_py.joints import Joint
+from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.parameters import ParameterSpec
 
 __all__ = ["STANDARD_GRAVITY", "Body", "Mechanism", "Point", "Rotor", "gravity_spec", "positive"]

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from pendulum_msgs_py.contract.joints import ONE_JOINT
 from pendulum_msgs_py.dynamics.rigid import rigid_acceleration, rigid_energy
-from pendulum_msgs_py.joints import ONE_JOINT
 from pendulum_msgs_py.mechanisms.mechanism import STANDARD_GRAVITY, Body, Mechanism, Point, positive
 from pendulum_msgs_py.parameters import ParameterSpec
 

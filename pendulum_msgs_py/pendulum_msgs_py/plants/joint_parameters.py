@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Annotated
 
+from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Joint
 from pendulum_msgs_py.parameters import ParameterSpec, reject_unknown, require_mapping
 from pendulum_msgs_py.plants.quantities import Quantity, read_quantities, specs_of
 

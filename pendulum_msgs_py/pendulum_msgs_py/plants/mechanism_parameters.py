@@ -26,9 +26,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates, Vector
 from pendulum_msgs_py.dynamics.joint_steps import FAR, JointTable
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import ONE_JOINT, Coordinates, Vector
 from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
 from pendulum_msgs_py.parameters import ParameterSpec, load_yaml, reject_unknown, require_mapping, suggestion
 from pendulum_msgs_py.plants.joint_parameters import (

@@ -15,10 +15,10 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pendulum_msgs_py.contract.cdr import JointStateFields, decode_joint_state
+from pendulum_msgs_py.contract.joints import ONE_JOINT
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
-from pendulum_msgs_py.joints import ONE_JOINT
 
 __all__ = [
     "class_of",

@@ -9,8 +9,8 @@ import math
 from collections.abc import Sequence
 from xml.etree import ElementTree
 
+from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Joint
 from pendulum_msgs_py.mechanisms import Body
 from pendulum_msgs_py.plants.joint_parameters import JointParameters
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters

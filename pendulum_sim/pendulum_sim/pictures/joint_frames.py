@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_msgs_py.joints import Vector
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.mechanisms import Body
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_msgs_py.joints import Joint, Vector
+from pendulum_msgs_py.contract.joints import Joint, Vector
 from pendulum_msgs_py.mechanisms.mechanism import Mechanism, Point
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.pictures.canvas import BACKGROUND, BOB, DISTURBANCE, GREY, INK, LINK, TORQUE, Colour, Picture

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from pendulum_msgs_py.joints import ONE_JOINT, Vector
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Vector
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant, MechanismState
 from pendulum_sim.stepping.plant import Plant, PlantState
 

@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pendulum_msgs_py.contract.joints import Coordinates, Vector
 from pendulum_msgs_py.dynamics.joint_steps import LAG, advance_joints, joint_functions
 from pendulum_msgs_py.dynamics.runge_kutta import rk4_joints
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Coordinates, Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
 from pendulum_sim.stepping.plant import DelayLine, check_step, period_segments
 

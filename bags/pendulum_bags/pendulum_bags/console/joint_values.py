@@ -6,7 +6,7 @@ from math import isfinite
 from typing import Any
 
 from pendulum_msgs_py.contract.cdr import JointStateFields
-from pendulum_msgs_py.joints import Joint
+from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.mechanisms import MECHANISMS
 
 __all__ = ["JointValues"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 __all__ = ["Table"]
 
-_NUMERIC = re.compile(r"^[−–±]?[\d.]*(×10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)?$")
+_NUMERIC = re.compile(r"^[-+−–±]?[\d.]*(×10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)?$")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pendulum_bags.frequency_response.analyse import NUMBERS
 from pendulum_bags.frequency_response.designs import design_rows
 from pendulum_bags.frequency_response.figures import response_figures
 from pendulum_bags.frequency_response.result import Analysis
-from pendulum_bags.report.layer_page import write_layer_page
+from pendulum_bags.pages.layer_page import write_layer_page
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import write_layer
 from pendulum_lqr.responses.measured_response import write_response

@@ -29,9 +29,9 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.runs.csv_mapping import read_csv
 from pendulum_bags.runs.datasets import Recording, check_consistency, unwrap
 from pendulum_bags.runs.run_data import find_prefix
+from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.contract.names import APPLIED_EFFORT, JOINT_STATES, PUSH
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.joints import Coordinates
 from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping
 from pendulum_rosbag.reader import read_bag
 

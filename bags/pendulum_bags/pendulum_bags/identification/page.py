@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,12 +11,13 @@ from matplotlib.figure import Figure as Canvas
 
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.render_files import write_figures
+from pendulum_bags.figures.table import Table
 from pendulum_bags.identification.model import UNITS
 from pendulum_bags.identification.problem import simulate
 from pendulum_bags.identification.thesis import ThesisResult, trial_part
 from pendulum_bags.identification.thesis_figures import TrialSet, thesis_figures
+from pendulum_bags.pages.sheet import Sentence, write_sheet
 from pendulum_bags.runs.datasets import Recording
-from pendulum_msgs_py.whole_file import write_whole
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.result import IdentificationResult
@@ -26,14 +25,6 @@ if TYPE_CHECKING:
 __all__ = ["write_page", "write_thesis_page"]
 
 _MEASURED, _SIMULATED = "#444444", "#c2410c"
-
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #1c1917; }
-table { border-collapse: collapse; margin: 1rem 0; } th, td { padding: .2rem .8rem; text-align: right; }
-th { border-bottom: 1px solid #78716c; } td:first-child, th:first-child { text-align: left; }
-img { max-width: 100%; } .wide { overflow-x: auto; } td { white-space: nowrap; }
-.alarm { color: #b91c1c; font-weight: bold; } pre { font-size: 12px; overflow-x: auto; }
-"""
 
 
 def write_page(result: IdentificationResult, folder: str | Path) -> Path:
@@ -57,16 +48,18 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
         (name, *(f"{value:+.2f}" for value in row))
         for name, row in zip(names, result.uncertainty.correlation, strict=True)
     ]
-    body = [
-        f"<p>Friction model <b>{escape(chosen.friction)}</b>, {escape(result.created)}.</p>",
-        _sentences(result.sentences()),
-        _table("Parameters", ("parameter", "value", "95 % interval", "unit"), parameters),
-        _table("Friction models", ("model", "held-out rms [mrad]", "training rms [mrad]"), models),
-        _table("Other recordings", ("recording", "rms [mrad]", "mean absolute [mrad]"), held),
-        _table(f"Correlation (condition number {result.uncertainty.condition_number:.2g})", ("", *names), correlation),
-        *map(_image, figures),
+    tables = [
+        Table("Parameters", "", ("parameter", "value", "95 % interval", "unit"), parameters),
+        Table("Friction models", "", ("model", "held-out rms [mrad]", "training rms [mrad]"), models),
+        Table("Other recordings", "", ("recording", "rms [mrad]", "mean absolute [mrad]"), held),
+        Table(
+            f"Correlation (condition number {result.uncertainty.condition_number:.2g})", "", ("", *names), correlation
+        ),
     ]
-    return _write(target, "Identification", body)
+    kicker = f"Friction model {chosen.friction}, {result.created}"
+    return write_sheet(
+        target / "index.html", "Identification", _told(result.sentences()), tables, figures, kicker=kicker
+    )
 
 
 def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], folder: str | Path) -> Path:
@@ -79,45 +72,21 @@ def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], fol
         (name, f"{value:.5g}", f"{result.intervals[name][0]:.5g} to {result.intervals[name][1]:.5g}", UNITS[name])
         for name, value in result.average.items()
     ]
-    body = [
-        _sentences(result.sentences),
-        _table("Average over trials", ("coefficient", "value", "95 % interval", "unit"), rows),
-        *(f"<h2>{escape(r.trial)}</h2><pre>{escape(r.summary)}</pre>" for r in result.trials),
-        *(f"<p>No figure: {escape(one)}.</p>" for one in drawn if isinstance(one, str)),
-        *map(_image, figures),
-    ]
-    return _write(target, f"Regression: {result.kind.replace('_', ' and ')}", body)
+    return write_sheet(
+        target / "index.html",
+        f"Regression: {result.kind.replace('_', ' and ')}",
+        _told(result.sentences),
+        [Table("Average over trials", "", ("coefficient", "value", "95 % interval", "unit"), rows)],
+        figures,
+        listings=[(one.trial, one.summary) for one in result.trials],
+        notes=[f"No figure: {one}." for one in drawn if isinstance(one, str)],
+    )
 
 
-def _sentences(sentences: Sequence[str]) -> str:
+def _told(sentences: Sequence[str]) -> list[Sentence]:
     from pendulum_bags.identification.result import ALARMS
 
-    items = []
-    for sentence in sentences:
-        css = ' class="alarm"' if sentence.startswith(ALARMS) else ""
-        items.append(f"<li{css}>{escape(sentence)}</li>")
-    return f"<ul>{''.join(items)}</ul>"
-
-
-def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    if not rows:
-        return ""
-    cells = "".join(f"<th>{escape(h)}</th>" for h in head)
-    lines = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-    return f'<h2>{escape(title)}</h2><div class="wide"><table><tr>{cells}</tr>{lines}</table></div>'
-
-
-def _image(path: Path) -> str:
-    data = base64.b64encode(path.read_bytes()).decode("ascii")
-    return f'<p><img alt="{escape(path.stem)}" src="data:image/png;base64,{data}"></p>'
-
-
-def _write(folder: Path, title: str, body: Sequence[str]) -> Path:
-    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-    style, lines = f"<title>{escape(title)}</title><style>{_STYLE}</style>", "\n".join(body)
-    path = folder / "index.html"
-    write_whole(path, f'<!doctype html><html lang="en">{head}{style}<h1>{escape(title)}</h1>{lines}</html>\n')
-    return path
+    return [Sentence(sentence, alarming=sentence.startswith(ALARMS)) for sentence in sentences]
 
 
 def _fit_figures(result: IdentificationResult) -> dict[str, Canvas]:

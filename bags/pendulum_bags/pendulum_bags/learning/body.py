@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pendulum_bags.arrays import Array
 from pendulum_bags.learning.task import VARIED
 from pendulum_lqr.policies.policy import coordinates_of
+from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.joint_steps import (
     COULOMB,
@@ -32,7 +33,6 @@ from pendulum_msgs_py.dynamics.joint_steps import (
 )
 from pendulum_msgs_py.dynamics.steps import actuator_torque
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Coordinates
 from pendulum_msgs_py.mechanisms import Mechanism
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
 from pendulum_msgs_py.plants.plant_differences import AnyPlant

@@ -18,8 +18,8 @@ from pendulum_lqr.controllers.policy import LearnedPolicy
 from pendulum_lqr.laws.policy_answers import START_TIME
 from pendulum_lqr.policies.policy import Policy
 from pendulum_msgs_py.contract.angles import from_upright
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_sim.stepping.joint_plant import JointPlant, joint_plant

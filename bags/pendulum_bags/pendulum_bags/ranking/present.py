@@ -13,8 +13,8 @@ from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.figures.table import Table
 from pendulum_bags.figures.terminal_table import number_table
+from pendulum_bags.pages.layer_page import write_layer_page
 from pendulum_bags.ranking.ranking import Ranking
-from pendulum_bags.report.layer_page import write_layer_page
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
 

@@ -10,9 +10,9 @@ from typing import Any
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
+from pendulum_bags.pages.html import render, script_json
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
-from pendulum_bags.report.html import render, script_json
 from pendulum_bags.report.provenance import emulator_table, provenance_table, seed_of, settings_table
 from pendulum_bags.report.wording import name_in
 from pendulum_bags.runs.run_data import stand_in_of, timing_warning

@@ -12,8 +12,8 @@ from pendulum_bags.comparison import Comparison
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
 from pendulum_bags.identification.thesis_figures import GRAVITY, INERTIA, UNITS, TrialSet
+from pendulum_bags.pages.layer_page import evidence_table
 from pendulum_bags.report.data import ReportData
-from pendulum_bags.report.layer_page import evidence_table
 from pendulum_bags.verdict import Layer, LayerResult, Mark
 from pendulum_bags.verdict.same_run import seen_note
 from pendulum_lqr.design_command.design_cli import THESIS_WEIGHTS

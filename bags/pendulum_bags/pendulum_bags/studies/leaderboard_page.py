@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.pages.html import encoded, render_plain
 from pendulum_bags.runs.run_folder import git_revision, versions
 from pendulum_bags.studies.leaderboard import (
     COSTS,
@@ -35,18 +35,14 @@ def write_page(path: Path, entries: Sequence[Entry], duration: float) -> Path:
         entries: The lines.
         duration: Length of each run [s].
     """
-    from jinja2 import Environment, PackageLoader, select_autoescape
-
-    environment = Environment(
-        loader=PackageLoader("pendulum_bags.studies", "templates"), autoescape=select_autoescape(["html", "j2"])
-    )
     plants: dict[str, list[dict[str, Any]]] = {entry.plant: [] for entry in entries}
     for entry in sorted(entries, key=lambda one: -one.scores.get(_ORDER, -math.inf)):
         plants[entry.plant].append(_row(entry))
     heads = [("controller", ""), ("up", ""), ("v1", ""), ("v2", ""), ("v3", "")]
     heads += [(cost.name.replace("_", " "), cost.unit) for cost in COSTS]
     heads += [(name.replace("_", " "), "%") for name in PERTURBATIONS]
-    text = environment.get_template("leaderboard.html.j2").render(
+    text = render_plain(
+        "leaderboard.html.j2",
         plants=plants,
         hardware=HARDWARE,
         heads=heads,
@@ -133,4 +129,4 @@ def _image(entry: Entry) -> str:
         axes.spines[["top", "right"]].set_visible(False)
     sink = io.BytesIO()
     canvas.savefig(sink, format="png", dpi=100)
-    return base64.b64encode(sink.getvalue()).decode()
+    return encoded(sink.getvalue())

@@ -20,9 +20,9 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.studies.mechanism_benchmark import criteria_of, score_v2, time_above_line
 from pendulum_lqr.swing_up.mechanism_controller import MechanismController
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
-from pendulum_msgs_py.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_sim.batches.compiling import compile_tree
 

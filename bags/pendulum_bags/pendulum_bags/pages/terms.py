@@ -184,14 +184,18 @@ _COMMANDS = re.compile(
 
 
 class Terms:
-    """Marks commands and terms in the texts of one page, and knows which terms the page used."""
+    """Marks commands and terms in the texts of one page, and knows which terms the page used.
 
-    def __init__(self) -> None:
+    Args:
+        explained: The terms, by the anchors of their sentences: those of comparisons, or none where words mean others.
+    """
+
+    def __init__(self, explained: Mapping[str, Term] = TERMS) -> None:
         self._used: set[str] = set()
         # The longest words first: "not equivalent" is no "equivalent".
-        ranked = sorted(TERMS.items(), key=lambda item: -len(item[1].words.split("|")[0]))
+        ranked = sorted(explained.items(), key=lambda item: -len(item[1].words.split("|")[0]))
         groups = "|".join(f"(?P<{key.replace('-', '_')}>{term.words})" for key, term in ranked)
-        self._words = re.compile(rf"(?<![\w-])(?:{groups})(?![\w-])")
+        self._words = re.compile(rf"(?<![\w-])(?:{groups or '(?!)'})(?![\w-])")
 
     @property
     def used(self) -> Iterable[tuple[str, Term]]:

@@ -14,15 +14,15 @@ from typing import Any
 
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.render_plotly import graphs_of
-from pendulum_bags.report.terms import Terms
+from pendulum_bags.pages.terms import Terms
 
-__all__ = ["render", "script_json"]
+__all__ = ["encoded", "render", "render_plain", "script_json"]
 
 
 def render(
     template: str, figures: Sequence[Figure], pictures: Mapping[str, bytes] = MappingProxyType({}), **content: Any
 ) -> str:
-    """Return a page.
+    """Return a page whose figures are plots.
 
     Args:
         template: Name of its template.
@@ -30,34 +30,46 @@ def render(
         pictures: The same as PNG by name, for paper and for readers without scripts.
         content: What else the template asks for.
     """
-    import jinja2
-
-    templates = resources.files("pendulum_bags.report").joinpath("templates")
-
-    def read(name: str) -> str:
-        return templates.joinpath(name).read_text(encoding="utf-8")
-
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(read), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
-    terms = Terms()
-    environment.filters["marked"] = terms.mark
     graphs = {
         figure.name: {f"{figure.name}-{i}": graph for i, graph in enumerate(graphs_of(figure))} for figure in figures
     }
-    return environment.get_template(template).render(
+    return _render(
+        template,
+        Terms(),
         **content,
         figures=figures,
-        pictures={name: base64.b64encode(picture).decode("ascii") for name, picture in pictures.items()},
-        terms=terms,
-        made_at=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        pictures={name: encoded(picture) for name, picture in pictures.items()},
         graph_names={name: list(parts) for name, parts in graphs.items()},
         graphs=script_json({name: graph for parts in graphs.values() for name, graph in parts.items()}),
         plotly=_packed_plotly(),
-        style=read("report.css"),
-        script=read("report.js"),
-        diagram=read("block_diagram.svg"),
+        script=_read("report.js"),
+        diagram=_read("block_diagram.svg"),
     )
+
+
+def render_plain(template: str, **content: Any) -> str:
+    """Return a page of text, tables and pictures, by a template and what it asks for; it explains no terms."""
+    return _render(template, Terms({}), **content)
+
+
+def _render(template: str, terms: Terms, **content: Any) -> str:
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_read), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["marked"] = terms.mark
+    return environment.get_template(template).render(
+        **content,
+        terms=terms,
+        made_at=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        style=_read("report.css"),
+    )
+
+
+def encoded(picture: bytes) -> str:
+    """Return a picture as a page holds it."""
+    return base64.b64encode(picture).decode("ascii")
 
 
 def script_json(value: Any) -> str:
@@ -70,3 +82,7 @@ def _packed_plotly() -> str:
     """Return plotly.js, gzipped and in base64: a third of its size, and browsers unpack gzip by themselves."""
     source = resources.files("plotly").joinpath("package_data").joinpath("plotly.min.js").read_bytes()
     return base64.b64encode(gzip.compress(source, 9, mtime=0)).decode("ascii")
+
+
+def _read(name: str) -> str:
+    return resources.files("pendulum_bags.pages").joinpath("templates").joinpath(name).read_text(encoding="utf-8")

@@ -8,7 +8,7 @@ from pathlib import Path
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
-from pendulum_bags.report.html import render
+from pendulum_bags.pages.html import render
 from pendulum_bags.verdict import LayerResult
 from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.whole_file import write_whole, writing
