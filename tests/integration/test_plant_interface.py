@@ -323,7 +323,14 @@ def test_twins_behind_one_frame_id_get_no_torque(any_peer: Peer, name: str) -> N
 
     peer.answer = both
     peer.told(lambda: "expected" in peer.diagnostics["reason"], "the conflict to be seen")
-    assert peer.applied[-1].effort[0] == 0.0
+    # Here diagnostics may be read before torques that were published before them.
+    since = time.time_ns()
+
+    def later() -> list[float]:
+        return [it.effort[0] for it in peer.applied if stamp_from_message(it.header.stamp) > since]
+
+    peer.until(lambda: len(later()) >= 10, "later torques")
+    assert not any(later())
     twin_node.destroy_publisher(twin)
     peer.stream(1.0)
     peer.until(lambda: peer.applied[-1].effort[0] == 1.0, "torque after the twin has gone")
@@ -416,7 +423,8 @@ def test_a_stop_signal_ends_torque_at_once_and_the_program_with_zero_torque_last
     assert "Traceback" not in plant.output
     peer.answer = None
     assert peer.driven_since(last) <= PERIODS_TO_ZERO
-    assert peer.diagnostics["mode"] == "disarmed"
+    # Said before the last torque, and on another topic: here a torque may be read first.
+    peer.until(lambda: peer.diagnostics["mode"] == "disarmed", "its last words")
     assert peer.diagnostics["reason"] == "plant ends"
 
 
