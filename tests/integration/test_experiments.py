@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -119,14 +120,16 @@ def test_lockstep_runs_of_a_policy_on_the_emulated_hardware_with_one_seed_are_id
 def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
     domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looks = 0
-    spent_at_look: list[float] = []
+    looks, newest, now, asking = 0, 0, 0.0, False
     counts: list[int] = []
+    recorders: list[RecorderClient] = []
     wait_for, received = Conductor.wait_for, RecorderClient.received
 
     def noted(conductor: Conductor, what: str, *arguments: Any, **more: Any) -> Any:
         nonlocal looks
         looks += what == "the end of a run of 20 s of simulated time"
+        if looks and not recorders:
+            recorders.append(RecorderClient(conductor, "/sim"))
         return wait_for(conductor, what, *arguments, **more)
 
     def counted(recorder: RecorderClient, topic: str) -> int:
@@ -134,30 +137,35 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
         return counts[-1]
 
     def hold() -> None:
-        """Let the plant compute for a tenth of a second before the first look and the second, and not before the third.
+        """Let the plant go on until enough has come for the first look and the second, and not before the third.
 
-        Ten states take it a twentieth of that; a run at full speed would only cost more.
+        When all of it has been counted, the time of a look is over, however late others are; a run at full speed would
+        only cost more.
         """
-        if not looks:
+        nonlocal now, newest, asking
+        if not looks or asking:
             return
         assert looks < 10, "a run that stands still is taken for a live one"
+        # To ask is to wait, which calls this again.
+        asking = True
+        before, newest = newest, received(recorders[0], "/sim/joint_states")
+        asking = False
         simulator = _program("simulator")
-        spent = sum(simulator.cpu_times()[:2])
-        if looks > len(spent_at_look):
-            spent_at_look.append(spent)
-        if looks < 3 and spent < spent_at_look[-1] + 0.1:
+        if looks < 3 and newest < sum(counts[-1:]) + 10:
             simulator.resume()
-        else:
-            simulator.suspend()
+            return
+        simulator.suspend()
+        if newest == before:
+            now += lockstep._PATIENCE
 
     monkeypatch.setattr(Conductor, "wait_for", noted)
     monkeypatch.setattr(RecorderClient, "received", counted)
-    # Longer than a busy machine needs for ten states.
-    monkeypatch.setattr(lockstep, "_PATIENCE", 1.5)
+    monkeypatch.setattr(lockstep, "time", SimpleNamespace(monotonic=lambda: now))
     # The conductor knows the state of one joint only, and looks away from any.
     spec = JointRun(JointSettings("cart_pole", duration=20.0), "sim", "cart_pole", "cart_pole")
     with pytest.raises(
-        FaultError, match=r"waited 1\.5 s for 10 more states of a run of 20 s of simulated time, in vain"
+        FaultError,
+        match=rf"waited {lockstep._PATIENCE:g} s for 10 more states of a run of 20 s of simulated time, in vain",
     ):
         lockstep.record_run(tmp_path / "frozen", spec, on_wait=hold)
     # Patience counts from the last look. A recorder that a busy machine keeps waiting has states to count after the
