@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import SetParametersAtomically
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
@@ -57,6 +57,11 @@ class Twins(GraphPeer):
             self.until(lambda: [len(each) for each in self.answers] >= counts, "answers of both")
         else:
             self.spin(0.15)
+            # Nor may one that stood still meanwhile find the next in its place.
+            for space in ("/a", "/b"):
+                self.call(
+                    GetParameters, f"{space}/controller/get_parameters", GetParameters.Request(names=["compiled"])
+                )
         assert [len(each) for each in self.answers] == counts
 
     def counted(self) -> list[dict[str, str]]:

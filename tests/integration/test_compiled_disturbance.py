@@ -6,6 +6,7 @@ import json
 from contextlib import closing
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -64,6 +65,10 @@ def test_torques_and_events_are_the_same_compiled_and_interpreted(processes: Pro
                 peer.until(lambda: [len(heard) for heard in torques] >= counts, "answers of both")
             else:
                 peer.spin(0.1)
+                # One that stood still meanwhile would find the next in its place, and refuse one state less.
+                for space in _SPACES:
+                    asked = GetParameters.Request(names=["compiled"])
+                    peer.call(GetParameters, f"{space}/disturbance/get_parameters", asked)
             assert [len(heard) for heard in torques] == counts
 
         for k, stamp_ns in enumerate(_stamps()):
