@@ -169,8 +169,7 @@ def test_lifecycle_moves_states_and_torque_and_a_signal_ends_torque_at_once_and_
     assert not lab.states
     assert lab.change(Transition.TRANSITION_ACTIVATE)
     lab.until(lambda: len(lab.states) > 20, "states", 30.0)
-    assert lab.call(SetBool, "bridge/arm", SetBool.Request(data=True)).success
-    assert lab.truth.status()["strategy"] == Strategy.DIRECT_PWM
+    lab.until(lambda: lab.armed() and lab.truth.status()["strategy"] == Strategy.DIRECT_PWM, "an armed bridge")
     assert lab.change(Transition.TRANSITION_DEACTIVATE)
     assert lab.truth.status()["strategy"] == Strategy.OFF
     _is_refused_as_inactive(lab)
@@ -239,7 +238,8 @@ def test_who_has_not_heard_the_last_words_does_not_keep_a_signal_from_releasing_
 
 
 def test_after_sigkill_the_command_lifetime_ends_torque(lab: Lab) -> None:
-    bridge = lab.bridge()
+    # A commander that a busy machine keeps waiting, this process, is not to end torque before.
+    bridge = lab.bridge("command_timeout:=1.0", "feedback_watchdog:=50")
     lab.drive()
     before = lab.truth.status()
     assert before["strategy"] == Strategy.DIRECT_PWM
