@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
@@ -18,9 +19,13 @@ __all__ = ["JointsPeer"]
 
 
 class JointsPeer(GraphPeer):
-    """Hears one plant and answers each of its states with what it is told to."""
+    """Hears one plant and answers each of its states with what it is told to.
 
-    def __init__(self) -> None:
+    Args:
+        states: Quality of service with which it hears states; by default the newest alone, as controllers do.
+    """
+
+    def __init__(self, states: QoSProfile = qos.NEWEST_STATE) -> None:
         super().__init__("peer", namespace="sim")
         self.states: list[JointState] = []
         self.applied: list[JointState] = []
@@ -29,7 +34,7 @@ class JointsPeer(GraphPeer):
         self.answer: dict[str, Any] | None = None
         self.commands = self.node.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
         self.trajectories = self.node.create_publisher(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
-        self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE)
+        self.node.create_subscription(JointState, names.JOINT_STATES, self._on_state, states)
         self.node.create_subscription(JointState, names.APPLIED_EFFORT, self.applied.append, qos.STATE)
         self.node.create_subscription(
             String, names.EVENTS, lambda message: self.events.append(json.loads(message.data)), qos.EVENTS

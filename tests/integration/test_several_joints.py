@@ -26,7 +26,8 @@ JOINTS = ["shoulder", "elbow"]
 
 @pytest.fixture
 def peer(domain_id: int) -> Iterator[JointsPeer]:
-    with closing(JointsPeer()) as peer:
+    # All states: a test that a busy machine keeps waiting would miss the first ones, and could miss the last.
+    with closing(JointsPeer(qos.STATE)) as peer:
         yield peer
 
 
