@@ -124,8 +124,9 @@ def test_it_is_stamped_armed_driven_limited_moved_and_stopped(adopted: Peer) -> 
     start = peer.states[-1].position[0]
     peer.moves.publish(trajectory_to_message(from_points([0.0, 4.0], [start, 2.2], [0.0, 0.0])))
     peer.until(lambda: "holding" in peer.diagnostics["reason"], "the end of the move")
-    # Past a right angle, where theirs wraps; slow enough for 13 N m against 11.77 N m s/rad.
-    assert peer.states[-1].position[0] == pytest.approx(2.2, abs=0.05)
+    # Past a right angle, where theirs wraps; slow enough for 13 N m against 11.77 N m s/rad. A robot that a busy
+    # machine keeps waiting is behind.
+    peer.until(lambda: abs(peer.states[-1].position[0] - 2.2) < 0.05, "the place")
     assert peer.ask("e_stop").success
     peer.until(lambda: peer.sent[-1] == 0.0, "zero torque after the e-stop")
     count = len(peer.sent)
@@ -160,7 +161,8 @@ def test_a_robot_that_dies_is_a_fault_a_new_one_gets_no_torque_by_itself_and_the
     pair.adopter.send_signal(signal.SIGTERM)
     peer.until(lambda: pair.adopter.returncode is not None, "the end")
     assert pair.adopter.returncode == 0
-    assert peer.sent[-1] == 0.0
+    # It was sent before the end, and may be read here after it.
+    peer.until(lambda: peer.sent[-1] == 0.0, "zero torque at last")
 
 
 def test_states_that_are_not_finite_or_of_another_joint_are_refused(processes: ProcessGroup, peer: Peer) -> None:
