@@ -19,6 +19,7 @@ from pendulum_bags.console.console_node import Hub
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.ros import qos
+from tests.fixtures import wait_for
 from tests.graph_peer import GraphPeer
 
 FIRST, SECOND = "/first/plant", "/second/plant"
@@ -124,7 +125,8 @@ def test_a_reset_that_waits_takes_back_no_stop_that_is_pressed_after_it(lab: Lab
     asyncio.run(lab.hub.e_stop([FIRST]))
 
     def press_again() -> None:
-        time.sleep(0.1)
+        # Its thread has begun when it has taken the first stop back.
+        wait_for(lambda: not lab.hub._order.holds(FIRST), DEADLINE, "the reset to wait")
         asyncio.run(lab.hub.e_stop([FIRST]))
 
     assert "was told to stop again meanwhile" in lab.reset(FIRST, press_again)
