@@ -111,7 +111,7 @@ def test_ctrl_c_ends_the_parts_and_what_their_tests_started(processes: ProcessGr
     program.send_signal(signal.SIGINT)
     assert program.wait(60) == pytest.ExitCode.INTERRUPTED
     assert "interrupted" in program.output
-    assert processes.leftovers() == []
+    wait_for(lambda: not processes.leftovers(), 10, "the end of what they started, which sleeps for ten minutes")
 
 
 def test_each_file_of_tests_is_in_one_part() -> None:
