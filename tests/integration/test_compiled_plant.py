@@ -168,14 +168,19 @@ def test_in_real_time_it_runs_compiled_and_answers_whoever_calls(
         assert "rclpy" in mapped
         assert "llvmlite" not in mapped
         assert "numba" not in mapped
-        first = peer.diagnostics
-        peer.spin(1.2)
-        last = peer.diagnostics
-        cycles, compiled, accepted = (
-            int(last[key]) - int(first[key]) for key in ("cycles", "periods_compiled", "effort_command.accepted")
-        )
-        assert compiled > 0.5 * cycles > 0.0
-        assert accepted > 0.5 * cycles
+        first = last = peer.diagnostics
+
+        def is_ordinary() -> bool:
+            """Tell whether most periods of half a second or more were compiled, and most states answered in time."""
+            nonlocal first, last
+            first, last = last, peer.diagnostics
+            cycles, compiled, accepted = (
+                int(last[key]) - int(first[key]) for key in ("cycles", "periods_compiled", "effort_command.accepted")
+            )
+            return compiled > 0.5 * cycles > 0.0 and accepted > 0.5 * cycles
+
+        # A period that a busy machine lets begin late is Python's.
+        peer.until(lambda: peer.diagnostics is not last and is_ordinary(), "compiled periods, and answers to them")
         assert float(last["command_latency_p50_us"]) > 0.0
         # A service has its turn at once, in the middle of a slice.
         begun = time.monotonic()
