@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 import warnings
 from collections.abc import Iterator
@@ -97,6 +98,43 @@ def test_a_client_that_went_is_waited_for_once_where_another_is_there(server: Gr
         assert in_vain(caught) <= 1
     finally:
         peer.close()
+
+
+def test_who_was_answered_by_a_thread_that_then_stood_still_is_answered_again(domain_id: int) -> None:
+    """Such a thread has waited for as long as for a client that has gone."""
+    server = GraphPeer("runner", domain=domain_id)
+    node = PollingNode("server", context=server.context)
+    service = node.create_service(Trigger, "~/ask", lambda _, response: response)
+    answer_who_listens(node)
+    answers = service.send_response.__self__
+    send, stalls, ends = answers._send, [0.12], threading.Event()
+
+    def send_and_stall(response: Trigger.Response, header: object) -> None:
+        send(response, header)
+        time.sleep(stalls.pop() if stalls else 0.0)
+
+    def serve() -> None:
+        while not ends.is_set():
+            server.spin_once()
+
+    answers._send = send_and_stall
+    node.poll_services()
+    server.executor.add_node(node)
+    peer = GraphPeer("asker", domain=domain_id)
+    client = peer.node.create_client(Trigger, "/server/ask")
+    serving = threading.Thread(target=serve)
+    serving.start()
+    try:
+        peer.until(client.service_is_ready, "the service")
+        for number in range(2):
+            future = client.call_async(Trigger.Request())
+            peer.until(future.done, f"answer {number}", 10.0)
+    finally:
+        ends.set()
+        serving.join()
+        node.destroy_node()
+        peer.close()
+        server.close()
 
 
 @pytest.mark.parametrize("told", [True, False], ids=["told by the middleware", "looked for"])

@@ -96,10 +96,11 @@ class _Answers:
         if self._follows_gone(header):
             self._gone = header.request_id.sequence_number
             return
-        began = time.monotonic()
+        # A client that has gone asked before that; who asks later has been answered, by a thread that was kept waiting.
+        began, began_ns = time.monotonic(), time.time_ns()
         self._send(response, header)
         if time.monotonic() - began > _WAITED:
-            self._gone, self._gone_ns = header.request_id.sequence_number, time.time_ns()
+            self._gone, self._gone_ns = header.request_id.sequence_number, began_ns
 
     def _follows_gone(self, header: Any) -> bool:
         """Tell whether a request is the next of a client that has just been waited for in vain."""
