@@ -38,7 +38,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 _ME = "/peer"
-_PERIOD_NS = 40_000_000
+_PERIOD_NS = 100_000_000
 """Long, for a busy machine."""
 _STATES, _APPLIED = 101, 102
 _NONE_LEFT, _OK, _ERROR = 401, 0, 1
