@@ -31,7 +31,7 @@ from tests.refusals import Refused, not_refused
 
 STATE = {"position": math.pi + 0.1, "velocity": 0.2, "effort": 0.0}
 # A busy machine delivers states late; how old is too old is judged by tests that need no middleware.
-PATIENT = "state_timeout:=2.0"
+PATIENT = "state_timeout:=60.0"
 ANSWER = -(33.345265 * 0.1 + 0.158993 * 0.2)
 
 
@@ -41,6 +41,7 @@ class FakePlant(GraphPeer):
     def __init__(self) -> None:
         super().__init__("plant", namespace="/sim")
         self.states = self.node.create_publisher(JointState, "joint_states", qos.STATE)
+        self.published: list[int] = []
         self.commands: list = []
         self.disturbances: list = []
         self.arrays: list[float] = []
@@ -61,6 +62,7 @@ class FakePlant(GraphPeer):
     def publish(self, stamp_ns: int | None = None, **state: float) -> int:
         stamp = time.time_ns() if stamp_ns is None else stamp_ns
         self.states.publish(encode_joint_state(stamp, **(STATE | state)))
+        self.published.append(stamp)
         return stamp
 
     def run(self, count: int, period: float = 0.005) -> list[int]:
@@ -70,6 +72,22 @@ class FakePlant(GraphPeer):
             self.spin(period)
         self.spin(0.1)
         return stamps
+
+    def run_until(self, predicate: Callable[[], object], what: str) -> None:
+        """Publish states until something is seen: whoever answers them may be kept waiting meanwhile."""
+
+        def seen() -> object:
+            self.publish()
+            self.spin(0.005)
+            return predicate()
+
+        self.until(seen, what)
+
+    def answer(self) -> float:
+        """Publish states until one of them is answered, and return the answer [N m]."""
+        before = len(self.published)
+        self.run_until(lambda: self.commands and self.commands[-1].stamp_ns in self.published[before:], "an answer")
+        return self.commands[-1].effort[0]
 
     def connect(self, nodes: int = 1) -> None:
         self.until(lambda: self.states.get_subscription_count() >= nodes, "subscriptions")
@@ -123,40 +141,40 @@ def test_a_design_while_running_makes_no_plant_wait(plant, processes):
 def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(plant, processes):
     program = processes.start("pendulum_lqr", "controller", *ros(PATIENT), alone=True)
     program.wait_for_output(r"lqr for plant thesis: K = \[33\.345265, 0\.158993\]", 30)
-    plant.until(lambda: plant.publish() and plant.commands, "the first answer")
-    plant.spin(0.5)
-    plant.commands.clear()
-    stamps = plant.run(60, period=0.01)
+
+    def each_is_answered() -> bool:
+        # But for the last few, which may be on their way.
+        lately = plant.published[-23:-3]
+        return len(lately) == 20 and {*lately} <= {command.stamp_ns for command in plant.commands}
+
+    # Only the newest state is kept, so a busy machine may skip some now and then; none is answered twice.
+    plant.run_until(each_is_answered, "twenty states that are all answered")
     answered = [command.stamp_ns for command in plant.commands]
-    # Only the newest state is kept, so a busy machine may skip some; none is answered twice.
-    assert len(answered) >= 30
     assert answered == sorted(set(answered))
-    assert set(answered) <= set(stamps)
+    assert {*answered} <= {*plant.published}
     assert plant.commands[0].frame_id == "/sim/controller"
     assert all(command.effort[0] == pytest.approx(ANSWER, abs=1e-5) for command in plant.commands)
     assert all(not command.position and not command.velocity for command in plant.commands)
     # What must not be answered, one state at a time because only the newest is kept.
-    plant.spin(0.5)
+    plant.until(lambda: plant.commands[-1].stamp_ns == plant.published[-1], "the answer to the last state")
     count = len(plant.commands)
-    for state in ({"stamp_ns": time.time_ns() - 10**10}, {"position": math.nan}):
+
+    def refused(reason: str) -> object:
+        return plant.diagnostics.get("/sim/controller: controller", {}).get(f"refused.{reason}")
+
+    for reason, state in (("stale", {"stamp_ns": time.time_ns() - 10**11}), ("not_finite", {"position": math.nan})):
         plant.publish(**state)
-        plant.spin(0.3)
+        plant.until(lambda reason=reason: refused(reason), f"diagnostics of a state that is {reason}")
     assert len(plant.commands) == count
-    told = plant.until(
-        lambda: (d := plant.diagnostics.get("/sim/controller: controller", {})).get("refused.not_finite") and d,
-        "diagnostics of the refusals",
-    )
-    assert (told["refused.stale"], told["refused.not_finite"]) == ("1", "1")
+    assert (refused("stale"), refused("not_finite")) == ("1", "1")
     # A change designs aside and swaps; a bad value leaves the old gain in force and says why.
-    refused = plant.set_parameters("controller", q=[1.0, 0.01, 5.0])
-    assert not refused.successful
-    assert refused.reason.startswith("q has the shape (3,); expected (2,)")
+    bad = plant.set_parameters("controller", q=[1.0, 0.01, 5.0])
+    assert not bad.successful
+    assert bad.reason.startswith("q has the shape (3,); expected (2,)")
     assert not plant.set_parameters("controller", r=-1.0).successful
-    plant.run(3)
-    assert plant.commands[-1].effort[0] == pytest.approx(ANSWER, abs=1e-5)
+    assert plant.answer() == pytest.approx(ANSWER, abs=1e-5)
     assert plant.set_parameters("controller", q=[1.0, 0.01]).successful
-    plant.run(3)
-    assert plant.commands[-1].effort[0] == pytest.approx(-(5.257900 * 0.1 + 0.028783 * 0.2), abs=1e-5)
+    assert plant.answer() == pytest.approx(-(5.257900 * 0.1 + 0.028783 * 0.2), abs=1e-5)
     assert not plant.set_parameters("controller", plant="dfki").successful
     program.send_signal(signal.SIGTERM)
     assert program.wait(15) == 0
@@ -191,7 +209,8 @@ def test_the_period_is_taken_from_the_states_or_refused_where_the_loop_would_be_
         lambda: (d := plant.diagnostics.get("/sim/controller: controller", {})).get("measured_period") != "nan" and d,
         "the measured period",
     )
-    assert told["period"] == told["measured_period"]
+    # States that were missed meanwhile may have changed what is measured; what is assumed without is far from both.
+    assert float(told["period"]) == pytest.approx(float(told["measured_period"]), rel=0.6)
     program.send_signal(signal.SIGTERM)
     assert program.wait(15) == 0
 
@@ -278,18 +297,14 @@ def test_a_manager_can_hold_the_controller_and_deactivation_sends_zero(plant, pr
     plant.run(5)
     assert not plant.commands
     assert change(Transition.TRANSITION_ACTIVATE)
-    plant.run(10)
-    assert plant.commands
-    assert plant.commands[-1].effort[0] != 0.0
+    assert plant.answer() != 0.0
     assert change(Transition.TRANSITION_DEACTIVATE)
-    plant.spin(0.2)
-    assert plant.commands[-1].effort[0] == 0.0
+    plant.until(lambda: plant.commands[-1].effort[0] == 0.0, "the last zero")
     count = len(plant.commands)
     plant.run(5)
     assert len(plant.commands) == count
     assert change(Transition.TRANSITION_ACTIVATE)
-    plant.run(5)
-    assert len(plant.commands) > count
+    assert plant.answer() != 0.0
     program.interrupt()
     assert program.wait(15) == 0
 
@@ -318,7 +333,16 @@ def test_the_disturbance_follows_seed_and_stamp_between_start_and_end_and_a_stop
 ):
     program = processes.start("pendulum_lqr", "disturbance", *ros("seed:=7", "duration:=0.2"))
     plant.until(lambda: plant.publish() and plant.disturbances, "the first answer")
-    plant.run(20, period=0.01)
+    # Stamps of a steady plant: a state is followed by the next once it is answered, however long that takes.
+    stamps = itertools.count(time.time_ns(), 10_000_000)
+
+    def answer(count: int) -> None:
+        for stamp in itertools.islice(stamps, count):
+            plant.until(
+                lambda stamp=stamp: plant.publish(stamp) and plant.disturbances[-1].stamp_ns == stamp, "an answer"
+            )
+
+    answer(20)
     assert all(answer.effort[0] == 0.0 for answer in plant.disturbances)
     assert plant.call(Trigger, "disturbance/start", Trigger.Request()).success
     assert not plant.call(Trigger, "disturbance/start", Trigger.Request()).success
@@ -326,7 +350,7 @@ def test_the_disturbance_follows_seed_and_stamp_between_start_and_end_and_a_stop
     assert not running.successful
     assert "is running; expected ~/stop before a change" in running.reason
     count = len(plant.disturbances)
-    plant.run(60, period=0.01)
+    answer(30)
     plant.until(lambda: len(plant.events) >= 2, "both events")
     begin, end = plant.events
     assert (begin["name"], end["name"]) == ("noise_start", "noise_end")
@@ -335,15 +359,15 @@ def test_the_disturbance_follows_seed_and_stamp_between_start_and_end_and_a_stop
     signal_7 = make_disturbance({"seed": 7})
     allowed = {signal_7(k * 10_000_000) for k in range(21)}
     during = [a for a in plant.disturbances[count:] if begin["stamp_ns"] <= a.stamp_ns < end["stamp_ns"]]
-    assert len(during) >= 5
-    assert {answer.effort[0] for answer in during} <= allowed
-    assert end["stamp_ns"] - begin["stamp_ns"] >= 200_000_000
+    assert len(during) == 20
+    assert {a.effort[0] for a in during} <= allowed
+    assert end["stamp_ns"] - begin["stamp_ns"] == 200_000_000
     assert all(a.effort[0] == 0.0 for a in plant.disturbances if a.stamp_ns >= end["stamp_ns"])
     assert plant.set_parameters("disturbance", kind="step", duration=60.0).successful
 
     plant.events.clear()
     assert plant.call(Trigger, "disturbance/start", Trigger.Request()).success
-    plant.until(lambda: plant.publish() and plant.disturbances[-1].effort[0] == 2.5, "the step")
+    plant.until(lambda: plant.publish(next(stamps)) and plant.disturbances[-1].effort[0] == 2.5, "the step")
     program.send_signal(signal.SIGTERM)
     assert program.wait(15) == 0
     plant.until(lambda: plant.disturbances[-1].effort[0] == 0.0, "the last zero")
