@@ -116,6 +116,8 @@ def test_a_recording_holds_everything_and_says_so(tmp_path: Path, node: Node, pr
         shared[index % 2].publish(Float64(data=float(index)))
         time.sleep(0.001)
     events.publish(event_message(6, "hold"))
+    # A recorder that is late would read the new value first, and there would be no change to tell of.
+    wait_for(lambda: "/source" in read_bag(bag).metadata.get("pendulum.parameters", {}), 60.0, "the values of before")
     node.set_parameters([Parameter("gain", value=[3.0, 4.0])])
     status = wait_until_received(
         node,
