@@ -97,11 +97,16 @@ def test_slow_steps_are_told_from_one_pause() -> None:
 def test_a_step_that_does_not_come_back_is_noticed_and_a_quick_one_is_not() -> None:
     stalled = threading.Event()
     watch = StallWatch(0.1, stalled.set)
+    longest = 0.0
     for _ in range(100):
+        began = time.monotonic()
         with watch:
             time.sleep(0.002)
-    assert not stalled.is_set()
-    with watch:
+        longest = max(longest, time.monotonic() - began)
+    # On a busy machine one of them may have taken as long as none may.
+    assert not stalled.is_set() or longest > 0.1
+    stalled.clear()
+    with StallWatch(0.1, stalled.set):
         assert stalled.wait(10.0)
     unused = StallWatch(0.1, stalled.clear)
     unused.close()
