@@ -38,13 +38,13 @@ class Running:
         self.actuator = EmulatedX5(parameters, seed=1, start_ns=clock.now_ns())
         self.port = EmulatorBackend(self.actuator, clock)
         self.supervisor = SharedSupervisor(
-            PlantLimits(effort=(13.0,), command_timeout=0.5, feedback_timeout=0.5), self._prepare
+            PlantLimits(effort=(13.0,), command_timeout=5.0, feedback_timeout=5.0), self._prepare
         )
         self.module = DrivenModule(
             self.port,
             EffortMapping(EffortStrategy.DIRECT_PWM, parameters.drivetrain),
-            SafetyMonitor(SafetyLimits(feedback_cycles=50), 0.01, parameters.drivetrain),
-            BridgeSettings(gains=DEFAULT_GAINS[3], command_lifetime=1.0),
+            SafetyMonitor(SafetyLimits(feedback_cycles=500), 0.01, parameters.drivetrain),
+            BridgeSettings(gains=DEFAULT_GAINS[3], command_lifetime=5.0),
         )
         self.bridge = Bridge([self.module], self.supervisor)
         self.states: list[JointSample] = []
@@ -439,10 +439,10 @@ def test_an_error_of_a_job_goes_to_its_caller(running: Running) -> None:
 
 
 def test_a_job_for_a_busy_thread_ends_in_time(running: Running) -> None:
-    busy = threading.Event()
-    thread = threading.Thread(target=lambda: running.loop.call(lambda: busy.wait(5.0)))
+    begun, busy = threading.Event(), threading.Event()
+    thread = threading.Thread(target=lambda: running.loop.call(lambda: (begun.set(), busy.wait(20.0))))
     thread.start()
-    time.sleep(0.05)
+    assert begun.wait(20.0)
     with pytest.raises(ActuatorError, match=r"did not answer within 0\.05 s"):
         running.loop.call(lambda: None, timeout=0.05)
     busy.set()
