@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from pendulum_hw_bridge.backends import emulator_process
+from pendulum_hw_bridge.backends import hebi as hebi_backend
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_hw_bridge.backends.hebi import HebiBackend
@@ -51,7 +53,11 @@ def hebi_on(where: str) -> HebiBackend:
 
 
 @pytest.fixture(params=["emulator", "emulator_process", "replay", "hebi", "hebi_emulated"])
-def port(request: pytest.FixtureRequest) -> Iterator[ActuatorPort]:
+def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[ActuatorPort]:
+    # The emulator's thread may have to wait for a core; how long a stop waits is no part of the contract.
+    monkeypatch.setattr(emulator_process, "_STOP_PATIENCE", 5.0)
+    monkeypatch.setattr(hebi_backend, "STOP_ACKNOWLEDGE_MS", 5000)
+    monkeypatch.setattr(hebi_backend, "ACKNOWLEDGE_MS", 5000)
     if request.param not in {"emulator_process", "hebi_emulated"}:
         makers: dict[str, Callable[[], ActuatorPort]] = {
             "emulator": emulator,
