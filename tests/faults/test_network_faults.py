@@ -89,7 +89,7 @@ def test_cable_delays_and_loses_what_it_is_told_to() -> None:
                 echo.stdout.close()
 
 
-def _ask(namespace: str, *, patience: float = 0.2) -> tuple[float, int]:
+def _ask(namespace: str, *, patience: float = 5.0) -> tuple[float, int]:
     done = subprocess.run(
         ["ip", "netns", "exec", namespace, sys.executable, "-c", _ASK, str(patience)],
         capture_output=True,

@@ -189,9 +189,11 @@ def wait_for_torque(bag: Path, processes: ProcessSet, since_ns: int) -> None:
 def _report(bag: Path, duration: float, pulled_ns: int, plugged_ns: int) -> CutReport:
     with read_bag(bag) as opened:
         applied = opened.array("/sim/applied_effort")
-        commands = opened.log_times("/sim/effort_command")
-    times, efforts = applied["log_time_ns"], applied["effort"]
-    last = int(commands[commands < plugged_ns][-1])
+        commands = opened.array("/sim/effort_command")
+    # By the plant's own clock, on which a command has the stamp of the state that it answers: a recorder that is kept
+    # waiting adds nothing.
+    times, efforts = applied["stamp_ns"], applied["effort"]
+    last = int(commands["stamp_ns"][commands["log_time_ns"] < plugged_ns][-1])
     during = (times > max(last, pulled_ns)) & (times < plugged_ns) & (efforts != 0.0)
     back = times[(times > plugged_ns) & (efforts != 0.0)]
     return CutReport(
