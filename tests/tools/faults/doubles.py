@@ -216,8 +216,9 @@ def start_in_order(system: LiveSystem, order: tuple[str, ...], *, one_by_one: bo
     outcome = Outcome()
     for complaint in system.finish_all():
         outcome.demand(False, complaint)
+    # What the ones before said last may come later still: it is told by its stamp.
+    ended_ns = time.time_ns()
     system.listen(0.1)
-    heard = len(system.applied)
     controlled = float("inf")
     for name in order:
         if name == "controller":
@@ -227,7 +228,11 @@ def start_in_order(system: LiveSystem, order: tuple[str, ...], *, one_by_one: bo
         if one_by_one:
             system.wait_for(f"{name} to be on the graph", partial(system.is_on_graph, name), START_TIMEOUT)
     system.wait_for("torque to flow", system.torque_flows, START_TIMEOUT)
-    early = [applied for applied in system.applied[heard:] if applied.when < controlled and applied.effort != 0.0]
+    early = [
+        applied
+        for applied in system.applied
+        if applied.stamp_ns > ended_ns and applied.when < controlled and applied.effort != 0.0
+    ]
     outcome.demand(not early, f"{len(early)} torques before there was a controller")
     # A recorder may meet the controller later than the plant does: before, it has only half of what is judged.
     system.wait_for("torque and commands to be recorded", partial(_has_torque_and_commands, system), START_TIMEOUT)
