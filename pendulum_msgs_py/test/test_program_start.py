@@ -121,7 +121,8 @@ def test_an_interrupt_is_not_lost_where_python_drops_what_is_raised(where: str) 
         run.send_signal(signal.SIGINT)
         rest, error = run.communicate(timeout=50.0)
     assert run.returncode == EXIT_INTERRUPTED
-    assert rest == b"went on\n"
+    # It goes on for the hundredth of a second until it is interrupted once more; without a core, it says nothing in it.
+    assert rest in {b"went on\n", b""}
     assert error == b"interrupted\n"
 
 
