@@ -65,15 +65,17 @@ def handles_signals(argv):
     return 0
 
 def leaves_middleware(argv):
+    named = threading.Event()
     def receive():
         ctypes.CDLL(None).prctl(15, b"dds.udp.7400", 0, 0, 0)
+        named.set()
         time.sleep(60)
     threading.Thread(target=receive, daemon=True).start()
-    time.sleep(0.2)
-    return 0
+    return 0 if named.wait(20) else 1
 
 def starts_thread(argv):
-    threading.Thread(target=time.sleep, args=(0.5,)).start()
+    # It ends with the process, and no sooner.
+    threading.Thread(target=threading.main_thread().join).start()
     return 0
 
 def takes_priority(argv):
