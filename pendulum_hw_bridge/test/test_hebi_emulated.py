@@ -88,7 +88,10 @@ def test_who_looks_does_not_stop_a_motor_that_another_drives(served: Served) -> 
     assert served.actuator.strategy is Strategy.DIRECT_PWM
 
 
-def test_a_command_brings_what_it_has_and_nothing_else(served: Served) -> None:
+def test_a_command_brings_what_it_has_and_nothing_else(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The module's thread may have to wait for a core.
+    monkeypatch.setattr(backend_module, "ACKNOWLEDGE_MS", 5000)
+    monkeypatch.setattr(backend_module, "STOP_ACKNOWLEDGE_MS", 5000)
     port = HebiBackend(make_group=lambda: EmulatedGroup(served.where, hebi))
     port.connect()
     port.set_limits(HardwareLimits(effort=2.0, velocity=1.0, m_stop=MStopAction.HOLD_POSITION))
