@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shlex
@@ -55,7 +56,12 @@ def run_command(words: Sequence[str], *more: str) -> None:
 
 def _program(name: str) -> psutil.Process:
     """Return the process of a program that this process has started, and that has it to itself."""
-    return next(one for one in psutil.Process().children(recursive=True) if name in one.cmdline())
+    for one in psutil.Process().children(recursive=True):
+        # One may end while it is asked.
+        with contextlib.suppress(psutil.Error):
+            if name in one.cmdline():
+                return one
+    raise LookupError(f"no {name} runs")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -189,11 +195,11 @@ def test_a_run_of_which_the_recorder_was_told_nothing_on_a_topic_fails_and_names
 
     monkeypatch.setattr(HostPool, "start", start_deaf)
     monkeypatch.setattr(RecorderClient, "heard", lambda recorder: {*heard(recorder), "/sim/disturbance"})
-    monkeypatch.setattr(RecorderClient.wait_for_all, "__defaults__", (1.0,))
+    monkeypatch.setattr(RecorderClient.wait_for_all, "__defaults__", (3.0,))
     # The recorder is no listener of it.
     monkeypatch.setitem(lockstep._RUN_LISTENERS, "disturbance", 1)
     spec = lockstep.lockstep_spec(RegulationSettings(noise=NoiseSettings(duration=0.2)), side="sim")
-    with pytest.raises(FaultError, match=r"the recorder has 0 of 100 messages of /sim/disturbance after 1 s"):
+    with pytest.raises(FaultError, match=r"the recorder has 0 of 100 messages of /sim/disturbance after 3 s"):
         lockstep.record_run(tmp_path / "run", spec, hosts=hosts)
 
 

@@ -162,7 +162,7 @@ _MODEL = """
 
 def _await(peer: Peer, program: RunningProgram) -> RunningProgram:
     peer.until(
-        lambda: peer.states and peer.diagnostics and peer.command.get_subscription_count() == 1, "the plant", 20.0
+        lambda: peer.states and peer.diagnostics and peer.command.get_subscription_count() == 1, "the plant", 60.0
     )
     return program
 

@@ -83,7 +83,9 @@ def begin(processes: ProcessGroup, lab: Laboratory, folder: Path) -> RunningProg
         "--duration", "1", "--budget", "0", "--simulation", "ros:/lab", "--plant", plant, "--hardware", model, "--yes",
         alone=True,
     )  # fmt: skip
-    lab.peer.until(lambda: run.returncode is not None or lab.peer.states[-1].position[0] > before + 0.1, "the way up")
+    lab.peer.until(
+        lambda: run.returncode is not None or lab.peer.states[-1].position[0] > before + 0.1, "the way up", 90.0
+    )
     assert run.returncode is None, run.output
     return run
 
