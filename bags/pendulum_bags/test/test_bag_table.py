@@ -165,7 +165,7 @@ def test_answers_are_kept_by_all_packages_that_they_depend_on(tmp_path: Path, mo
         (tmp_path / package).mkdir()
     monkeypatch.setattr(bag_table.resources, "files", lambda package: tmp_path / package)
     seen = [bag_table.program_hash.__wrapped__()]
-    for changed in ("pendulum_lqr/linear/design.py", "pendulum_bags/margins.yaml", "pendulum_sim/design.py"):
+    for changed in ("pendulum_lqr/design.py", "pendulum_bags/margins.yaml", "pendulum_sim/design.py"):
         (tmp_path / changed).write_text("x")
         seen.append(bag_table.program_hash.__wrapped__())
     assert len(set(seen)) == 4
