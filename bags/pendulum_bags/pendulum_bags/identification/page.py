@@ -17,7 +17,7 @@ from pendulum_bags.identification.problem import simulate
 from pendulum_bags.identification.thesis import ThesisResult, trial_part
 from pendulum_bags.identification.thesis_figures import TrialSet, thesis_figures
 from pendulum_bags.pages.sheet import Sentence, write_sheet
-from pendulum_bags.runs.datasets import Recording
+from pendulum_bags.runs.datasets import Recording, distinct_names
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.result import IdentificationResult
@@ -92,7 +92,9 @@ def _told(sentences: Sequence[str]) -> list[Sentence]:
 def _fit_figures(result: IdentificationResult) -> dict[str, Canvas]:
     """Return the figures of an output-error fit: by recording, residual tests, friction models."""
     figures: dict[str, Canvas] = {}
-    for i, (piece, state) in enumerate(zip(result.fit.pieces, result.fit.chosen.solution.states, strict=True)):
+    names = distinct_names([piece.recording for piece in result.fit.pieces])
+    states = result.fit.chosen.solution.states
+    for i, (name, piece, state) in enumerate(zip(names, result.fit.pieces, states, strict=True)):
         recording = piece.recording
         simulated = simulate(result.model, piece, state)
         figure = Canvas(figsize=(9.0, 5.2), layout="constrained")
@@ -104,7 +106,7 @@ def _fit_figures(result: IdentificationResult) -> dict[str, Canvas]:
         top.plot(recording.time, theta, color=_SIMULATED, linewidth=0.9, label="simulated")
         top.set_ylabel("angle [rad]")
         top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
-        top.set_title(recording.name)
+        top.set_title(name)
         middle.plot(recording.time, 1e3 * (simulated.theta - recording.position), color=_SIMULATED, linewidth=0.7)
         middle.axhline(0.0, color="black", linewidth=0.5)
         middle.set_ylabel("residual [mrad]")
