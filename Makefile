@@ -97,7 +97,9 @@ types: $(VENV)/.linked $(VENV)/.extras $(VENV)/.checks $(VENV)/.test # Check typ
 imports: $(VENV)/.linked $(VENV)/.checks # Check which package and which module may import what
 	@$(VENV)/bin/lint-imports --no-logo $(ARGS)
 
+# Anew each time: colcon leaves a module that was moved or deleted where it has installed it, and it would run.
 build: $(VENV)/.run $(VENV)/.build # Build the packages with colcon into install/, as for ros2 run
+	@rm -rf $(foreach p,$(notdir $(PACKAGES)),build/$(p) install/$(p))
 	@$(VENV)/bin/colcon build --base-paths $(PACKAGES) $(ARGS)
 
 faults: venv # Attack the running system, count what it stood, print a table (tests/tools/faults; tests/faults has the short form)

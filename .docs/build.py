@@ -92,7 +92,7 @@ def for_the_site(text: str, page: str, gathered: set[str]) -> str:
 
 def reference() -> str:
     """Return the reference page, from the tables that the programs themselves read."""
-    from pendulum_lqr.laws.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
+    from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
     from pendulum_lqr.nodes.bringup import ARGUMENTS
     from pendulum_msgs_py.parameters import markdown_table
     from pendulum_msgs_py.programs.executables import summary

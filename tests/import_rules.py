@@ -76,9 +76,9 @@ class NoCirclesContract(Contract):
 
 
 class RoomsContract(Contract):
-    """Forbid imports in a circle between the rooms of a package, the folders right below it.
+    """Forbid imports in a circle between what lies side by side in a package or a room: rooms and modules.
 
-    A command line joins what stands beside it with what stands above, and may.
+    A command line joins what stands beside it with what stands above, and may, unless others than commands import it.
     """
 
     type_name = "rooms"
@@ -87,34 +87,40 @@ class RoomsContract(Contract):
     commands = fields.SetField(subfield=fields.StringField())
 
     def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
-        """Leave out, again and again, rooms that import none of the rest or that none imports; the rest is a circle."""
-        rooms = {
-            room for package in self.packages for room in graph.find_children(package) if graph.find_children(room)
-        }
+        """Look at each folder by itself: what lies in it imports each other one way."""
+        ours = {module for package in self.packages for module in {package, *graph.find_descendants(package)}}
+        commands = {module for module in ours if _matches(module, self.commands)}
+        free = {one for one in commands if not graph.find_modules_that_directly_import(one) - commands}
         imports = [
             (importer, imported)
-            for importer in graph.modules
-            if not graph.is_module_squashed(importer) and not _matches(importer, self.commands)
-            for imported in graph.find_modules_directly_imported_by(importer)
+            for importer in sorted(ours - free)
+            for imported in sorted(graph.find_modules_directly_imported_by(importer) & ours)
         ]
-        between: dict[str, dict[str, str]] = {room: {} for room in rooms}
-        for importer, imported in sorted(imports):
-            at, to = (".".join(module.split(".")[:2]) for module in (importer, imported))
-            if at != to and {at, to} <= rooms:
-                between[at].setdefault(to, f"{importer} imports {imported}")
-        left = set(rooms)
+        folders = sorted(module for module in ours if graph.find_children(module))
+        offences = [told for folder in folders for told in self._circle_within(folder, imports)]
+        return ContractCheck(kept=not offences, metadata={"offences": offences})
+
+    @staticmethod
+    def _circle_within(folder: str, imports: list[tuple[str, str]]) -> list[str]:
+        """Leave out, again and again, what imports none of the rest or what none imports; the rest is a circle."""
+        between: dict[str, dict[str, str]] = {}
+        depth = folder.count(".") + 2
+        for importer, imported in imports:
+            if all(module.startswith(f"{folder}.") for module in (importer, imported)):
+                at, to = (".".join(module.split(".")[:depth]) for module in (importer, imported))
+                if at != to:
+                    between.setdefault(at, {}).setdefault(to, f"{importer} imports {imported}")
+                    between.setdefault(to, {})
+        left = set(between)
         while gone := {
-            room
-            for room in left
-            if not between[room].keys() & left or not any(room in between[other] for other in left)
+            one for one in left if not between[one].keys() & left or not any(one in between[other] for other in left)
         }:
             left -= gone
-        circle = [told for room in sorted(left) for to, told in between[room].items() if to in left]
-        return ContractCheck(kept=not left, metadata={"circle": circle})
+        return [told for one in sorted(left) for to, told in between[one].items() if to in left]
 
     def render_broken_contract(self, check: ContractCheck) -> None:
-        """Name one import for each pair of rooms on a circle."""
-        for line in check.metadata["circle"]:
+        """Name one import for each pair on a circle."""
+        for line in check.metadata["offences"]:
             output.print_error(line, bold=False)
         output.print_error("expected: rooms that import each other one way; move what both need into one below them")
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pendulum_hw_bridge.bridge.e_stop_input import EStopInput
+from pendulum_hw_bridge.nodes.e_stop_input import EStopInput
 
 MS = 1_000_000
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.disturbances.disturbance import Disturbance
-from pendulum_lqr.laws.interface import Controller
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.laws.controller import BaseController, make_controller
+from pendulum_lqr.controller_interface.controller import BaseController, make_controller
 from pendulum_lqr.nodes.answering import AnswerLoop, StateRefusal
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.plants.plant_parameters import load_plant

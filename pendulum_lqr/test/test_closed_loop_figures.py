@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.design_command.design_cli import main
 from pendulum_lqr.design_command.time_figures import time_figures
-from pendulum_lqr.laws.controller import make_controller
 from pendulum_lqr.linear.analysis import loop_margins
 from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import linearise

@@ -9,10 +9,15 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from pendulum_lqr.controller_interface.controller import (
+    EstimatedVelocity,
+    SoftStart,
+    controller_parameters,
+    make_controller,
+)
+from pendulum_lqr.controller_interface.law import MOST_MEMORY, MOST_NUMBERS
+from pendulum_lqr.controller_interface.sampling import PeriodWatch, goes_on
 from pendulum_lqr.controllers.lqr import Lqr
-from pendulum_lqr.laws.controller import EstimatedVelocity, SoftStart, controller_parameters, make_controller
-from pendulum_lqr.laws.law import MOST_MEMORY, MOST_NUMBERS
-from pendulum_lqr.laws.sampling import PeriodWatch, goes_on
 from pendulum_lqr.nodes.answer_rules import judge_state
 from pendulum_lqr.nodes.compiled_controller import law_of
 from pendulum_msgs_py.contract.angles import deviation_from_upright, from_upright

@@ -9,11 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.controllers.nmpc import NonlinearMpc
-from pendulum_lqr.controllers.playback import Playback
-from pendulum_lqr.disturbances.disturbance import make_disturbance
-from pendulum_lqr.laws import controller as registry
-from pendulum_lqr.laws.controller import (
+from pendulum_lqr.controller_interface import controller as registry
+from pendulum_lqr.controller_interface.controller import (
     COMMON_PARAMETERS,
     CONTROLLERS,
     BaseController,
@@ -22,6 +19,9 @@ from pendulum_lqr.laws.controller import (
     make_controller,
     unwrapped,
 )
+from pendulum_lqr.controllers.nmpc import NonlinearMpc
+from pendulum_lqr.controllers.playback import Playback
+from pendulum_lqr.disturbances.disturbance import make_disturbance
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.linear.analysis import delayed_spectral_radius
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.linear.model import linearise

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pendulum_bags.experiments.joint_run import stand_in_for
+from pendulum_lqr.controller_interface.interface import JointController
+from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.controllers.joint_energy_swing_up import JointEnergySwingUp
-from pendulum_lqr.laws.interface import JointController
-from pendulum_lqr.laws.joint_controller import make_joint_controller
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.swing_up.energy_margin import EnergyMargin
 from pendulum_lqr.swing_up.mechanism_catch import make_mechanism_catch

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_lqr.nodes.answering import AnswerLoop

@@ -10,9 +10,9 @@ import control
 import numpy as np
 import pytest
 
+from pendulum_lqr.controller_interface.interface import JointController
+from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.controllers.joint_lqg import JointLqg
-from pendulum_lqr.laws.interface import JointController
-from pendulum_lqr.laws.joint_controller import make_joint_controller
 from pendulum_lqr.linear.design import DesignError, kalman_gain
 from pendulum_lqr.linear.mechanism_model import linearise_mechanism
 from pendulum_lqr.linear.sampled_design import discretise

@@ -12,8 +12,8 @@ import scipy.integrate
 import scipy.linalg
 import scipy.optimize
 
+from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.controllers.joint_mpc import JointMpc
-from pendulum_lqr.laws.joint_controller import make_joint_controller
 from pendulum_lqr.linear.mechanism_model import linearise_mechanism
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_lqr.nodes.answering import AnswerLoop

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.laws.controller import make_controller
-from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.policies.onnx_file import observation_names
 from pendulum_lqr.policies.policy_file import dumps_policy, load_policy, loads_policy, write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError

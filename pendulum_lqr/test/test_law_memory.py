@@ -5,7 +5,7 @@ import random
 import numpy as np
 import pytest
 
-from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT

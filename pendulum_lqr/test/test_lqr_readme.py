@@ -5,9 +5,14 @@ from pathlib import Path
 
 import pytest
 
+from pendulum_lqr.controller_interface.controller import (
+    COMMON_PARAMETERS,
+    CONTROLLERS,
+    controller_class,
+    make_controller,
+)
+from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS, joint_controller_class
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
-from pendulum_lqr.laws.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class, make_controller
-from pendulum_lqr.laws.joint_controller import JOINT_CONTROLLERS, joint_controller_class
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.nodes.answering import StateRefusal
 from pendulum_msgs_py.parameters import markdown_table

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.controllers.mechanism_controllers import DifferencedVelocity, make_mechanism_controller
-from pendulum_lqr.laws.joint_controller import make_joint_controller
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.swing_up import mechanism_catch, swing_up_cli

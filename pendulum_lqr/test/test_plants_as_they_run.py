@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.loop_check import growth
 from pendulum_lqr.disturbances.disturbance import make_disturbance
-from pendulum_lqr.laws.controller import make_controller
-from pendulum_lqr.laws.loop_check import growth
 from pendulum_lqr.linear.design import DesignError
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError

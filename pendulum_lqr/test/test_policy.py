@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.controllers.policy import LearnedPolicy
-from pendulum_lqr.laws.controller import make_controller
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.policies.policy import Network, fingerprint
 from pendulum_lqr.policies.policy_file import LARGEST_FILE, dumps_policy, load_policy, loads_policy, write_policy

@@ -23,7 +23,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.policies.convert_policy_cli import main
 from pendulum_lqr.policies.onnx_file import dumps_onnx, observation_names
 from pendulum_lqr.policies.policy_file import header_of, load_policy, write_policy

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.laws.controller import CONTROLLERS, make_controller
-from pendulum_lqr.laws.loop_check import settles
-from pendulum_lqr.laws.sampling import PeriodWatch, differs, rate_problem, uses_period
+from pendulum_lqr.controller_interface.controller import CONTROLLERS, make_controller
+from pendulum_lqr.controller_interface.loop_check import settles
+from pendulum_lqr.controller_interface.sampling import PeriodWatch, differs, rate_problem, uses_period
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 MS = 1_000_000

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pendulum_lqr.laws.controller import CONTROLLERS, controller_parameters, make_controller, unwrapped
+from pendulum_lqr.controller_interface.controller import CONTROLLERS, controller_parameters, make_controller, unwrapped
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.swing_up.minimum_time import minimum_time
 from pendulum_lqr.swing_up.trajectory_optimisation import swing_up_trajectory
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.loop_check import growth
 from pendulum_lqr.controllers.lqr_tracking import LqrTracking
-from pendulum_lqr.laws.controller import make_controller
-from pendulum_lqr.laws.loop_check import growth
 from pendulum_lqr.linear.design import DesignError, output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.reference import SHAPES, Reference

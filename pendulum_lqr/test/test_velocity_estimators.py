@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pendulum_lqr.laws.controller import make_controller
-from pendulum_lqr.laws.velocity import VELOCITY_ESTIMATORS, KalmanVelocity, SavitzkyGolay
+from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.velocity import VELOCITY_ESTIMATORS, KalmanVelocity, SavitzkyGolay
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant

@@ -8,9 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import grimp
 import pytest
 
 from tests.fixtures import PROJECT
+from tests.import_rules import RoomsContract
 
 FOLDERS = [
     "pendulum_msgs_py",
@@ -84,8 +86,8 @@ OFFENCES = {
     ),
     "theory that imports the controllers' table": (
         "pendulum_lqr/pendulum_lqr/linear/offender.py",
-        "import pendulum_lqr.laws.controller",
-        "pendulum_lqr.linear.offender -> pendulum_lqr.laws.controller",
+        "import pendulum_lqr.controller_interface.controller",
+        "pendulum_lqr.linear.offender -> pendulum_lqr.controller_interface.controller",
     ),
     "stepped plants that import the simulator's engines": (
         "pendulum_sim/pendulum_sim/stepping/offender.py",
@@ -96,6 +98,16 @@ OFFENCES = {
         "pendulum_hw_bridge/pendulum_hw_bridge/drive/offender.py",
         "import pendulum_hw_bridge.bridge.module",
         "pendulum_hw_bridge.drive.offender -> pendulum_hw_bridge.bridge.module",
+    ),
+    "a room of the vocabulary that its layers forget": (
+        "pendulum_msgs_py/pendulum_msgs_py/attic/__init__.py",
+        "",
+        "pendulum_msgs_py.attic",
+    ),
+    "mechanisms that import programs": (
+        "pendulum_msgs_py/pendulum_msgs_py/mechanisms/offender.py",
+        "import pendulum_msgs_py.programs.options",
+        "pendulum_msgs_py.mechanisms.offender -> pendulum_msgs_py.programs.options",
     ),
     "a simulator that imports the vendor's library": (
         "pendulum_sim/pendulum_sim/offender.py",
@@ -115,6 +127,7 @@ def linted(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProc
     for name in ("pyproject.toml", "tests/__init__.py", "tests/import_rules.py"):
         shutil.copyfile(PROJECT / name, root / name)
     for where, code, _ in OFFENCES.values():
+        (root / where).parent.mkdir(exist_ok=True)
         (root / where).write_text(f"{code}\n", encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(root / folder) for folder in FOLDERS)}
     command = [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"]
@@ -126,3 +139,49 @@ def test_an_offence_is_found_and_named(linted: subprocess.CompletedProcess[str],
     _, _, named = OFFENCES[offence]
     assert linted.returncode == 1, linted.stdout
     assert named in " ".join(linted.stdout.split()), linted.stdout
+
+
+_COMMANDS = {"*_cli", "*.__main__"}
+CIRCLES = {
+    "two rooms": ("p.a.x -> p.b.x", "p.b.y -> p.a.y"),
+    "three rooms": ("p.a.x -> p.b.x", "p.b.y -> p.c.x", "p.c.y -> p.a.y"),
+    "the room itself": ("p.a.x -> p.b", "p.b -> p.a.y"),
+    "a module beside the rooms": ("p.a.x -> p.helper", "p.helper -> p.b.x", "p.b.y -> p.a.y"),
+    "rooms within a room": ("p.a.one.x -> p.a.two.x", "p.a.two.y -> p.a.one.y"),
+    "a room and the one within it": ("p.a.x -> p.a.one.x", "p.a.one.y -> p.a.x"),
+    "a command that others import": ("p.a.x -> p.a.x_cli", "p.a.x_cli -> p.b.x", "p.b.y -> p.a.y"),
+}
+ONE_WAY = {
+    "one way": ("p.a.x -> p.b.x", "p.a.y -> p.b.y", "p.b.x -> p.c.x", "p.a.x -> p.c.y"),
+    "a command": ("p.a.x_cli -> p.b.x", "p.b.y -> p.a.y"),
+    "a command of commands": ("p.a.x_cli -> p.b.x", "p.__main__ -> p.a.x_cli", "p.b.y -> p.a.y"),
+    "within one room": ("p.a.x -> p.a.y", "p.a.y -> p.a.z"),
+}
+
+
+def _offences(imports: tuple[str, ...]) -> list[str]:
+    graph = grimp.ImportGraph()
+    for told in imports:
+        for module in told.split(" -> "):
+            parts = module.split(".")
+            for depth in range(1, len(parts) + 1):
+                graph.add_module(".".join(parts[:depth]))
+        importer, imported = told.split(" -> ")
+        graph.add_import(importer=importer, imported=imported)
+    # As import-linter reads them from the project's file.
+    options = {"packages": ["p"], "commands": sorted(_COMMANDS)}
+    contract = RoomsContract("rooms", {"root_packages": ["p"]}, options)
+    found: list[str] = contract.check(graph, verbose=False).metadata["offences"]
+    return found
+
+
+@pytest.mark.parametrize("circle", CIRCLES)
+def test_a_circle_of_rooms_is_found_in_whatever_way_it_goes(circle: str) -> None:
+    found = _offences(CIRCLES[circle])
+    assert found
+    assert set(found) <= {told.replace(" -> ", " imports ") for told in CIRCLES[circle]}
+
+
+@pytest.mark.parametrize("way", ONE_WAY)
+def test_rooms_that_import_each_other_one_way_keep_the_rule(way: str) -> None:
+    assert _offences(ONE_WAY[way]) == []

@@ -163,6 +163,7 @@ def test_other_programs_say_their_help_with_the_first_layer_alone(tmp_path: Path
             "pendulum_sim[gymnasium]",
         ),
         ("pendulum_bags experiment lockstep --bag b --controller mpc", "osqp", "pendulum_lqr[mpc]"),
+        ("pendulum_lqr controller --ros-args -p controller:=nmpc", "casadi", "pendulum_lqr[mpc]"),
         ("pendulum_hw_bridge scan", "hebi", "pendulum_hw_bridge[hebi]"),
         ("pendulum_lqr design --preset thesis", "control", "pendulum_lqr[design]"),
     ],
@@ -191,6 +192,22 @@ def test_a_library_that_no_package_names_is_no_matter_of_extras() -> None:
     assert extra_of("fastapi.responses") == "pendulum_bags[console]"
     assert how_to_install(ModuleNotFoundError("No module named 'nobody'", name="nobody")) == ""
     assert how_to_install(ImportError("numpy is broken")) == ""
+
+
+@pytest.mark.parametrize(
+    ("module", "said"),
+    [
+        ("pendulum_hw_bridge.actuator", "pendulum_hw_bridge.actuator is pendulum_hw_bridge.port.actuator now"),
+        (
+            "pendulum_lqr.policy",
+            "pendulum_lqr.policy is pendulum_lqr.controllers.policy or pendulum_lqr.policies.policy now",
+        ),
+        ("pendulum_lqr.design.design", "pendulum_lqr.design.design is pendulum_lqr.linear.design now"),
+        ("pendulum_lqr.nowhere", ""),
+    ],
+)
+def test_a_module_of_ours_that_has_moved_is_answered_with_its_place(module: str, said: str) -> None:
+    assert how_to_install(ModuleNotFoundError(f"No module named '{module}'", name=module)) == said
 
 
 def test_targets_of_make_bring_the_layers_that_they_need() -> None:

@@ -29,7 +29,7 @@ PACKAGES = (
 
 FILES = {
     "pendulum_lqr/controllers/springy.py": """
-from pendulum_lqr.laws.controller import BaseController
+from pendulum_lqr.controller_interface.controller import BaseController
 from pendulum_msgs_py.parameters import ParameterSpec
 
 
@@ -119,7 +119,10 @@ LINES = {
             "drag_exponent": (2.0, Quantity("-", "How it grows with the speed.", positive=True)),
         }),""",
     ),
-    "pendulum_lqr/laws/controller.py": ("CONTROLLERS", '"springy": "pendulum_lqr.controllers.springy:Springy",'),
+    "pendulum_lqr/controller_interface/controller.py": (
+        "CONTROLLERS",
+        '"springy": "pendulum_lqr.controllers.springy:Springy",',
+    ),
     "pendulum_hw_bridge/backends/__init__.py": (
         "BACKENDS",
         '"toy": Backend("pendulum_hw_bridge.backends.toy:ToyBackend", _fixed("colour", "red", "`toy`: its colour.")),',
@@ -172,7 +175,7 @@ from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_hw_bridge.emulation.kernel import STATES, STEP, advance
 from pendulum_hw_bridge.emulation.parameters import EmulatorParameters
 from pendulum_hw_bridge.bridge.node_specs import SPECS
-from pendulum_lqr.laws.controller import controller_parameters
+from pendulum_lqr.controller_interface.controller import controller_parameters
 from pendulum_lqr.nodes.controller_node import main as controller
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
 from pendulum_lqr.disturbances.disturbance_node import main as disturbance

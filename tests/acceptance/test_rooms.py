@@ -13,6 +13,10 @@ from tests.fixtures import PROJECT
 
 _MOST_FILES = 40
 """More modules than this in one folder, and nobody finds the right one by looking."""
+_FOR_ALL = {
+    "pendulum_msgs_py": {"errors", "json_values", "parameters", "whole_file"},
+    "pendulum_bags": {"arrays", "distributions", "pendulum_cli"},
+}
 
 
 def _rooms(package: str) -> list[Path]:
@@ -37,6 +41,12 @@ def test_a_readme_lists_the_rooms_of_its_package_in_their_own_words(package: str
     readme = (root / "README.md").read_text(encoding="utf-8")
     found = re.search(r"<!-- table: rooms -->\n\n(.*?)\n<!-- end -->", readme, re.DOTALL)
     assert (found[1].strip() if found else "") == expected, f"expected in {root.name}/README.md:\n{expected}"
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_modules_lie_in_rooms_but_for_the_few_that_all_rooms_need(package: str) -> None:
+    beside = {path.stem for path in (PROJECT / FOLDERS[package] / package).glob("*.py")}
+    assert beside <= {"__init__", "__main__", "executables"} | _FOR_ALL.get(package, set())
 
 
 @pytest.mark.parametrize("package", FOLDERS)

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_lqr.controller_interface.controller import CONTROLLERS, make_controller
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.playback import Playback
-from pendulum_lqr.laws.controller import CONTROLLERS, make_controller
-from pendulum_lqr.laws.interface import Controller
 from pendulum_lqr.linear.design import continuous_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.swing_up.trajectory_optimisation import swing_up_trajectory

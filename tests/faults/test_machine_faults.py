@@ -19,7 +19,7 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.nodes.bridge_node import BridgeNode
 from pendulum_hw_bridge.port.actuator import Strategy
 from pendulum_hw_bridge.port.clocks import SteppedClock
-from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_msgs_py.contract.commands import Refusal
 from pendulum_msgs_py.contract.supervisor import Input, Mode, PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import thesis_ramp

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pendulum_hw_bridge.bridge.node_specs import SPECS
-from pendulum_lqr.laws.controller import make_controller
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand

@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 from pendulum_hw_bridge.bridge.node_specs import SPECS as BRIDGE_SPECS
+from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, controller_parameters
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
 from pendulum_lqr.disturbances.disturbance_node import NODE_SPECS as DISTURBANCE_NODE_SPECS
-from pendulum_lqr.laws.controller import COMMON_PARAMETERS, controller_parameters
 from pendulum_lqr.nodes.bringup import ARGUMENTS, SIDES, parameter_file, programs
 from pendulum_lqr.nodes.controller_node import NODE_SPECS as CONTROLLER_SPECS
 from pendulum_msgs_py.errors import ParameterError

@@ -187,7 +187,7 @@ TARGETS: tuple[Target, ...] = (
         ),
         (f"{_BRIDGE}/test_module_files.py", f"{_BRIDGE}/test_hebi_emulated.py"),
     ),
-    Target("pendulum_hw_bridge.bridge.e_stop_input", ("EStopInput",), (f"{_BRIDGE}/test_e_stop_input.py",)),
+    Target("pendulum_hw_bridge.nodes.e_stop_input", ("EStopInput",), (f"{_BRIDGE}/test_e_stop_input.py",)),
 )
 
 

@@ -10,7 +10,7 @@ import pytest
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RAMP_SPEEDS, RegulationSettings
 from pendulum_hw_bridge.bridge.node_specs import SPECS
-from pendulum_lqr.laws.controller import COMMON_PARAMETERS, CONTROLLERS, controller_parameters
+from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, CONTROLLERS, controller_parameters
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.plant_specs import limits_from_parameters

@@ -14,7 +14,7 @@ from pendulum_bags.ranking import joint_choice
 from pendulum_bags.ranking.joint_choice import joint_cost_parts, rank_joints, rankable
 from pendulum_bags.ranking.present import Words, same_choice
 from pendulum_bags.verdict import Mark
-from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.linear.mechanism_model import linearise_mechanism
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.noise import uniform_array

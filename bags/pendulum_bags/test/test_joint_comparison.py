@@ -24,7 +24,7 @@ from pendulum_bags.runs.run_data import joints_of, read_run
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_bags.verdict.answer import answer_of_joints, join_joints
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
-from pendulum_lqr.laws.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.errors import DataError, ParameterError

@@ -25,7 +25,7 @@ from pendulum_bags.studies.leaderboard import (
 )
 from pendulum_bags.studies.leaderboard_hardware import HARDWARE_PERTURBATIONS, arrays_of_bag
 from pendulum_bags.studies.leaderboard_page import write_page
-from pendulum_lqr.laws.controller import CONTROLLERS
+from pendulum_lqr.controller_interface.controller import CONTROLLERS
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag
@@ -99,7 +99,7 @@ def test_every_controller_is_on_the_board() -> None:
 
 
 MINE = """
-from pendulum_lqr.laws.controller import BaseController
+from pendulum_lqr.controller_interface.controller import BaseController
 
 class Mine(BaseController):
     SUMMARY = "A spring to upright."

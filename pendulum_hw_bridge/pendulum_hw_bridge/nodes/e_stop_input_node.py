@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
-from pendulum_hw_bridge.bridge.e_stop_input import EStopInput
+from pendulum_hw_bridge.nodes.e_stop_input import EStopInput
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.ros.e_stop import EStopThread
 from pendulum_msgs_py.ros.timers import create_wall_timer

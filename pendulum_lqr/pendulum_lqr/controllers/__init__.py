@@ -1,1 +1,1 @@
-"""Controllers, one file each; ``pendulum_lqr.laws.controller.CONTROLLERS`` names them."""
+"""Controllers, one file each; ``pendulum_lqr.controller_interface.controller.CONTROLLERS`` names them."""

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_lqr.controller_interface.controller import LawController
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, Q, R
-from pendulum_lqr.laws.controller import LawController
-from pendulum_lqr.laws.interface import Controller
-from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.linear.design import DesignError, Gain
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
@@ -31,7 +31,7 @@ _LAGGED, _PENDING = range(2)
 def discrete_lqr_law(
     _t: float, angle: float, velocity: float, memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return u* - K [x - x*; lagged; on their way] within the limit [N m]; see :data:`pendulum_lqr.laws.law.Law`.
+    """Return u* - K [x - x*; lagged; on their way] within the limit [N m], as a :data:`.law.Law`.
 
     It remembers the lagged torque and those on their way, oldest first, as deviations from the one that holds [N m].
     """

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from pendulum_lqr.controller_interface.catch import CatchingController
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
-from pendulum_lqr.laws.catch import CatchingController
-from pendulum_lqr.laws.interface import Controller
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.swing_up.energy_margin import EnergyMargin
 from pendulum_msgs_py.contract.angles import wrap

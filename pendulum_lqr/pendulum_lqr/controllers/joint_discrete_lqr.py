@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_lqr.controller_interface.interface import Controller, JointController
+from pendulum_lqr.controller_interface.sampling import require_period
 from pendulum_lqr.controllers.joint_lqr import UprightController, gain_text
-from pendulum_lqr.laws.interface import Controller, JointController
-from pendulum_lqr.laws.sampling import require_period
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.contract.joints import Vector

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_lqr.controller_interface.interface import Controller, JointController
 from pendulum_lqr.controllers.joint_discrete_lqr import JointDiscreteLqr
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, gain_text, joint_weights
-from pendulum_lqr.laws.interface import Controller, JointController
 from pendulum_lqr.linear.design import kalman_gain
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract.joints import Vector

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_lqr.controller_interface.interface import Controller, JointController
+from pendulum_lqr.controller_interface.sampling import require_period
 from pendulum_lqr.controllers.joint_lqr import (
     JOINT_LIMIT,
     SMALLER_Q,
@@ -16,8 +18,6 @@ from pendulum_lqr.controllers.joint_lqr import (
     joint_weights,
     require_settling,
 )
-from pendulum_lqr.laws.interface import Controller, JointController
-from pendulum_lqr.laws.sampling import require_period
 from pendulum_lqr.linear.mechanism_model import mechanism_lqr
 from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.swing_up.mechanism_controller import within_limits

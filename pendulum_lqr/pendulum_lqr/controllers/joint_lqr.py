@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.laws.interface import JointController
+from pendulum_lqr.controller_interface.interface import JointController
 from pendulum_lqr.linear.analysis import delayed_spectral_radius
 from pendulum_lqr.linear.design import Gain
 from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits
-from pendulum_lqr.laws.interface import Controller, JointController
-from pendulum_lqr.laws.joint_controller import make_joint_controller
-from pendulum_lqr.laws.policy_answers import (
+from pendulum_lqr.controller_interface.interface import Controller, JointController
+from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.policy_answers import (
     START_TIME,
     ZERO,
     PolicyAnswers,
@@ -16,6 +15,7 @@ from pendulum_lqr.laws.policy_answers import (
     policy_specs,
     states_to_hold,
 )
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits
 from pendulum_lqr.policies.policy import Policy, require_plant
 from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_lqr.controller_interface.controller import BaseController
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, OFFSET_NOISE, Q, R
-from pendulum_lqr.laws.controller import BaseController
-from pendulum_lqr.laws.interface import Controller
 from pendulum_lqr.linear.design import Gain, Matrix
 from pendulum_lqr.linear.model import LinearModel, linearise
 from pendulum_lqr.linear.observer import Observer

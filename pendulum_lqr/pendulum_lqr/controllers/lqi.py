@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any
 
+from pendulum_lqr.controller_interface.controller import LawController
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
-from pendulum_lqr.laws.controller import LawController
-from pendulum_lqr.laws.interface import Controller
-from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.linear.design import Gain, integral_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -24,7 +24,7 @@ _INTEGRAL = 0
 def lqi_law(
     _t: float, angle: float, velocity: float, memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return u* - K [x - x*; integral] within the limit [N m]; see :data:`pendulum_lqr.laws.law.Law`.
+    """Return u* - K [x - x*; integral] within the limit [N m]; see :data:`pendulum_lqr.controller_interface.law.Law`.
 
     It remembers the integral [rad s].
     """

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any, ClassVar
 
+from pendulum_lqr.controller_interface.controller import LawController
+from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
-from pendulum_lqr.laws.controller import LawController
-from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.linear.design import Gain, output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -22,7 +22,7 @@ _HOLD, _K0, _K1 = range(OWN, OWN + 3)
 def lqr_law(
     _t: float, angle: float, velocity: float, _memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return u* - K (x - x*) within the limit [N m]; see :data:`pendulum_lqr.laws.law.Law`."""
+    """Return u* - K (x - x*) within the limit [N m]; see :data:`pendulum_lqr.controller_interface.law.Law`."""
     error = deviation(angle, numbers[SET_POINT])
     return clamped(numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity, numbers[EFFORT_LIMIT])
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_lqr.controller_interface.controller import LawController
+from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
-from pendulum_lqr.laws.controller import LawController
-from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.linear.analysis import delayed_spectral_radius
 from pendulum_lqr.linear.design import DesignError, Gain, output_lqr
 from pendulum_lqr.linear.model import LinearModel, linearise

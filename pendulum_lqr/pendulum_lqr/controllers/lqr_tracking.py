@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pendulum_lqr.controller_interface.controller import BaseController
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.specs import Q, R
-from pendulum_lqr.laws.controller import BaseController
-from pendulum_lqr.laws.interface import Controller
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.linear.reference import SHAPES, Motion, Reference, Way
 from pendulum_lqr.linear.scheduling import Schedule, ScheduledMargins, scheduled_margins

@@ -10,8 +10,8 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_lqr.controller_interface.catch import CatchingController
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R
-from pendulum_lqr.laws.catch import CatchingController
 from pendulum_lqr.swing_up.trajectory_optimisation import rigid_flow
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any
 
-from pendulum_lqr.laws.controller import LawController
-from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
+from pendulum_lqr.controller_interface.controller import LawController
+from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.linear.model import linearise, low_frequency
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.equilibrium import torque_gain

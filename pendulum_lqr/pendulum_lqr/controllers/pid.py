@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_lqr.controller_interface.controller import LawController
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.controllers.specs import Q, R
-from pendulum_lqr.laws.controller import LawController
-from pendulum_lqr.laws.interface import Controller
-from pendulum_lqr.laws.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.tuning import PidGains, pid_loop, tune_numerically, ziegler_nichols
@@ -30,7 +30,7 @@ _NOTHING_YET = (0.0, 0.0, math.nan)
 def pid_law(
     _t: float, angle: float, _velocity: float, memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return the torque of the three terms within the limit [N m]; see :data:`pendulum_lqr.laws.law.Law`.
+    """Return the torque of the three terms within the limit [N m], as a :data:`.law.Law`.
 
     It remembers the integral's torque [N m], the filtered derivative [rad/s] and the last angle [rad].
     """

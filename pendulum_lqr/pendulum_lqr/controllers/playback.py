@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pendulum_lqr.laws.controller import BaseController
+from pendulum_lqr.controller_interface.controller import BaseController
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.parameters import ParameterSpec, read_text
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

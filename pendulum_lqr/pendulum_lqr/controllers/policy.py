@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pendulum_lqr.laws.controller import BaseController, make_controller
-from pendulum_lqr.laws.interface import Controller
-from pendulum_lqr.laws.loop_check import require_stable
-from pendulum_lqr.laws.policy_answers import (
+from pendulum_lqr.controller_interface.controller import BaseController, make_controller
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.loop_check import require_stable
+from pendulum_lqr.controller_interface.policy_answers import (
     START_TIME,
     ZERO,
     PolicyAnswers,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pendulum_lqr.laws.controller import BaseController
+from pendulum_lqr.controller_interface.controller import BaseController
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 

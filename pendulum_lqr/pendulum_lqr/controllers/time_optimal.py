@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_lqr.controller_interface.catch import CatchingController
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
-from pendulum_lqr.laws.catch import CatchingController
 from pendulum_lqr.linear.model import acceleration_from_upright
 from pendulum_lqr.swing_up.minimum_time import SIGN_VELOCITY, TimeToGo, minimum_time
 from pendulum_msgs_py.parameters import ParameterSpec

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_lqr.controller_interface.catch import CatchingController
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.energy_swing_up import EnergySwingUp
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R
-from pendulum_lqr.laws.catch import CatchingController
-from pendulum_lqr.laws.interface import Controller
 from pendulum_lqr.linear.design import cost_matrices
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discretise

@@ -7,9 +7,9 @@ from typing import Any, cast
 
 from rich.console import Console
 
+from pendulum_lqr.controller_interface.controller import controller_parameters, make_controller
+from pendulum_lqr.controller_interface.sampling import ASSUMED_PERIOD
 from pendulum_lqr.controllers.lqr_tracking import LqrTracking
-from pendulum_lqr.laws.controller import controller_parameters, make_controller
-from pendulum_lqr.laws.sampling import ASSUMED_PERIOD
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import suggestion
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

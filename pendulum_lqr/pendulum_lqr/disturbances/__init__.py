@@ -1,1 +1,1 @@
-"""Disturbance torques and their node."""
+"""Disturbance torques, compiled and interpreted, and their node."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Any, cast
 
-from pendulum_lqr.laws.interface import Controller, JointController
+from pendulum_lqr.controller_interface.interface import Controller, JointController
 from pendulum_lqr.nodes.answer_rules import (
     DUPLICATE,
     FROM_FUTURE,

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from pendulum_lqr.controller_interface.controller import CONTROLLERS
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
-from pendulum_lqr.laws.controller import CONTROLLERS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import load_yaml, parameter_sections, suggestion
 from pendulum_msgs_py.plants.lab_file import LabFile, load_lab

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.laws.controller import LawController, unwrapped
-from pendulum_lqr.laws.interface import Controller, JointController
-from pendulum_lqr.laws.law import MOST_MEMORY, MOST_NUMBERS
-from pendulum_lqr.laws.sampling import PeriodWatch
+from pendulum_lqr.controller_interface.controller import LawController, unwrapped
+from pendulum_lqr.controller_interface.interface import Controller, JointController
+from pendulum_lqr.controller_interface.law import MOST_MEMORY, MOST_NUMBERS
+from pendulum_lqr.controller_interface.sampling import PeriodWatch
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.loops.answer_record import LoopKind

@@ -6,7 +6,7 @@ import importlib
 import math
 from typing import Any
 
-from pendulum_lqr.laws.sampling import goes_on
+from pendulum_lqr.controller_interface.sampling import goes_on
 from pendulum_lqr.nodes.answer_rules import NEW, is_saturated, judge_state
 from pendulum_lqr.nodes.compiled_controller import ANSWERING
 from pendulum_msgs_py.contract.angles import deviation_from_upright

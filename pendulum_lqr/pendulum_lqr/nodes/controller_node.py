@@ -6,6 +6,7 @@ from __future__ import annotations
 import pendulum_msgs_py.programs.one_thread  # noqa: F401  # before anything that imports numpy
 # isort: on
 
+import contextlib
 import math
 import sys
 import time
@@ -17,21 +18,21 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from pendulum_lqr.laws.controller import (
+from pendulum_lqr.controller_interface.controller import (
     CONTROLLERS,
     BaseController,
     controller_parameters,
     make_controller,
     unwrapped,
 )
-from pendulum_lqr.laws.interface import Controller, JointController
-from pendulum_lqr.laws.joint_controller import (
+from pendulum_lqr.controller_interface.interface import Controller, JointController
+from pendulum_lqr.controller_interface.joint_controller import (
     JOINT_CONTROLLER_NAMES,
     JOINT_CONTROLLERS,
     joint_controller_class,
     make_joint_controller,
 )
-from pendulum_lqr.laws.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
+from pendulum_lqr.controller_interface.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_lqr.nodes.compiled_controller import CompiledController
 from pendulum_msgs_py.contract import names
@@ -464,5 +465,7 @@ def _specs_for_help(arguments: Sequence[str]) -> tuple[ParameterSpec, ...]:
     for argument in arguments:
         name, separator, value = argument.partition(":=")
         if separator and name == "controller" and value in CONTROLLERS:
-            return controller_parameters(value)
+            # The node refuses one whose library is missing, in a sentence.
+            with contextlib.suppress(PendulumError):
+                return controller_parameters(value)
     return controller_parameters("lqr")

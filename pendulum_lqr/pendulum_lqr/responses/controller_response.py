@@ -14,8 +14,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_lqr.laws.controller import controller_class, make_controller
-from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.controller_interface.controller import controller_class, make_controller
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import DiscreteModel, discretise
 from pendulum_msgs_py.errors import ParameterError

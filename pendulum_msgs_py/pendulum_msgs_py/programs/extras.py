@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 __all__ = ["extra_of", "how_to_install"]
 
@@ -46,7 +47,7 @@ def extra_of(module: str) -> str:
 
 
 def how_to_install(error: ImportError) -> str:
-    """Return a sentence that says which library is missing and how to get it.
+    """Return a sentence that says which library is missing and how to get it, or where a module of ours is now.
 
     Args:
         error: What an import of it raised.
@@ -55,6 +56,12 @@ def how_to_install(error: ImportError) -> str:
         Empty where the library is none that a package of ours names.
     """
     module = error.name if isinstance(error, ModuleNotFoundError) else None
+    if module and (package := module.partition(".")[0]) in _PACKAGES and (place := _place_of(package)) is not None:
+        # It is there; a module of it is not, which whoever imports it knows by the name of an earlier version.
+        now = sorted(
+            f"{package}.{path.parent.name}.{path.stem}" for path in place.glob(f"*/{module.split('.')[-1]}.py")
+        )
+        return f"{module} is {' or '.join(now)} now" if now else ""
     extra = extra_of(module) if module else ""
     if not module or not extra:
         return ""
@@ -62,6 +69,13 @@ def how_to_install(error: ImportError) -> str:
         f"{module.partition('.')[0]} is not installed, which this needs; "
         f"install it with make extras, or python -m pip install '{extra}'"
     )
+
+
+def _place_of(package: str) -> Path | None:
+    from importlib.util import find_spec
+
+    spec = find_spec(package)
+    return None if spec is None or spec.origin is None else Path(spec.origin).parent
 
 
 def _plain(name: str) -> str:

@@ -22,9 +22,9 @@ from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
 from pendulum_lqr.disturbances.disturbing import DisturbanceLoop
-from pendulum_lqr.laws.controller import make_controller
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright

@@ -26,8 +26,8 @@ from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from pendulum_lqr.laws.controller import make_controller
-from pendulum_lqr.laws.sampling import PeriodWatch
+from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.sampling import PeriodWatch
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_lqr.nodes.compiled_controller import CompiledController
 from pendulum_msgs_py.contract import names

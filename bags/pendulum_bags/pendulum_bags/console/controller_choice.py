@@ -11,8 +11,8 @@ from nicegui import run, ui
 
 from pendulum_bags.console.graph import Graph
 from pendulum_bags.console.jobs import Jobs
-from pendulum_lqr.laws.controller import CONTROLLERS
-from pendulum_lqr.laws.joint_controller import JOINT_CONTROLLERS
+from pendulum_lqr.controller_interface.controller import CONTROLLERS
+from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS
 from pendulum_msgs_py.errors import FaultError, PendulumError
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
 from pendulum_lqr.disturbances.disturbing import DisturbanceLoop
-from pendulum_lqr.laws.controller import make_controller
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor

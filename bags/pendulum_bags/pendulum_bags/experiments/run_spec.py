@@ -11,8 +11,8 @@ from typing import Any
 from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
+from pendulum_lqr.controller_interface.controller import controller_parameters
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
-from pendulum_lqr.laws.controller import controller_parameters
 from pendulum_lqr.policies.policy_file import policy_record
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT

@@ -14,7 +14,7 @@ from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE, THESIS_METHOD,
 from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
-from pendulum_lqr.laws.controller import controller_parameters
+from pendulum_lqr.controller_interface.controller import controller_parameters
 from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy, policy_record
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.trajectory import (

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from pendulum_bags.learning.body import can_exist, kicks_of, start_spread
 from pendulum_bags.learning.task import SwingUpTask, value_of
+from pendulum_lqr.controller_interface.policy_answers import START_TIME
 from pendulum_lqr.controllers.joint_policy import JointPolicy
 from pendulum_lqr.controllers.policy import LearnedPolicy
-from pendulum_lqr.laws.policy_answers import START_TIME
 from pendulum_lqr.policies.policy import Policy
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.contract.joints import Vector

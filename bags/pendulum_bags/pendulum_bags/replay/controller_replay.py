@@ -14,7 +14,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.runs.run_data import find_prefix
 from pendulum_bags.runs.run_record import run_record
-from pendulum_lqr.laws.controller import controller_parameters, make_controller
+from pendulum_lqr.controller_interface.controller import controller_parameters, make_controller
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.contract.values import NANOSECONDS

@@ -1,6 +1,6 @@
 """Every controller on one board: swing-up and balance on each rigid plant, the public leaderboards' scores, robustness.
 
-A new controller is on the board as soon as it is in ``pendulum_lqr.laws.controller.CONTROLLERS``.
+A new controller is on the board as soon as it is in ``pendulum_lqr.controller_interface.controller.CONTROLLERS``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.in_process import RunArrays, simulate_plant
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_lqr.laws.controller import CONTROLLERS
+from pendulum_lqr.controller_interface.controller import CONTROLLERS
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import PendulumError

@@ -42,7 +42,7 @@ def leaderboard(
     from pendulum_bags.studies.leaderboard import HARDWARE, contenders, evaluate
     from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
     from pendulum_bags.studies.leaderboard_page import best_sentence, to_json, write_page
-    from pendulum_lqr.laws.controller import controller_class
+    from pendulum_lqr.controller_interface.controller import controller_class
     from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, named_controller
     from pendulum_msgs_py.plants.plant_parameters import load_plant
 

@@ -6,8 +6,8 @@ import statistics
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from pendulum_lqr.laws.interface import Controller
-from pendulum_lqr.laws.loop_check import settles
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.loop_check import settles
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

@@ -17,7 +17,7 @@ from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 
 if TYPE_CHECKING:
-    from pendulum_lqr.laws.interface import Controller
+    from pendulum_lqr.controller_interface.interface import Controller
 
 __all__ = ["growth", "require_stable", "settles"]
 

@@ -9,8 +9,8 @@ import importlib
 from collections.abc import Mapping
 from typing import Any, cast
 
-from pendulum_lqr.laws.interface import JointController
-from pendulum_lqr.laws.sampling import ASSUMED_PERIOD
+from pendulum_lqr.controller_interface.interface import JointController
+from pendulum_lqr.controller_interface.sampling import ASSUMED_PERIOD
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters

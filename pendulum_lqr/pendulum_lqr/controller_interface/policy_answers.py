@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.laws.controller import soft_start
+from pendulum_lqr.controller_interface.controller import soft_start
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.policies.policy import Policy
 from pendulum_msgs_py.contract.joints import Vector

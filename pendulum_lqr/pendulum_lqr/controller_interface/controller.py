@@ -11,11 +11,11 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, cast
 
-from pendulum_lqr.laws.interface import Controller
-from pendulum_lqr.laws.joint_controller import JOINT_CONTROLLERS
-from pendulum_lqr.laws.law import Law, clamped, deviation
-from pendulum_lqr.laws.loop_check import require_stable
-from pendulum_lqr.laws.velocity import VELOCITY_ESTIMATORS, VelocityEstimator
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS
+from pendulum_lqr.controller_interface.law import Law, clamped, deviation
+from pendulum_lqr.controller_interface.loop_check import require_stable
+from pendulum_lqr.controller_interface.velocity import VELOCITY_ESTIMATORS, VelocityEstimator
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, suggestion, validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

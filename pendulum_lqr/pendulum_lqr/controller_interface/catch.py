@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from pendulum_lqr.laws.controller import BaseController
-from pendulum_lqr.laws.interface import Controller
+from pendulum_lqr.controller_interface.controller import BaseController
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.linear.design import DesignError, Gain, continuous_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.roa import proven_level

@@ -1,0 +1,1 @@
+"""What all controllers have: interface, tables of names, velocities, rates, laws as functions, a policy's answers."""
