@@ -320,6 +320,25 @@ def test_the_drive_is_off_before_the_supervisor_is_told_which_may_have_to_be_wai
     assert seen == [Strategy.OFF]
 
 
+def test_a_fault_wins_over_a_disarm_that_comes_while_the_drive_stops_and_is_stamped_then(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = Rig().armed()
+    stamps: list[int] = []
+    fault, stop = rig.supervisor.fault, rig.port.stop
+
+    def slow_stop() -> None:
+        stop()
+        rig.port.time_ns += 45_000_000
+        rig.supervisor.disarm(rig.port.time_ns, "asked")
+
+    monkeypatch.setattr(rig.port, "stop", slow_stop)
+    monkeypatch.setattr(rig.supervisor, "fault", lambda reason, now_ns: (stamps.append(now_ns), fault(reason, now_ns)))
+    rig.bridge.fail("m_stop", "pressed")
+    assert (rig.supervisor.mode, rig.supervisor.reason) == (Mode.FAULT, "m_stop: pressed")
+    assert stamps == [rig.port.time_ns]
+
+
 # --- observing -------------------------------------------------------------------------------------------------
 
 

@@ -206,6 +206,7 @@ def test_all_are_released_whatever_one_of_them_raises_and_are_asked_again(broken
     assert all("stop" in port.calls for port in rig.ports)
     assert not any(module.driving for module in rig.bridge.drives)
     assert rig.bridge.stop_pending
+    assert rig.bridge.faults == {"m_stop": 1, "exception": len(broken)}
     assert rig.bridge.prepare() == "the module has not confirmed that it is off"
     for port in rig.ports:
         port.fails.clear()

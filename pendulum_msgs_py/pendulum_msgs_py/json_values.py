@@ -24,11 +24,22 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {key: without_nan(item) for key, item in value.items()}
+        return {_key(key): without_nan(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [without_nan(item) for item in value]
     return value
 
 
+def _key(key: Any) -> Any:
+    """Return a key as JSON takes it; those of other kinds, and NaN, as their text."""
+    return (
+        key
+        if isinstance(key, str | int) or key is None or (isinstance(key, float) and math.isfinite(key))
+        else str(key)
+    )
+
+
 def _plain(value: Any) -> Any:
-    return without_nan(value.tolist()) if hasattr(value, "tolist") else str(value)
+    plain = value.tolist() if hasattr(value, "tolist") else None
+    # Of a number with more digits than Python's, numpy makes itself.
+    return str(value) if plain is None or type(plain) is type(value) else without_nan(plain)

@@ -32,6 +32,15 @@ def test_numbers_of_numpy_are_numbers_and_other_things_their_text() -> None:
     assert _read(json_text(content)) == expected
 
 
+def test_keys_are_what_json_takes() -> None:
+    content = {np.int64(3): 1, (1, 2): 2, Path("a"): 3, math.nan: 4, 1.5: 5, True: 6, None: 7}
+    assert _read(json_text(content)) == {"3": 1, "(1, 2)": 2, "a": 3, "nan": 4, "1.5": 5, "true": 6, "null": 7}
+
+
+def test_a_number_with_more_digits_than_pythons_is_its_text() -> None:
+    assert _read(json_text([np.longdouble("1.5")])) == ["1.5"]
+
+
 def test_finite_values_stay_what_they_are() -> None:
     content = {"a": [0.1, -1e300, 7, "NaN", None, True]}
     assert without_nan(content) == content

@@ -100,7 +100,24 @@ def test_a_client_that_went_is_waited_for_once_where_another_is_there(server: Gr
         peer.close()
 
 
-def test_who_was_answered_by_a_thread_that_then_stood_still_is_answered_again(domain_id: int) -> None:
+@pytest.mark.parametrize("server", ["in turn"], indirect=True)
+def test_another_client_whose_requests_have_the_next_numbers_is_answered(server: GraphPeer, domain_id: int) -> None:
+    """Numbers are each client's own, and rclpy does not tell whose they are."""
+    peer = GraphPeer("other", domain=domain_id)
+    client = client_of(peer)
+    try:
+        for _ in range(REQUESTS + 5):
+            until_done(server, peer, client.call_async(SetParameters.Request()), "an answer before")
+        asked_and_gone(server, domain_id, left=1)
+        until_done(server, peer, client.call_async(SetParameters.Request()), "the answer to the other client")
+    finally:
+        peer.close()
+
+
+@pytest.mark.parametrize(("told", "at_once"), [(True, 3), (False, 1)], ids=["told by the middleware", "judged by time"])
+def test_who_was_answered_by_a_thread_that_then_stood_still_is_answered_again(
+    domain_id: int, told: bool, at_once: int
+) -> None:
     """Such a thread has waited for as long as for a client that has gone."""
     server = GraphPeer("runner", domain=domain_id)
     node = PollingNode("server", context=server.context)
@@ -109,9 +126,10 @@ def test_who_was_answered_by_a_thread_that_then_stood_still_is_answered_again(do
     answers = service.send_response.__self__
     send, stalls, ends = answers._send, [0.12], threading.Event()
 
-    def send_and_stall(response: Trigger.Response, header: object) -> None:
-        send(response, header)
+    def send_and_stall(response: Trigger.Response, header: object) -> bool | None:
+        gone = send(response, header)
         time.sleep(stalls.pop() if stalls else 0.0)
+        return gone if told else None
 
     def serve() -> None:
         while not ends.is_set():
@@ -123,15 +141,16 @@ def test_who_was_answered_by_a_thread_that_then_stood_still_is_answered_again(do
     peer = GraphPeer("asker", domain=domain_id)
     client = peer.node.create_client(Trigger, "/server/ask")
     serving = threading.Thread(target=serve)
-    serving.start()
     try:
         peer.until(client.service_is_ready, "the service")
-        for number in range(2):
-            future = client.call_async(Trigger.Request())
-            peer.until(future.done, f"answer {number}", 10.0)
+        first = [client.call_async(Trigger.Request()) for _ in range(at_once)]
+        serving.start()
+        peer.until(lambda: all(future.done() for future in first), "the answers to all at once", 10.0)
+        peer.until(client.call_async(Trigger.Request()).done, "the answer to the next", 10.0)
     finally:
         ends.set()
-        serving.join()
+        if serving.ident is not None:
+            serving.join()
         node.destroy_node()
         peer.close()
         server.close()

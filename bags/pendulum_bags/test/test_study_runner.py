@@ -279,7 +279,13 @@ def test_hands_of_an_identification_experiment_are_pooled(tmp_path: Path) -> Non
     # Student's t of one degree of freedom at 97.5 %: 12.706.
     half = 12.706204736174698 * math.sqrt(0.5) / math.sqrt(2.0)
     assert result["pooled"]["damping"] == pytest.approx({"mean": 11.5, "low": 11.5 - half, "high": 11.5 + half})
-    (tmp_path / "runs" / hands.runs[0].name / "run" / "identified.json").write_text("{}", encoding="utf-8")
+    # A number that is none is null in a result file; the table says so.
+    first = tmp_path / "runs" / hands.runs[0].name / "run" / "identified.json"
+    first.write_text('{"average": {"damping": null}, "intervals": {"damping": [null, 1.0]}}', encoding="utf-8")
+    console = Console(width=200, record=True)
+    pooled.print_table(console, pooled.analyse(tmp_path, hands, records))
+    assert "nan (nan to 1)" in console.export_text()
+    first.write_text("{}", encoding="utf-8")
     with pytest.raises(DataError, match="holds no identification"):
         pooled.analyse(tmp_path, hands, records)
 

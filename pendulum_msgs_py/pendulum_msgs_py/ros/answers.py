@@ -74,11 +74,12 @@ class _Answers:
     def __init__(self, node: Node, service: Service) -> None:
         self._name = name = service.handle.name
         self._count: Callable[[], int] = lambda: node.count_clients(name)
-        self._send: Callable[[Any, Any], None] = functools.partial(send_response, service, service.send_response)
+        self._send: Callable[[Any, Any], bool | None] = functools.partial(send_response, service, service.send_response)
         self._kept: deque[tuple[float, Any, Any]] = deque()
         self._lock = threading.Lock()
         self._gone: int | None = None
         self._gone_ns = 0
+        self._gone_guid = b""
 
     def send(self, response: Any, header: Any) -> None:
         """Send an answer, keep it for a while where no client is known yet, or drop it where the client has gone."""
@@ -98,13 +99,16 @@ class _Answers:
             return
         # A client that has gone asked before that; who asks later has been answered, by a thread that was kept waiting.
         began, began_ns = time.monotonic(), time.time_ns()
-        self._send(response, header)
-        if time.monotonic() - began > _WAITED:
+        gone = self._send(response, header)
+        if gone is None:
+            gone = time.monotonic() - began > _WAITED
+        if gone:
             self._gone, self._gone_ns = header.request_id.sequence_number, began_ns
+            self._gone_guid = _guid(header)
 
     def _follows_gone(self, header: Any) -> bool:
         """Tell whether a request is the next of a client that has just been waited for in vain."""
-        if self._gone is None or header.source_timestamp > self._gone_ns:
+        if self._gone is None or header.source_timestamp > self._gone_ns or _guid(header) != self._gone_guid:
             return False
         return 0 < header.request_id.sequence_number - self._gone <= _FARTHEST
 
@@ -123,3 +127,8 @@ class _Answers:
                     self._kept.popleft()
                 if not self._kept:
                     return
+
+
+def _guid(header: Any) -> bytes:
+    """Return who asked; empty where rclpy took the request, which does not tell."""
+    return bytes(getattr(header.request_id, "writer_guid", b""))

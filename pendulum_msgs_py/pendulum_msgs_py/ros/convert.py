@@ -19,6 +19,7 @@ from pendulum_msgs_py.contract.joints import ONE_JOINT
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.json_values import without_nan
 
 __all__ = [
     "class_of",
@@ -203,7 +204,7 @@ def seconds_to_duration(seconds: float) -> Duration:
 
 def event_message(stamp_ns: int, name: str, **details: Any) -> String:
     """Return an event for the ``events`` topic: JSON with at least ``stamp_ns`` and ``name``."""
-    return String(data=json.dumps({"stamp_ns": stamp_ns, "name": name, **details}, sort_keys=True))
+    return String(data=json.dumps(without_nan({"stamp_ns": stamp_ns, "name": name, **details}), sort_keys=True))
 
 
 def diagnostic_status(

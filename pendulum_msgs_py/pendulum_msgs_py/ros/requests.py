@@ -88,8 +88,8 @@ def take_request(service: Service) -> tuple[Any, Any]:
     return data if isinstance(data, TooLarge) else deserialize_message(data, service.srv_type.Request), header
 
 
-def send_response(service: Service, send: Callable[[Any, Any], None], response: Any, header: Any) -> None:
-    """Answer a request.
+def send_response(service: Service, send: Callable[[Any, Any], None], response: Any, header: Any) -> bool | None:
+    """Answer a request; return whether its client has gone, None where rclpy does not tell.
 
     Args:
         service: Whose answer it is.
@@ -100,7 +100,7 @@ def send_response(service: Service, send: Callable[[Any, Any], None], response: 
     rcl = _rcl()
     if rcl is None or not isinstance(header, RequestHeader):
         send(response, header)
-        return
+        return None
     kind = _kind(service.srv_type.Response)
     data = serialize_message(response)
     held = ctypes.create_string_buffer(data, len(data))
@@ -116,8 +116,9 @@ def send_response(service: Service, send: Callable[[Any, Any], None], response: 
         rcl.rcutils_reset_error()
         told = f"failed to send response to {service.srv_name} (timeout): client will not receive response"
         warnings.warn(told, RuntimeWarning, stacklevel=2)
-        return
+        return True
     _expect(rcl, code, f"answer of {service.srv_name} was not sent")
+    return False
 
 
 class _Kind(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,12 +38,18 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
         path = place / "identified.json"
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
-            values, intervals = dict(found["average"]), dict(found["intervals"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            values = {name: _number(value) for name, value in found["average"].items()}
+            intervals = {name: [_number(end) for end in ends] for name, ends in found["intervals"].items()}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise DataError(f"{path} holds no identification: {error}") from error
         rows.append({"seed": run.labels["seed"], "values": values, "intervals": intervals})
     pooled = {name: _mean([row["values"][name] for row in rows]) for name in rows[0]["values"]} if rows else {}
     return {"identified": rows, "pooled": pooled}
+
+
+def _number(value: float | None) -> float:
+    """Return a number of a result file, where null stands for one that is none."""
+    return math.nan if value is None else float(value)
 
 
 def _alike(runs: Sequence[tuple[StudyRun, Path]]) -> dict[tuple[str, ...], list[Path]]:

@@ -112,7 +112,9 @@ def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
                 _write_parquet(path, table, bag.topics[topic])
             files.append(path)
         path = folder / "metadata.json"
-        path.write_text(json.dumps(bag.metadata, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+        path.write_text(
+            json.dumps(without_nan(bag.metadata), indent=2, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8"
+        )
         files.append(path)
     return files
 
