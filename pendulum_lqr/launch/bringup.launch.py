@@ -21,6 +21,7 @@ from launch_ros.substitutions import FindPackageShare
 
 from pendulum_lqr.nodes.bringup import ARGUMENTS, SIDES, parameter_file, programs
 from pendulum_msgs_py.programs.graph import NodeProgram
+from pendulum_msgs_py.programs.starter import bound_environment
 
 PLANTS = {"simulator", "bridge"}
 
@@ -42,6 +43,7 @@ def to_action(program: NodeProgram, params_file: str) -> Node:
         parameters=[dict(program.parameters), *([params_file] if params_file else [])],
         remappings=list(program.remappings.items()),
         output="screen",
+        additional_env=bound_environment({}),
         on_exit=Shutdown(reason=f"{program.full_name} has ended") if vital else None,
     )
 
@@ -55,6 +57,7 @@ def recorder(side: str, outer: str, folder: Path) -> Node:
         namespace=side,
         arguments=["-o", str(folder / side), "--regex", f"^({outer}{side}/.*|/diagnostics|/clock)$"],
         output="screen",
+        additional_env=bound_environment({}),
         # It hears the plants' last words: it gets time to write them.
         sigterm_timeout="10",
     )

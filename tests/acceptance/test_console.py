@@ -279,6 +279,31 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(browser: Any, bench:
     wait_for(lambda: desk.evaluate("pendulumConsole.plants['/sim'].stamp_ns") != before, 10, "new states")
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_a_controller_that_the_page_started_ends_with_the_console_where_it_survived_all_but_ctrl_c(
+    chromium: Any, number: signal.Signals, domain_id: int, tmp_path: Path
+) -> None:
+    processes = ProcessGroup(tmp_path / "processes", cwd=PROJECT)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    try:
+        processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "rate_hz:=100.0")
+        console = processes.start("pendulum_bags", "console", "--port", port, "--runs", tmp_path / "runs", alone=True)
+        address = console.wait_for_output(r"console at (\S+)", 60)[1]
+        page = _open(chromium, address)
+        page.get_by_role("button", name="Start controller /sim").click()
+        page.locator("[data-card='/sim']").get_by_text("lqr: inactive").wait_for()
+        page.close()
+        assert processes.leftovers()
+        console.send_signal(number)
+        console.wait(60)
+        wait_for(lambda: not processes.leftovers(), 60, "the end of the controller")
+    finally:
+        left = processes.close()
+    assert left == []
+
+
 def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, bench: Bench) -> None:
     page = _open(browser, bench.address)
     acrobot = ["-p", "plant:=acrobot", "-p", "rate_hz:=100.0"]

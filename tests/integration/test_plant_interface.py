@@ -408,7 +408,7 @@ def test_parameters_change_at_run_time_or_say_why_not(any_peer: Peer) -> None:
     assert peer.program.returncode is None
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_stop_signal_ends_torque_at_once_and_the_program_with_zero_torque_last(
     plant: RunningProgram, peer: Peer, number: signal.Signals
 ) -> None:

@@ -1,11 +1,15 @@
-"""Ctrl-C is not lost: where a shell says so, and in destructors and callbacks, where Python drops what is raised."""
+"""Whatever asks a program to end interrupts it as Ctrl-C does, and no such request is lost."""
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
+from types import FrameType
 from typing import Any
+
+from pendulum_msgs_py.programs.starter import end_with_starter
 
 __all__ = ["keep_interrupts"]
 
@@ -14,7 +18,9 @@ _MOMENT = 0.01
 
 
 def keep_interrupts() -> None:
-    """Raise KeyboardInterrupt where this process was started deaf to it, and again where Python would drop it.
+    """Raise KeyboardInterrupt on SIGINT, SIGTERM, SIGHUP and the end of the starter, again where Python drops it.
+
+    A program that dies of a closed terminal leaves plants armed and bags open; one that ``nohup`` started ignores it.
 
     Without job control, as in a script, a shell starts what it puts into the background with SIGINT ignored. Python
     leaves that as it is, and hands it on to all that it starts. An experiment would then go on, plants armed, whoever
@@ -23,6 +29,12 @@ def keep_interrupts() -> None:
     in_main = threading.current_thread() is threading.main_thread()
     if in_main and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if in_main:
+        _interrupted.add(os.getpid())
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, _interrupt)
+        end_with_starter()
     before = sys.unraisablehook
     if getattr(before, "keeps_interrupts", False):
         return
@@ -38,3 +50,14 @@ def keep_interrupts() -> None:
 
     hook.keeps_interrupts = True  # type: ignore[attr-defined]
     sys.unraisablehook = hook
+
+
+_interrupted: set[int] = set()
+"""This process; a forked worker, which is another one, dies of these signals as usual."""
+
+
+def _interrupt(number: int, _frame: FrameType | None) -> None:
+    if os.getpid() in _interrupted:
+        raise KeyboardInterrupt
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)

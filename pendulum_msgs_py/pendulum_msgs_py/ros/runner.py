@@ -41,6 +41,7 @@ from pendulum_msgs_py.programs.executables import (
     split_ros_arguments,
 )
 from pendulum_msgs_py.programs.realtime import run_in_real_time
+from pendulum_msgs_py.programs.starter import end_with_starter
 from pendulum_msgs_py.ros.answers import answer_who_listens
 from pendulum_msgs_py.ros.leaving import leaving_graph
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
@@ -55,7 +56,7 @@ _LARGEST_HEAP_BLOCK = 128 * 1024
 """[bytes]"""
 _ECHO_TIME = 1.0
 """Time within which a repeated stop signal is taken for an echo of the first [s]."""
-_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _KEPT_OPEN: list[socket.socket] = []
 """Write ends of the signal sockets: closed by the garbage collector, they would take the wakeup with them."""
 
@@ -85,7 +86,7 @@ def run_node(
     specs: Iterable[ParameterSpec] = (),
     example: str = "",
 ) -> int:
-    """Run one node until it asks to stop, SIGINT or SIGTERM; return the exit code.
+    """Run one node until it asks to stop, its starter ends, SIGINT, SIGTERM or SIGHUP; return the exit code.
 
     rclpy's own signal handlers invalidate the context before a last zero torque could be sent, so signals are taken
     by a thread here: the node is closed first, then the context is shut down. A second signal ends at once.
@@ -120,6 +121,7 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
     if os.environ.get("NO_COLOR"):  # https://no-color.org, which rcutils does not know
         os.environ.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
     signals = _listen_for_stop_signals()
+    end_with_starter()
     _wake_punctually()
     _give_memory_back()
     try:
@@ -252,7 +254,9 @@ def _listen_for_stop_signals() -> socket.socket:
         _KEPT_OPEN.pop().close()
     _KEPT_OPEN.append(writer)
     for stop_signal in _STOP_SIGNALS:
-        signal.signal(stop_signal, lambda _number, _frame: None)
+        # A closed terminal is to be ignored by what nohup started.
+        if stop_signal is not signal.SIGHUP or signal.getsignal(stop_signal) is not signal.SIG_IGN:
+            signal.signal(stop_signal, lambda _number, _frame: None)
     return reader
 
 

@@ -10,6 +10,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from pendulum_bags.experiments.bound_process import start_bound_process
 from pendulum_msgs_py.errors import FaultError
 
 __all__ = ["Job", "Jobs", "NewestPage"]
@@ -136,14 +137,7 @@ class Jobs:
         log = folder.with_suffix(".log")
         command = [sys.executable, "-m", package, *arguments, *([option, str(folder)] if option else [])]
         with log.open("wb") as sink:
-            process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=sink,
-                stderr=subprocess.STDOUT,
-                env=dict(environment),
-                start_new_session=True,
-            )
+            process = start_bound_process(command, environment=environment, output=sink)
         self._jobs[kind] = Job(kind, folder, process, log, time.monotonic())
         return self._jobs[kind]
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
-import signal
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
-__all__ = ["start_bound_process"]
+from pendulum_msgs_py.programs.starter import bound_environment
 
-_PR_SET_PDEATHSIG = 1
+__all__ = ["start_bound_process"]
 
 
 def start_bound_process(
@@ -24,7 +22,7 @@ def start_bound_process(
     niceness: int = 0,
     pass_fds: Sequence[int] = (),
 ) -> subprocess.Popen[bytes]:
-    """Start a command in a process group of its own, so that Ctrl-C reaches it through us, in order.
+    """Start a program of ours in a process group of its own, so that Ctrl-C reaches it through us, in order.
 
     Args:
         command: Program and arguments.
@@ -38,22 +36,16 @@ def start_bound_process(
         stdin=subprocess.DEVNULL,
         stdout=output,
         stderr=subprocess.STDOUT,
-        env=dict(environment),
+        env=bound_environment(environment),
         start_new_session=True,
         pass_fds=tuple(pass_fds),
-        # prctl and priorities only; no lock is taken between fork and exec
-        preexec_fn=_bind(os.getpid(), niceness),  # noqa: PLW1509
+        # Priorities only; no lock is taken between fork and exec.
+        preexec_fn=_set_priority(niceness),  # noqa: PLW1509
     )
 
 
-def _bind(parent: int, niceness: int) -> Callable[[], None]:
-    libc = ctypes.CDLL(None, use_errno=True)
-
-    def bind() -> None:
-        # SIGINT: a child of a killed experiment ends as after Ctrl-C, plants at zero torque, bags closed.
-        libc.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
-        if os.getppid() != parent:
-            os._exit(1)
+def _set_priority(niceness: int) -> Callable[[], None]:
+    def set_priority() -> None:
         # Taking priority is a privilege; without it the run is as good as the machine is idle.
         with contextlib.suppress(PermissionError):
             os.nice(niceness)
@@ -62,4 +54,4 @@ def _bind(parent: int, niceness: int) -> Callable[[], None]:
             with contextlib.suppress(OSError):
                 Path("/proc/self/autogroup").write_text(str(now), encoding="ascii")
 
-    return bind
+    return set_priority

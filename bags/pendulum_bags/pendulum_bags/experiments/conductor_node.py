@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import signal
 import time
 from collections.abc import Callable, Collection, Mapping
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, TypeVar
 
 import rclpy
@@ -69,7 +68,6 @@ class Conductor:
 
     def __enter__(self) -> Conductor:
         """Join the graph."""
-        self._previous = signal.signal(signal.SIGTERM, _interrupt)
         set_middleware_defaults()
         self.context = Context()
         rclpy.init(context=self.context, domain_id=self.domain, signal_handler_options=SignalHandlerOptions.NO, args=[])
@@ -87,7 +85,6 @@ class Conductor:
             self._executor.shutdown()
             self.node.destroy_node()
             rclpy.try_shutdown(context=self.context)
-        signal.signal(signal.SIGTERM, self._previous)
 
     def spin(self, duration: float) -> None:
         """Do nothing but listen for a while [s]."""
@@ -484,7 +481,3 @@ class RecorderClient:
         response = self._conductor.call(self._status, Trigger.Request(), "the recorder's status", 30.0)
         status: dict[str, Any] = json.loads(response.message)
         return status
-
-
-def _interrupt(_number: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt

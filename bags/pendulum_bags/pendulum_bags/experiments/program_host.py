@@ -27,6 +27,7 @@ from typing import Any
 from pendulum_bags.experiments.host_pool import AGAIN, BEGUN, LAST, HostPool, keep_pool
 from pendulum_msgs_py.programs.executables import EXIT_USAGE, run_package
 from pendulum_msgs_py.programs.realtime import priority_kept
+from pendulum_msgs_py.programs.starter import end_with_starter
 
 __all__ = ["main"]
 
@@ -42,6 +43,7 @@ def main() -> int:
         return EXIT_USAGE
     # Between two programs nobody is asked to end: the socket tells.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_starter()
     with (
         socket.socket(fileno=int(sys.argv[1])) as connection,
         HostPool() as pool,
@@ -77,7 +79,8 @@ def _run(order: Mapping[str, Any], on_begin: Callable[[], None]) -> int:
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.set_wakeup_fd(-1)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
     sys.stdout.flush()
     sys.stderr.flush()
     # Nodes freeze what is there when they start. What is left of them must go now: a node that only the collector would

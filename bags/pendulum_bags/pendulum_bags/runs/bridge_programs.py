@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+
+from pendulum_msgs_py.programs.starter import bound_environment
 
 __all__ = ["last_words", "run_bridge_program"]
 
@@ -16,7 +19,7 @@ def run_bridge_program(
     Args:
         arguments: Of its command line.
         timeout: When it is ended [s]; then subprocess.TimeoutExpired is raised.
-        deaf_to_ctrl_c: Whether Ctrl-C of this terminal shall not reach it.
+        deaf_to_ctrl_c: Whether it completes whatever happens to this process or its terminal.
     """
     return subprocess.run(
         [sys.executable, "-m", "pendulum_hw_bridge", *arguments],
@@ -26,6 +29,7 @@ def run_bridge_program(
         errors="replace",
         timeout=timeout,
         check=False,
+        env=None if deaf_to_ctrl_c else bound_environment(os.environ),
         start_new_session=deaf_to_ctrl_c,
     )
 
