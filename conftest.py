@@ -3,6 +3,8 @@
 import gc
 import importlib
 import os
+import sys
+from pathlib import Path
 
 from hypothesis import settings
 
@@ -28,6 +30,9 @@ for _package in (
 # xdist tells its workers the width of the terminal in which nobody reads them; tables are whole without one.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.pop("COLUMNS", None)
+
+# As in an activated environment, where printed commands start with plain `python`.
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
 
 # The same examples each time, so that a failure belongs to the change at hand; `--hypothesis-profile=explore` looks for
 # new ones. No deadline: on a busy machine it measures the neighbours.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -156,3 +158,24 @@ def test_the_window_shows_whichever_plant_runs_and_refuses_what_it_cannot_draw(
     assert viewer.wait(60.0) == 2
     assert "/joint_states tells of left, right, which cannot be drawn; expected the joints" in viewer.output
     assert "Traceback" not in viewer.output
+
+
+@pytest.mark.parametrize("display", [{}, {"DISPLAY": ":4095"}], ids=["no display", "a display that is not there"])
+def test_a_viewer_that_would_have_no_window_ends_at_once_with_a_sentence(
+    domain_id: int, display: dict[str, str]
+) -> None:
+    unset = {"DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"}
+    environment = {name: value for name, value in os.environ.items() if name not in unset} | display
+    done = subprocess.run(
+        [sys.executable, "-m", "pendulum_sim", "viewer"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=200,
+    )
+    assert done.returncode == 2
+    assert "ready" not in done.stdout + done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("error: ")
+    assert last.endswith("expected a display (ssh -X, or window:=false with png or gif)")

@@ -286,3 +286,16 @@ def test_json_of_a_table_is_json(capsys: pytest.CaptureFixture[str]) -> None:
 
     assert fault_main(["--json"]) == 0
     assert "m_stop" in json.loads(capsys.readouterr().out)["faults"]
+
+
+@pytest.mark.parametrize("program", ["experiment", "course"])
+def test_a_help_of_80_columns_has_the_whole_summary_of_each_command(program: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "pendulum_bags", program, "--help"],
+        env={**os.environ, "COLUMNS": "80"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "..." not in done.stdout.partition("Commands:")[2]
+    assert max(map(len, done.stdout.splitlines())) <= 80

@@ -165,7 +165,6 @@ def test_other_programs_say_their_help_with_the_first_layer_alone(tmp_path: Path
         ("pendulum_bags experiment lockstep --bag b --controller mpc", "osqp", "pendulum_lqr[mpc]"),
         ("pendulum_lqr controller --ros-args -p controller:=nmpc", "casadi", "pendulum_lqr[mpc]"),
         ("pendulum_hw_bridge scan", "hebi", "pendulum_hw_bridge[hebi]"),
-        ("pendulum_lqr design --preset thesis", "control", "pendulum_lqr[design]"),
     ],
 )
 def test_a_program_whose_library_is_missing_says_which_extra_brings_it(
@@ -185,6 +184,24 @@ def test_a_program_whose_library_is_missing_says_which_extra_brings_it(
     assert "Traceback" not in done.stderr
     assert f"{library} is not installed" in done.stderr
     assert f"install it with make extras, or python -m pip install '{extra}'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "command", ["pendulum_lqr design --preset thesis", "pendulum_bags experiment ranking --dry-run"]
+)
+def test_what_the_readme_and_the_report_of_make_experiment_point_at_runs_with_the_first_layer(
+    tmp_path: Path, command: str
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", *command.split()],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=280,
+        cwd=tmp_path,
+        env=environment_of(tmp_path / "hide", "run"),
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_library_that_no_package_names_is_no_matter_of_extras() -> None:

@@ -119,9 +119,9 @@ def share_interval(hits: int, runs: int) -> tuple[float, float]:
         runs: Of so many, at least one.
 
     Source:
-        Wilson, Journal of the American Statistical Association 22 (1927), as in statsmodels.
+        Wilson, Journal of the American Statistical Association 22 (1927).
     """
-    from statsmodels.stats.proportion import proportion_confint
+    from scipy.stats import binomtest
 
-    low, high = proportion_confint(hits, runs, alpha=0.05, method="wilson")
-    return float(low), float(high)
+    interval = binomtest(hits, runs).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)

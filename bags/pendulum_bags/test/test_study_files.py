@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +41,42 @@ def test_every_shipped_study_is_valid_and_says_what_it_needs() -> None:
         assert study.description
         assert all(run.seconds > 0.0 and run.bytes > 0 for run in study.runs)
         assert len({run.name for run in study.runs}) == len(study.runs)
+
+
+_WITHOUT = """
+import sys
+sys.modules["casadi"] = None
+from pendulum_bags.studies.study_file import load_study
+study = load_study(sys.argv[1])
+print(*sorted({run.labels["controller"] for run in study.runs}), *study.left_out, sep="\\n")
+"""
+
+
+def run_without_casadi(study: Path | str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", _WITHOUT, str(study)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_the_ranking_that_a_report_suggests_runs_without_the_extras_and_names_what_is_left_out() -> None:
+    found = run_without_casadi("ranking")
+    assert found.returncode == 0, found.stderr
+    left_out = [line for line in found.stdout.splitlines() if line.startswith("controller ")]
+    assert [line.split(":")[0] for line in left_out] == ["controller tvlqr", "controller nmpc"]
+    assert all("make extras" in line for line in left_out)
+    assert len(found.stdout.splitlines()) == 32
+    assert not load_study("ranking").left_out
+
+
+def test_a_controller_that_is_not_optional_needs_its_library_and_an_optional_one_exists(tmp_path: Path) -> None:
+    text = HEAD + "plants:\n  sim: {}\ncontrollers:\n  nmpc: {}\n  lqr: {}\n"
+    found = run_without_casadi(study_file(tmp_path, text))
+    assert "study.yaml:6: controller nmpc: casadi is not installed" in found.stderr
+    with pytest.raises(ParameterError, match=r"study.yaml:8: optional has 'mpc'; expected names of controllers"):
+        load_study(study_file(tmp_path, text + "optional: [mpc]\n"))
+    with pytest.raises(ParameterError, match=r"study.yaml:7: controller is 'lgr'"):
+        load_study(
+            study_file(tmp_path, HEAD + "plants:\n  sim: {}\ncontrollers:\n  lqr: {}\n  lgr: {}\noptional: [lgr]\n")
+        )
 
 
 def test_matrix_is_the_product_of_all_axes_in_their_order(tmp_path: Path) -> None:

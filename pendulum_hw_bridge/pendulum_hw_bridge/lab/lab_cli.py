@@ -29,6 +29,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.typed_commands import as_typed
 
 __all__ = ["main"]
 
@@ -121,7 +122,7 @@ def new(
     )
     write_lab(file, LabFile(values))
     print(f"{file}: {LabFile(values).describe()}")
-    print(f"next: python -m pendulum_hw_bridge lab zero {file}")
+    print(as_typed(f"next: python -m pendulum_hw_bridge lab zero {file}"))
 
 
 @app.command()
@@ -228,7 +229,7 @@ def backup(
         )
     for path in written:
         print(path)
-    print(f"give it back: python -m pendulum_hw_bridge lab restore {file} {folder}")
+    print(as_typed(f"give it back: python -m pendulum_hw_bridge lab restore {file} {folder}"))
 
 
 @app.command()

@@ -22,6 +22,7 @@ from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.programs import completion
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_msgs_py.programs.interrupts import keep_interrupts
+from pendulum_msgs_py.programs.typed_commands import as_typed
 
 if TYPE_CHECKING:
     import typer
@@ -181,8 +182,9 @@ def cli_main(
         print_text("\n".join(completion.of_command(command, own)))
         return 0
     _refuse_repeats(command)
+    _complete_help(command)
     try:
-        prog_name = (_called_as and _called_as[-1]) or name
+        prog_name = (_called_as and _called_as[-1]) or (name and as_typed(name))
         result = command.main(args=own, prog_name=prog_name, standalone_mode=False, obj=ros)
         # What is still buffered would else meet a broken pipe at exit, where nobody can catch it.
         sys.stdout.flush()
@@ -250,6 +252,14 @@ def _refuse_repeats(command: Any) -> None:
     command.make_parser = make_strict_parser
 
 
+def _complete_help(command: Any) -> None:
+    """Let help show commands that the shell finds, and summaries of subcommands whole: click cuts them to one line."""
+    for one in getattr(command, "commands", {}).values():
+        _complete_help(one)
+        one.short_help = one.short_help or " ".join((one.help or "").partition("\n\n")[0].split()).removesuffix(".")
+    command.help, command.epilog = (text and as_typed(text) for text in (command.help, command.epilog))
+
+
 def _one_name(name: str) -> str:
     """Return the name that we have for an option: ``--output`` of ROS 2's own tools is ``--out`` here, not in helps."""
     return "out" if name == "output" else name
@@ -282,7 +292,7 @@ def typed_options(context: typer.Context, names: Collection[str]) -> list[str]:
 
 def report_error(error: BaseException) -> int:
     """Print an error as one sentence on standard error and return the exit code for it."""
-    print(f"error: {error}", file=sys.stderr, flush=True)
+    print(f"error: {as_typed(str(error))}", file=sys.stderr, flush=True)
     return EXIT_USAGE
 
 
@@ -366,4 +376,4 @@ def _usage(package: str, table: dict[str, str]) -> str:
     lines += [f"  {name:<{width}}  {summary(name, table[name])}".rstrip() for name in names]
     lines += ["", f"example: python -m {package} {names[0]} --help"]
     lines += [f"completion with the Tab key, in bash or zsh: source <(python -m {package} --completion bash)"]
-    return "\n".join(lines)
+    return as_typed("\n".join(lines))

@@ -33,7 +33,6 @@ from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.programs import completion
 from pendulum_msgs_py.programs.executables import (
-    EXIT_USAGE,
     print_text,
     report_error,
     report_exhaustion,
@@ -42,6 +41,7 @@ from pendulum_msgs_py.programs.executables import (
 )
 from pendulum_msgs_py.programs.realtime import run_in_real_time
 from pendulum_msgs_py.programs.starter import end_with_starter
+from pendulum_msgs_py.programs.typed_commands import as_typed
 from pendulum_msgs_py.ros.answers import answer_who_listens
 from pendulum_msgs_py.ros.leaving import leaving_graph
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
@@ -108,12 +108,12 @@ def run_node(
         return 0
     own, _ = split_ros_arguments(arguments)
     if own:
-        print(
-            f"error: {program} does not know {own[0]!r}; parameters go after --ros-args, as in "
-            f"{example or f'python -m {program} --ros-args -p NAME:=VALUE'}",
-            file=sys.stderr,
+        return report_error(
+            ParameterError(
+                f"{program} does not know {own[0]!r}; parameters go after --ros-args, as in "
+                f"{example or f'python -m {program} --ros-args -p NAME:=VALUE'}"
+            )
         )
-        return EXIT_USAGE
     return _run(make_node, arguments)
 
 
@@ -305,4 +305,4 @@ def _help(program: str, description: str, specs: Iterable[ParameterSpec], exampl
         ]
     if example:
         lines += ["", f"example: {example}"]
-    return "\n".join(lines)
+    return as_typed("\n".join(lines))

@@ -10,6 +10,8 @@ with the link hanging along -y in its own frame, and the screen's y axis pointin
 from __future__ import annotations
 
 import math
+import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -121,6 +123,10 @@ class PendulumPicture(Picture):
         self.draw_text(rows, note)
 
 
+_EXPECTED = "expected a display (ssh -X, or window:=false with png or gif)"
+_INVISIBLE = ("dummy", "offscreen", "evdev", "kmsdrm")
+
+
 class Window:
     """A window on the screen that shows pictures.
 
@@ -137,11 +143,18 @@ class Window:
 
         self.closed = False
         self._pygame = pygame
+        chosen = os.environ.get("SDL_VIDEODRIVER", "")
+        if sys.platform == "linux" and not (chosen or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))):
+            raise ParameterError(f"DISPLAY and WAYLAND_DISPLAY are not set, so there is no window; {_EXPECTED}")
         try:
             pygame.display.init()
+            # SDL falls back to drivers that show nothing.
+            if (driver := pygame.display.get_driver()) in _INVISIBLE and driver != chosen:
+                pygame.display.quit()
+                raise ParameterError(f"no window can be opened, {driver} shows none; {_EXPECTED}")
             self._screen = pygame.display.set_mode(size)
         except pygame.error as error:
-            raise ParameterError(f"no window can be opened: {error}; expected a display") from error
+            raise ParameterError(f"no window can be opened: {error}; {_EXPECTED}") from error
         pygame.display.set_caption(title)
         self._clock = pygame.time.Clock()
 

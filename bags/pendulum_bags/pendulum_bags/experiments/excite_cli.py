@@ -12,6 +12,7 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.options import Json, RunningDomain, out_option
+from pendulum_msgs_py.programs.typed_commands import as_typed
 
 __all__ = ["app", "main"]
 
@@ -143,7 +144,7 @@ def excite(
     except KeyboardInterrupt:
         typer.echo("interrupted: the torque is zero, all programs have ended", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
-    typer.echo(f"played and recorded; next\n  python -m pendulum_bags identify {target}", err=as_json)
+    typer.echo(as_typed(f"played and recorded; next\n  python -m pendulum_bags identify {target}"), err=as_json)
 
 
 main = partial(cli_main, app, name="python -m pendulum_bags excite")

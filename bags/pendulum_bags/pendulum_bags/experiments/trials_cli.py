@@ -17,6 +17,7 @@ from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.programs.options import Domain, Json, Lab, Storage, Yes, out_option
 from pendulum_msgs_py.programs.terminal import make_console
+from pendulum_msgs_py.programs.typed_commands import as_typed
 
 if TYPE_CHECKING:
     from pendulum_bags.experiments.trials import TrialSettings
@@ -114,7 +115,7 @@ def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_out
     code = identify_cli.main([*map(str, bags), *arguments, *(["--json"] if json_output else [])])
     console.print(
         f"\nbags    {folder / 'trial_1'} to {folder / f'trial_{len(bags)}'} ({elapsed:.0f} s)\n"
-        f"again   python -m pendulum_bags identify {folder}/trial_* --method thesis --experiment {name}",
+        + as_typed(f"again   python -m pendulum_bags identify {folder}/trial_* --method thesis --experiment {name}"),
         soft_wrap=True,
     )
     if code:

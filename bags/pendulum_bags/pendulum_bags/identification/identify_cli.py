@@ -17,6 +17,7 @@ from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
+from pendulum_msgs_py.programs.typed_commands import as_typed
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.mechanism_result import MechanismResult
@@ -277,7 +278,7 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
         console.print(f"wrote {out}", highlight=False)
         told, command = result.next_step(str(out))
         # The command is on a line of its own, to be copied.
-        console.print(f"{told}\n  {command}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"{told}\n  {as_typed(command)}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _several_joints(

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 from html import escape
 from typing import NamedTuple
 
+from pendulum_msgs_py.programs.typed_commands import as_typed
+
 __all__ = ["TERMS", "Html", "Term", "Terms"]
 
 
@@ -208,7 +210,7 @@ class Terms:
         seen: set[str] = set()
         end = 0
         for found in _COMMANDS.finditer(text):
-            pieces += [self._linked(text[end : found.start()], seen), f"<code>{escape(found[0])}</code>"]
+            pieces += [self._linked(text[end : found.start()], seen), f"<code>{escape(as_typed(found[0]))}</code>"]
             end = found.end()
         pieces.append(self._linked(text[end:], seen))
         return Html("".join(pieces))

@@ -188,8 +188,9 @@ def write_ranking(
     ranking: Ranking,
     formats: Sequence[str] = ("png", "pdf"),
     words: Words = Words(),
+    notes: Sequence[str] = (),
 ) -> Path:
-    """Write numbers, layer, figure and page into a folder; return the page."""
+    """Write numbers, layer, figure and page, with notes at its end, into a folder; return the page."""
     folder.mkdir(parents=True, exist_ok=True)
     layer = same_choice(ranking, words=words)
     write_json(folder / "ranking.json", ranking.to_json())
@@ -213,7 +214,7 @@ def write_ranking(
                 _pair_rows(ranking),
             )
         )
-    return write_layer_page(folder / "ranking.html", "Ranking of controllers", [layer], figures, tables)
+    return write_layer_page(folder / "ranking.html", "Ranking of controllers", [layer], figures, tables, notes)
 
 
 def print_ranking(console: Console, ranking: Ranking) -> None:

@@ -16,6 +16,7 @@ from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counting_bar, resumable
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from pendulum_msgs_py.programs.typed_commands import as_typed
 
 if TYPE_CHECKING:
     from pendulum_bags.studies.study_file import Study, StudyRun
@@ -181,6 +182,8 @@ def _study(
         return
     folder = out or Path("bags", "runs", found.name)
     found = open_study_folder(folder, found)
+    for sentence in found.left_out:
+        console.print(f"left out: {as_typed(sentence)}", markup=False)
     told = -1
 
     def show(progress: StudyProgress) -> None:
@@ -238,7 +241,7 @@ def _analyse(
     from pendulum_bags.studies import pid_vs_lqr, pooled, strategies
     from pendulum_bags.studies.results import group_runs, groups_to_json
 
-    result: dict[str, Any] = {"study": found.name, "runs": len(records)}
+    result: dict[str, Any] = {"study": found.name, "runs": len(records), "left_out": list(found.left_out)}
     tell: Callable[[Console, Any], None]
     if found.experiment == "run":
         key, tell = "groups", _print_groups
@@ -258,7 +261,7 @@ def _analyse(
         from pendulum_bags.ranking.ranking import rank
 
         ranked = rank(collect_contenders([folder]))
-        write_ranking(folder, ranked)
+        write_ranking(folder, ranked, notes=[f"Left out: {sentence}." for sentence in found.left_out])
         key, tell = "ranking", lambda console, _: print_ranking(console, ranked)
         result[key] = ranked.to_json()
     write_json(folder / "results.json", result)

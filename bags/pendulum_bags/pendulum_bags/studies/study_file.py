@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence, Sized
+from collections.abc import Collection, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import resources
@@ -16,6 +16,7 @@ from typing import Any
 from pendulum_bags.experiments.run_spec import CLOCKS, PERIODS, RunSpec
 from pendulum_bags.experiments.settings import TIME_BESIDE_NOISE
 from pendulum_bags.studies.located import LocatedMapping
+from pendulum_lqr.controller_interface.controller import controller_class
 from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -31,7 +32,7 @@ AXES = ("plant", "controller", "disturbance", "set_point", "start")
 STARTS = {"upright": UPRIGHT, "bottom": 0.0}
 _KEYS = (
     "format", "name", "description", "experiment", "analysis", "clock", "duration", "plants", "controllers",
-    "disturbances", "set_points", "starts", "seeds", "repeats", "trials",
+    "disturbances", "set_points", "starts", "seeds", "repeats", "trials", "optional",
 )  # fmt: skip
 _PLANT_KEYS = ("side", "plant", "design_plant", "strategy", "method", "engine", "parameters", "hardware", "lab")
 _MAX_RUNS = 100_000
@@ -109,6 +110,7 @@ class Study:
         runs: The matrix.
         text: The file, as it is kept beside the results.
         clock: ``lockstep``, as fast as possible, or ``realtime``.
+        left_out: Why each optional controller is left out whose library is not installed, one sentence each.
     """
 
     name: str
@@ -118,6 +120,7 @@ class Study:
     runs: tuple[StudyRun, ...]
     text: str = field(repr=False, default="")
     clock: str = "lockstep"
+    left_out: tuple[str, ...] = ()
 
     @property
     def realtime(self) -> bool:
@@ -186,16 +189,21 @@ def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Stu
     repeats = file.get("repeats", int, 1, "a whole number >= 1")
     if not 1 <= repeats <= _MAX_RUNS:
         file.fail(f"repeats is {repeats}; expected >= 1 and <= {_MAX_RUNS}", "repeats")
-    make = _plain_runs if experiment == "run" else _named_runs
-    runs = tuple(make(file, experiment, clock, values, repeats))
+    left_out: dict[str, str] = {}
+    if experiment == "run":
+        left_out = _missing(file)
+        runs = _plain_runs(file, clock, values, repeats, left_out)
+    else:
+        runs = _named_runs(file, experiment, clock, values, repeats)
     return Study(
         file.get("name", str, None, "a name"),
         file.get("description", str, "", "a sentence"),
         experiment,
         analysis,
-        runs,
+        tuple(runs),
         path.read_text(encoding="utf-8"),
         clock,
+        tuple(left_out.values()),
     )
 
 
@@ -212,9 +220,28 @@ def _law(file: LocatedMapping, name: str, entry: LocatedMapping) -> tuple[str, d
     return kind, values
 
 
-def _plain_runs(file: LocatedMapping, _: str, clock: str, seeds: Sequence[int], repeats: int) -> list[StudyRun]:
+def _missing(file: LocatedMapping) -> dict[str, str]:
+    """Return the optional controllers whose library is not installed, each with the sentence that says which."""
+    controllers = _axis(file, "controllers")
+    found = {}
+    for name in file.get("optional", list, [], "a list of controllers"):
+        if name not in controllers:
+            file.fail(f"optional has {name!r}; expected names of controllers", "optional")
+        try:
+            controller_class(controllers[name].values.get("kind", name))
+        except ParameterError as error:
+            if not isinstance(error.__cause__, ImportError):
+                file.fail(str(error), "controllers", name)
+            found[name] = str(error)
+    return found
+
+
+def _plain_runs(
+    file: LocatedMapping, clock: str, seeds: Sequence[int], repeats: int, left_out: Collection[str]
+) -> list[StudyRun]:
     duration = _duration(file)
-    plants, controllers = _axis(file, "plants"), _axis(file, "controllers")
+    plants = _axis(file, "plants")
+    controllers = {name: entry for name, entry in _axis(file, "controllers").items() if name not in left_out}
     disturbances = _axis(file, "disturbances", {"none": {}})
     set_points = file.get("set_points", list, [0.0], "a list of angles from upright [rad]")
     starts = file.get("starts", list, ["upright"], "a list of upright, bottom, random or angles [rad]")

@@ -15,6 +15,7 @@ from pendulum_bags.figures.terminal_table import number_table
 from pendulum_bags.verdict.layers import Answer, Mark, name_hardware
 from pendulum_bags.verdict.same_run import seen_note
 from pendulum_msgs_py.programs.terminal import WholeTable
+from pendulum_msgs_py.programs.typed_commands import as_typed
 
 __all__ = ["layers_table", "print_answer", "print_tests", "tests_table"]
 
@@ -41,7 +42,7 @@ def layers_table(answer: Answer) -> WholeTable:
     for number, result in enumerate(answer.layers, start=1):
         mark = Text(SIGNS[result.mark], _STYLES[result.mark])
         because = Text(textwrap.fill(result.layer.question, _WIDTH), "italic")
-        because.append("\n" + textwrap.fill(result.sentence, _WIDTH), "not italic")
+        because.append("\n" + textwrap.fill(as_typed(result.sentence), _WIDTH), "not italic")
         table.add_row(f"{number} {result.layer.title}", mark, because)
     return table
 
@@ -78,4 +79,4 @@ def print_answer(console: Console, answer: Answer) -> None:
     if answer.next_steps:
         console.print("What to do next:")
         for step in answer.next_steps:
-            console.print(f"  - {escape(step)}", highlight=False, soft_wrap=True)
+            console.print(f"  - {escape(as_typed(step))}", highlight=False, soft_wrap=True)

@@ -1,0 +1,10 @@
+"""Answer ``python3 -m pendulum_msgs_py`` of a Python that the package is not installed for."""
+
+import sys
+
+print(
+    "error: pendulum_msgs_py is not installed for this Python; run .venv/bin/python -m pendulum_msgs_py ..., "
+    "or source .venv/bin/activate first (make experiment creates .venv)",
+    file=sys.stderr,
+)
+sys.exit(2)
