@@ -38,12 +38,14 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
     whose = verdict.margins.whose
     if mark is Mark.YES:
         reason = f"in {runs} simulation and the hardware move alike within {whose}, in all {len(tests)} tests"
+        told = [test for test in tests if math.isfinite(test.interval.estimate)]
+        reason += f"; nearest to its margin, {in_words(max(told, key=_beyond))}" if told else ""
         steps: Sequence[str] = ()
     elif mark is Mark.NO:
         failed = sorted((test for test in tests if test.outcome is Outcome.DIFFERENT), key=_beyond, reverse=True)
         told = _each_once(failed)
         beside = ", ".join(test.quantity for test in told[_MOST_REASONS:])
-        reason = "; ".join(in_words(test, comparison.seen) for test in told[:_MOST_REASONS])
+        reason = "; ".join(in_words(test) for test in told[:_MOST_REASONS])
         reason += f"; also beyond its margin: {beside}" if beside else ""
         steps = _remedies(comparison, failed)
     else:
@@ -56,33 +58,30 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
     return LayerResult(Layer.SAME_RUN, mark, sentence, tuple(map(_evidence, tests)), steps, reason=reason)
 
 
-def in_words(test: EquivalenceTest, seen: str) -> str:
-    """Return what a test found as half a sentence, with the name and the figure that its table has.
-
-    Args:
-        test: The test.
-        seen: Of what its spreads and distances are, as :attr:`Comparison.seen` says: a spread over all samples, which
-            stands in other tables, may be another.
-    """
+def in_words(test: EquivalenceTest) -> str:
+    """Return what a test found as half a sentence, with its margin in the same quantity and unit."""
     value = test.interval.estimate
+    unit = "" if test.unit == "-" else f" {test.unit}"
+    allowed = f"{test.high if value >= 0.0 or not math.isfinite(test.low) else -test.low:.3g}{unit} allowed"
     if test.quantity == "delay":
         when = "later" if value >= 0.0 else "earlier"
-        return f"the hardware answers {abs(value):.3g} {test.unit} {when} than the simulation"
+        return f"the hardware answers {abs(value):.3g}{unit} {when} than the simulation ({allowed})"
     if test.quantity.startswith("mean "):
         what = test.quantity.removeprefix("mean ").split(" ", maxsplit=1)[0]
-        return f"the hardware's mean {what} is {abs(value):.3g} {test.unit} {'higher' if value >= 0.0 else 'lower'}"
+        way = "higher" if value >= 0.0 else "lower"
+        return f"the hardware's mean {what} is {abs(value):.3g}{unit} {way} ({allowed})"
     if test.quantity.startswith("spread of "):
-        what = test.quantity.removeprefix("spread of ").split(" ", maxsplit=1)[0]
-        if test.unit != "-":
-            size, ratio = f"{abs(value):.3g} {test.unit} {'larger' if value >= 0.0 else 'smaller'}", ""
-        elif value >= 2.0:
-            size, ratio = f"{value:.3g} times as large", ""
-        else:
-            size = f"{100.0 * abs(value - 1.0):.2g} % {'larger' if value >= 1.0 else 'smaller'}"
-            ratio = f"ratio {value:.3g} "
-        return f"the hardware's spread of {what} is {size} ({ratio}{seen})"
-    apart = "% of the hardware's spread" if test.unit == "%" else test.unit
-    return f"the {test.quantity} is {value:.3g} {apart} ({seen})"
+        what = f"the hardware's {test.quantity.partition(' (')[0].removesuffix(' difference')} is"
+        if unit:
+            return f"{what} {abs(value):.3g}{unit} {'larger' if value >= 0.0 else 'smaller'} ({allowed})"
+        if value >= 2.0:
+            return f"{what} {value:.3g} times as large ({test.high:.3g} times allowed)"
+        way, bound = ("larger", test.high) if value >= 1.0 else ("smaller", test.low)
+        sizes = [f"{100.0 * abs(one - 1.0):.3g} %" for one in (value, bound)]
+        return f"{what} {sizes[0]} {way} ({sizes[1]} allowed; ratio {value:.3g})"
+    if unit == " %":
+        return f"the {test.quantity} is {value:.3g} % of the hardware's spread ({allowed})"
+    return f"the {test.quantity} is {value:.3g}{unit} ({allowed})"
 
 
 def seen_note(comparison: Comparison) -> str:
