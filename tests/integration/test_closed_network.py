@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import psutil
 import pytest
@@ -68,6 +69,16 @@ def test_a_profile_that_is_missing_ends_a_program(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(middleware, "_LOOPBACK", Path("/nowhere/loopback.xml"))
     with pytest.raises(FaultError, match=r"/nowhere/loopback\.xml is missing"):
         middleware_defaults({}, _FAST)
+
+
+def test_both_generations_of_fast_dds_get_one_profile() -> None:
+    """A profile with the name that the other generation has is not read at all, and the node is refused."""
+    trees = []
+    for name in ("loopback.xml", "loopback_3.xml"):
+        text = Path(middleware.__file__).with_name(name).read_text(encoding="utf-8")
+        trees.append(ElementTree.canonicalize(text, strip_text=True, with_comments=False))
+    assert trees[0].replace("heartbeatPeriod", "heartbeat_period") == trees[1]
+    assert trees[0] != trees[1]
 
 
 @pytest.fixture

@@ -18,7 +18,10 @@ _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 _TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
 _SETTINGS = (_TRANSPORTS, "FASTDDS_DEFAULT_PROFILES_FILE", _PROFILES)
-_LOOPBACK = Path(__file__).with_name("loopback.xml")
+_MAPPED = Path("/proc/self/maps")
+# rclpy has loaded the middleware by now. Fast DDS 3 refuses the whole profile for one element that was renamed.
+_IS_FAST_DDS_3 = _MAPPED.is_file() and "/libfastdds.so" in _MAPPED.read_text(encoding="utf-8", errors="replace")
+_LOOPBACK = Path(__file__).with_name("loopback_3.xml" if _IS_FAST_DDS_3 else "loopback.xml")
 _LEAST_MEMORY = 1 << 30
 """Address space in which Fast DDS starts its threads; with less, it ends the process in ways of its own [bytes]."""
 _PORTS_OF_DOMAIN = 250
