@@ -13,7 +13,7 @@ from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.port.actuator import ActuatorError, HardwareLimits, Strategy
+from pendulum_hw_bridge.port.actuator import ActuatorError, HardwareLimits, Strategy, no_torque
 from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.port.settings import BridgeSettings
@@ -262,7 +262,7 @@ def test_torque_to_setpoint_and_back(kind: EffortStrategy, voltage: float) -> No
     moving = MotorState(voltage, 0.3)
     for effort in (-5.0, 0.0, 0.3, 9.0):
         assert mapping.effort_of(mapping.command(effort, moving), moving, 0.7) == pytest.approx(effort, abs=1e-12)
-    assert mapping.effort_of(mapping.idle(), moving, 0.7) == 0.0
+    assert mapping.effort_of(no_torque(mapping.strategy), moving, 0.7) == 0.0
 
 
 def test_release_never_raises_and_close_may_follow_any_failure() -> None:

@@ -31,12 +31,11 @@ def test_a_torque_is_its_own_setpoint_within_the_limit(asked: float, sent: float
     assert mapping().bounded(mapping().command(asked, MOTOR), MOTOR).effort == sent
 
 
-def test_nothing_but_an_effort_leaves_the_bridge_and_no_torque_is_zero() -> None:
+def test_nothing_but_an_effort_leaves_the_bridge() -> None:
     bounded = mapping().bounded(Command(1.0, 2.0, 0.5, 0.25), MOTOR)
     assert bounded.effort == 0.5
     assert all(map(math.isnan, (bounded.position, bounded.velocity, bounded.pwm)))
     assert math.isnan(mapping().bounded(Command(), MOTOR).effort)
-    assert mapping().idle().effort == 0.0
     assert mapping().strategy is Strategy.PARALLEL_PWM
     assert mapping().limited_gains(24.0) is DEFAULT_GAINS[3]
 

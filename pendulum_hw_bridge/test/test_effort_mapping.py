@@ -9,7 +9,7 @@ import pytest
 
 from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.drive.motor_state import MotorState
-from pendulum_hw_bridge.port.actuator import Command, Strategy
+from pendulum_hw_bridge.port.actuator import Command, Strategy, no_torque
 from pendulum_hw_bridge.port.gains import GainSet, PidGains
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
@@ -67,10 +67,6 @@ def test_each_way_to_make_a_torque_has_its_strategy_and_setpoint() -> None:
     command = mapping(LOOP).command(1.0, motor)
     assert command.effort == 1.0
     assert math.isnan(command.pwm)
-    for kind in (PWM, COMPENSATED):
-        assert mapping(kind).idle().pwm == 0.0
-    idle = mapping(LOOP).idle()
-    assert all(math.isnan(value) for value in (idle.position, idle.velocity, idle.effort, idle.pwm))
 
 
 def test_the_torque_that_setpoints_stand_for_is_the_way_back() -> None:
@@ -78,7 +74,7 @@ def test_the_torque_that_setpoints_stand_for_is_the_way_back() -> None:
     for kind in (PWM, COMPENSATED, LOOP):
         for effort in (1.0, -0.25):
             assert mapping(kind).effort_of(mapping(kind).command(effort, motor), motor, 0.7) == effort
-        assert mapping(kind).effort_of(mapping(kind).idle(), motor, 0.7) == 0.0
+        assert mapping(kind).effort_of(no_torque(mapping(kind).strategy), motor, 0.7) == 0.0
     # Under position control the duty in force tells.
     assert mapping().effort_of(Command(position=1.0), motor, 0.5) == 1.0
     assert mapping().effort_of(Command(position=1.0), motor, NAN) == 0.0

@@ -20,7 +20,7 @@ from pendulum_hw_bridge.bridge.bridge import Bridge
 from pendulum_hw_bridge.bridge.module import DrivenModule, Module
 from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
-from pendulum_hw_bridge.port.actuator import ActuatorError, Command, CommandLock, Strategy
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, CommandLock, Strategy, no_torque
 from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_hw_bridge.port.gains import GAIN_FIELDS, LOOPS
 from pendulum_hw_bridge.port.settings import BridgeSettings
@@ -462,7 +462,7 @@ def test_setpoints_that_were_kept_do_not_outlive_the_connection_and_a_new_one_is
     first, second = (drive.port for drive in rig.bridge.drives)
     first.stop()
     # What the other joint has kept is still there, since it is let go without a stop.
-    rig.shared.keep(1, Command(pwm=0.25), Strategy.DIRECT_PWM)
+    rig.shared.keep(1, Command(pwm=0.25))
     rig.shared._stop_told = {0}
     for port in (first, second):
         port.let_go()  # type: ignore[attr-defined]
@@ -478,7 +478,7 @@ def test_setpoints_that_were_kept_do_not_outlive_the_connection_and_a_new_one_is
 def test_setpoints_that_were_kept_do_not_outlive_a_stop() -> None:
     rig = Rig().armed()
     first, second = (drive.port for drive in rig.bridge.drives)
-    rig.bridge.drives[0].send(Strategy.DIRECT_PWM, rig.bridge.drives[0].mapping.idle())
+    rig.bridge.drives[0].send(Strategy.DIRECT_PWM, no_torque(Strategy.DIRECT_PWM))
     second.stop()
     rig.forget()
     first.flush()  # type: ignore[attr-defined]
@@ -646,11 +646,13 @@ def test_zero_and_off_are_sent_to_every_module_also_when_one_does_not_acknowledg
     rig.forget()
     rig.fakes[deaf].deaf = True
     rig.bridge.fail("m_stop", "pressed")
-    # One round of zero, three of off, for all joints together: not as many for each.
+    # One round of no torque, three of off, for all joints together: not as many for each.
     assert rig.network.rounds == ["send", "ask", "ask", "ask"]
     assert rig.all_off()
     for index in coordinates.driven:
-        assert rig.fakes[index].packets[0] == {"effort": 0.0}
+        first = rig.fakes[index].packets[0]
+        assert list(first) == list(SETPOINTS)
+        assert first["effort"] == 0.0
     for module in rig.fakes:
         # Off, and no setpoint that a strategy put in force by somebody else could begin with.
         for off in module.packets[1:]:
@@ -664,7 +666,7 @@ def test_zero_and_off_are_sent_to_every_module_also_when_one_does_not_acknowledg
     rig.forget()
     rig.clock.wait_until(rig.clock.now_ns() + 100_000_000)
     rig.bridge.insist()
-    assert rig.network.rounds == ["ask"]
+    assert rig.network.rounds == ["send", "ask"]
     assert not rig.bridge.stop_pending
     assert [module.settings["control_strategy"] for module in rig.fakes] == [0, 0]
 
@@ -677,7 +679,7 @@ def test_what_is_sent_after_a_stop_is_stopped_anew(sends: str) -> None:
     if sends == "strategy":
         second.set_strategy(Strategy.DIRECT_PWM)
     else:
-        second.write(rig.bridge.drives[1].mapping.idle())
+        second.write(no_torque(Strategy.DIRECT_PWM))
         second.flush()  # type: ignore[attr-defined]
     rig.forget()
     second.stop()
@@ -711,7 +713,7 @@ def test_a_stop_from_a_second_thread_does_nothing_and_a_write_is_refused() -> No
 
     def run() -> None:
         port.stop()
-        for call in (lambda: port.write(rig.bridge.drives[0].mapping.idle()), port.flush):  # type: ignore[attr-defined]
+        for call in (lambda: port.write(no_torque(Strategy.DIRECT_PWM)), port.flush):  # type: ignore[attr-defined]
             try:
                 call()
             except ActuatorError as error:

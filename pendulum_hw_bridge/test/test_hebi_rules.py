@@ -312,20 +312,54 @@ def test_what_was_written_is_returned_with_its_time_and_strategy() -> None:
     assert group.sent[-1].velocity[0] == 0.5
 
 
+def setpoints(command: Any) -> Command:
+    """Return the setpoints that a packet carries, the effort field as the effort."""
+    held = {name: _holds(command, name) for name in ("position", "velocity", "effort")}
+    assert all(held.values()), "a field that is left out may keep its last setpoint"
+    return Command(**{name: float(getattr(command, name)[0]) for name in held})
+
+
 @pytest.mark.parametrize(
     ("strategy", "setpoint"),
-    [(Strategy.DIRECT_PWM, Command(pwm=0.25)), (Strategy.PARALLEL_PWM, Command(effort=1.0))],
+    [
+        (Strategy.DIRECT_PWM, Command(pwm=0.25)),
+        (Strategy.TORQUE_CASCADE, Command(position=1.0)),
+        (Strategy.PARALLEL_PWM, Command(position=1.0)),
+        (Strategy.PARALLEL_PWM, Command(effort=1.0)),
+        (Strategy.MIXED, Command(position=1.0)),
+    ],
 )
-def test_a_stop_begins_with_zero_whatever_the_strategy(strategy: Strategy, setpoint: Command) -> None:
+def test_a_stop_begins_with_no_torque_where_an_effort_of_zero_would_wake_the_torque_loop(
+    strategy: Strategy, setpoint: Command
+) -> None:
     port, _ = port_on(group := Group(), imitation=True)
     port.set_strategy(strategy, setpoint)
     port.stop()
-    assert group.sent[-2].effort[0] == 0.0
+    effort = setpoints(group.sent[-2]).effort
+    assert effort == 0.0 if strategy is Strategy.DIRECT_PWM else math.isnan(effort)
+    assert given(group.sent[-2]) == ({"effort"} if strategy is Strategy.DIRECT_PWM else set())
     assert given(group.sent[-1]) == set()
     # Off already, there is nothing that a zero could end.
     count = len(group.sent)
     port.stop()
     assert len(group.sent) == count + 1
+
+
+@pytest.mark.parametrize("first", [Strategy.DIRECT_PWM, Strategy.PARALLEL_PWM])
+def test_a_stop_wakes_no_loop_where_the_acknowledgement_of_the_strategy_was_lost(first: Strategy) -> None:
+    other = Strategy.PARALLEL_PWM if first is Strategy.DIRECT_PWM else Strategy.DIRECT_PWM
+    port, _ = port_on(group := Group(), imitation=True)
+    port.set_strategy(first)
+    group.acknowledges = False
+    with pytest.raises(ActuatorError, match="did not acknowledge its strategy"):
+        port.set_strategy(other)
+    group.acknowledges = True
+    port.stop()
+    assert math.isnan(setpoints(group.sent[-2]).effort)
+    # Off is confirmed, and so is the next strategy: a duty of zero is certain to be one.
+    port.set_strategy(Strategy.DIRECT_PWM)
+    port.stop()
+    assert setpoints(group.sent[-2]).effort == 0.0
 
 
 def test_after_a_stop_that_nobody_confirmed_no_duty_can_be_written() -> None:

@@ -179,7 +179,7 @@ class DrivePort(JointPort):
         return self.machine.drives[self._motor].lifetime
 
     def stop(self) -> None:
-        """Effort zero, then off; both are lost where the way there is cut, and the command lifetime ends the torque."""
+        """Off, which ends the torque; lost where the way there is cut: the command lifetime then ends the torque."""
         if not self._connected:
             return
         self._strategy = Strategy.OFF

@@ -20,6 +20,7 @@ from pendulum_hw_bridge.port.actuator import (
     Feedback,
     HardwareLimits,
     Strategy,
+    no_torque,
 )
 from pendulum_hw_bridge.port.clocks import Clock, WallClock
 from pendulum_hw_bridge.port.command_check import check_command, check_lifetime
@@ -174,13 +175,12 @@ class EmulatorBackend:
         self.actuator.push = torque if math.isfinite(torque) else 0.0
 
     def stop(self) -> None:
-        """Effort zero, then strategy off; both are lost where the way there is cut."""
+        """No torque, then strategy off; both are lost where the way there is cut."""
         if not self._connected:
             return
         self._catch_up()
         if self._strategy is not Strategy.OFF and ActuatorFault.SEND_FAILED not in self.actuator.faults:
-            zero = Command(pwm=0.0) if self._strategy is Strategy.DIRECT_PWM else Command(effort=0.0)
-            self.actuator.deliver(zero, self.clock.now_ns())
+            self.actuator.deliver(no_torque(self._strategy), self.clock.now_ns())
             self._catch_up()
         self._strategy = Strategy.OFF
         if self.actuator.faults & _CUT_OFF:

@@ -17,6 +17,7 @@ from pendulum_hw_bridge.port.actuator import (
     Feedback,
     HardwareLimits,
     Strategy,
+    no_torque,
 )
 from pendulum_hw_bridge.port.clocks import Clock, WallClock
 from pendulum_hw_bridge.port.command_check import check_command, check_lifetime
@@ -49,7 +50,7 @@ class EmulatorProcessBackend:
         self._clock = clock or WallClock()
         self._socket: socket.socket | None = None
         self._strategy = Strategy.OFF
-        self._off_confirmed = True
+        self._possible = {Strategy.OFF}
         self._limits = HardwareLimits()
         self._requests = 0
         self._push = 0.0
@@ -76,6 +77,7 @@ class EmulatorProcessBackend:
             attempts = self._attempts
         status = self._request({}, attempts=attempts)
         self._strategy = Strategy(status["strategy"])
+        self._possible = {self._strategy}
         return ActuatorInfo(
             backend=self.name,
             family=str(status["family"]),
@@ -117,9 +119,10 @@ class EmulatorProcessBackend:
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
         """Change the strategy, then send first setpoints."""
         limited = None if command is None else check_command(command, strategy, self._limits)[0]
-        # Asked for is as good as set, until off is confirmed: the acknowledgement may be what is lost.
-        self._off_confirmed = False
+        # Requested is as good as set until it is confirmed: the acknowledgement may be what is lost.
+        self._possible.add(strategy)
         self._strategy = Strategy(self._request({"settings": {"strategy": int(strategy)}})["strategy"])
+        self._possible = {self._strategy}
         if limited is not None and self._strategy is strategy:
             self._send(wire.encode_command(limited))
         return self._strategy
@@ -151,19 +154,19 @@ class EmulatorProcessBackend:
             self._send(wire.encode_json(wire.REQUEST, {"push": torque}))
 
     def stop(self) -> None:
-        """Effort zero, then strategy off; the strategy is tried several times, because a packet may be lost."""
-        if self._socket is None or (self._strategy is Strategy.OFF and self._off_confirmed):
+        """No torque, then strategy off; the strategy is tried several times, because a packet may be lost."""
+        driving = self._possible - {Strategy.OFF}
+        if self._socket is None or not driving:
             return
-        direct, self._strategy = self._strategy is Strategy.DIRECT_PWM, Strategy.OFF
-        self._off_confirmed = False
+        self._strategy = Strategy.OFF
         try:
-            self._send(wire.encode_command(Command(pwm=0.0) if direct else Command(effort=0.0)))
+            self._send(wire.encode_command(no_torque(*driving)))
         finally:
             try:
                 self._request({"settings": {"strategy": int(Strategy.OFF)}}, patience=_STOP_PATIENCE)
             except ActuatorError as error:
                 raise ActuatorError("stop_unacknowledged", f"{error}; the command lifetime ends its torque") from error
-        self._off_confirmed = True
+        self._possible = {Strategy.OFF}
 
     def close(self) -> None:
         """Stop and let go."""

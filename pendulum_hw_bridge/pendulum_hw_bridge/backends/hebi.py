@@ -30,6 +30,7 @@ from pendulum_hw_bridge.port.actuator import (
     LimitState,
     Strategy,
     TemperatureState,
+    no_torque,
 )
 from pendulum_hw_bridge.port.clocks import Clock, WallClock
 from pendulum_hw_bridge.port.command_check import check_command, check_lifetime
@@ -134,6 +135,7 @@ class HebiBackend:
         self._feedback: Any = None
         self._owner: int | None = None
         self._strategy = Strategy.OFF
+        self._possible = {Strategy.OFF}
         self._limits = HardwareLimits()
         self._gains: GainSet | None = None
         self._counter = 0
@@ -179,6 +181,7 @@ class HebiBackend:
             # A strategy that we do not know is not ours; the bridge switches it off before anything else.
             number = int(info.control_strategy[0])
             self._strategy = Strategy(number) if number in set(Strategy) else Strategy.OFF
+            self._possible = {self._strategy}
             family, name = str(info.family[0]), str(info.name[0])
             serial, firmware = str(info.serial[0]), str(info.firmware_revision[0])
         return ActuatorInfo(
@@ -229,17 +232,19 @@ class HebiBackend:
         limited, changed = check_command(command, self._strategy, self._limits)
         now = self._clock.now_ns()
         self._command.clear()
-        self._set_setpoints(limited, self._strategy)
+        self._set_setpoints(limited)
         self._send()
         return Applied(limited, self._strategy, changed, now)
 
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
         """Change the strategy, with first setpoints in the same packet."""
         self._own()
-        limited, _ = check_command(command or Command(), strategy, self._limits)
+        limited, _ = check_command(command or no_torque(strategy), strategy, self._limits)
+        # Requested is as good as set until it is confirmed: the acknowledgement may be what is lost.
+        self._possible.add(strategy)
         self._command.clear()
         self._command.control_strategy = int(strategy)
-        self._set_setpoints(limited, strategy)
+        self._set_setpoints(limited)
         self._acknowledged("strategy")
         info = self._read_info()
         number = int(strategy) if info is None else int(info.control_strategy[0])
@@ -248,6 +253,7 @@ class HebiBackend:
                 "strategy", f"strategy reads back as {number}; expected {strategy.name} ({int(strategy)})"
             )
         self._strategy = Strategy(number)
+        self._possible = {self._strategy}
         return self._strategy
 
     def set_gains(self, gains: GainSet) -> GainSet:
@@ -286,22 +292,22 @@ class HebiBackend:
         return float(self._group.feedback_frequency)
 
     def stop(self) -> None:
-        """Effort zero, then strategy off, acknowledged; tried several times, because a packet may be lost."""
+        """No torque, then strategy off, acknowledged; tried several times, because a packet may be lost."""
         if self._group is None or threading.get_ident() != self._owner:
             return
-        zero = Command(pwm=0.0) if self._strategy is Strategy.DIRECT_PWM else Command(effort=0.0)
-        if self._strategy is not Strategy.OFF:
+        driving = self._possible - {Strategy.OFF}
+        self._strategy = Strategy.OFF
+        if driving:
             self._command.clear()
-            self._set_setpoints(zero, self._strategy)
+            self._set_setpoints(no_torque(*driving))
             self._group.send_command(self._command)
         for _ in range(STOP_ATTEMPTS):
             self._command.clear()
             self._command.control_strategy = int(Strategy.OFF)
-            self._set_setpoints(Command(), Strategy.OFF)
+            self._set_setpoints(no_torque(Strategy.OFF))
             if self._group.send_command_with_acknowledgement(self._command, STOP_ACKNOWLEDGE_MS):
-                self._strategy = Strategy.OFF
+                self._possible = {Strategy.OFF}
                 return
-        self._strategy = Strategy.OFF
         raise ActuatorError(
             "stop_unacknowledged",
             f"HEBI module did not confirm that it is off, asked {STOP_ATTEMPTS} times; the command lifetime ends its "
@@ -333,11 +339,10 @@ class HebiBackend:
     def _new_command(self) -> Any:
         return self._hebi.GroupCommand(1)
 
-    def _set_setpoints(self, command: Command, strategy: Strategy) -> None:
+    def _set_setpoints(self, command: Command) -> None:
         self._command.position = command.position
         self._command.velocity = command.velocity
-        # Under direct PWM the effort field carries the duty.
-        self._command.effort = command.pwm if strategy is Strategy.DIRECT_PWM else command.effort
+        self._command.effort = command.effort_field
 
     def _send(self) -> None:
         if not self._group.send_command(self._command):

@@ -22,7 +22,7 @@ from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_hw_bridge.backends.hebi_log import ATTRIBUTES
 from pendulum_hw_bridge.backends.hebi_settings import LIMIT_DISABLED, LIMIT_MOTOR_OFF, M_STOPS
 from pendulum_hw_bridge.emulation import wire
-from pendulum_hw_bridge.port.actuator import ActuatorError, Command, Feedback, Strategy
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, Feedback
 from pendulum_hw_bridge.port.gains import GAIN_FIELDS, LOOPS
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.plants.lab_file import EMULATED_NETWORK
@@ -116,9 +116,7 @@ class EmulatedGroup:
         self._hebi = hebi
         self._port = EmulatorProcessBackend(where, attempts=_LOOK_ATTEMPTS)
         self._port.connect()
-        self._strategy = Strategy.OFF
-        self._status: dict[str, Any] = {}
-        self._note(self._port.status())
+        self._status = self._port.status()
 
     def __del__(self) -> None:
         """Let the socket go, as the library lets its group go."""
@@ -172,7 +170,7 @@ class EmulatedGroup:
     def request_info(self, timeout_ms: float) -> Any:
         """Return all settings in one of hebi-py's own commands, or None where the module does not answer."""
         try:
-            self._note(self._port.configure(patience=1e-3 * timeout_ms))
+            self._configure(timeout_ms)
         except ActuatorError:
             return None
         return _Info(self._status, self._hebi)
@@ -186,12 +184,8 @@ class EmulatedGroup:
 
     # --- inside ---------------------------------------------------------------------------------------------
 
-    def _note(self, status: dict[str, Any]) -> None:
-        self._status = status
-        self._strategy = Strategy(status["strategy"])
-
     def _configure(self, timeout_ms: float, **settings: Any) -> None:
-        self._note(self._port.configure(patience=1e-3 * timeout_ms, **settings))
+        self._status = self._port.configure(patience=1e-3 * timeout_ms, **settings)
 
     def _send_setpoints(self, command: Any) -> None:
         """Send the setpoints that a command has, if any."""
@@ -199,16 +193,7 @@ class EmulatedGroup:
         if not any(has.values()):
             return
         values = {name: float(getattr(command, name)[0]) if held else math.nan for name, held in has.items()}
-        # Under direct PWM the effort field carries the duty.
-        direct = self._strategy is Strategy.DIRECT_PWM
-        self._port.transmit(
-            Command(
-                values["position"],
-                values["velocity"],
-                math.nan if direct else values["effort"],
-                values["effort"] if direct else math.nan,
-            )
-        )
+        self._port.transmit(Command(**values))
 
     def _settings_of(self, command: Any) -> dict[str, Any]:
         """Return the settings that a command has, as they stand in a packet to the emulator."""

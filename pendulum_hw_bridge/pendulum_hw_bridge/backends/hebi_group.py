@@ -7,7 +7,7 @@ Each driven joint has a :class:`GroupDrive`, the backend ``hebi`` on its part of
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from pendulum_hw_bridge.port.actuator import (
     Command,
     Feedback,
     Strategy,
+    no_torque,
 )
 from pendulum_hw_bridge.port.clocks import Clock, WallClock
 from pendulum_hw_bridge.port.command_check import check_command
@@ -77,7 +78,8 @@ class HebiGroup:
         self._buffer: Any = None
         self._frame: Any = None
         self._asked: list[Strategy] = []
-        self._setpoints: dict[int, tuple[Command, Strategy]] = {}
+        self._possible: list[set[Strategy]] = []
+        self._setpoints: dict[int, Command] = {}
         self._stop_told: set[int] | None = None
         self._stop_error: Exception | None = None
         self._users = 0
@@ -135,6 +137,7 @@ class HebiGroup:
                 "no_acknowledgement", f"HEBI modules did not all confirm within {ACKNOWLEDGE_MS} ms that they are off"
             )
         self._records, self._asked = records, [Strategy.OFF] * group.size
+        self._possible = [{Strategy.OFF} for _ in records]
         self._check_info(_answered(group.request_info(ACKNOWLEDGE_MS)))
         self._setpoints.clear()
         self._stop_told = self._frame = None
@@ -146,10 +149,10 @@ class HebiGroup:
 
     # --- packets --------------------------------------------------------------------------------------------
 
-    def keep(self, index: int, command: Command, strategy: Strategy) -> None:
+    def keep(self, index: int, command: Command) -> None:
         """Keep a joint's setpoints for the next round of packets."""
         self._stop_told = None
-        self._setpoints[index] = (command, strategy)
+        self._setpoints[index] = command
 
     def send(self) -> None:
         """Send the setpoints that were kept, all in one round.
@@ -159,13 +162,8 @@ class HebiGroup:
         """
         if not self._setpoints:
             return
-        self._packet.clear()
-        for index, (command, strategy) in self._setpoints.items():
-            part = self._packet.create_view([index])
-            part.position, part.velocity = command.position, command.velocity
-            part.effort = command.pwm if strategy is Strategy.DIRECT_PWM else command.effort
-        self._setpoints.clear()
-        if not self.group.send_command(self._packet):
+        setpoints, self._setpoints = self._setpoints, {}
+        if not self._send_setpoints(setpoints):
             raise ActuatorError("send_failed", "commands could not be sent to the HEBI modules: network down?")
 
     def acknowledged(self, index: int, packet: Any, strategy: Strategy | None, timeout_ms: float) -> bool:
@@ -186,6 +184,7 @@ class HebiGroup:
         if strategy is not None:
             # Asked for is as good as set: the acknowledgement may be what is lost.
             self._asked[index] = strategy
+            self._possible[index].add(strategy)
             # What was kept was meant for the strategy before: a duty would become a torque.
             self._setpoints.pop(index, None)
         return bool(self.group.send_command_with_acknowledgement(packet, timeout_ms))
@@ -214,7 +213,7 @@ class HebiGroup:
         return self._frame
 
     def stop(self, index: int) -> None:
-        """Effort zero, then all modules off, in one round for all joints: the next to ask is told what came of it.
+        """No torque, then all modules off, in one round for all joints: the next to ask is told what came of it.
 
         Args:
             index: Which joint asks.
@@ -236,21 +235,27 @@ class HebiGroup:
 
     def _stop_all(self) -> None:
         self._setpoints.clear()
-        driving = [index for index, strategy in enumerate(self._asked) if strategy is not Strategy.OFF]
         self._asked = [Strategy.OFF] * len(self._asked)
+        driving = {index: possible - {Strategy.OFF} for index, possible in enumerate(self._possible)}
         try:
-            if driving:
-                self._packet.clear()
-                for index in driving:
-                    self._packet.create_view([index]).effort = 0.0
-                self.group.send_command(self._packet)
+            nothing = {index: no_torque(*strategies) for index, strategies in driving.items() if strategies}
+            if nothing:
+                self._send_setpoints(nothing)
         finally:
             self._switch_off()
+
+    def _send_setpoints(self, setpoints: Mapping[int, Command]) -> bool:
+        self._packet.clear()
+        for index, command in setpoints.items():
+            part = self._packet.create_view([index])
+            part.position, part.velocity, part.effort = command.position, command.velocity, command.effort_field
+        return bool(self.group.send_command(self._packet))
 
     def _switch_off(self) -> None:
         for _ in range(STOP_ATTEMPTS):
             self._fill_off(self._packet)
             if self.group.send_command_with_acknowledgement(self._packet, STOP_ACKNOWLEDGE_MS):
+                self._possible = [{Strategy.OFF} for _ in self._possible]
                 return
         raise ActuatorError(
             "stop_unacknowledged",
@@ -276,6 +281,8 @@ class HebiGroup:
                     f"{'/'.join(known[:2])} ({known[2]})",
                 )
             number, wanted = int(info.control_strategy[index]), self._asked[index]
+            if number in set(Strategy):
+                self._possible[index] = {Strategy(number)}
             if index != but and number != int(wanted):
                 raise ActuatorError(
                     "strategy",
@@ -402,7 +409,7 @@ class GroupDrive(_GroupPort):
         """Keep setpoints, checked and limited, for the next :meth:`flush`."""
         self._own()
         limited, changed = check_command(command, self._strategy, self._limits)
-        self.shared.keep(self._index, limited, self._strategy)
+        self.shared.keep(self._index, limited)
         return Applied(limited, self._strategy, changed, self._clock.now_ns())
 
     def flush(self) -> None:
@@ -411,7 +418,7 @@ class GroupDrive(_GroupPort):
         self.shared.send()
 
     def stop(self) -> None:
-        """Effort zero, then strategy off, on all modules of the group."""
+        """No torque, then strategy off, on all modules of the group."""
         if self._group is None or threading.get_ident() != self._owner:
             return
         self._strategy = Strategy.OFF

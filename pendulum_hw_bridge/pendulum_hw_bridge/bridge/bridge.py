@@ -1,7 +1,7 @@
 """The bridge between the rules of a plant and its modules: one cycle at a time, without ROS.
 
 A cycle is ``observe`` (feedback of all modules in, checks), then ``act`` (the supervisor's decision carried out on
-the driven ones). Every way out of driving goes through ``release``: on each of them effort zero, then strategy off. A
+the driven ones). Every way out of driving goes through ``release``: on each of them no torque, then strategy off. A
 fault of one module, driven or not, releases all.
 """
 
@@ -122,7 +122,7 @@ class Bridge:
         return ""
 
     def release(self) -> None:
-        """Effort zero, then strategy off, on every module whatever another does; never raises.
+        """No torque, then strategy off, on every module whatever another does; never raises.
 
         Modules that do not confirm it are asked again.
         """

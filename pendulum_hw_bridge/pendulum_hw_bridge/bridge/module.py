@@ -20,6 +20,7 @@ from pendulum_hw_bridge.port.actuator import (
     EncoderPort,
     Feedback,
     Strategy,
+    no_torque,
 )
 from pendulum_hw_bridge.port.settings import BridgeSettings, write_rate, write_settings
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind
@@ -173,7 +174,7 @@ class DrivenModule(Module):
         Raises:
             ActuatorError: It cannot be sent, or does not read back.
         """
-        self.send(self.mapping.strategy, self.mapping.idle())
+        self.send(self.mapping.strategy, no_torque(self.mapping.strategy))
 
     def carry_out(self, drive: Drive, index: int, feedback: Feedback) -> Applied:
         """Send what a decision says for one of the driven joints.
@@ -208,7 +209,7 @@ class DrivenModule(Module):
         return applied
 
     def stop(self) -> Exception | None:
-        """Effort zero, then strategy off; return why the module has not confirmed it, never raise."""
+        """No torque, then strategy off; return why the module has not confirmed it, never raise."""
         self._strategy = Strategy.OFF
         # No torque is in force any more: the next hand-over must not begin with that of an earlier drive.
         self._effort = self._handover_left = 0.0
@@ -226,7 +227,7 @@ class DrivenModule(Module):
         if drive.kind is DriveKind.EFFORT:
             self._handover_left = 0.0
             if drive.starved:
-                return mapping.strategy, mapping.idle()
+                return mapping.strategy, no_torque(mapping.strategy)
             return mapping.strategy, mapping.command(sign * drive.effort[index], self._motor.state)
         if drive.handover > self._handover_left:
             # The torque in force passes on with the speed that the link has: neither the setpoints' nor zero.

@@ -21,7 +21,6 @@ from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
     ActuatorInfo,
     ActuatorPort,
-    Command,
     CommandLock,
     EncoderPort,
     Feedback,
@@ -102,7 +101,7 @@ def run_checklist(
                 )
             items += rest_items(records, settings, plant, window, hangs)
         progress("trying the strategy at zero torque")
-        items.append(strategy_item(port, Strategy.DIRECT_PWM, Command(pwm=0.0), "direct PWM can be set"))
+        items.append(strategy_item(port, Strategy.DIRECT_PWM, "direct PWM can be set"))
         items.append(sign_item(port, settings, hand, progress))
     except PendulumError as error:
         items.append(error_item(error))
@@ -338,9 +337,9 @@ def state_items(
     ]
 
 
-def strategy_item(port: ActuatorPort, strategy: Strategy, idle: Command, name: str) -> CheckItem:
+def strategy_item(port: ActuatorPort, strategy: Strategy, name: str) -> CheckItem:
     """Judge whether a strategy can be set, at no torque, and switch it off again."""
-    reads = port.set_strategy(strategy, idle)
+    reads = port.set_strategy(strategy)
     port.stop()
     return CheckItem(name, reads is strategy, reads.name, strategy.name)
 

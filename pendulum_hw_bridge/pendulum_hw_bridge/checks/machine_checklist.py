@@ -153,7 +153,7 @@ def _check(
         return
     progress(f"{joint.name}: trying the strategy at no effort")
     mapping = driven.mapping
-    found.items.append(strategy_item(driven.port, mapping.strategy, mapping.idle(), "the loop of effort can be set"))
+    found.items.append(strategy_item(driven.port, mapping.strategy, "the loop of effort can be set"))
 
 
 def _rest_items(

@@ -33,10 +33,6 @@ class CurrentMapping(EffortMapping):
 
     late: int = 0
 
-    def idle(self) -> Command:
-        """Return the setpoints of no torque."""
-        return Command(effort=0.0)
-
     def bounded(self, command: Command, motor: MotorState) -> Command:
         """Return setpoints within the effort limit; there are no others than those of effort.
 

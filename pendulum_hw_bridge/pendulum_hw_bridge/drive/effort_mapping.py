@@ -109,10 +109,6 @@ class EffortMapping:
             return Command(effort=effort)
         return Command(pwm=effort * self.pwm_per_torque(motor.voltage) + self._compensated_pwm(motor))
 
-    def idle(self) -> Command:
-        """Return the setpoints of no torque: no duty, whatever the speed; a torque loop is off."""
-        return Command() if self.kind is EffortStrategy.EFFORT_LOOP else Command(pwm=0.0)
-
     def effort_of(self, command: Command, motor: MotorState, pwm_in_force: float) -> float:
         """Return the torque that setpoints stand for: the inverse of :meth:`command`, after limits [N m].
 

@@ -330,11 +330,8 @@ class EmulatedX5:
             return
         if self._expires_ns is not None and self._lock_holder not in {None, sender}:
             return
-        effort = command.pwm if self.strategy is Strategy.DIRECT_PWM else command.effort
-        if ActuatorFault.STRATEGY_CHANGED in self.faults:
-            # The sender still speaks the old strategy: one field of the packet carries torque or PWM.
-            effort = command.effort if math.isnan(command.pwm) else command.pwm
-        self._setpoints[:] = (command.position, command.velocity, effort)
+        # The strategy in force decides what the field means, whatever the sender meant by it.
+        self._setpoints[:] = (command.position, command.velocity, command.effort_field)
         self.last_command_ns = time_ns
         self._expires_ns = time_ns + round(self.command_lifetime * NANOSECONDS)
         self._lock_holder = sender

@@ -21,6 +21,7 @@ from pendulum_hw_bridge.port.actuator import (
     MStopAction,
     Strategy,
     afterwards,
+    no_torque,
 )
 from pendulum_hw_bridge.port.settings import BridgeSettings, write_limits
 from pendulum_msgs_py.contract.values import NANOSECONDS
@@ -182,7 +183,7 @@ class _GentleDrive:
         write_limits(port, settings)
         self._port, self._settings = port, settings
         self._mapping = EffortMapping(EffortStrategy.DIRECT_PWM, drivetrain or load_emulator("thesis").drivetrain)
-        reads = port.set_strategy(Strategy.DIRECT_PWM, Command(pwm=0.0))
+        reads = port.set_strategy(Strategy.DIRECT_PWM, no_torque(Strategy.DIRECT_PWM))
         if reads is not Strategy.DIRECT_PWM:
             raise ActuatorError("strategy", f"strategy reads back as {reads.name}; expected DIRECT_PWM")
         self._monitor = SafetyMonitor(checks or SafetyLimits(), 1.0 / settings.feedback_rate)

@@ -1,7 +1,7 @@
 """``bridge``: connect a HEBI actuator, or its emulator, to ROS.
 
 A lifecycle node. ``configure`` connects the actuator and reads its settings back, ``activate`` lets states flow and
-arming be asked for; ``deactivate``, ``cleanup``, ``shutdown``, SIGINT, SIGTERM and every error end with effort zero
+arming be asked for; ``deactivate``, ``cleanup``, ``shutdown``, SIGINT, SIGTERM and every error end with no torque
 and then strategy off.
 """
 
@@ -152,7 +152,7 @@ class BridgeNode(LifecycleNode, PollingNode):
             self._autostart()
 
     def close(self) -> None:
-        """Disarm, effort zero, strategy off; a last zero torque is published, so that a recording shows it."""
+        """Disarm, no torque, strategy off; a last zero torque is published, so that a recording shows it."""
         stamp_ns = self._interface.clock()
         self._interface.safe_stop("bridge ends")
         self.release_actuator()

@@ -36,6 +36,7 @@ __all__ = [
     "Strategy",
     "TemperatureState",
     "afterwards",
+    "no_torque",
     "state_name",
 ]
 
@@ -247,6 +248,20 @@ class Command:
     effort: float = NO_SETPOINT
     pwm: float = NO_SETPOINT
 
+    @property
+    def effort_field(self) -> float:
+        """What the effort field of a packet carries: the duty under direct PWM [-], else the effort [N m]."""
+        return self.effort if math.isnan(self.pwm) else self.pwm
+
+
+def no_torque(*strategies: Strategy) -> Command:
+    """Return the setpoints that make no torque under a strategy; under each of several where it is uncertain.
+
+    Under direct PWM that is a duty of zero, under every other strategy no setpoint at all: an effort of zero wakes the
+    torque loop, which drives against the torque that the spring holds.
+    """
+    return Command(pwm=0.0) if set(strategies) == {Strategy.DIRECT_PWM} else Command()
+
 
 @dataclass(frozen=True, slots=True)
 class Applied:
@@ -370,7 +385,7 @@ class ActuatorPort(EncoderPort, Protocol):
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
         """Change the strategy, with first setpoints in the same packet, and return the one that reads back.
 
-        Without ``command`` all loops are off afterwards.
+        Without ``command`` there is no torque afterwards.
         """
 
     def set_gains(self, gains: GainSet) -> GainSet:
@@ -383,4 +398,4 @@ class ActuatorPort(EncoderPort, Protocol):
         """Set the command lifetime [s], > 0, and return what reads back."""
 
     def stop(self) -> None:
-        """Make it safe: effort zero, then strategy off. Safe to call at any time, twice, and after a failure."""
+        """Make it safe: no torque, then strategy off. Safe to call at any time, twice, and after a failure."""
