@@ -356,7 +356,8 @@ def test_a_stop_wakes_no_loop_where_the_acknowledgement_of_the_strategy_was_lost
     group.acknowledges = True
     port.stop()
     assert math.isnan(setpoints(group.sent[-2]).effort)
-    # Off is confirmed, and so is the next strategy: a duty of zero is certain to be one.
+    # Off is confirmed, and so are the next strategies: a duty of zero is certain to be one.
+    port.set_strategy(Strategy.PARALLEL_PWM)
     port.set_strategy(Strategy.DIRECT_PWM)
     port.stop()
     assert setpoints(group.sent[-2]).effort == 0.0

@@ -135,6 +135,16 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target("pendulum_hw_bridge.drive.derating", ("Derating",), (f"{_BRIDGE}/test_derating.py",)),
     Target(
+        "pendulum_hw_bridge.port.actuator",
+        ("no_torque", "Command.effort_field", "afterwards"),
+        (f"{_BRIDGE}/test_no_torque.py", f"{_BRIDGE}/test_lifetime_proof.py"),
+    ),
+    Target(
+        "pendulum_hw_bridge.backends.emulator_process",
+        ("EmulatorProcessBackend.set_strategy", "EmulatorProcessBackend.stop", "EmulatorProcessBackend.connect"),
+        (f"{_BRIDGE}/test_emulator_process_stop.py",),
+    ),
+    Target(
         "pendulum_hw_bridge.port.command_check",
         ("check_command", "check_lifetime", "_clip"),
         (f"{_BRIDGE}/test_command_check.py",),
