@@ -144,6 +144,8 @@ _VALUE_BOUNDS = [
     ("voltage_window", [17.9, 50.0], [18.0, 50.0], "inside 18 to 52 V"),
     ("voltage_window", [22.0, 52.1], [22.0, 52.0], "inside 18 to 52 V"),
     ("voltage_window", [-1e9, 1e9], [30.0, 40.0], "inside 18 to 52 V"),
+    ("m_stop_action", "disabled", "motor_off", "motor_off or hold_position"),
+    ("m_stop_action", "disabled", "hold_position", "motor_off or hold_position"),
     ("e_stop_input_timeout", 1e-9, 0.05, "0.05 to 1 s, or 0 for no such input"),
     ("e_stop_input_timeout", 1.01, 1.0, "0.05 to 1 s, or 0 for no such input"),
     ("e_stop_input_timeout", 0.049, 0.0, "0.05 to 1 s, or 0 for no such input"),
@@ -164,7 +166,7 @@ def test_a_limit_of_a_real_machine_that_limits_nothing_is_refused(
 
 @pytest.mark.parametrize(("name", "refused", "taken", "expected"), _VALUE_BOUNDS)
 def test_a_value_that_no_real_machine_can_have_is_refused(
-    name: str, refused: float | list[float], taken: float | list[float], expected: str
+    name: str, refused: float | list[float] | str, taken: float | list[float] | str, expected: str
 ) -> None:
     check(backend="emulator", **{name: refused})
     check(backend="hebi", **{name: taken})

@@ -19,7 +19,7 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.nodes import bridge_node
-from pendulum_hw_bridge.port.actuator import Feedback, Strategy
+from pendulum_hw_bridge.port.actuator import Feedback, MStopAction, Strategy
 from pendulum_hw_bridge.port.clocks import SteppedClock, WallClock
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.port.settings import BridgeSettings
@@ -122,6 +122,14 @@ def lossy_checklist(lost: Sequence[int]) -> tuple[Checklist, list[str]]:
 
 def passed(found: Checklist) -> dict[str, bool | None]:
     return {item.name: item.passed for item in found.items}
+
+
+def test_a_motion_stop_that_is_disabled_as_it_was_set_fails_the_check() -> None:
+    limits = replace(SETTINGS.limits, m_stop=MStopAction.DISABLED)
+    found = checklist(settings=replace(SETTINGS, limits=limits))
+    (item,) = [item for item in found.items if item.name == "motion stop does what it should"]
+    assert (item.passed, item.seen) == (False, "disabled")
+    assert not found.ready
 
 
 @pytest.mark.parametrize("plant", ["thesis", "x5_9"])

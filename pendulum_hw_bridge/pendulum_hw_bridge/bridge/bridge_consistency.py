@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pendulum_hw_bridge.backends import BACKENDS
-from pendulum_hw_bridge.port.actuator import PEAK_EFFORT
+from pendulum_hw_bridge.port.actuator import PEAK_EFFORT, MStopAction
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
 
@@ -91,6 +91,11 @@ def _check_hardware(values: Mapping[str, Any], limits: PlantLimits) -> None:
         raise ParameterError(
             f"measured_effort_limit is {values['measured_effort_limit']:g} N m; expected at most "
             f"{_LARGEST_MEASURED:g} N m {where}: the actuator makes {PEAK_EFFORT:g} N m"
+        )
+    if values["m_stop_action"] == MStopAction.DISABLED.value:
+        raise ParameterError(
+            f"m_stop_action is {MStopAction.DISABLED.value}; expected {MStopAction.MOTOR_OFF.value} or "
+            f"{MStopAction.HOLD_POSITION.value} {where}: the motion stop would stop nothing"
         )
     low, high = _SUPPLY
     if not all(low <= voltage <= high for voltage in values["voltage_window"]):

@@ -148,7 +148,7 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         "m_stop_action",
         MStopAction.MOTOR_OFF.value,
         "",
-        "What the module does when the motion stop is pressed.",
+        "What the module does when the motion stop is pressed; `disabled` on emulators alone.",
         choices=tuple(action.value for action in MStopAction),
     ),
     _fixed(

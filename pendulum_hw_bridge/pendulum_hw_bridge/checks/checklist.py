@@ -24,6 +24,7 @@ from pendulum_hw_bridge.port.actuator import (
     CommandLock,
     EncoderPort,
     Feedback,
+    MStopAction,
     Strategy,
     TemperatureState,
 )
@@ -132,9 +133,9 @@ def setting_items(port: ActuatorPort, settings: BridgeSettings) -> list[CheckIte
         _equal("velocity limit reads back", limits.velocity, settings.limits.velocity, joint.velocity_unit),
         CheckItem(
             "motion stop does what it should",
-            limits.m_stop is settings.limits.m_stop,
+            limits.m_stop is settings.limits.m_stop is not MStopAction.DISABLED,
             limits.m_stop.value,
-            settings.limits.m_stop.value,
+            settings.limits.m_stop.value if settings.limits.m_stop is not MStopAction.DISABLED else "an action",
         ),
     ]
     if settings.gains is not None:
