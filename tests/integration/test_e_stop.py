@@ -5,6 +5,7 @@ One bridge for all; at the end its actuator dies.
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import struct
 import time
@@ -174,6 +175,82 @@ def test_bytes_of_many_points_are_a_trajectory() -> None:
     expected = JointTrajectory(joint_names=[JOINT])
     expected.points = [JointTrajectoryPoint(positions=[0.0]) for _ in range(5)]
     assert deserialize_message(of_many_points(5), JointTrajectory) == expected
+
+
+@contextlib.contextmanager
+def frozen(lab: Lab) -> Iterator[None]:
+    """Let the bridge stand still, longer than its watchdog and than the command lifetime."""
+    lab.running.send_signal(signal.SIGSTOP)
+    try:
+        lab.until(lambda: lab.truth.status()["link"]["pwm"] == 0.0, "the end of the command lifetime")
+        began = time.monotonic()
+        lab.until(lambda: time.monotonic() - began > 1.0, "a pause beyond the watchdog")
+        yield
+    finally:
+        lab.running.send_signal(signal.SIGCONT)
+
+
+def is_mode(lab: Lab, told: list[str], mode: str) -> bool:
+    lab.spin(0.05)
+    return bool(told) and told[-1] == mode
+
+
+def modes(lab: Lab) -> list[str]:
+    """Return a list to which the bridge's modes are appended as they are published."""
+    told: list[str] = []
+    lab.node.create_subscription(
+        DiagnosticArray,
+        names.DIAGNOSTICS,
+        lambda message: told.extend(
+            pair.value for each in message.status for pair in each.values if pair.key == "mode"
+        ),
+        qos.DIAGNOSTICS,
+    )
+    return told
+
+
+def stays_off(lab: Lab, since_ns: int) -> None:
+    """Expect that the motor has had no duty since an instant, with commands coming all the while."""
+    count = len(lab.states)
+    lab.until(lambda: len(lab.states) > count + 100, "states with commands")
+    times, duties = lab.duties()
+    assert not duties[times > since_ns].any()
+
+
+def test_an_e_stop_that_waits_for_a_frozen_bridge_is_honoured_when_it_goes_on(lab: Lab) -> None:
+    told = modes(lab)
+    lab.drive()
+    client = lab.node.create_client(Trigger, "bridge/e_stop")
+    lab.until(client.service_is_ready, "the e-stop")
+    with frozen(lab):
+        pressed = client.call_async(Trigger.Request())
+        lab.spin(0.2)
+        assert not pressed.done()
+        since_ns = lab.truth.status()["link"]["time_ns"]
+    lab.until(pressed.done, "the answer of the e-stop")
+    assert pressed.result().success
+    lab.until(lambda: is_mode(lab, told, "e_stop"), "the e-stop in diagnostics")
+    stays_off(lab, since_ns)
+    assert not lab.call(SetBool, "bridge/arm", SetBool.Request(data=True)).success
+
+
+def test_a_stop_that_cannot_be_delivered_says_so_and_the_bridge_does_not_drive_when_it_goes_on(lab: Lab) -> None:
+    told = modes(lab)
+    lab.drive()
+    with frozen(lab):
+        stop = lab.processes.start("pendulum_bags", "move", "stop", "--namespace", "/", alone=True)
+        stop.wait(90.0)
+        since_ns = lab.truth.status()["link"]["time_ns"]
+    assert stop.returncode == 2, stop.output
+    assert "e-stop is not confirmed yet; stop the machine by its own means" in stop.output
+    assert "was not confirmed, and may not act" in stop.output
+    assert "latched" not in stop.output
+    told.clear()
+    lab.until(lambda: told, "diagnostics")
+    # A request that reached its socket while it stood still is honoured; without one, its own stop holds.
+    lab.until(lambda: told[-1] in {"fault", "e_stop"}, "a bridge that has noticed its pause")
+    stays_off(lab, since_ns)
+    assert told[-1] in {"fault", "e_stop"}
 
 
 def test_an_emulator_that_dies_puts_the_bridge_into_its_fault_state(lab: Lab) -> None:

@@ -28,7 +28,8 @@ def test_move_holds_an_angle_and_its_stop_latches_until_its_reset(processes: Pro
     assert angle is not None, held.output
     assert abs(float(angle.group(1)) + 0.15) < 0.05
     stopped = move("stop")
-    assert (stopped.returncode, stopped.output) == (0, "/sim: e-stop, latched; end it with: move reset\n")
+    assert stopped.returncode == 0
+    assert stopped.output.endswith("/sim: e-stop, latched; end it with: move reset\n")
     refused = move("0.1")
     assert refused.returncode == 2, refused.output
     assert "e-stop" in refused.output

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,6 +30,8 @@ _STOPS = {
 """Goals that are no place: service of the plant, and what is said then."""
 _PATIENCE = 20.0
 """Longest wait for a node that is to answer [s]."""
+_SOON = 3.0
+"""Time after which a user reads that an e-stop is not confirmed yet [s]."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -48,7 +54,9 @@ def move(
     Deactivates the controller and arms the plant if necessary. At the end of `upright` it activates the controller,
     which takes over from position control; at the end of `down` it disarms the plant; at an angle the plant holds.
     Ctrl-C disarms it. `stop` latches the plant's e-stop, and `reset` releases it without arming. `stop` needs the
-    network and this computer: on a real machine use the motion stop first.
+    network and this computer: on a real machine use the motion stop first. Where the plant does not confirm it, the
+    exit code is 2. A request that reached a plant which stands still acts when it goes on; the plant itself is in
+    `fault` then, and arms only on request.
     """
     from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
     from pendulum_bags.experiments.domain import check_domain
@@ -56,12 +64,14 @@ def move(
 
     place = goal if goal in {*_STOPS, "upright", "down"} else _angle(goal)
     with Conductor(check_domain(domain) or 0) as conductor:
-        node = find_plant(conductor, namespace)
         if place in _STOPS:
             service, said = _STOPS[str(place)]
-            PlantClient(conductor, namespace, node, watch=False).call(f"{node}/{service.removeprefix('~/')}")
+            with _unless_confirmed(namespace) if place == "stop" else nullcontext():
+                node = find_plant(conductor, namespace)
+                PlantClient(conductor, namespace, node, watch=False).call(f"{node}/{service.removeprefix('~/')}")
             print(f"{namespace}: {said}", flush=True)
             return 0
+        node = find_plant(conductor, namespace)
         plant = PlantClient(conductor, namespace, node)
         plant.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
         # What is on the graph by then has been met: the plant's own services are no older.
@@ -77,6 +87,27 @@ def move(
             plant.disarm_quietly()
             raise
     return 0
+
+
+@contextmanager
+def _unless_confirmed(namespace: str) -> Iterator[None]:
+    """Say what to do where a plant does not confirm its e-stop, soon and at the end.
+
+    Raises:
+        FaultError: It was not confirmed.
+    """
+    advice = "stop the machine by its own means (motion stop, power)"
+    soon = threading.Timer(
+        _SOON, lambda: print(f"{namespace}: e-stop is not confirmed yet; {advice}", file=sys.stderr, flush=True)
+    )
+    soon.daemon = True
+    soon.start()
+    try:
+        yield
+    except FaultError as error:
+        raise FaultError(f"e-stop of {namespace} was not confirmed, and may not act: {error}; {advice}") from error
+    finally:
+        soon.cancel()
 
 
 def _angle(text: str) -> float:
