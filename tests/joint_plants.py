@@ -7,13 +7,18 @@ from dataclasses import replace
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 
-__all__ = ["delayed_plant", "near_upright", "without_friction"]
+__all__ = ["delayed_plant", "lagging_plant", "near_upright", "without_friction"]
 
 
 def delayed_plant(name: str, delay: float) -> MechanismParameters:
     """Return a preset whose motors act a time after they are told [s]."""
     plant = load_mechanism(name)
     return plant.with_values({f"{joint}.transport_delay": delay for joint in plant.coordinates.driven_names})
+
+
+def lagging_plant(plant: MechanismParameters, lag: float) -> MechanismParameters:
+    """Return a plant whose motors follow with a first-order lag [s]."""
+    return plant.with_values({f"{joint}.time_constant": lag for joint in plant.coordinates.driven_names})
 
 
 def near_upright(plant: MechanismParameters, *off: float) -> Vector:

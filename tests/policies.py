@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.design import output_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.policies.policy import (
     DEFAULT_SIGNALS,
     Network,
@@ -49,7 +50,7 @@ def linear_policy(plant: PlantParameters, angle_gain: float, velocity_gain: floa
 
 def lqr_policy(plant: MechanismParameters, **changes: Any) -> Policy:
     """Return the policy that answers as the LQR of a plant of several joints does near upright, u = -K [x, q']."""
-    gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights).K
+    gain = output_lqr(linearise(plant), *plant.mechanism.weights).rows
     coordinates = plant.coordinates
     layout = sample_layout(default_signals(coordinates), coordinates)
     n, box = len(coordinates.joints), 0.5

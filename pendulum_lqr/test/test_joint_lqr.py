@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 
 import numpy as np
 import pytest
 import scipy.linalg
 
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.controller_interface.joint_controller import joint_controller_class, make_joint_controller
+from pendulum_lqr.linear.design import DesignError, output_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
+from tests.joint_plants import lagging_plant
 
 PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")
 
@@ -24,8 +28,8 @@ PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "c
 def test_it_answers_with_the_law_within_each_limit_whatever_turns_were_made(name: str) -> None:
     plant = load_mechanism(name)
     controller = make_joint_controller("lqr", plant, {})
-    model = linearise_mechanism(plant)
-    K = mechanism_lqr(model, *plant.mechanism.weights).K
+    model = linearise(plant)
+    K = output_lqr(model, *plant.mechanism.weights).rows
     x = np.array([1e-3, -2e-3, 3e-3, 1e-3])
     joints = plant.coordinates.joints
     upright = zip(joints, plant.coordinates.goal, x[:2], strict=True)
@@ -56,6 +60,35 @@ def test_a_period_at_which_it_does_not_settle_is_refused() -> None:
         make_joint_controller("lqr", acrobot, {}, 0.2)
 
 
+@pytest.mark.parametrize("name", ["lqr", "lqi"])
+@pytest.mark.parametrize(("period", "lag"), [(0.002, 0.0), (0.002, 0.02), (0.01, 0.0), (0.01, 0.02)])
+def test_it_is_refused_where_the_sampled_loop_with_lag_and_delay_grows_and_nowhere_else(
+    name: str, period: float, lag: float
+) -> None:
+    refused = []
+    for delay in np.linspace(0.0, 0.05, 6):
+        plant = lagging_plant(load_mechanism("furuta"), lag).with_values({"arm.transport_delay": float(delay)})
+        kind = joint_controller_class(name, plant)
+        loop = kind.design(plant, validate(kind.parameters(plant), {"effort_limit": 0.0}), period)
+        # The law itself around the sampled plant, from a small deviation on, and no limit in the way.
+        loop.effort_limits = (math.inf,)
+        sampled, goal = discretise(linearise(plant), period), plant.coordinates.goal
+        z = 1e-9 * np.eye(sampled.A.shape[0])[1]
+        sizes = []
+        for _ in range(round(6.0 / period)):
+            u = loop.command(0.0, (goal[0] + float(z[0]), goal[1] + float(z[1])), (float(z[2]), float(z[3])))
+            z = sampled.A @ z + sampled.B @ u
+            sizes.append(float(np.abs(z[:4]).max()))
+            if sizes[-1] > 1e-3:
+                break
+        refused.append(True)
+        with contextlib.suppress(DesignError):
+            make_joint_controller(name, plant, {}, period)
+            refused[-1] = False
+        assert refused[-1] == (sizes[-1] > 1e-3)
+    assert set(refused) == {True, False}
+
+
 def test_a_swing_up_wants_a_plant_for_which_one_is_stored_and_the_period_of_its_design() -> None:
     swing_up = make_joint_controller("tvlqr", load_mechanism("acrobot_frictionless"), {})
     with pytest.raises(ParameterError, match=r"the trajectory is followed every 0\.01 s"):
@@ -74,7 +107,7 @@ def test_a_state_that_is_not_finite_at_any_joint_is_not_answered(bad: float) -> 
 
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.01, 0.013])
 def test_a_model_of_two_inputs_is_sampled_as_two_models_of_one(delay: float) -> None:
-    model = linearise_mechanism(load_mechanism("double_pendulum"))
+    model = linearise(load_mechanism("double_pendulum"))
     whole = discretise(model, 0.01, delay)
     rng = np.random.default_rng(3)
     inputs = rng.normal(size=(6, 2))
@@ -94,6 +127,6 @@ def test_no_effort_is_made_of_a_law_that_has_no_number() -> None:
     controller = make_joint_controller("lqr", load_mechanism("cart_pole"), {})
     answering = AnswerLoop(controller, math.inf)
     # Finite velocities whose terms are inf and -inf.
-    first, second = (math.copysign(1e308, float(k)) for k in controller.gain.K[0, 2:])
+    first, second = (math.copysign(1e308, float(k)) for k in controller.gain.K[2:])
     assert answering.answer(JointSample(1, (0.0, 0.0), (first, -second), (0.0, 0.0)), 1) is None
     assert answering.last_reason == "controller answered nan"

@@ -14,7 +14,7 @@ from pendulum_lqr.controller_interface.interface import JointController
 from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.controllers.joint_lqg import JointLqg
 from pendulum_lqr.linear.design import DesignError, kalman_gain
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism
+from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
@@ -110,6 +110,36 @@ def test_integrals_leave_no_offset_of_the_driven_joints_under_a_constant_effort(
         make_joint_controller("lqi", delayed_plant("furuta", 0.012), {}).check(PERIOD)
 
 
+@pytest.mark.parametrize("name", ["cart_pole", "acrobot_frictionless", "double_pendulum"])
+def test_an_integral_unwinds_at_the_limit_joint_by_joint_whatever_the_sign_of_its_gain(name: str) -> None:
+    plant = load_mechanism(name)
+    driven, n = plant.coordinates.driven, len(plant.joints)
+    controller = make_joint_controller("lqi", plant, {}, PERIOD)
+    own = np.diag(controller.gain.rows[:, 2 * n :])
+    hold = tuple(0.0 for _ in range(n))
+    for count, joint in enumerate(driven):
+        controller.reset()
+        # A small offset fills the integral; then velocity drives the effort to its limit on the same side.
+        side = [0.0] * n
+        side[joint] = 1e-3
+        for k in range(1000):
+            controller.command(k * PERIOD, near_upright(plant, *side), hold)
+        filled = controller._integral.copy()
+        assert filled[count] == pytest.approx(10.0 * 1e-3, rel=1e-6)
+        fast = np.linalg.lstsq(controller.gain.rows[:, n : 2 * n], np.eye(len(driven))[count], rcond=None)[0]
+        velocity = tuple(map(float, -100.0 * np.sign(-own[count]) * fast))
+        for sign in (-1.0, 1.0):
+            before = controller._integral.copy()
+            side[joint] = sign * 1e-3
+            for k in range(100):
+                efforts = controller.command(k * PERIOD, near_upright(plant, *side), velocity)
+                assert abs(efforts[count]) == plant.effort_limits[count]
+            # Away from the limit it goes, further beyond it does not, and no other joint's moves.
+            change = controller._integral - before
+            assert change[count] == pytest.approx(-1e-3 if sign < 0.0 else 0.0, rel=1e-6, abs=1e-12)
+            assert np.abs(np.delete(change, count)).max(initial=0.0) < 1e-12
+
+
 @pytest.mark.parametrize("name", ["lqi", "lqg", "discrete_lqr"])
 def test_the_limit_that_is_given_holds(name: str) -> None:
     plant = load_mechanism("cart_pole")
@@ -137,7 +167,7 @@ def test_what_the_filter_predicts_comes(delay: float) -> None:
 @pytest.mark.parametrize("name", PLANTS)
 def test_the_gain_with_integrals_is_that_of_python_control(name: str) -> None:
     plant = load_mechanism(name)
-    model = linearise_mechanism(plant)
+    model = linearise(plant)
     driven, m = plant.coordinates.driven, len(plant.coordinates.driven)
     integrated = np.eye(4)[list(driven)]
     A = np.block([[model.A, np.zeros((4, m))], [integrated, np.zeros((m, m))]])
@@ -145,7 +175,7 @@ def test_the_gain_with_integrals_is_that_of_python_control(name: str) -> None:
     q, r = plant.mechanism.weights
     K, _, _ = control.lqr(A, B, np.diag([*q, *(10.0,) * m]), r * np.eye(m))
     controller = make_joint_controller("lqi", plant, {}, PERIOD)
-    assert pytest.approx(K, rel=1e-6, abs=1e-9) == controller.gain.K
+    assert pytest.approx(K, rel=1e-6, abs=1e-9) == controller.gain.rows
 
 
 @pytest.mark.parametrize("name", PLANTS)
@@ -164,7 +194,7 @@ def test_the_filter_asks_for_a_fraction_of_the_effort_where_velocities_are_noise
 
 def test_the_filter_is_that_of_python_control_and_uses_velocities_where_their_noise_is_told() -> None:
     plant = load_mechanism("cart_pole")
-    model = linearise_mechanism(plant)
+    model = linearise(plant)
     sampled = discretise(model, PERIOD)
     E = discretise(replace(model, B=model.E), PERIOD).B
     values = {"position_noise": 1e-3, "velocity_noise": 0.02, "effort_noise": 0.3}

@@ -14,7 +14,7 @@ import scipy.optimize
 
 from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.controllers.joint_mpc import JointMpc
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism
+from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.values import JointSample
@@ -32,7 +32,7 @@ PERIOD = 0.01
 def test_without_active_limits_it_is_the_discrete_lqr(name: str, period: float, horizon: int) -> None:
     plant = load_mechanism(name)
     controller = make_joint_controller("mpc", plant, {"horizon": horizon}, period)
-    model = linearise_mechanism(plant)
+    model = linearise(plant)
     cost = sampled_cost(model, *plant.mechanism.weights, period)
     K = np.atleast_2d(discrete_lqr(discretise(model, period), *cost).K)
     x = np.array([1e-3, -1e-3, 2e-3, -1e-3])
@@ -44,7 +44,7 @@ def test_without_active_limits_it_is_the_discrete_lqr(name: str, period: float, 
 
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.01, 0.013])
 def test_the_cost_of_two_inputs_is_collected_as_that_of_one(delay: float) -> None:
-    model = linearise_mechanism(load_mechanism("double_pendulum"))
+    model = linearise(load_mechanism("double_pendulum"))
     q, r, period = (3.0, 2.0, 1.0, 0.5), 0.7, 0.01
     Q, R, N = sampled_cost(model, q, r, period, delay)
     sampled = discretise(model, period, delay)
@@ -173,8 +173,8 @@ def test_a_pole_that_may_not_lean_far_leans_less_far() -> None:
 
 def test_an_effort_that_holds_upright_is_within_the_limits_and_not_on_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
     plant = delayed_plant("acrobot_frictionless", PERIOD)
-    weighted = replace(linearise_mechanism(plant), efforts=(2.0,))
-    monkeypatch.setattr("pendulum_lqr.controllers.joint_lqr.linearise_mechanism", lambda _: weighted)
+    weighted = replace(linearise(plant), efforts=(2.0,))
+    monkeypatch.setattr("pendulum_lqr.controllers.joint_lqr.linearise", lambda _: weighted)
     controller = make_joint_controller("mpc", plant, {}, PERIOD)
     for _ in range(3):
         assert controller.command(0.0, plant.coordinates.goal, (0.0, 0.0)) == pytest.approx((2.0,), abs=1e-4)
@@ -210,7 +210,7 @@ def test_it_asks_for_no_more_than_each_limit_and_plans_with_it() -> None:
 def test_what_is_on_its_way_counts() -> None:
     plant = delayed_plant("acrobot_frictionless", 0.015)
     controller = make_joint_controller("mpc", plant, {}, PERIOD)
-    model = linearise_mechanism(plant)
+    model = linearise(plant)
     gain = discrete_lqr(discretise(model, PERIOD), *sampled_cost(model, *plant.mechanism.weights, PERIOD))
     x = np.array([1e-3, 0.0, 0.0, 0.0])
     sent = [0.0, 0.0]

@@ -15,11 +15,11 @@ from pendulum_lqr.linear.analysis import analyse, delayed_spectral_radius, large
 from pendulum_lqr.linear.design import (
     DesignError,
     continuous_lqr,
-    integral_lqr,
     kalman_gain,
     output_lqr,
     require_controllable,
     require_observable,
+    with_integrals,
 )
 from pendulum_lqr.linear.model import LinearModel, linearise
 from pendulum_lqr.linear.sampled_design import DiscreteModel, discrete_lqr, discretise, sampled_cost
@@ -108,7 +108,7 @@ def test_the_gain_on_the_measurements_costs_least_of_all_such_gains_and_little_m
 
 def test_an_integral_on_the_series_elastic_plant_leaves_no_offset():
     model = linearise(X5_9)
-    gain = integral_lqr(model, (100.0, 0.01, 100.0), 0.1)
+    gain = output_lqr(with_integrals(model), (100.0, 0.01, 100.0), 0.1)
     assert gain.K.shape == (3,)
     assert np.max(gain.poles.real) < -0.5
 
@@ -255,11 +255,11 @@ def test_sampled_cost_agrees_with_quadrature():
 
 
 def test_integral_action_leaves_no_offset_and_needs_a_weight():
-    gain = integral_lqr(UPRIGHT, (100.0, 0.01, 50.0), 0.1)
+    gain = output_lqr(with_integrals(UPRIGHT), (100.0, 0.01, 50.0), 0.1)
     assert np.max(gain.poles.real) < 0.0
     assert gain.K[2] == pytest.approx(math.sqrt(50.0 / 0.1), rel=1e-6)
-    with pytest.raises(DesignError, match="weight of the integral is 0; expected > 0"):
-        integral_lqr(UPRIGHT, (100.0, 0.01, 0.0), 0.1)
+    with pytest.raises(DesignError, match=r"no stabilising gain for q = \[100.0, 0.01, 0.0\]"):
+        output_lqr(with_integrals(UPRIGHT), (100.0, 0.01, 0.0), 0.1)
 
 
 @pytest.mark.parametrize(

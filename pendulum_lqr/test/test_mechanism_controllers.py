@@ -13,8 +13,8 @@ import pytest
 
 from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.controllers.mechanism_controllers import DifferencedVelocity, make_mechanism_controller
-from pendulum_lqr.linear.design import DesignError
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.design import DesignError, output_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.swing_up import mechanism_catch, swing_up_cli
 from pendulum_lqr.swing_up.mechanism_catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
@@ -91,7 +91,7 @@ def test_the_catch_takes_over_within_its_region_where_it_catches_and_lets_go_bey
     # Other states than those that it was sampled from.
     assert all(caught(1.0, direction) for direction in rng.standard_normal((12, 4)))
     # The way in which the limit tells first: all of the effort for nothing.
-    assert not caught(6.0, np.linalg.solve(catch.gain.S, catch.gain.K[0]))
+    assert not caught(6.0, np.linalg.solve(catch.gain.S, catch.gain.K))
     unit = np.array([1.0, 0.0, 0.0, 0.0]) / math.sqrt(catch.gain.S[0, 0] / catch.region.level)
     assert [catch.holds(scale * unit) for scale in (1.1, 0.9, 1.1, 1.3, 1.5, 1.1)] == [
         False,
@@ -345,7 +345,7 @@ def test_a_swing_up_that_its_lqr_would_not_hold_at_this_period_is_refused() -> N
 @pytest.mark.timeout(400)
 def test_a_wild_state_does_not_cost_a_plan_and_from_wild_states_alone_there_is_none() -> None:
     plant = load_mechanism("cart_pole")
-    gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
+    gain = output_lqr(linearise(plant), *plant.mechanism.weights)
     controllers = [MechanismMpc(DT, MechanismCatch(plant, gain, CaughtRegion(0.1, 0))) for _ in range(2)]
     x: Vector = (0.0,) * 4
     wild = (0.0, 1.0, 1e200, -1e200)
@@ -366,7 +366,7 @@ def test_a_wild_state_does_not_cost_a_plan_and_from_wild_states_alone_there_is_n
 @pytest.mark.timeout(400)
 def test_mpc_plans_from_the_last_plan_and_searches_where_that_leads_nowhere_or_there_is_none() -> None:
     plant = load_mechanism("cart_pole")
-    gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
+    gain = output_lqr(linearise(plant), *plant.mechanism.weights)
     controller = MechanismMpc(DT, MechanismCatch(plant, gain, CaughtRegion(0.1, 0)))
     search = controller.search
     nodes = round(PLAN.step / DT)
@@ -417,7 +417,7 @@ def test_mpc_plans_from_the_last_plan_and_searches_where_that_leads_nowhere_or_t
 
 def test_nothing_is_planned_from_a_state_that_is_no_number() -> None:
     plant = load_mechanism("cart_pole")
-    gain = mechanism_lqr(linearise_mechanism(plant), *plant.mechanism.weights)
+    gain = output_lqr(linearise(plant), *plant.mechanism.weights)
     controller = MechanismMpc(DT, MechanismCatch(plant, gain, CaughtRegion(1.0, 0)))
     for x in ((0.0, math.nan, 0.0, 0.0), (0.0, 0.0, 0.0, math.inf)):
         with pytest.raises(ParameterError, match=r"plan begins at .*(nan|inf).*; expected finite numbers"):

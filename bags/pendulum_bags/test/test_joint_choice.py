@@ -15,7 +15,7 @@ from pendulum_bags.ranking.joint_choice import joint_cost_parts, rank_joints, ra
 from pendulum_bags.ranking.present import Words, same_choice
 from pendulum_bags.verdict import Mark
 from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism
+from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.contract.values import NANOSECONDS
@@ -52,7 +52,7 @@ def record(bag: Path, run: JointRun, **_: Any) -> Path:
 
 def designs(*texts: str) -> Any:
     plant = load_mechanism("cart_pole")
-    return joint_designs(texts, plant, linearise_mechanism(plant))
+    return joint_designs(texts, plant, linearise(plant))
 
 
 @pytest.fixture

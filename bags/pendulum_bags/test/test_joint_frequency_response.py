@@ -20,8 +20,8 @@ from pendulum_bags.frequency_response.joint_experiment import JointMultisine
 from pendulum_bags.frequency_response.record import Record
 from pendulum_bags.verdict import Mark
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.linear.design import output_lqr
+from pendulum_lqr.linear.model import LinearModel, linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_lqr.responses.certificate import Certifier, is_stable
 from pendulum_lqr.responses.gap_metric import JointScaling
@@ -40,7 +40,7 @@ DRIVEN_ALONE = ("cart_pole", "acrobot_frictionless", "furuta")
 
 @cache
 def _model(name: str) -> LinearModel:
-    return linearise_mechanism(load_mechanism(name))
+    return linearise(load_mechanism(name))
 
 
 @cache
@@ -50,7 +50,7 @@ def _record(name: str, *, periods: int = 3, noise: float = 0.0, label: str = "si
     multisine = JointMultisine(JointSettings(name, amplitude=0.02 * plant.effort_limits[0]), periods)
     parameters = {**multisine.excitation, "amplitude": multisine.run.amplitude, "seed": 3}
     wave = make_disturbance(validate(DISTURBANCE_SPECS, parameters))
-    gain = mechanism_lqr(_model(name), *plant.mechanism.weights).K[0]
+    gain = output_lqr(_model(name), *plant.mechanism.weights).K
     simulated, coordinates = MechanismPlant(plant, PERIOD), plant.coordinates
     state = simulated.reset(coordinates.goal)
     generator = np.random.default_rng(1)
@@ -145,7 +145,7 @@ def test_delay_and_gain_are_those_of_the_driven_joint() -> None:
 @pytest.mark.parametrize("name", DRIVEN_ALONE)
 def test_between_and_below_the_lines_the_machine_is_what_it_is(name: str) -> None:
     plant, model = load_mechanism(name), _model(name)
-    other = replace(linearise_mechanism(stand_in_for(plant, share=0.1, delay=0.0, seed=2)), delay=0.005)
+    other = replace(linearise(stand_in_for(plant, share=0.1, delay=0.0, seed=2)), delay=0.005)
     measured = _exact(other, plant, "hw")
     machine = Machine.beside(measured, model)
     true = model_response(other, machine.frequency, PERIOD)
@@ -190,7 +190,7 @@ def test_the_same_plant_is_yes_and_all_that_stabilises_it_is_certified(name: str
 def _gains(model: LinearModel, weights: Sequence[float], generator: np.random.Generator) -> NDArray[np.float64]:
     scale = 10.0 ** generator.uniform(-2.0, 2.0, len(weights))
     cost = 10.0 ** generator.uniform(-3.0, 2.0)
-    return np.asarray(mechanism_lqr(model, np.array(weights) * scale, cost).K[0], dtype=np.float64)
+    return np.asarray(output_lqr(model, np.array(weights) * scale, cost).K, dtype=np.float64)
 
 
 @pytest.mark.parametrize("name", DRIVEN_ALONE)
@@ -200,7 +200,7 @@ def test_no_certified_gain_fails_on_the_machine_that_was_measured(name: str) -> 
     certified = sound = 0
     for seed in range(6):
         machine = stand_in_for(plant, share=0.1, delay=0.0, seed=seed)
-        other = replace(linearise_mechanism(machine), delay=float(generator.uniform(0.0, 0.01)))
+        other = replace(linearise(machine), delay=float(generator.uniform(0.0, 0.01)))
         certifier = Certifier(model, Machine.beside(_exact(other, plant, "hw"), model), _scaling(plant, model))
         sampled = discretise(other, PERIOD)
         for _ in range(40):
@@ -218,7 +218,7 @@ def test_a_machine_that_falls_under_the_design_is_not_certified() -> None:
     plant, model = load_mechanism("cart_pole"), _model("cart_pole")
     late = replace(model, delay=0.15)
     certifier = Certifier(model, Machine.beside(_exact(late, plant, "hw"), model), _scaling(plant, model))
-    K = mechanism_lqr(model, *plant.mechanism.weights).K[0]
+    K = output_lqr(model, *plant.mechanism.weights).K
     assert is_stable(discretise(model, PERIOD), K)
     assert not is_stable(discretise(late, PERIOD), K)
     assert not certifier.gain(K).certified
@@ -248,7 +248,7 @@ def test_what_is_no_design_of_the_plant_is_refused(design: str, words: str) -> N
 def test_a_gain_is_certified_as_it_is_written() -> None:
     plant, model = load_mechanism("cart_pole"), _model("cart_pole")
     certifier = Certifier(model, Machine.beside(_exact(model, plant, "hw"), model), _scaling(plant, model))
-    K = mechanism_lqr(model, *plant.mechanism.weights).K[0]
+    K = output_lqr(model, *plant.mechanism.weights).K
     own, same, wrong = certify_joint_designs(
         ["q=10,100,1,1 r=0.1", "k=" + ",".join(map(repr, map(float, K))), "k=0,0,0,0"], plant, certifier
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,14 @@ import pytest
 
 from pendulum_bags.experiments.experiment_cli import main
 from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo, joint_shares
+from pendulum_bags.studies.joint_region import JointRegion
+from pendulum_bags.studies.monte_carlo import MonteCarlo
 from pendulum_bags.studies.random_runs import replay, run_chunk, run_monte_carlo
+from pendulum_bags.studies.region_map import RegionMap
+from pendulum_bags.studies.start_grid import run_map
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 
 SHARES = {"cart_mass": 0.1, "pole.damping": 0.5}
 SMALL = JointMonteCarlo("cart_pole", runs=250, chunk=100, duration=0.5, shares=SHARES, start=0.02)
@@ -40,6 +46,37 @@ def test_parameters_scatter_as_told_about_their_value() -> None:
     assert np.abs(drawn["start_cart"]).max() == pytest.approx(0.02, rel=0.01)
     assert np.abs(drawn["start_pole"] - np.pi).max() == pytest.approx(0.02, rel=0.01)
     assert abs(np.corrcoef(drawn["start_cart"], drawn["start_pole"])[0, 1]) < 0.03
+
+
+def test_studies_of_one_joint_and_of_several_refuse_a_gain_whose_sampled_loop_grows_with_lag_and_delay(
+    tmp_path: Path,
+) -> None:
+    several = load_mechanism("cart_pole").with_values({"cart.transport_delay": 0.15, "cart.time_constant": 0.05})
+    one = load_plant("dfki").with_values(transport_delay=0.15, actuator_time_constant=0.05)
+    files = [str(write_mechanism(tmp_path / "several.yaml", several)), str(write_plant(tmp_path / "one.yaml", one))]
+    runs: list[Callable[[], object]] = [
+        lambda: run_chunk(replace(SMALL, plant=files[0], shares={}), 0),
+        lambda: run_chunk(MonteCarlo(plant=files[1], runs=10, chunk=10), 0),
+        lambda: JointRegion(plant=files[0]).gain(several),
+        lambda: RegionMap(plant=files[1]).gain(),
+    ]
+    for run in runs:
+        with pytest.raises(
+            ParameterError, match=r"lqr asked every 0\.002 s does not settle on plant .*: deviations grow"
+        ):
+            run()
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.03])
+def test_maps_and_runs_of_a_lagging_plant_are_those_of_the_gain_that_knows_the_lag(tmp_path: Path, lag: float) -> None:
+    several = load_mechanism("cart_pole").with_values({"cart.time_constant": lag})
+    file = str(write_mechanism(tmp_path / "several.yaml", several))
+    columns = run_chunk(replace(SMALL, plant=file, shares={}, amplitude=0.0, duration=8.0, runs=20), 0)
+    assert np.abs(columns["end_pole"] - np.pi).max() < 1e-3
+    region = JointRegion(plant=file, plants=1, points=5, spans=(0.05, 0.02))
+    assert run_map(tmp_path / "several", region).share.all()
+    one = write_plant(tmp_path / "one.yaml", load_plant("thesis").with_values(actuator_time_constant=lag))
+    assert run_map(tmp_path / "one", RegionMap(str(one), plants=1, points=5, angle_span=0.1)).share[2].all()
 
 
 @pytest.mark.parametrize("change", [{"shares": {}}, {"amplitude": 0.0}, {"start": 0.0}])

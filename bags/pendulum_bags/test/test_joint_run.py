@@ -23,7 +23,8 @@ from pendulum_bags.experiments.joint_run import (
 )
 from pendulum_bags.frequency_response.joint_experiment import JointMultisine
 from pendulum_bags.runs.run_record import RUN_RECORD
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.design import output_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
@@ -113,7 +114,7 @@ def test_a_machine_with_other_values_is_taken() -> None:
 def _longest_time_upright(plant: MechanismParameters, design: MechanismParameters, amplitude: float) -> float:
     """Return for how long an LQR holds a plant upright under seeded noise, at most 3 s."""
     mechanism, step = plant.mechanism, 4e-3
-    gain = np.array(mechanism_lqr(linearise_mechanism(design), *mechanism.weights).K)
+    gain = output_lqr(linearise(design), *mechanism.weights).rows
     simulated = MechanismPlant(plant, dt=step)
     goal = np.array(plant.coordinates.goal)
     simulated.reset(tuple(goal))

@@ -16,6 +16,7 @@ from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS
 from pendulum_lqr.controller_interface.law import Law, clamped, deviation
 from pendulum_lqr.controller_interface.loop_check import require_stable
 from pendulum_lqr.controller_interface.velocity import VELOCITY_ESTIMATORS, VelocityEstimator
+from pendulum_lqr.linear.analysis import Feedback
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, suggestion, validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -100,8 +101,10 @@ class BaseController:
         effort_limit: Largest torque [N m].
         set_point: Angle to hold, from upright [rad].
         notice: What the user has to be told while it runs; empty for nothing.
+        feedback: What it is near its set-point where that is a gain; None for any other law.
     """
 
+    feedback: Feedback | None = None
     SUMMARY: ClassVar[str] = ""
     """One sentence for tables."""
     PARAMETERS: ClassVar[tuple[ParameterSpec, ...]] = ()

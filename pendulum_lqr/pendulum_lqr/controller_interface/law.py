@@ -6,7 +6,17 @@ from collections.abc import Callable, MutableSequence, Sequence
 
 from pendulum_msgs_py.contract.angles import wrap_angle
 
-__all__ = ["EFFORT_LIMIT", "MOST_MEMORY", "MOST_NUMBERS", "OWN", "SET_POINT", "Law", "clamped", "deviation"]
+__all__ = [
+    "EFFORT_LIMIT",
+    "MOST_MEMORY",
+    "MOST_NUMBERS",
+    "OWN",
+    "SET_POINT",
+    "Law",
+    "clamped",
+    "deviation",
+    "winds_up",
+]
 
 Law = Callable[[float, float, float, MutableSequence[float], Sequence[float]], float]
 """``law(t, angle, velocity, memory, numbers)`` -> torque [N m].
@@ -34,3 +44,16 @@ def clamped(effort: float, limit: float) -> float:
 def deviation(angle: float, set_point: float) -> float:
     """Return the deviation of an angle from a set-point, the short way round [rad]."""
     return wrap_angle(angle - set_point)
+
+
+def winds_up(push: float, wanted: float, effort: float) -> bool:
+    """Tell whether an integral must stand still: it would push its effort further beyond the limit (N m or N).
+
+    It may come back while the effort is at its limit (conditional integration); what is not a number is not integrated.
+
+    Args:
+        push: Of the integral's next step on the effort, of any size.
+        wanted: The effort, that step included.
+        effort: The same within its limit.
+    """
+    return not (wanted == effort or (wanted - effort) * push < 0.0)

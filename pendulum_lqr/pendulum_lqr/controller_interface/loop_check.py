@@ -10,16 +10,19 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.linear.analysis import Feedback, delayed_spectral_radius
+from pendulum_lqr.linear.design import DesignError, Gain, output_lqr
 from pendulum_lqr.linear.model import RigidPlant, linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 if TYPE_CHECKING:
     from pendulum_lqr.controller_interface.interface import Controller
 
-__all__ = ["growth", "require_stable", "settles"]
+__all__ = ["growth", "require_settling", "require_stable", "settles", "settling_lqr"]
 
 _START = 1e-5
 """Deviation from which the loop is released [rad]; a hundred times as much is still far from every limit."""
@@ -28,14 +31,15 @@ _WINDOW = 100
 _WINDOWS = 100
 _DEAD, _FALLEN = 0.2, 100.0 * _START
 """A spread below this share of the largest one has died out; beyond this deviation [rad] it never will."""
-_MOST_GROWTH = 1.05
-"""Growth up to which a loop counts as one that settles."""
+_STRETCH, _UNEVEN = 25, 1.02
+"""Windows that are compared where motion does not die out, and how much more of them a steady one may show."""
 
 
 def growth(controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> float:
     """Return by how much motion grows after a release: below 1 it dies out, inf if it has grown a hundredfold.
 
-    The loop is followed until its motion has died out, for 10 000 samples at most.
+    Of a law that is a gain it is the spectral radius of the sampled loop, to the power of a window. Any other loop is
+    followed until its motion has died out, for 10 000 samples at most.
 
     Args:
         controller: Any controller; one that predicts has to feed forward the torque that holds. It is reset before
@@ -45,6 +49,8 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
         set_point: The angle that it holds, from upright [rad].
     """
     model = linearise(plant, UPRIGHT + set_point)
+    if (feedback := getattr(controller, "feedback", None)) is not None:
+        return delayed_spectral_radius(model, feedback.K, period, summed=feedback.summed) ** _WINDOW
     sampled = discretise(model, period)
     n = model.A.shape[0]
     z = np.zeros(n + sampled.pending)
@@ -73,14 +79,16 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
             z = A @ z + B * (effort - hold)
         spreads.append(max(float(np.ptp(angles)), 1e-6 * _START))
         if window and spreads[-1] < _DEAD * max(spreads) and spreads[-1] < spreads[-2]:
-            break
+            controller.reset()
+            return spreads[-1] / spreads[-2]
     controller.reset()
-    return spreads[-1] / spreads[-2]
+    # Between such long stretches the phase of an oscillation in its window hardly counts.
+    return max(spreads[-_STRETCH:]) / max(spreads[-2 * _STRETCH : -_STRETCH]) / _UNEVEN
 
 
 def settles(controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> bool:
     """Tell whether a balancing controller settles on the linear model of its plant; arguments as of :func:`growth`."""
-    return growth(controller, plant, period, set_point) <= _MOST_GROWTH
+    return growth(controller, plant, period, set_point) < 1.0
 
 
 def require_stable(name: str, controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> None:
@@ -105,3 +113,39 @@ def require_stable(name: str, controller: Controller, plant: RigidPlant, period:
         f"{name} makes the loop unstable with a period of {period:g} s{late}{hidden}; expected a shorter period or "
         "smaller gains (larger r, smaller bandwidth), or lqg, which reckons with delay and hidden states"
     )
+
+
+def require_settling(
+    name: str, plant: RigidPlant | MechanismParameters, feedback: Feedback, period: float, remedy: str
+) -> None:
+    """Refuse a gain whose sampled loop with the plant about upright grows, lags and delay included.
+
+    Args:
+        name: Of the controller.
+        plant: The plant.
+        feedback: The gain.
+        period: Sampling period [s].
+        remedy: What helps.
+
+    Raises:
+        DesignError: The loop grows.
+    """
+    radius = delayed_spectral_radius(linearise(plant), feedback.K, period, summed=feedback.summed)
+    if radius >= 1.0:
+        raise DesignError(
+            f"{name} asked every {period:g} s does not settle on plant {getattr(plant, 'name', '')!r}: deviations grow "
+            f"by {radius:.4g} a period; expected {remedy}"
+        )
+
+
+def settling_lqr(plant: RigidPlant | MechanismParameters, q: ArrayLike, r: ArrayLike, period: float) -> Gain:
+    """Return the best gain on what is measured about upright, which holds at a sampling period [s].
+
+    Arguments as of :func:`~pendulum_lqr.linear.design.output_lqr`.
+
+    Raises:
+        DesignError: There is no such gain, or its sampled loop grows, lags and delay included.
+    """
+    gain = output_lqr(linearise(plant), q, r)
+    require_settling("lqr", plant, Feedback(gain.K), period, "a shorter period, larger r or smaller q")
+    return gain

@@ -118,7 +118,7 @@ class JointEnergySwingUp(JointController):
         """Return how far the driven joint goes, and from where the LQR catches."""
         joint = self._coordinates.joints[self._coordinates.driven[0]]
         within = f" within {self.pump.reach:.3g} {joint.unit}" if math.isfinite(self.pump.reach) else ""
-        K = ", ".join(f"{value:.4g}" for value in self.catch.gain.K[0])
+        K = ", ".join(f"{value:.4g}" for value in self.catch.gain.K)
         return f"pumps by {joint.name}{within}, LQR K = [{K}] within {self.catch.region.describe()}"
 
     def carry_over(self, previous: Controller | JointController) -> None:

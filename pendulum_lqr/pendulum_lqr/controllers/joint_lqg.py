@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.controller_interface.interface import Controller, JointController
 from pendulum_lqr.controllers.joint_discrete_lqr import JointDiscreteLqr
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, gain_text, joint_weights
 from pendulum_lqr.linear.design import kalman_gain
@@ -24,11 +23,11 @@ Array = NDArray[np.float64]
 
 
 class JointLqg(JointDiscreteLqr):
-    """Stationary LQG regulator about upright: positions are filtered, velocities come from them.
+    """Stationary LQG regulator about upright: positions are filtered, velocities and lagged efforts come from them.
 
         x[k+1] = A x[k] + B u[k - delay] + E w[k],   y = [q - q*, v] + noise,
 
-    with w an unknown effort on every joint, held for a period.
+    with w an unknown effort on every joint, at a driven one added to the command, held for a period.
     """
 
     SUMMARY = "discrete LQR on the state that a Kalman filter estimates from positions"
@@ -36,15 +35,14 @@ class JointLqg(JointDiscreteLqr):
     def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
         super().__init__(plant, p, period)
         n = len(plant.joints)
-        disturbed = discretise(replace(self._linear, B=self._linear.E, delay=0.0), period).B
+        entry = self._linear.E.copy()
+        entry[:, list(plant.coordinates.driven)] = self._linear.B
+        disturbed = discretise(replace(self._linear, B=entry, delay=0.0), period).B
         rows = 2 * n if p["velocity_noise"] > 0.0 else n
-        self._A, self._late = self.model.A[: 2 * n, : 2 * n], self.model.A[: 2 * n, 2 * n :]
-        self._B = self.model.B[: 2 * n]
         variances = np.repeat([p["position_noise"] ** 2, p["velocity_noise"] ** 2], n)[:rows]
         process = p["effort_noise"] ** 2 * (disturbed @ disturbed.T)
-        self.filter = kalman_gain(self._A, np.eye(rows, 2 * n), process, np.diag(variances))
+        self.filter = kalman_gain(self._A, np.eye(rows, len(self._A)), process, np.diag(variances))
         self._rows = rows
-        self._predicted: Array | None = None
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
@@ -60,13 +58,8 @@ class JointLqg(JointDiscreteLqr):
             JOINT_LIMIT,
         )  # fmt: skip
 
-    def reset(self) -> None:
-        """Forget the estimate and what was sent."""
-        super().reset()
-        self._predicted = None
-
     def _state(self, position: Vector, velocity: Vector) -> Array:
-        """Return the estimate; the first velocity is always believed."""
+        """Return the estimate; the first velocity is always used."""
         measured = super()._state(position, velocity)
         if self._predicted is None:
             return measured
@@ -75,18 +68,6 @@ class JointLqg(JointDiscreteLqr):
         surprise[:n] = self._deviation(measured[:n].tolist(), self._predicted[:n].tolist())
         return np.asarray(self._predicted + self.filter.L @ surprise[: self._rows])
 
-    def _move_on(self, x: Array, moving: Array, sent: Array) -> None:
-        predicted = self._A @ x + self._late @ moving + self._B @ sent
-        # What was measured beyond all bounds once must not be remembered for ever.
-        self._predicted = predicted if np.isfinite(predicted).all() else None
-        super()._move_on(x, moving, sent)
-
     def describe(self) -> str:
         """Return both gains."""
         return f"K = [{gain_text(self._K)}], L = [{gain_text(self.filter.L.T)}]"
-
-    def carry_over(self, previous: Controller | JointController) -> None:
-        """Take over the estimate and what is on its way."""
-        super().carry_over(previous)
-        if isinstance(previous, JointLqg) and previous.period == self.period:
-            self._predicted = previous._predicted

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from pendulum_lqr.controller_interface.interface import Controller, JointController
+from pendulum_lqr.controller_interface.law import winds_up
+from pendulum_lqr.controller_interface.loop_check import require_settling
 from pendulum_lqr.controller_interface.sampling import require_period
-from pendulum_lqr.controllers.joint_lqr import (
-    JOINT_LIMIT,
-    SMALLER_Q,
-    UprightController,
-    gain_text,
-    joint_weights,
-    require_settling,
-)
-from pendulum_lqr.linear.mechanism_model import mechanism_lqr
-from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, SMALLER_Q, UprightController, gain_text, joint_weights
+from pendulum_lqr.linear.analysis import Feedback
+from pendulum_lqr.linear.design import output_lqr, with_integrals
 from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -32,17 +26,18 @@ class JointLqi(UprightController):
     """u = u* - K [q - q*, v, integrals of the driven joints' q - q*] about upright.
 
     As many outputs as there are efforts can be brought to where they belong, whatever constant effort disturbs: those
-    of the driven joints. All integrals stand still while an effort is at its limit, so that they do not wind up.
+    of the driven joints. None winds up while its joint's effort is at its limit:
+    :func:`~pendulum_lqr.controller_interface.law.winds_up`.
     """
 
     SUMMARY = "LQR with integrals of the driven joints: no offset of theirs under a constant effort"
 
     def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
         super().__init__(plant, p, period)
-        self._driven = plant.coordinates.driven
-        self._model = _with_integrals(self._linear, self._driven)
-        self.gain = mechanism_lqr(self._model, [*p["q"], *(p["q_integral"],) * len(self._driven)], p["r"])
-        self._integral = np.zeros(len(self._hold))
+        self._driven, n, m = list(plant.coordinates.driven), len(plant.joints), len(self._hold)
+        self.gain = output_lqr(with_integrals(self._linear, self._driven), [*p["q"], *(p["q_integral"],) * m], p["r"])
+        self._K, self._KI = self.gain.rows[:, : 2 * n], self.gain.rows[:, 2 * n :]
+        self.reset()
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
@@ -54,7 +49,8 @@ class JointLqi(UprightController):
     def check(self, period: float) -> None:
         """Refuse another period than that of the design [s], and one at which it does not settle."""
         require_period("it is integrated", self.period, period)
-        require_settling("lqi", self._plant.name, self._model, self.gain, period, SMALLER_Q)
+        feedback = Feedback(np.hstack([self._K, self.period * self._KI]), tuple(self._driven))
+        require_settling("lqi", self._plant, feedback, period, SMALLER_Q)
 
     def reset(self) -> None:
         """Empty the integrals."""
@@ -63,32 +59,19 @@ class JointLqi(UprightController):
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts [N m or N]."""
         deviation = self._deviation(position)
-        integral = self._integral + self.period * np.array([deviation[joint] for joint in self._driven])
-        wanted = self._hold - self.gain.K @ np.array([*deviation, *velocity, *integral])
+        error = np.array([deviation[joint] for joint in self._driven])
+        integral = self._integral + self.period * error
+        wanted = self._hold - self._K @ [*deviation, *velocity] - self._KI @ integral
         efforts = within_limits(wanted, self.effort_limits)
-        if all(abs(effort) <= limit for effort, limit in zip(wanted, self.effort_limits, strict=True)):
-            self._integral = integral
+        stands = list(map(winds_up, -np.diag(self._KI) * error, wanted, efforts))
+        self._integral = np.where(stands, self._integral, integral)
         return efforts
 
     def describe(self) -> str:
         """Return the gain."""
-        return f"K = [{gain_text(self.gain.K)}]"
+        return f"K = [{gain_text(self.gain.rows)}]"
 
     def carry_over(self, previous: Controller | JointController) -> None:
         """Keep the efforts that the integrals stand for, though the gain on them has changed."""
         if isinstance(previous, JointLqi):
-            m = len(self._hold)
-            self._integral = np.linalg.solve(self.gain.K[:, -m:], previous.gain.K[:, -m:] @ previous._integral)
-
-
-def _with_integrals(model: LinearModel, driven: tuple[int, ...]) -> LinearModel:
-    """Return the model with the integrals of the driven joints' deviations as its last states."""
-    size, m = model.B.shape
-    A = np.zeros((size + m, size + m))
-    A[:size, :size] = model.A
-    for index, joint in enumerate(driven):
-        A[size + index, joint] = 1.0
-    B = np.vstack([model.B, np.zeros((m, m))])
-    E = np.vstack([model.E, np.zeros((m, model.E.shape[1]))])
-    names = (*model.states, *(f"integral of {model.states[joint]}" for joint in driven))
-    return replace(model, A=A, B=B, C=np.eye(size + m), E=E, states=names)
+            self._integral = np.linalg.solve(self._KI, previous._KI @ previous._integral)

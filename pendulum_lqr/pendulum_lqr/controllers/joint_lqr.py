@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from pendulum_lqr.controller_interface.interface import JointController
-from pendulum_lqr.linear.analysis import delayed_spectral_radius
-from pendulum_lqr.linear.design import Gain
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.controller_interface.loop_check import require_settling
+from pendulum_lqr.linear.analysis import Feedback
+from pendulum_lqr.linear.design import output_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
 from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.contract.joints import Vector
-from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
@@ -29,7 +28,6 @@ __all__ = [
     "joint_limits",
     "joint_weights",
     "require_catching",
-    "require_settling",
 ]
 
 JOINT_LIMIT = ParameterSpec(
@@ -56,28 +54,13 @@ def joint_limits(plant: MechanismParameters, limit: float) -> Vector:
     return tuple(min(limit or math.inf, own) for own in plant.effort_limits)
 
 
-def require_settling(
-    controller: str, plant: str, model: LinearModel, gain: Gain, period: float, remedy: str = "a faster plant"
-) -> None:
-    """Refuse a gain with which the linear model of a plant grows when asked at a period [s], delay included.
-
-    Raises:
-        ParameterError: It does.
-    """
-    if (growth := delayed_spectral_radius(model, gain.K, period)) >= 1.0:
-        raise ParameterError(
-            f"{controller} asked every {period:g} s does not settle on plant {plant!r}: deviations grow by "
-            f"{growth:.3g} a period; expected {remedy}"
-        )
-
-
 def require_catching(controller: str, catch: MechanismCatch, period: float) -> None:
-    """Refuse an LQR that would not hold what comes up, asked at a period [s], delay included.
+    """Refuse an LQR that would not hold what comes up, asked at a period [s], lag and delay included.
 
     Raises:
-        ParameterError: It does not settle.
+        DesignError: It does not settle.
     """
-    require_settling(controller, catch.plant.name, linearise_mechanism(catch.plant), catch.gain, period)
+    require_settling(controller, catch.plant, Feedback(catch.gain.K), period, "a faster plant")
 
 
 def gain_text(rows: Iterable[Iterable[float]]) -> str:
@@ -101,7 +84,7 @@ class UprightController(JointController):
         super().__init__(joint_limits(plant, p["effort_limit"]))
         self.period = period
         self._plant = plant
-        self._linear = linearise_mechanism(plant)
+        self._linear = linearise(plant)
         self._hold = np.array(self._linear.efforts)
         self._deviation = plant.coordinates.deviation
 
@@ -119,13 +102,13 @@ class JointLqr(UprightController):
 
     def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
         super().__init__(plant, p, period)
-        self.gain = mechanism_lqr(self._linear, p["q"], p["r"])
+        self.gain = output_lqr(self._linear, p["q"], p["r"])
         # Plain floats: indexing an array on every state costs more than the law itself.
-        self._rows = tuple(tuple(float(value) for value in row) for row in self.gain.K)
+        self._rows = tuple(tuple(float(value) for value in row) for row in self.gain.rows)
 
     def check(self, period: float) -> None:
         """Refuse a period at which it does not settle [s]."""
-        require_settling("lqr", self._plant.name, self._linear, self.gain, period, SMALLER_Q)
+        require_settling("lqr", self._plant, Feedback(self.gain.K), period, SMALLER_Q)
 
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts."""

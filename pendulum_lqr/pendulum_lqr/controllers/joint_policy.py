@@ -15,7 +15,7 @@ from pendulum_lqr.controller_interface.policy_answers import (
     policy_specs,
     states_to_hold,
 )
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits
+from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, require_catching
 from pendulum_lqr.policies.policy import Policy, require_plant
 from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
@@ -99,8 +99,10 @@ class JointPolicy(JointController):
         return self._answers.notice
 
     def check(self, period: float) -> None:
-        """Refuse a period that the policy's is no whole multiple of, and at which its fallback does not settle [s]."""
+        """Refuse a period that the policy's is no multiple of, and at which catch or fallback do not settle [s]."""
         check_policy_period(self.policy, period)
+        if self.catch is not None:
+            require_catching("policy", self.catch, period)
         if self.fallback is not None:
             self.fallback.check(period)
 

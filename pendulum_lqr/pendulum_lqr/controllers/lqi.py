@@ -7,9 +7,10 @@ from typing import Any
 
 from pendulum_lqr.controller_interface.controller import LawController
 from pendulum_lqr.controller_interface.interface import Controller
-from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
+from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation, winds_up
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
-from pendulum_lqr.linear.design import Gain, integral_lqr
+from pendulum_lqr.linear.analysis import Feedback
+from pendulum_lqr.linear.design import Gain, output_lqr, with_integrals
 from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -32,8 +33,7 @@ def lqi_law(
     integral = memory[_INTEGRAL] + numbers[_PERIOD] * error
     wanted = numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity - numbers[_KI] * integral
     effort = clamped(wanted, numbers[EFFORT_LIMIT])
-    # wanted beyond the limit with the error's sign opposed means that integrating on would push further out.
-    if wanted == effort or (wanted - effort) * error > 0.0:
+    if not winds_up(-numbers[_KI] * error, wanted, effort):
         memory[_INTEGRAL] = integral
     return effort
 
@@ -41,8 +41,7 @@ def lqi_law(
 class Lqi(LawController):
     """LQI: u = u* - K [theta - theta*, theta_dot, integral of (theta - theta*)].
 
-    The integral stands still while the torque is at its limit and integrating would drive it further (conditional
-    integration), so that it does not wind up.
+    The integral does not wind up at the torque limit: :func:`~pendulum_lqr.controller_interface.law.winds_up`.
     """
 
     SUMMARY = "LQR with an integral state: no offset under a constant torque"
@@ -62,7 +61,8 @@ class Lqi(LawController):
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         model = linearise(plant, UPRIGHT + p["set_point"])
-        self.gain: Gain = integral_lqr(model, [*p["q"], p["q_integral"]], p["r"])
+        self.gain: Gain = output_lqr(with_integrals(model), [*p["q"], p["q_integral"]], p["r"])
+        self.feedback = Feedback(self.gain.K * (1.0, 1.0, period), (0,))
         hold = model.effort if p["feedforward"] else 0.0
         super().__init__(lqi_law, p["effort_limit"], p["set_point"], (hold, *self.gain.K, period), (0.0,))
 

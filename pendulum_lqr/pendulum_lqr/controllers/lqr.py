@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 from pendulum_lqr.controller_interface.controller import LawController
 from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
+from pendulum_lqr.linear.analysis import Feedback
 from pendulum_lqr.linear.design import Gain, output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -39,6 +40,7 @@ class Lqr(LawController):
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         model = linearise(plant, UPRIGHT + p["set_point"])
         self.gain: Gain = output_lqr(model, p["q"], p["r"])
+        self.feedback = Feedback(self.gain.K)
         hold = model.effort if p["feedforward"] else 0.0
         super().__init__(lqr_law, p["effort_limit"], p["set_point"], (hold, *self.gain.K))
 

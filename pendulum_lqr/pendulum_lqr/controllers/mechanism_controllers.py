@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from pendulum_lqr.controller_interface.interface import JointController
 from pendulum_lqr.controller_interface.policy_answers import check_policy_period, states_to_hold
+from pendulum_lqr.controllers.joint_lqr import require_catching
 from pendulum_lqr.controllers.joint_policy import JointPolicy
 from pendulum_lqr.policies.policy import require_plant
 from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy
@@ -99,7 +101,8 @@ def make_mechanism_controller(name: str, plant: MechanismParameters, period: flo
         period: Sampling period [s].
 
     Raises:
-        ParameterError: No controller has this name, or it does not go with this plant.
+        ParameterError: No controller has this name, it does not go with this plant, or the LQR that catches does not
+            settle at this period.
         DataError: A policy file is refused.
     """
     file = name.removesuffix(_CATCH_SUFFIX)
@@ -111,9 +114,13 @@ def make_mechanism_controller(name: str, plant: MechanismParameters, period: flo
         hold = states_to_hold(policy, period)
         # It has all of its effort from the start.
         inner = JointPolicy(policy, hold, plant.effort_limits, start_time=0.0, catch=catch)
+        inner.check(period)
         return _WholeStates(inner, len(plant.joints))
     if name not in _CONTROLLERS:
         raise ParameterError(
             f"controller {name!r} is unknown; expected one of {', '.join(_CONTROLLERS)}, or a policy file (.npz)"
         )
-    return _CONTROLLERS[name](plant, period)
+    controller: Any = _CONTROLLERS[name](plant, period)
+    require_catching(name, getattr(controller, "controller", controller).catch, period)
+    found: MechanismController = controller
+    return found

@@ -18,6 +18,7 @@ from rich.console import Console
 from pendulum_lqr.design_command.certificate_table import certificate_document, certify_rows, print_certificates
 from pendulum_lqr.design_command.design_tables import (
     RowTable,
+    hidden_and_late,
     margin_cells,
     pole_cell,
     print_time_figures,
@@ -258,16 +259,8 @@ def _plant_lines(name: str, model: LinearModel) -> list[str]:
             )
         ]
     else:
-        lines = [
-            f"{at}: states {', '.join(model.states)}; u* = {model.effort:.4g} N m",
-            (
-                f"{' and '.join(model.hidden)} not measured: K is the best gain on angle and velocity alone, without "
-                "the margins that an LQR on the whole state guarantees; the controller lqg estimates the rest"
-            ),
-        ]
-    if model.delay > 0.0:
-        lines.append(f"transport delay {model.delay:g} s: counted in margins and periods, not in the eigenvalues")
-    return lines
+        lines = [f"{at}: states {', '.join(model.states)}; u* = {model.effort:.4g} N m"]
+    return [*lines, *hidden_and_late(model)]
 
 
 def _document(

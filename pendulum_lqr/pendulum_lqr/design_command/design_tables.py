@@ -9,11 +9,20 @@ from rich.console import Console
 
 from pendulum_lqr.design_command.time_figures import TimeFigures
 from pendulum_lqr.linear.analysis import Margins
+from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.linear.parameter_box import ParameterBox, WorstCase
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 from pendulum_msgs_py.programs.terminal import WholeTable
 
-__all__ = ["RowTable", "margin_cells", "pole_cell", "print_time_figures", "print_worst_cases", "time_cell"]
+__all__ = [
+    "RowTable",
+    "hidden_and_late",
+    "margin_cells",
+    "pole_cell",
+    "print_time_figures",
+    "print_worst_cases",
+    "time_cell",
+]
 
 _UNITS = {spec.name: spec.unit for spec in PLANT_SPECS}
 
@@ -134,3 +143,17 @@ def print_worst_cases(console: Console, box: ParameterBox, found: Sequence[Worst
 
 def _place(where: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:.4g} {_UNITS[name]}" for name, value in where.items())
+
+
+def hidden_and_late(model: LinearModel) -> list[str]:
+    """Return what a design leaves out of the states that are not measured, and of the delay, in sentences."""
+    lines = []
+    if model.hidden:
+        measured = "angle and velocity" if model.measured[0] == "theta" else "positions and velocities"
+        lines.append(
+            f"{' and '.join(model.hidden)} not measured: K is the best gain on {measured} alone, without "
+            "the margins that an LQR on the whole state guarantees; the controller lqg estimates the rest"
+        )
+    if model.delay > 0.0:
+        lines.append(f"transport delay {model.delay:g} s: counted in margins and periods, not in the eigenvalues")
+    return lines

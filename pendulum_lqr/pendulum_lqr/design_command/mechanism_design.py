@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pendulum_lqr.design_command.design_tables import RowTable, pole_cell, time_cell
+from pendulum_lqr.design_command.design_tables import RowTable, hidden_and_late, pole_cell, time_cell
 from pendulum_lqr.linear.analysis import LoopReport, analyse
-from pendulum_lqr.linear.design import Gain
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
-from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.linear.design import Gain, output_lqr
+from pendulum_lqr.linear.model import LinearModel, linearise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -25,7 +24,7 @@ class _Row:
     q: tuple[float, ...]
     r: float
     gain: Gain
-    report: LoopReport | None
+    report: LoopReport
 
 
 def design_mechanism(
@@ -42,16 +41,13 @@ def design_mechanism(
     Raises:
         ParameterError: A weight is refused, or the plant cannot be held upright.
     """
-    model = linearise_mechanism(plant)
-    size = model.A.shape[0]
+    model = linearise(plant)
     diagonal, cost = plant.mechanism.weights
     rows = []
-    for weights in [_diagonal(text, model.states) for text in q] if q else [diagonal]:
+    for weights in [_diagonal(text, model.measured) for text in q] if q else [diagonal]:
         for each in r or [cost]:
-            gain = mechanism_lqr(model, weights, each)
-            # Margins of a loop cut at one input are those of a plant with one.
-            report = analyse(model, gain.K[0]) if gain.K.shape == (1, size) else None
-            rows.append(_Row(weights, each, gain, report))
+            gain = output_lqr(model, weights, each)
+            rows.append(_Row(weights, each, gain, analyse(model, gain.K)))
     if as_json:
         sys.stdout.write(json_text(_document(plant, model, rows)) + "\n")
     else:
@@ -70,6 +66,8 @@ def _print(plant: MechanismParameters, model: LinearModel, rows: Sequence[_Row])
     )
     console.print(f"plant {plant.name}, a {plant.mechanism.name}, at {held}; held by {driven}")
     console.print(f"states {', '.join(model.states)}; poles without control {pole_cell(model.poles)} 1/s")
+    for line in hidden_and_late(model):
+        console.print(line)
     if plant.has_dry_friction:
         console.print(
             "dry friction has no derivative at rest and is not in the model: simulate the loop to see its cost"
@@ -84,10 +82,10 @@ def _print(plant: MechanismParameters, model: LinearModel, rows: Sequence[_Row])
             ", ".join(f"{value:g}" for value in row.q),
             f"{row.r:g}",
             pole_cell(row.gain.poles),
-            "\n".join(", ".join(f"{value:.4f}" for value in line) for line in row.gain.K),
-            f"{-1.0 / row.gain.poles[0].real:.4f}",
-            "\u2013" if report is None or report.margins is None else time_cell(report.margins.delay),
-            "\u2013" if report is None or report.largest_period is None else time_cell(report.largest_period),
+            "\n".join(", ".join(f"{value:.4f}" for value in line) for line in row.gain.rows),
+            f"{report.time_constant:.4f}" if report.stable else "unstable",
+            "\u2013" if report.margins is None else time_cell(report.margins.delay),
+            "none" if not report.largest_period else time_cell(report.largest_period),
         )
     console.print(table)
 
@@ -109,10 +107,9 @@ def _document(plant: MechanismParameters, model: LinearModel, rows: Sequence[_Ro
             {
                 "q": list(row.q),
                 "r": row.r,
-                "K": row.gain.K.tolist(),
+                "K": row.gain.rows.tolist(),
                 "poles": [[pole.real, pole.imag] for pole in row.gain.poles],
-                "margins": None if row.report is None else row.report.to_dict()["margins"],
-                "largest_period": None if row.report is None else row.report.to_dict()["largest_period"],
+                **{key: row.report.to_dict()[key] for key in ("stable", "margins", "largest_period")},
             }
             for row in rows
         ],

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -21,6 +21,7 @@ from pendulum_lqr.linear.sampled_design import closed_loop, discretise
 from pendulum_msgs_py.json_values import without_nan
 
 __all__ = [
+    "Feedback",
     "LoopReport",
     "Margins",
     "analyse",
@@ -36,6 +37,18 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _PERIOD_LIMIT = 1e3
+
+
+class Feedback(NamedTuple):
+    """A sampled law u = -K [y; sums of the outputs ``summed``, that of this sample included].
+
+    Attributes:
+        K: Gain, shape (k + sums,) or (m, k + sums); without sums also on the whole state.
+        summed: Indices of the outputs that are summed up.
+    """
+
+    K: Array
+    summed: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +77,14 @@ class LoopReport:
     """Everything the design table shows about one gain.
 
     Attributes:
-        K: Gain (theta, theta_dot, ...) [N m/rad, N m s/rad, ...].
+        K: Gain (theta, theta_dot, ...), of several inputs row by row [N m/rad, N m s/rad, ...].
         poles: Closed-loop eigenvalues without the plant's delay, slowest first [1/s].
         stable: Whether the loop is stable, the plant's delay included.
         time_constant: -1 / (largest real part), inf if unstable [s].
         damping_ratio: Smallest damping ratio of the poles [-]; 1 for real stable ones.
         natural_frequency: Magnitude of the slowest pole [rad/s].
-        margins: Gain, phase, delay and modulus margins; None without feedback.
+        margins: Gain, phase, delay and modulus margins; None without feedback, and of several inputs, whose loop is
+            not cut at one.
         largest_period: Largest sampling period under zero-order hold that stays stable [s]; None without feedback.
     """
 
@@ -95,7 +109,7 @@ def closed_loop_poles(model: LinearModel, K: ArrayLike) -> NDArray[np.complex128
 
     Args:
         model: Linear model.
-        K: Gain, shape (2,) or (n,).
+        K: Gain, shape (k,) or (n,); a row for each of several inputs.
     """
     return sort_poles(np.linalg.eigvals(model.A - model.B @ _on_state(model, K)))
 
@@ -105,21 +119,23 @@ def analyse(model: LinearModel, K: ArrayLike | None) -> LoopReport:
 
     Args:
         model: Linear model.
-        K: Gain, shape (2,) or (n,).
+        K: Gain, shape (k,) or (n,); a row for each of several inputs.
     """
-    gain = np.zeros(2) if K is None else np.asarray(K, dtype=np.float64)
+    k, m = model.outputs_and_inputs
+    gain = np.zeros((m, k)) if K is None else np.asarray(K, dtype=np.float64)
     poles = closed_loop_poles(model, gain)
     slowest = float(poles[0].real)
+    period = math.nan if K is None else largest_stable_period(model, gain)
     ratios = [-pole.real / abs(pole) if abs(pole) > 0.0 else 0.0 for pole in poles]
     return LoopReport(
-        K=tuple(float(value) for value in gain),
+        K=tuple(float(value) for value in gain.ravel()),
         poles=tuple(complex(pole) for pole in poles),
-        stable=slowest < 0.0 and (K is None or model.delay == 0.0 or bears_its_delay(model, gain)),
+        stable=slowest < 0.0 and (K is None or model.delay == 0.0 or period > 0.0),
         time_constant=-1.0 / slowest if slowest < 0.0 else math.inf,
         damping_ratio=float(min(ratios)),
         natural_frequency=float(abs(poles[0])),
-        margins=None if K is None else loop_margins(model, gain),
-        largest_period=None if K is None else largest_stable_period(model, gain),
+        margins=None if K is None or m > 1 else loop_margins(model, gain),
+        largest_period=None if K is None else period,
     )
 
 
@@ -128,7 +144,7 @@ def loop_transfer(model: LinearModel, K: ArrayLike, omega: ArrayLike) -> NDArray
 
     Args:
         model: Linear model.
-        K: Gain, shape (2,) or (n,).
+        K: Gain, shape (k,) or (n,); a row for each of several inputs.
         omega: Angular frequencies, shape (n,) [rad/s].
     """
     s = 1j * np.asarray(omega, dtype=np.float64)
@@ -209,17 +225,27 @@ def _delayed_crossings(model: LinearModel, gain: Array) -> tuple[Array, Array, A
     return gains, phases, crossovers
 
 
-def delayed_spectral_radius(model: LinearModel, K: ArrayLike, period: float, delay: float = 0.0) -> float:
-    """Return the largest |pole| of the sampled loop u[k] = -K x[k] that acts after a delay; stable if < 1.
+def delayed_spectral_radius(
+    model: LinearModel, K: ArrayLike, period: float, delay: float = 0.0, summed: Sequence[int] = ()
+) -> float:
+    """Return the largest |pole| of the sampled loop that acts after a delay; stable if < 1.
 
     Args:
-        model: Linear model.
-        K: Gain, shape (2,), (n,) or (m, n).
+        model: Linear model; its lags and its delay are in the loop.
+        K: Gain, shape (k,), (n,) or (m, n); with sums as of :class:`Feedback`.
         period: Sampling period [s].
         delay: Time from state to torque, beyond the model's own [s].
+        summed: Indices of the outputs whose sums the last columns of K are for.
     """
     sampled = discretise(model, period, delay)
-    return float(np.max(np.abs(np.linalg.eigvals(closed_loop(sampled, K)))))
+    gain, sums = np.array(np.atleast_2d(K), dtype=np.float64), len(summed)
+    of_sums = gain[:, gain.shape[1] - sums :]
+    gain = gain[:, : gain.shape[1] - sums]
+    gain[:, list(summed)] += of_sums
+    loop = closed_loop(sampled, gain)
+    if sums:
+        loop = np.block([[loop, -sampled.B @ of_sums], [np.eye(len(loop))[list(summed)], np.eye(sums)]])
+    return float(np.max(np.abs(np.linalg.eigvals(loop))))
 
 
 def largest_stable_period(model: LinearModel, K: ArrayLike) -> float:
@@ -227,7 +253,7 @@ def largest_stable_period(model: LinearModel, K: ArrayLike) -> float:
 
     Args:
         model: Linear model.
-        K: Gain, shape (2,) or (n,).
+        K: Gain, shape (k,) or (n,); a row for each of several inputs.
     """
 
     def stable(period: float) -> bool:
@@ -271,7 +297,7 @@ def bears_its_delay(model: LinearModel, K: ArrayLike) -> bool:
 
     Args:
         model: Linear model.
-        K: Gain, shape (2,) or (n,).
+        K: Gain, shape (k,) or (n,); a row for each of several inputs.
     """
     return model.delay < loop_margins(replace(model, delay=0.0), K).delay
 

@@ -24,19 +24,22 @@ __all__ = [
     "KalmanGain",
     "continuous_lqr",
     "cost_matrices",
-    "integral_lqr",
     "kalman_gain",
     "no_solution",
     "output_lqr",
     "require_controllable",
     "require_observable",
-    "riccati_gain",
+    "with_integrals",
 ]
 
 Matrix = NDArray[np.float64]
 
 _RANK_TOLERANCE = 1e-9
 """Smallest singular value, relative to the norm, under which a mode counts as out of reach."""
+
+
+_DISCOUNTS = 60
+"""Discounts that are tried until an output feedback is stable."""
 
 
 class DesignError(ParameterError):
@@ -48,7 +51,7 @@ class Gain:
     """State feedback u = -K x and the proof that came with it.
 
     Attributes:
-        K: Gain, shape (n,) [N m/rad, N m s/rad, ...].
+        K: Gain, shape (n,) of one input, (m, n) of several [N m/rad, N m s/rad, ...].
         S: Solution of the Riccati equation, shape (n, n); x' S x is the cost to go and a Lyapunov function.
         poles: Closed-loop eigenvalues, slowest first, shape (n,) [1/s], or on the z-plane for a discrete design.
     """
@@ -56,6 +59,11 @@ class Gain:
     K: Matrix
     S: Matrix
     poles: NDArray[np.complex128]
+
+    @property
+    def rows(self) -> Matrix:
+        """K with a row for each input, shape (m, n)."""
+        return np.atleast_2d(self.K)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,13 +79,14 @@ class KalmanGain:
     P: Matrix
 
 
-def cost_matrices(q: ArrayLike, r: float, size: int = 2) -> tuple[Matrix, Matrix]:
-    """Return the checked cost matrices Q (size, size) and R (1, 1).
+def cost_matrices(q: ArrayLike, r: ArrayLike, size: int = 2, inputs: int = 1) -> tuple[Matrix, Matrix]:
+    """Return the checked cost matrices Q (size, size) and R (inputs, inputs).
 
     Args:
         q: Diagonal of Q, shape (size,), or the whole symmetric matrix, shape (size, size).
-        r: Cost of torque, > 0 [1/(N m)^2].
+        r: Cost of effort, > 0, one for all inputs or one for each [1/(N m)^2].
         size: Number of states.
+        inputs: Number of inputs, m.
 
     Raises:
         DesignError: A weight is not finite, negative, not symmetric, or of the wrong shape.
@@ -94,18 +103,21 @@ def cost_matrices(q: ArrayLike, r: float, size: int = 2) -> tuple[Matrix, Matrix
     lowest = float(np.linalg.eigvalsh(weights)[0])
     if lowest < -1e-12 * max(1.0, float(np.abs(weights).max())):
         raise DesignError(f"q is {_plain(q)}, with the eigenvalue {lowest:.6g}; expected no negative weight")
-    if not (math.isfinite(r) and r > 0.0):
-        raise DesignError(f"r is {r} 1/(N m)^2; expected a finite weight > 0")
-    return weights, np.array([[float(r)]])
+    costs = np.asarray(r, dtype=np.float64)
+    if costs.size not in {1, inputs} or not (np.isfinite(costs).all() and costs.min() > 0.0):
+        expected = "a finite weight > 0" if inputs == 1 else f"one finite weight > 0, or {inputs}"
+        raise DesignError(f"r is {costs.tolist()} 1/(N m)^2; expected {expected}")
+    return weights, np.diag(np.broadcast_to(costs, inputs))
 
 
-def continuous_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
+def continuous_lqr(model: LinearModel, q: ArrayLike, r: ArrayLike) -> Gain:
     """Return the gain on the whole state that minimises the integral of x' Q x + u' R u.
 
     Args:
-        model: Linear model; its delay is not counted, the margins say how much of it the loop bears.
-        q: Weights of [theta, theta_dot]; states that are not measured cost nothing. See :func:`cost_matrices`.
-        r: Weight of the torque, > 0.
+        model: Linear model; its delay is not counted, the margins show how much of it the loop bears.
+        q: Weights of the measured states, [theta, theta_dot] of one joint; the others cost nothing. See
+            :func:`cost_matrices`.
+        r: Weight of the efforts, > 0: one for all, or m.
 
     Raises:
         DesignError: Weights out of domain, or a mode that torque cannot reach or that the cost does not see.
@@ -113,25 +125,34 @@ def continuous_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
     Source:
         Thesis, section 6.1; Anderson and Moore, Optimal Control, 1990, section 3.2.
     """
-    Q, R = cost_matrices(q, r)
-    gain = riccati_gain(model.A, model.B, model.C.T @ Q @ model.C, R[0])
-    return replace(gain, K=gain.K[0])
+    Q, R = cost_matrices(q, r, *model.outputs_and_inputs)
+    require_controllable(model.A, model.B)
+    try:
+        S = scipy.linalg.solve_continuous_are(model.A, model.B, model.C.T @ Q @ model.C, R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise DesignError(no_solution(Q, float(R[0, 0]), error)) from error
+    K = model.B.T @ S / np.diag(R)[:, None]
+    poles = sort_poles(np.linalg.eigvals(model.A - model.B @ K))
+    if np.max(poles.real) >= 0.0:
+        raise DesignError(no_solution(Q, float(R[0, 0]), "the closed loop is not stable"))
+    return Gain(_of_inputs(K), S, poles)
 
 
-def output_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
-    """Return the best gain on what is measured, u = -K [theta, theta_dot].
+def output_lqr(model: LinearModel, q: ArrayLike, r: ArrayLike) -> Gain:
+    """Return the best gain on what is measured, u = -K [theta, theta_dot] of one joint.
 
-    Where that is the whole state, it is the LQR. Where motor, spring or lag have states of their own, it is the gain
-    that costs least on average over releases of the resting pendulum from all angles and velocities: no gain on two
-    measurements can be optimal for every start, and none has the LQR's guaranteed margins.
+    Where that is the whole state, it is the LQR. Where motor, spring or lags have states of their own, it is the gain
+    that costs least on average over releases of the resting plant from all positions and velocities: no gain on
+    measurements alone can be optimal for every start, and none has the LQR's guaranteed margins.
 
     Args:
         model: Linear model; its delay is not counted.
-        q: Weights of [theta, theta_dot].
-        r: Weight of the torque, > 0.
+        q: Weights of the k measured states.
+        r: Weight of the efforts, > 0: one for all, or m.
 
     Returns:
-        K of shape (2,); S (n, n) gives the cost to go of this gain, x' S x.
+        K on the measured states, shape (k,) or (m, k); S (k, k) gives the cost to go of this gain, y' S y, from a
+        release at y.
 
     Raises:
         DesignError: As :func:`continuous_lqr`; or no gain on the measurements stabilises the plant.
@@ -139,41 +160,27 @@ def output_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
     Source:
         Levine and Athans, On the determination of the optimal constant output feedback gains, IEEE TAC 15(1), 1970.
     """
-    if not model.hidden:
-        return continuous_lqr(model, q, r)
-    Q, R = cost_matrices(q, r)
     full = continuous_lqr(model, q, r)
-    return _output_feedback(model.A, model.B, model.C, model.C.T @ Q @ model.C, float(R[0, 0]), full.K, _lift(model))
+    return _output_feedback(model, *cost_matrices(q, r, *model.outputs_and_inputs), full) if model.hidden else full
 
 
-def integral_lqr(model: LinearModel, q: ArrayLike, r: float) -> Gain:
-    """Return the LQI gain on [theta, theta_dot, integral of (theta - set-point)], which leaves no offset.
-
-    With states that are not measured it is the best gain on these three, as in :func:`output_lqr`.
+def with_integrals(model: LinearModel, outputs: Sequence[int] = (0,)) -> LinearModel:
+    """Return the model with the integrals of some measured states as its last measured ones.
 
     Args:
         model: Linear model.
-        q: Weights of the three, shape (3,) or (3, 3); the third > 0.
-        r: Weight of the torque, > 0.
-
-    Raises:
-        DesignError: As :func:`output_lqr`; in particular if the integral carries no weight.
+        outputs: Which are integrated; of each driven joint the position, in the order of the joints.
     """
-    Q, R = cost_matrices(q, r, 3)
-    if not Q[2, 2] > 0.0:
-        raise DesignError(f"weight of the integral is {Q[2, 2]:g}; expected > 0, or use plain LQR")
-    n = model.A.shape[0]
-    A = np.zeros((n + 1, n + 1))
-    A[:n, :n] = model.A
-    A[n, 0] = 1.0
-    B = np.vstack([model.B, [[0.0]]])
-    C = scipy.linalg.block_diag(model.C, [[1.0]])
-    full = riccati_gain(A, B, C.T @ Q @ C, R[0])
-    full = replace(full, K=full.K[0])
-    if not model.hidden:
-        return full
-    lift = scipy.linalg.block_diag(_lift(model), [[1.0]])
-    return _output_feedback(A, B, C, C.T @ Q @ C, float(R[0, 0]), full.K, lift)
+    k, more = model.C.shape[0], len(outputs)
+    size = model.A.shape[0] + more
+    old = [*range(k), *range(k + more, size)]
+    A = np.zeros((size, size))
+    A[np.ix_(old, old)] = model.A
+    A[range(k, k + more), list(outputs)] = 1.0
+    B, E = np.zeros((size, model.B.shape[1])), np.zeros((size, model.E.shape[1]))
+    B[old], E[old] = model.B, model.E
+    names = (*model.measured, *(f"integral of {model.states[output]}" for output in outputs), *model.hidden)
+    return replace(model, A=A, B=B, C=np.eye(k + more, size), E=E, states=names)
 
 
 def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike) -> KalmanGain:
@@ -252,65 +259,65 @@ def _unreached_mode(A: Matrix, B: Matrix, *, discrete: bool) -> complex | None:
 
 
 def _lift(model: LinearModel) -> Matrix:
-    """Return the states of a plant at ease at each measured angle and velocity, shape (n, 2): the motor follows."""
-    follows = {"theta": (1.0, 0.0), "theta_dot": (0.0, 1.0), "motor_angle": (1.0, 0.0), "motor_velocity": (0.0, 1.0)}
-    return np.array([follows.get(name, (0.0, 0.0)) for name in model.states])
+    """Return the states of a plant at ease at each value of the k measured ones, shape (n, k): the motor follows."""
+    k, size = model.C.shape
+    lift = np.eye(size, k)
+    for name, measured in (("motor_angle", 0), ("motor_velocity", 1)):
+        if name in model.states:
+            lift[model.states.index(name), measured] = 1.0
+    return lift
 
 
-def _output_feedback(A: Matrix, B: Matrix, C: Matrix, Q: Matrix, r: float, full: Matrix, lift: Matrix) -> Gain:
+def _output_feedback(model: LinearModel, Q: Matrix, R: Matrix, full: Gain) -> Gain:
     """Return u = -K C x of least tr(P X0), X0 = lift lift', by quasi-Newton on Levine and Athans' gradient."""
-    start = lift @ lift.T
+    A, B, C, lift = model.A, model.B, model.C, _lift(model)
+    start, cost, unit = lift @ lift.T, C.T @ Q @ C, np.eye(len(A))
 
-    def solve(K: Matrix) -> tuple[float, Matrix, Matrix]:
-        closed = A - B @ K[None, :] @ C
-        if float(np.max(np.linalg.eigvals(closed).real)) >= -1e-9:
+    def abscissa(K: Matrix) -> float:
+        return float(np.max(np.linalg.eigvals(A - B @ K @ C).real))
+
+    def solve(K: Matrix, discount: float = 0.0) -> tuple[float, Matrix, Matrix]:
+        if abscissa(K) >= discount - 1e-9:
             return math.inf, np.zeros_like(K), np.zeros_like(A)
-        P = scipy.linalg.solve_continuous_lyapunov(closed.T, -(Q + r * C.T @ np.outer(K, K) @ C))
+        closed = A - B @ K @ C - discount * unit
+        P = scipy.linalg.solve_continuous_lyapunov(closed.T, -(cost + C.T @ K.T @ R @ K @ C))
         L = scipy.linalg.solve_continuous_lyapunov(closed, -start)
-        gradient = 2.0 * ((r * K[None, :] @ C - B.T @ P) @ L @ C.T)[0]
-        return float(np.trace(P @ start)), gradient, P
+        return float(np.trace(P @ start)), 2.0 * (R @ K @ C - B.T @ P) @ L @ C.T, P
+
+    def improved(K: Matrix, discount: float = 0.0, most: int | None = None) -> Matrix:
+        value = solve(K, discount)[0]
+
+        def objective(relative: Matrix) -> tuple[float, Matrix]:
+            found, gradient, _ = solve(relative.reshape(scale.shape) * scale, discount)
+            return found / value, (gradient * scale / value).ravel()
+
+        options = {"gtol": 1e-9, "maxiter": most}
+        found = scipy.optimize.minimize(objective, (K / scale).ravel(), jac=True, method="BFGS", options=options)
+        return np.asarray(found.x.reshape(scale.shape) * scale)
 
     # What the full gain would do if the hidden states followed; smaller, should it excite what they really do.
-    follow = full @ lift
+    follow = full.rows @ lift
     scale = np.maximum(np.abs(follow), 1e-3 * float(np.max(np.abs(follow))))
-    guesses = [f * follow * mask for f in (1.0, 0.7, 0.5, 0.3, 0.2, 0.1) for mask in (1.0, _without_rate(follow))]
-    guess = min(guesses, key=lambda K: solve(K)[0])
-    if not math.isfinite(solve(guess)[0]):
+    best = min((share * follow for share in (1.0, 0.7, 0.5, 0.3, 0.2, 0.1)), key=abscissa)
+    # A cost that is discounted by exp(-2 discount t) is finite for a loop that grows more slowly; less discount with
+    # every gain found leads to one that is stable.
+    for _ in range(_DISCOUNTS):
+        if (growth := abscissa(best)) < -1e-9:
+            break
+        best = improved(best, growth + 0.1 * max(growth, 0.1), 30)
+    else:
         raise DesignError(
-            "no gain on angle and velocity found that stabilises the plant, whose other states are not measured; "
-            "expected larger r, smaller q, or lqg, which estimates them"
+            f"no gain on {', '.join(model.measured)} found that stabilises the plant, whose other states are not "
+            "measured; expected larger r, smaller q, or lqg, which estimates them"
         )
-    best, value = guess, solve(guess)[0]
-
-    def objective(relative: Matrix) -> tuple[float, Matrix]:
-        cost, gradient, _ = solve(relative * scale)
-        return cost / value, gradient * scale / value
-
     for _ in range(3):
-        found = scipy.optimize.minimize(objective, best / scale, jac=True, method="BFGS", options={"gtol": 1e-9})
-        best = found.x * scale
-    _, _, P = solve(best)
-    return Gain(best, P, sort_poles(np.linalg.eigvals(A - B @ best[None, :] @ C)))
+        best = improved(best)
+    return Gain(_of_inputs(best), lift.T @ solve(best)[2] @ lift, sort_poles(np.linalg.eigvals(A - B @ best @ C)))
 
 
-def _without_rate(gain: Matrix) -> Matrix:
-    mask = np.ones_like(gain)
-    mask[1] = 0.0
-    return mask
-
-
-def riccati_gain(A: Matrix, B: Matrix, Q: Matrix, costs: Matrix) -> Gain:
-    """Return the gain, its K of shape (m, n), for a cost Q of the states and costs of each input, shape (m,)."""
-    require_controllable(A, B)
-    try:
-        S = scipy.linalg.solve_continuous_are(A, B, Q, np.diag(costs))
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(no_solution(Q, float(costs[0]), error)) from error
-    K = B.T @ S / costs[:, None]
-    poles = sort_poles(np.linalg.eigvals(A - B @ K))
-    if np.max(poles.real) >= 0.0:
-        raise DesignError(no_solution(Q, float(costs[0]), "the closed loop is not stable"))
-    return Gain(K, S, poles)
+def _of_inputs(K: Matrix) -> Matrix:
+    """Return a gain as ``Gain.K`` holds it: without its only row where there is one input."""
+    return K[0] if len(K) == 1 else K
 
 
 def no_solution(Q: Matrix, r: float, reason: object) -> str:

@@ -1,21 +1,27 @@
-"""The linear model of the plant that runs: link, motor, spring and lag as states, the transport delay beside them.
+"""The linear model of the plant that runs, of one joint or several: links, motor, spring and lags of the actuators.
 
-The equations are those of :mod:`pendulum_msgs_py.dynamics`, which the simulator steps too; their derivatives come by
-complex step, exact to rounding. For the rigid pendulum ``M_c theta'' + b_c theta' + G_c sin(theta) = u`` that gives
+The equations are those of :mod:`pendulum_msgs_py.dynamics` and of the mechanism, which the simulator steps too; their
+derivatives come by complex step, exact to rounding. For a mechanism of n joints, m of them driven, that gives
+
+    x = [q - q*, v],   x' = A x + B du,   A = [[0, I], [d v'/dq, d v'/dv]],   B = [0; d v'/d torque at driven joints]
+
+and for the rigid pendulum ``M_c theta'' + b_c theta' + G_c sin(theta) = u``
 
     A = [[0, 1], [-G_c cos(theta*) / M_c, -b_c / M_c]],   B = [0, 1 / M_c]
 
-Only the smooth part of a plant is linearised: dry friction and the hysteresis of a spring have no derivative at rest,
-so that designs neglect them and the nonlinear closed loop, simulated, tells what they cost.
+An actuator with a lag T adds the state tau' = (u - tau) / T. The transport delay is a number of the model.
+Only the smooth part of a plant is linearised: dry friction, end stops and the hysteresis of a spring have no derivative
+at rest. Designs neglect them; a simulation of the nonlinear closed loop shows what they cost.
 """
 
 from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +47,7 @@ from pendulum_msgs_py.plants.equilibrium import (
     offset_of,
     resistance_of,
 )
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, SeriesElasticParameters
 
 __all__ = [
@@ -48,6 +55,7 @@ __all__ = [
     "RigidPlant",
     "acceleration_from_upright",
     "equilibrium_effort",
+    "holding_effort",
     "linearise",
     "low_frequency",
     "state_derivative",
@@ -55,27 +63,29 @@ __all__ = [
 
 Matrix = NDArray[np.float64]
 
+_BALANCED = 1e-9
+"""Share of the largest torque of gravity under which a joint counts as balanced."""
+
 
 @dataclass(frozen=True, slots=True)
 class LinearModel:
     """Linear model ``x' = A x + B du(t - delay) + E d``, ``y = C x`` around a fixed point, du = u - effort.
 
-    Of one joint the first two states are always [theta - theta*, theta_dot], and they are what is measured:
-    C = [I, 0].
+    The k measured states come first, C = [I, 0]: angle and velocity of one joint, positions and velocities of several.
 
     Attributes:
         A: State matrix, shape (n, n) [1/s and mixed].
-        B: Input matrix of the commanded torque, shape (n, 1) [state/(N m s)].
-        theta: Angle of the fixed point, 0 hanging down [rad].
-        effort: Commanded torque that holds the fixed point [N m].
-        C: Output matrix, shape (2, n): angle and velocity of the link.
-        E: Input matrix of a torque on the link itself, such as a push, shape (n, 1); without delay.
-        delay: Time between a command and its first effect [s]; not in A.
+        B: Input matrix of the commanded efforts, shape (n, m) [state/(N m s)].
+        theta: Angle of the fixed point, 0 hanging down [rad]; of several joints the last position.
+        effort: Commanded torque that holds the fixed point [N m]; of several driven joints the first.
+        C: Output matrix, shape (k, n).
+        E: Input matrix of a torque on each link itself, such as a push, shape (n, joints); without delay.
+        delay: Time between a command and its first effect [s], the longest of all actuators; not in A.
         states: Names of the states: theta, theta_dot, then motor_angle and motor_velocity (at the output side of the
-            gears) of a series-elastic plant, then torque, the lagged command, of a plant with a lag. Of a plant of
-            several joints (:mod:`~pendulum_lqr.linear.mechanism_model`) the joints, then their velocities.
-        position: Of several joints, the fixed point, n values [rad or m]; ``theta`` is then the last.
-        efforts: Of several joints, the m efforts that hold it [N m or N]; ``effort`` is then the first.
+            gears) of a series-elastic plant, then torque, the lagged command, of a plant with a lag. Of a mechanism
+            the joints, their velocities (``JOINT_dot``), then the lagged efforts (``JOINT_effort``).
+        position: The fixed point of a mechanism, one value for each joint [rad or m].
+        efforts: The m efforts that hold it [N m or N].
     """
 
     A: Matrix
@@ -105,6 +115,16 @@ class LinearModel:
         return sort_poles(np.linalg.eigvals(self.A))
 
     @property
+    def outputs_and_inputs(self) -> tuple[int, int]:
+        """K and m."""
+        return self.C.shape[0], self.B.shape[1]
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the states that are measured."""
+        return self.states[: self.C.shape[0]]
+
+    @property
     def hidden(self) -> tuple[str, ...]:
         """Names of the states that are not measured."""
         return self.states[self.C.shape[0] :]
@@ -116,56 +136,117 @@ def sort_poles(poles: NDArray[Any]) -> NDArray[np.complex128]:
     return values[np.lexsort((values.imag, -values.real))]
 
 
-def linearise(plant: RigidPlant, theta: float = UPRIGHT) -> LinearModel:
+class _Body(NamedTuple):
+    """A plant without lags at a fixed point: what is linearised.
+
+    Attributes:
+        states: Names.
+        at: Their values at the fixed point.
+        rates: Their derivatives, of the states, the efforts of m actuators, and a torque on each joint.
+        efforts: What holds the fixed point, m values.
+        lags: Lag of each actuator [s].
+        lag_states: Name of the state that each lag adds.
+        measured: Number of leading states that are measured.
+        joints: Number of joints.
+        delay: Longest transport delay [s].
+    """
+
+    states: tuple[str, ...]
+    at: tuple[float, ...]
+    rates: Callable[[tuple[complex, ...], Sequence[complex], Sequence[complex]], tuple[complex, ...]]
+    efforts: Vector
+    lags: Vector
+    lag_states: tuple[str, ...]
+    measured: int
+    joints: int
+    delay: float
+
+
+def linearise(plant: RigidPlant | MechanismParameters, at: float | Sequence[float] | None = None) -> LinearModel:
     """Return the linear model about the fixed point at an angle, of the plant that the simulator runs.
 
-    A rigid plant has two states, a series-elastic one four; a first-order lag (``actuator_time_constant``) adds one.
-    ``transport_delay`` is the model's ``delay``: :func:`~pendulum_lqr.linear.sampled_design.discretise` and margins
-    count it.
+    A rigid plant of n joints has 2n states, a series-elastic one four; a first-order lag adds one for each actuator
+    that has it. Transport delay is the model's ``delay``: :func:`~pendulum_lqr.linear.sampled_design.discretise` and
+    margins count it.
 
     Args:
-        plant: Plant parameters; dry friction and the spring's hysteresis are not part of the linear model.
-        theta: Angle of the fixed point, 0 hanging down [rad]; every angle is one, held by the torque ``effort``.
+        plant: Plant parameters; dry friction, end stops and the spring's hysteresis are not in the linear model.
+        at: Position of the fixed point, 0 hanging down, of one joint or of each [rad or m]; None for upright. Of one
+            joint every angle is one, held by the torque ``effort``; a mechanism needs one that its driven joints hold.
 
     Raises:
-        ParameterError: The angle is not finite.
+        ParameterError: The position is not finite, has another length, or a passive joint would fall from it; or no
+            joint is driven.
 
     Source:
         Thesis, section 6.2 "Linearisation about the unstable fixed point"; equations of
         :mod:`pendulum_msgs_py.dynamics`.
     """
-    if not math.isfinite(theta):
-        raise ParameterError(f"theta of the fixed point is {theta} rad; expected a finite angle")
-    drive = drivetrain_of(plant)
-    lag = offset_of(plant, "actuator_time_constant")
-    effort = equilibrium_effort(plant, theta)
-    states: tuple[str, ...] = ("theta", "theta_dot")
-    at: tuple[float, ...] = (theta, 0.0)
-    if drive is not None:
-        states = (*states, "motor_angle", "motor_velocity")
-        carried = held_torque(plant, theta)
-        at = (*at, theta + spring_deflection(carried, drive.stiffness, drive.stiffness_hardening), 0.0)
-    if lag > 0.0:
-        states = (*states, "torque")
-        at = (*at, effort)
-    n = len(states)
+    position: Vector = ()
+    if isinstance(plant, MechanismParameters):
+        position = _checked_position(plant, at)
+        body, theta = _mechanism_body(plant, position), position[-1]
+    else:
+        theta = UPRIGHT if at is None else float(at)  # type: ignore[arg-type]
+        if not math.isfinite(theta):
+            raise ParameterError(f"theta of the fixed point is {theta} rad; expected a finite angle")
+        body = _pendulum_body(plant, theta)
+    lagging = [index for index, lag in enumerate(body.lags) if lag > 0.0]
+    size, m = len(body.states), len(body.efforts)
+    n = size + len(lagging)
 
     def flow(*values: complex) -> tuple[complex, ...]:
-        x, command, push = values[:n], values[n], values[n + 1]
-        torque = x[-1] if lag > 0.0 else command
-        rates = _rigid_flow(plant, x, torque, push) if drive is None else _elastic_flow(plant, drive, x, torque, push)
-        return (*rates, (command - torque) / lag) if lag > 0.0 else rates
+        x, command, push = values[:n], values[n : n + m], values[n + m :]
+        torque = list(command)
+        for index, lagged in zip(lagging, x[size:], strict=True):
+            torque[index] = lagged
+        follow = ((command[index] - torque[index]) / body.lags[index] for index in lagging)
+        return (*body.rates(x[:size], torque, push), *follow)
 
-    jacobian = np.array(complex_step(flow, (*at, effort, 0.0)))
+    held = (body.efforts[index] for index in lagging)
+    jacobian = np.array(complex_step(flow, (*body.at, *held, *body.efforts, *(0.0,) * body.joints)))
     return LinearModel(
         jacobian[:, :n].copy(),
-        jacobian[:, n : n + 1].copy(),
+        jacobian[:, n : n + m].copy(),
         theta,
-        effort,
-        E=jacobian[:, n + 1 :].copy(),
-        delay=offset_of(plant, "transport_delay"),
-        states=states,
+        body.efforts[0],
+        C=np.eye(body.measured, n),
+        E=jacobian[:, n + m :].copy(),
+        delay=body.delay,
+        states=(*body.states, *(body.lag_states[index] for index in lagging)),
+        position=position,
+        efforts=body.efforts,
     )
+
+
+def holding_effort(plant: MechanismParameters, position: Sequence[float] | None = None) -> Vector:
+    """Return the efforts of the driven joints that hold a mechanism at a position, m values [N m or N].
+
+    Args:
+        plant: The plant.
+        position: n positions; None for upright [rad or m].
+
+    Raises:
+        ParameterError: The position has another length, is not finite, or a passive joint would fall from it.
+    """
+    q = _checked_position(plant, position)
+    n = len(q)
+    p = plant.packed
+    weight = np.array(complex_step(lambda *x: (in_arithmetic(plant.mechanism.potential, cmath)(x, p),), q))[0]
+    # The largest that gravity can do here, so that sin(pi), which is 1.2e-16, asks for nothing.
+    still = (0.0,) * n
+    around = [tuple(value + 0.5 * turn for value in q) for turn in (-np.pi, np.pi, 0.0, 1.0)]
+    forces = [np.array(plant.mechanism.mass(at, p)) @ plant.acceleration(at, still, still) for at in around]
+    scale = float(np.max(np.abs(forces)))
+    driven = plant.coordinates.driven
+    for index, joint in enumerate(plant.mechanism.joints):
+        if index not in driven and abs(weight[index]) > _BALANCED * scale:
+            raise ParameterError(
+                f"{joint.name} is passive and would fall from {q[index]:.6g} {joint.unit} with {-weight[index]:.4g} "
+                f"{joint.effort_unit}; expected a position at which gravity leaves it alone, such as "
+                f"{', '.join(f'{value:.6g}' for value in plant.coordinates.goal)}"
+            )
+    return tuple(float(weight[index]) if abs(weight[index]) > _BALANCED * scale else 0.0 for index in driven)
 
 
 def low_frequency(model: LinearModel) -> tuple[float, float, float]:
@@ -274,3 +355,59 @@ def _elastic_flow(
         plant.gravity,
     )
     return velocity, link, motor_velocity, motor
+
+
+def _pendulum_body(plant: RigidPlant, theta: float) -> _Body:
+    drive = drivetrain_of(plant)
+    states: tuple[str, ...] = ("theta", "theta_dot")
+    at: tuple[float, ...] = (theta, 0.0)
+    if drive is not None:
+        states = (*states, "motor_angle", "motor_velocity")
+        carried = held_torque(plant, theta)
+        at = (*at, theta + spring_deflection(carried, drive.stiffness, drive.stiffness_hardening), 0.0)
+
+    def rates(x: tuple[complex, ...], torque: Sequence[complex], push: Sequence[complex]) -> tuple[complex, ...]:
+        if drive is None:
+            return _rigid_flow(plant, x, torque[0], push[0])
+        return _elastic_flow(plant, drive, x, torque[0], push[0])
+
+    efforts = (equilibrium_effort(plant, theta),)
+    lags = (offset_of(plant, "actuator_time_constant"),)
+    return _Body(states, at, rates, efforts, lags, ("torque",), 2, 1, offset_of(plant, "transport_delay"))
+
+
+def _mechanism_body(plant: MechanismParameters, q: Vector) -> _Body:
+    coordinates, actuators = plant.coordinates, plant.actuators
+    if not actuators:
+        raise ParameterError(f"plant {plant.name!r} has no driven joint; expected an actuator at one of them")
+    n, names = len(q), coordinates.names
+    forward = in_arithmetic(plant.mechanism.forward, cmath)
+
+    def rates(x: tuple[complex, ...], torque: Sequence[complex], push: Sequence[complex]) -> tuple[complex, ...]:
+        at_joints = list(push)
+        for index, effort in zip(coordinates.driven, torque, strict=True):
+            at_joints[index] = effort + push[index]
+        return (*x[n:], *forward(x[:n], x[n:], tuple(at_joints), plant.packed))
+
+    return _Body(
+        (*names, *(f"{name}_dot" for name in names)),
+        (*q, *(0.0,) * n),
+        rates,
+        holding_effort(plant, q),
+        tuple(actuator.time_constant for actuator in actuators),
+        tuple(f"{name}_effort" for name in coordinates.driven_names),
+        2 * n,
+        n,
+        max(actuator.transport_delay for actuator in actuators),
+    )
+
+
+def _checked_position(plant: MechanismParameters, position: float | Sequence[float] | None) -> Vector:
+    coordinates = plant.coordinates
+    given = coordinates.goal if position is None else np.atleast_1d(position)
+    q = tuple(float(value) for value in given)
+    if len(q) != len(coordinates.joints) or not np.isfinite(q).all():
+        raise ParameterError(
+            f"position is {list(q)}; expected {len(coordinates.joints)} finite numbers, for {coordinates.with_units}"
+        )
+    return q

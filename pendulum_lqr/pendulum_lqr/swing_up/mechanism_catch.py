@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pendulum_lqr.linear.design import DesignError, Gain
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.design import DesignError, Gain, output_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.joints import Coordinates, Vector
@@ -18,7 +18,13 @@ from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["CaughtRegion", "MechanismCatch", "deviation_of", "make_mechanism_catch", "sample_caught_region"]
+__all__ = [
+    "CaughtRegion",
+    "MechanismCatch",
+    "deviation_of",
+    "make_mechanism_catch",
+    "sample_caught_region",
+]
 
 Array = NDArray[np.float64]
 
@@ -68,7 +74,7 @@ def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion
     Raises:
         DesignError: Not even the smallest states are caught.
     """
-    return _sampled(plant, *(tuple(map(tuple, matrix.tolist())) for matrix in (gain.K, gain.S)), tuple(gain.poles))
+    return _sampled(plant, *(tuple(map(tuple, matrix.tolist())) for matrix in (gain.rows, gain.S)), tuple(gain.poles))
 
 
 @lru_cache(maxsize=32)
@@ -113,7 +119,7 @@ def _all_caught(plant: MechanismParameters, gain: Gain, deviations: Array, known
     x[:n][turns] = wrap(x[:n][turns])
     slowest = -float(np.max(gain.poles.real))
     for k in range(round(min(_LONGEST, 6.0 / slowest) / _STEP)):
-        u = np.clip(-gain.K @ x, -limits, limits)
+        u = np.clip(-gain.rows @ x, -limits, limits)
         torque = [np.zeros(x.shape[1]) for _ in range(n)]
         for index, joint in enumerate(driven):
             torque[joint] = u[index]
@@ -172,7 +178,7 @@ class MechanismCatch:
 
     def command(self, deviation: Array) -> Vector:
         """Return the limited efforts [N m or N]."""
-        return within_limits(-self.gain.K @ deviation, self.plant.effort_limits)
+        return within_limits(-self.gain.rows @ deviation, self.plant.effort_limits)
 
 
 def make_mechanism_catch(
@@ -190,5 +196,5 @@ def make_mechanism_catch(
     if limits is not None:
         allowed = zip(plant.coordinates.driven_names, limits, plant.effort_limits, strict=True)
         plant = plant.with_values({f"{joint}.effort_limit": min(limit, own) for joint, limit, own in allowed})
-    gain = mechanism_lqr(linearise_mechanism(plant), q, r)
+    gain = output_lqr(linearise(plant), q, r)
     return MechanismCatch(plant, gain, sample_caught_region(plant, gain))

@@ -115,7 +115,7 @@ def joints(
     from pendulum_bags.ranking.joint_choice import FOLDER as RANKING
     from pendulum_bags.ranking.present import Words, same_choice, write_ranking
     from pendulum_bags.verdict import write_layer
-    from pendulum_lqr.linear.mechanism_model import linearise_mechanism
+    from pendulum_lqr.linear.model import linearise
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 
     settings = JointSettings(plant, joint, amplitude, hold_time, duration, seed, storage=storage, controller=controller)
@@ -131,7 +131,7 @@ def joints(
         )
     on = design_for(simulated)
     # Before anything runs: a slip of the pen should not cost a minute.
-    designs = joint_designs(design or (), on, linearise_mechanism(on)) if design or rank_seeds else ()
+    designs = joint_designs(design or (), on, linearise(on)) if design or rank_seeds else ()
     ranked = rankable(designs) if rank_seeds else ()
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()

@@ -18,7 +18,7 @@ from pendulum_bags.frequency_response.record import Record, record_of_joints, re
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import LayerResult
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.responses.certificate import Certifier
 from pendulum_lqr.responses.gap_metric import DEFAULT_SCALING, JointScaling, Scaling, SignalScaling
@@ -134,10 +134,10 @@ def analyse_responses(
     if responses[0].joints:
         mechanism = load_mechanism(plant)
         _refuse_other_joints(mechanism, responses[0])
-        model, (q, r) = linearise_mechanism(mechanism), mechanism.mechanism.weights
+        model, (q, r) = linearise(mechanism), mechanism.mechanism.weights
         joints, effort_unit = mechanism.coordinates.joints, mechanism.coordinates.drive_unit
         units = [joint.unit for joint in joints] + [joint.velocity_unit for joint in joints]
-        scaling = scaling or JointScaling.of_weights(model.states, units, q, r, effort_unit)
+        scaling = scaling or JointScaling.of_weights(model.measured, units, q, r, effort_unit)
         machine = Machine.beside(by_label["hw"], model) if "hw" in by_label else None
         longer = longer or f"{LONGER_OF_JOINTS} --plant {plant}"
         certify = partial(certify_joint_designs, designs, mechanism)
@@ -154,7 +154,7 @@ def analyse_responses(
     layers: list[LayerResult] = []
     if certifier is not None and "sim" in by_label:
         if margin is None:  # of several joints alone
-            margin = certifier.gain(mechanism_lqr(model, q, r).K[0]).margin
+            margin = certifier.gain(output_lqr(model, q, r).K).margin
         difference = compare_responses(by_label["sim"], by_label["hw"], model, scaling)
         layers.append(same_plant(by_label["sim"], by_label["hw"], difference, margin, longer=longer))
     if certifier is not None:

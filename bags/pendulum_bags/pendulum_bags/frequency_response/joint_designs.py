@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.frequency_response.designs import DesignResult
-from pendulum_lqr.linear.mechanism_model import mechanism_lqr
+from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.responses.certificate import Certifier
 from pendulum_msgs_py.errors import ParameterError
@@ -79,7 +79,7 @@ def _one(text: str, own_cost: float, model: LinearModel) -> JointDesign:
     if match := _WEIGHTS.fullmatch(text):
         weights, (cost, *more) = _numbers(match[1], text), _numbers(match[2] or f"{own_cost}", text)
         if len(weights) == size and not more:
-            K = np.asarray(mechanism_lqr(model, weights, cost).K[0], dtype=np.float64)
+            K = np.asarray(output_lqr(model, weights, cost).K, dtype=np.float64)
             name = f"LQR q=({', '.join(f'{value:g}' for value in weights)}) r={cost:g}"
             return JointDesign(name, text, K, (tuple(weights), cost))
     elif match := _GAIN.fullmatch(text):
@@ -88,7 +88,7 @@ def _one(text: str, own_cost: float, model: LinearModel) -> JointDesign:
             return JointDesign(f"K=({', '.join(f'{value:g}' for value in gain)})", text, np.array(gain))
     raise ParameterError(
         f"design is {text!r}; expected 'q=... r=...' or 'k=...' with {size} numbers for q or k, for "
-        f"{', '.join(model.states)}, and one for r"
+        f"{', '.join(model.measured)}, and one for r"
     )
 
 

@@ -18,7 +18,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.joint_run import LIMIT_PER_NOISE, design_for, identified_names
 from pendulum_bags.studies.random_runs import Columns, RandomRuns, figures_of_runs, replay
 from pendulum_bags.studies.uncertain import share_of_interval
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
+from pendulum_lqr.controller_interface.loop_check import settling_lqr
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism, load_mechanism_file
 from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
@@ -63,7 +63,7 @@ class JointMonteCarlo(RandomRuns):
             steps=self.steps,
             dt=self.dt,
             position=np.stack([drawn[f"start_{name}"] for name in plant.coordinates.names], axis=1),
-            gain=mechanism_lqr(linearise_mechanism(design_for(plant)), *plant.mechanism.weights).K,
+            gain=settling_lqr(design_for(plant), *plant.mechanism.weights, self.dt).rows,
             seeds=drawn["noise_seed"],
             amplitude=limits / LIMIT_PER_NOISE if self.amplitude is None else self.amplitude,
             hold=max(1, round(self.hold_time / self.dt)),

@@ -21,8 +21,8 @@ from pendulum_bags.studies.chunks import chunk_path, read_columns
 from pendulum_bags.studies.joint_monte_carlo import scatter
 from pendulum_bags.studies.random_runs import Columns
 from pendulum_bags.studies.start_grid import StartGrid, inside_ellipse, share_inside
+from pendulum_lqr.controller_interface.loop_check import settling_lqr
 from pendulum_lqr.linear.design import DesignError, Gain
-from pendulum_lqr.linear.mechanism_model import linearise_mechanism, mechanism_lqr
 from pendulum_lqr.linear.roa import sublevel_ellipse
 from pendulum_lqr.swing_up.mechanism_catch import CaughtRegion, sample_caught_region
 from pendulum_msgs_py.errors import ParameterError
@@ -115,6 +115,10 @@ class JointRegion(StartGrid):
         """Return the plant that is believed in."""
         return load_mechanism(self.plant)
 
+    def gain(self, plant: MechanismParameters) -> Gain:
+        """Return the plant's own LQR."""
+        return settling_lqr(design_for(plant), *plant.mechanism.weights, self.dt)
+
     def run_chunk(self, plant: MechanismParameters, index: int, threads: int | None) -> Columns:
         """Run a chunk and return its columns."""
         numbers, generator = self.chunk(index)
@@ -135,7 +139,7 @@ class JointRegion(StartGrid):
             dt=self.dt,
             position=np.tile(states[:, :n], (count, 1)),
             velocity=np.tile(states[:, n:], (count, 1)),
-            gain=_gain(plant).K,
+            gain=self.gain(plant).rows,
             threads=threads,
         )
         off = np.array([plant.coordinates.deviation(tuple(position)) for position in result.position])
@@ -156,7 +160,7 @@ class JointRegion(StartGrid):
             hits += attracted.sum(axis=0)
             if index == 0:
                 believed = attracted[0]
-        gain = _gain(plant)
+        gain = self.gain(plant)
         try:
             caught: CaughtRegion | None = sample_caught_region(plant, gain)
         except DesignError:
@@ -209,7 +213,3 @@ class JointRegionResult:
         names = [axis.name for axis in self.settings.both]
         columns = {names[0]: first.ravel(), names[1]: second.ravel(), "share": self.share.ravel()}
         return {**columns, "attracted_believed": self.believed.ravel()}
-
-
-def _gain(plant: MechanismParameters) -> Gain:
-    return mechanism_lqr(linearise_mechanism(design_for(plant)), *plant.mechanism.weights)

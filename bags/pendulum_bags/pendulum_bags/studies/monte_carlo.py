@@ -17,8 +17,7 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.studies.random_runs import Columns, RandomRuns, figures_of_runs, replay
 from pendulum_bags.studies.uncertain import THESIS_UNCERTAINTY, VARIED, Uncertainty, batch_variations
-from pendulum_lqr.linear.design import output_lqr
-from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.controller_interface.loop_check import settling_lqr
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
@@ -84,7 +83,7 @@ class MonteCarlo(RandomRuns):
             dt=self.dt,
             method=self.method,
             theta=drawn["theta_0"],
-            gain=output_lqr(linearise(plant, UPRIGHT), self.q, self.r).K,
+            gain=settling_lqr(plant, self.q, self.r, self.dt).K,
             seeds=drawn["noise_seed"],
             amplitude=self.amplitude,
             hold=max(1, round(self.hold_time / self.dt)),

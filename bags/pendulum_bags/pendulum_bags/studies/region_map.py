@@ -20,8 +20,8 @@ from pendulum_bags.studies.chunks import chunk_path, read_columns
 from pendulum_bags.studies.random_runs import Columns
 from pendulum_bags.studies.start_grid import StartGrid, inside_ellipse, share_inside
 from pendulum_bags.studies.uncertain import THESIS_UNCERTAINTY, VARIED, Uncertainty, batch_variations
-from pendulum_lqr.linear.design import Gain, output_lqr
-from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.controller_interface.loop_check import settling_lqr
+from pendulum_lqr.linear.design import Gain
 from pendulum_lqr.linear.roa import proven_level, sublevel_ellipse
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.errors import ParameterError
@@ -91,7 +91,7 @@ class RegionMap(StartGrid):
 
     def gain(self) -> Gain:
         """Return the LQR gain."""
-        return output_lqr(linearise(self.believed(), UPRIGHT), self.q, self.r)
+        return settling_lqr(self.believed(), self.q, self.r, self.dt)
 
     def numbers_of_plant(self) -> Any:
         """Return all numbers of the plant, for a fingerprint."""
