@@ -91,6 +91,49 @@ def test_a_commander_that_was_silent_for_long_begins_near_zero_but_a_short_gap_i
     assert plant.run(0.3, 9.0)[-1].effort[0] == 0.0
 
 
+def test_a_controller_that_was_deactivated_and_activated_within_a_second_begins_near_zero() -> None:
+    plant = Plant()
+    plant.run(0.1, 1.0)
+    plant.run(0.1, 9.0)
+    # Its last words are zero torque; then it is activated where it asks for much, or with another set point.
+    plant.run(0.01, 0.0)
+    plant.run(0.1)
+    assert all(drive.starved and drive.effort[0] == 0.0 for drive in plant.run(0.3, 9.0))
+    assert "lqr asks for 9.00 N m; expected at most 2.0 N m to begin" in plant.supervisor.reason
+    assert plant.run(0.01, -2.0)[-1].effort[0] == -2.0
+    assert plant.run(0.01, 9.0)[-1].effort[0] == 9.0
+
+
+@pytest.mark.parametrize(
+    ("again", "applied"), [(9.0, 9.0), (7.0, 7.0), (11.0, 11.0), (6.9, 0.0), (11.1, 0.0), (-9.0, 0.0)]
+)
+def test_after_a_short_gap_a_commander_goes_on_from_its_last_torque_alone(again: float, applied: float) -> None:
+    plant = Plant()
+    plant.run(0.1, 1.0)
+    plant.run(0.1, 9.0)
+    plant.run(0.2)
+    assert plant.run(0.01, again)[-1].effort[0] == applied
+    # What was refused in the gap is no torque to go on from.
+    assert plant.run(0.01, again)[-1].effort[0] == applied
+
+
+def test_a_controller_at_its_limit_goes_on_after_a_short_gap_whatever_it_asks_for_beyond_the_limit() -> None:
+    plant = Plant()
+    plant.run(0.1, 1.0)
+    plant.run(0.1, 100.0)
+    plant.run(0.2)
+    assert plant.run(0.01, 60.0)[-1].effort[0] == 13.0
+
+
+def test_a_conflict_of_a_moment_is_a_gap_too() -> None:
+    plant = Plant()
+    plant.run(0.1, 1.0)
+    plant.supervisor.set_commander_conflict("2 commanders named /lqr")
+    plant.run(0.1, 1.0)
+    plant.supervisor.set_commander_conflict("")
+    assert plant.run(0.01, 9.0)[-1].effort[0] == 0.0
+
+
 def test_two_commanders_of_one_name_that_part_begin_near_zero() -> None:
     plant = Plant()
     plant.run(0.1, 1.0)

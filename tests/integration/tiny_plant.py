@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
@@ -27,7 +28,8 @@ SPECS = (
     ParameterSpec("method", "exact", "", "How.", choices=("exact", "euler")),
     ParameterSpec("fixed", 2.0, "s", "Cannot change.", read_only=True),
     ParameterSpec("stubborn", 0.0, "s", "Time that the way out takes.", minimum=0.0),
-    *LIMIT_SPECS,
+    # Its commanders begin with what they like.
+    *(replace(spec, default=0.0) if spec.name == "start_effort_limit" else spec for spec in LIMIT_SPECS),
 )
 
 
@@ -38,7 +40,7 @@ class TinyPlant(PollingNode):
         super().__init__("tiny_plant")
         self.parameters = NodeParameters(self, SPECS, self._prepare)
         self.clock = SteadyWallClock()
-        self.supervisor = SharedSupervisor(limits_from_parameters(self.parameters.values, (5.0,)))
+        self.supervisor = SharedSupervisor(limits_from_parameters(self.parameters.values, (5.0,), lockstep=False))
         self.interface = PlantInterface(self, self.supervisor, self.clock)
         self.position = self.velocity = 0.0
         self.stop = stop

@@ -77,7 +77,9 @@ def test_ramps_are_the_thesis_s_unless_told_and_told_slower_or_faster_in_all_tha
 
 def test_the_fastest_ramp_is_one_that_a_bridge_with_its_usual_limit_follows_from_where_the_pendulum_stands() -> None:
     # The ramp down was refused, with the pendulum upright.
-    limits = limits_from_parameters({spec.name: spec.default for spec in SPECS}, (13.0,), feedback_timeout=0.1)
+    limits = limits_from_parameters(
+        {spec.name: spec.default for spec in SPECS}, (13.0,), lockstep=True, feedback_timeout=0.1
+    )
     for gap in (-0.29, -0.001, 0.001, 0.29):
         plant = PlantSupervisor(limits)
         sample = JointSample.of_one(0, UPRIGHT, 0.0, 0.0)

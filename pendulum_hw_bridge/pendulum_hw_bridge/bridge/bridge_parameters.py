@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 from pendulum_hw_bridge.backends import BACKENDS
@@ -334,16 +333,9 @@ def supervisor_limits(
     """
     # A period more than the monitor has, which names the fault; this one is behind it.
     patience = (values["feedback_watchdog"] + 1) / values["feedback_rate"]
-    limits = limits_from_parameters(
-        values,
-        effort_limits,
-        coordinates=coordinates,
-        feedback_timeout=patience,
+    return limits_from_parameters(
+        values, effort_limits, coordinates=coordinates, lockstep=lockstep, feedback_timeout=patience
     )
-    if lockstep:
-        # Here only an emulator runs, and the noise of an experiment begins with the controller.
-        return limits
-    return replace(limits, start_sum=limits.start_effort, handover_sum=limits.handover_effort)
 
 
 def bridge_settings(

@@ -14,7 +14,6 @@ _HARDWARE_DEFAULTS: dict[str, ParameterValue] = {
     "velocity_limit": 1.5,
     "position_window": [-4.0, 4.0],
     "effort_slew_limit": 2000.0,
-    "start_effort_limit": 2.0,
     "starvation_limit": 30.0,
 }
 """Limits that a simulated plant can do without and a real one cannot."""

@@ -112,6 +112,11 @@ class CommandGate:
         return None if self._expired or is_ahead(newest.stamp_ns, now_ns) else newest
 
     @property
+    def newest(self) -> JointCommand | None:
+        """The newest accepted command, however old, or None before the first."""
+        return self._newest
+
+    @property
     def newest_stamp_ns(self) -> int | None:
         """Stamp of the newest accepted command [ns], or None before the first."""
         return None if self._newest is None else self._newest.stamp_ns

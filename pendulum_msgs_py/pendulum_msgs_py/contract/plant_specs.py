@@ -140,9 +140,9 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
     ),
     ParameterSpec(
         "start_effort_limit",
-        0.0,
+        2.0,
         "N m",
-        "Largest torque with which a commander may begin where nobody commands; 0 for none.",
+        "Largest torque of each joint with which a commander begins; 0 for none, which the plant logs and reports.",
         minimum=0.0,
         read_only=True,
     ),
@@ -184,6 +184,7 @@ def limits_from_parameters(
     plant_effort_limits: Vector,
     *,
     coordinates: Coordinates = ONE_JOINT,
+    lockstep: bool,
     feedback_timeout: float = float("inf"),
     least_command_timeout: float = 0.0,
 ) -> PlantLimits:
@@ -194,6 +195,7 @@ def limits_from_parameters(
         plant_effort_limits: Effort limit of each driven joint in the plant file [N m or N]; the parameter can only
             lower them.
         coordinates: Joints of the plant.
+        lockstep: Whether time is simulated: there noise begins with the controller, and its sum is not limited.
         feedback_timeout: Age of a measurement that faults an armed plant [s].
         least_command_timeout: The shortest that the plant's own period allows; a shorter one is raised to it [s].
 
@@ -223,6 +225,7 @@ def limits_from_parameters(
         (low, high) if low != high else (-unlimited, unlimited)
         for low, high in zip(window[::2], window[1::2], strict=True)
     ]
+    start, handover = number("start_effort_limit") or unlimited, number("handover_effort_limit")
     return PlantLimits(
         effort=tuple(min(wanted, limit) if wanted else limit for limit in plant_effort_limits),
         command_timeout=max(number("command_timeout"), least_command_timeout),
@@ -233,8 +236,10 @@ def limits_from_parameters(
         slew=number("effort_slew_limit") or unlimited,
         handover_time=number("handover_time"),
         tracking_error=number("tracking_error_limit"),
-        handover_effort=number("handover_effort_limit"),
-        start_effort=number("start_effort_limit") or unlimited,
+        handover_effort=handover,
+        handover_sum=unlimited if lockstep else handover,
+        start_effort=start,
+        start_sum=unlimited if lockstep else start,
         starvation=number("starvation_limit") or unlimited,
         coordinates=coordinates,
     )

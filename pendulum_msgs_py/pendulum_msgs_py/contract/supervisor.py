@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from operator import add
+from operator import add, sub
 
 from pendulum_msgs_py.contract.commands import CommandGate, Refusal
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Input, Mode, PlantLimits
@@ -91,6 +91,7 @@ class PlantSupervisor:
         self._hold_position: float | None = None
         self._commanding: str | None = None
         self._commanded_ns = 0
+        self._gap_from: Vector | None = None
 
     # --- messages ------------------------------------------------------------------------------------------
 
@@ -161,7 +162,7 @@ class PlantSupervisor:
         self._trajectory = None
         self._applied = self._last_effort = self._nothing
         self._last_decision_ns = self._commanded_ns = now_ns
-        self._commanding = None
+        self._commanding = self._gap_from = None
         self._enter(Mode.EFFORT, "armed", now_ns)
         return ""
 
@@ -283,7 +284,7 @@ class PlantSupervisor:
                 self._handover = Handover(now_ns, self._applied)
                 self._last_effort = self._applied
                 self._last_decision_ns = self._commanded_ns = now_ns
-                self._commanding = command.source
+                self._commanding, self._gap_from = command.source, None
                 self._enter(Mode.EFFORT, self.commanded_by(command.source), now_ns)
                 return None
         return self._hold(handover, remaining, position, velocity, push)
@@ -323,7 +324,7 @@ class PlantSupervisor:
             refusal = self._begin_refusal(command, now_ns)
         if command is None or refusal:
             return self._starve(refusal, now_ns, push)
-        self._commanding, self._commanded_ns = command.source, now_ns
+        self._commanding, self._commanded_ns, self._gap_from = command.source, now_ns, None
         disturbance_command = self._disturbances.fresh(now_ns)
         limits = self.limits.effort
         disturbance = disturbance_command.effort if disturbance_command else self._nothing
@@ -354,14 +355,23 @@ class PlantSupervisor:
         )
 
     def _begin_refusal(self, command: JointCommand, now_ns: int) -> str:
-        """Return why a commander may not begin, or an empty string; one that commands already may ask for anything."""
-        if self._commanding == command.source and not has_lapsed(self._commanded_ns, now_ns):
-            return ""
+        """Return why a commander may not begin, or an empty string; one that commands already may ask for anything.
+
+        After a gap a commander goes on if it asks for what it asked for before; one that was deactivated or restarted
+        meanwhile ended with zero torque, or is at another state.
+        """
         largest, who, unit = self.limits.start_effort, command.source or "a controller", self.coordinates.drive_unit
+        if self._commanding == command.source and not has_lapsed(self._commanded_ns, now_ns):
+            if self._gap_from is None:
+                return ""
+            limits = self.limits.effort
+            if _largest(tuple(map(sub, _clamp(command.effort, limits), _clamp(self._gap_from, limits)))) <= largest:
+                return ""
         if not _largest(command.effort) <= largest:
             return (
                 f"zero torque: {who} asks for {written(command.effort, '.2f')} {unit}; "
-                f"expected at most {largest} {unit} to begin (a controller's start_time lets it rise)"
+                f"expected at most {largest} {unit} to begin: bring the plant to where it asks for less, "
+                "or let its torque rise (a controller's start_time)"
             )
         # With its first command a disturbance that waits would act at once, however large.
         largest = self.limits.start_sum
@@ -379,6 +389,9 @@ class PlantSupervisor:
             self.disarm(now_ns, f"disarmed: no command for {silence:.1f} s ({reason})")
             return self._off(push)
         self.starved_periods += 1
+        if self._gap_from is None:
+            newest = self._commands.newest
+            self._gap_from = self._nothing if newest is None else newest.effort
         self._handover = None
         self._last_effort = self._nothing
         self._last_decision_ns = now_ns

@@ -5,6 +5,7 @@ A plant (simulator, bridge) owns its clock and its loop; it asks ``decide`` what
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter
@@ -146,6 +147,8 @@ class PlantInterface:
         create_wall_timer(node, DIAGNOSTICS_PERIOD, self._on_housekeeping)
         self._pressed = threading.Event()
         self._e_stop = EStopServer(node, self.e_stop)
+        if math.isinf(supervisor.limits.start_effort):
+            node.get_logger().warning("start_effort_limit is 0: a commander may begin with any torque")
 
     # --- the plant's loop calls these ----------------------------------------------------------------------
 
@@ -251,6 +254,7 @@ class PlantInterface:
             "refused_commander": supervisor.gates[Input.EFFORT_COMMAND].refused_commander,
             "starved_periods": supervisor.starved_periods,
             "saturated_periods": supervisor.saturated_periods,
+            "start_effort_limit": supervisor.limits.start_effort,
             "requests": "told by the middleware" if self.node.told_of_requests else "looked for",
         }
         for kind in self.inputs:

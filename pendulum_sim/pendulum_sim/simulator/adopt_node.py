@@ -97,6 +97,7 @@ class AdoptNode(PollingNode):
         limits = limits_from_parameters(
             values,
             (plant.effort_limit,),
+            lockstep=False,
             feedback_timeout=values["state_timeout"],
             least_command_timeout=_LATENESS * values["period"],
         )

@@ -112,6 +112,7 @@ class SimulatorNode(PollingNode):
             values,
             self._plant.effort_limits,
             coordinates=self._coordinates,
+            lockstep=values["clock"] == "lockstep",
             least_command_timeout=least,
         )
         self._supervisor = SharedSupervisor(

@@ -198,7 +198,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
     try:
         parameters = load_plant("thesis")
         supervisor = SharedSupervisor(
-            limits_from_parameters(dict(validate(LIMIT_SPECS, {})), (parameters.effort_limit,))
+            limits_from_parameters(dict(validate(LIMIT_SPECS, {})), (parameters.effort_limit,), lockstep=True)
         )
         plant = make_plant(parameters, period_ns / NANOSECONDS)
         plant.reset(UPRIGHT, 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.experiments.run_spec import BEGINS_ANYWHERE, RunSpec
 from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
 from pendulum_lqr.disturbances.disturbing import DisturbanceLoop
@@ -78,8 +78,8 @@ def simulate_plant(spec: RunSpec, parameters: PlantParameters, sensors: Sensors 
 def _simulate(spec: RunSpec, plant: Plant, sensors: Sensors) -> RunArrays:
     period_ns = round(NANOSECONDS * spec.period)
     parameters = plant.parameters
-    limits: dict[str, Any] = validate(LIMIT_SPECS, {})
-    supervisor = PlantSupervisor(limits_from_parameters(limits, (parameters.effort_limit,)))
+    limits: dict[str, Any] = validate(LIMIT_SPECS, BEGINS_ANYWHERE)
+    supervisor = PlantSupervisor(limits_from_parameters(limits, (parameters.effort_limit,), lockstep=True))
     values = {**spec.controller_parameters, "set_point": spec.set_point}
     design = load_plant(spec.design_plant)
     controller = AnswerLoop(

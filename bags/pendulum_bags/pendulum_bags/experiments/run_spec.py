@@ -24,6 +24,7 @@ from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 
 __all__ = [
+    "BEGINS_ANYWHERE",
     "CLOCKS",
     "EMULATOR_LIFETIME",
     "EMULATOR_PATIENCE",
@@ -50,6 +51,8 @@ EMULATOR_PATIENCE: Mapping[str, graph.ParameterArgument] = {
 """What the bridge to an emulator in real time is told: its feedback is as punctual as this machine, which may be a busy
 one. A real actuator keeps the default."""
 _AT_REST = 1e-9
+BEGINS_ANYWHERE = {"start_effort_limit": 0.0}
+"""Of a simulated plant whose run begins at an angle of its own, with the torque that its controller asks for there."""
 THESIS_METHOD = "euler"
 """Integrator of the thesis's simulation, for rigid plants."""
 PERIODS = {"sim": 0.002, "hw": 0.01}
@@ -189,7 +192,7 @@ class RunSpec:
             # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
             loop.update(initial_position=float(self.theta), seed=self.seed)
             return graph.bridge("/hw", backend="emulator", effort_strategy=self.strategy, **loop)
-        loop.update(initial_theta=float(self.theta), armed_at_start=True, paused=True)
+        loop = {**BEGINS_ANYWHERE, **loop, "initial_theta": float(self.theta), "armed_at_start": True, "paused": True}
         if foreign is not None:
             return foreign.program(self.namespace, **loop)
         return graph.simulator("/sim", method=self.method, rate_hz=1.0 / self.period, **loop)
