@@ -176,7 +176,11 @@ def realtime_figures(duration: float, *, rate: float = 1000.0, cores: Sequence[i
         said = listener.rows[_SIMULATOR]
         try:
             programs = [
-                _start(group, domain, graph.simulator("/sim", rate_hz=rate, initial_theta=math.pi - 0.1)),
+                _start(
+                    group,
+                    domain,
+                    graph.simulator("/sim", rate_hz=rate, initial_theta=math.pi - 0.1, start_effort_limit=0.0),
+                ),
                 _start(group, domain, graph.controller("/sim")),
             ]
             listener.wait_for_loops()

@@ -12,6 +12,7 @@ from typing import Any
 __all__ = ["TARGETS", "Target", "functions_of"]
 
 _RULES = (
+    "pendulum_msgs_py/test/test_supervisor_stop.py",
     "pendulum_msgs_py/test/test_supervisor_rules.py",
     "pendulum_msgs_py/test/test_supervisor_begin.py",
     "pendulum_msgs_py/test/test_supervisor_edges.py",

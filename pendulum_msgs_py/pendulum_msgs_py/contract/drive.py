@@ -93,6 +93,7 @@ class PlantLimits:
         handover_sum: The same for the sum with a disturbance that waits [N m].
         start_effort: Largest torque with which a commander may begin where nobody commands [N m].
         start_sum: The same for the sum with a disturbance that waits [N m].
+        stop_time: Time over which torque fades at an e-stop and at disarming, stop category 1; 0 for category 0 [s].
         starvation: Time without a command after which a plant that is armed for effort disarms [s].
         coordinates: Joints whose units messages have.
     """
@@ -112,6 +113,7 @@ class PlantLimits:
     start_effort: float = math.inf
     start_sum: float = math.inf
     starvation: float = math.inf
+    stop_time: float = 0.0
     coordinates: Coordinates = field(default=ONE_JOINT, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -135,11 +137,11 @@ class PlantLimits:
         ):
             if not getattr(self, name) > 0.0:
                 raise ParameterError(f"{name} is {getattr(self, name)} {unit}; expected > 0")
-        for name, unit in (("handover_time", "s"), ("arm_effort", of_effort)):
+        for name, unit in (("handover_time", "s"), ("stop_time", "s"), ("arm_effort", of_effort)):
             if not getattr(self, name) >= 0.0:
                 raise ParameterError(f"{name} is {getattr(self, name)} {unit}; expected >= 0")
-        if not math.isfinite(self.handover_time):
-            raise ParameterError(f"handover_time is {self.handover_time} s; expected a finite number >= 0")
+            if unit == "s" and not math.isfinite(getattr(self, name)):
+                raise ParameterError(f"{name} is {getattr(self, name)} s; expected a finite number >= 0")
         if not self.tracking_error > 0.0:
             raise ParameterError(f"tracking_error is {self.tracking_error} {of_position}; expected > 0")
         for low, high in zip(self.position_min, self.position_max, strict=True):

@@ -155,6 +155,16 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         read_only=True,
     ),
     ParameterSpec(
+        "stop_time",
+        0.0,
+        "s",
+        "Time over which the torque fades to zero at an e-stop and at disarming (stop category 1 of IEC 60204-1); 0 "
+        "cuts it at once (category 0), as a fault always does.",
+        minimum=0.0,
+        maximum=1.0,
+        read_only=True,
+    ),
+    ParameterSpec(
         "tracking_error_limit",
         0.3,
         "rad",
@@ -241,5 +251,6 @@ def limits_from_parameters(
         start_effort=start,
         start_sum=unlimited if lockstep else start,
         starvation=number("starvation_limit") or unlimited,
+        stop_time=number("stop_time"),
         coordinates=coordinates,
     )

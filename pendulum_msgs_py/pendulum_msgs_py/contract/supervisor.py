@@ -92,6 +92,7 @@ class PlantSupervisor:
         self._commanding: str | None = None
         self._commanded_ns = 0
         self._gap_from: Vector | None = None
+        self._stop: Handover | None = None
 
     # --- messages ------------------------------------------------------------------------------------------
 
@@ -160,30 +161,33 @@ class PlantSupervisor:
             gate.reset()
         self._handover = None
         self._trajectory = None
+        self._stop = None
         self._applied = self._last_effort = self._nothing
         self._last_decision_ns = self._commanded_ns = now_ns
-        self._commanding = self._gap_from = None
+        self._commanding = None
+        self._gap_from = None
         self._enter(Mode.EFFORT, "armed", now_ns)
         return ""
 
     def disarm(self, now_ns: int, reason: str = "disarmed on request") -> None:
-        """Release the drive; also acknowledges a fault, but never an e-stop."""
+        """Stop the drive; also acknowledges a fault, but never an e-stop."""
         if self.mode is not Mode.E_STOP:
-            self._release(Mode.DISARMED, reason, now_ns)
+            self._stop_drive(Mode.DISARMED, reason, now_ns)
 
     def e_stop(self, now_ns: int, reason: str = "e-stop pressed") -> None:
         """Latch the e-stop."""
-        self._release(Mode.E_STOP, reason, now_ns)
+        self._stop_drive(Mode.E_STOP, reason, now_ns)
 
     def e_stop_reset(self, now_ns: int) -> str:
         """Leave the e-stop for DISARMED; return why not, or an empty string."""
         if self.mode is not Mode.E_STOP:
             return f"plant is {self.mode.value}; expected e_stop"
-        self._release(Mode.DISARMED, "e-stop reset; arm again to go on", now_ns)
+        self._stop_drive(Mode.DISARMED, "e-stop reset; arm again to go on", now_ns)
         return ""
 
     def fault(self, reason: str, now_ns: int) -> None:
         """Release the drive and stay so until somebody disarms; an e-stop outranks a fault."""
+        self._stop = None
         if self.mode not in {Mode.E_STOP, Mode.FAULT}:
             self._release(Mode.FAULT, reason, now_ns)
 
@@ -206,7 +210,7 @@ class PlantSupervisor:
         if not self.mode.armed or sample is None:
             self._last_effort = self._nothing
             self._last_decision_ns = now_ns
-            return self._off(push)
+            return self._decide_stop(now_ns, sample, push)
         if self.mode is Mode.POSITION:
             drive = self._decide_position(now_ns, sample, push)
             if drive is not None:
@@ -316,6 +320,28 @@ class PlantSupervisor:
 
     def _off(self, push: Vector) -> Drive:
         return Drive(DriveKind.OFF, self._nothing, self._nothing, self._nothing, self._nothing, self._nothing, push)
+
+    def _stop_drive(self, mode: Mode, reason: str, now_ns: int) -> None:
+        """Release the drive, or with stop category 1 let the torque that acts fade to zero first; one fade alone."""
+        stop = self._stop
+        if self.mode.armed and self.limits.stop_time > 0.0:
+            stop = Handover(now_ns, self._applied)
+        self._release(mode, reason, now_ns)
+        self._stop = stop
+
+    def _decide_stop(self, now_ns: int, sample: JointSample | None, push: Vector) -> Drive:
+        """Return what a plant does that is not armed: nothing, or what is left of a stop of category 1."""
+        stop = self._stop
+        if stop is None:
+            return self._off(push)
+        # A plant that catches up decides as of before the request; a clock that steps back must not lengthen the stop.
+        stop.start_ns = min(stop.start_ns, now_ns)
+        remaining = stop.remaining(now_ns, self.limits.stop_time)
+        if remaining == 0.0 or self._measurement_fault(now_ns, sample):
+            self._stop = None
+            return self._off(push)
+        effort = tuple(remaining * held for held in stop.effort)
+        return self._off(push)._replace(kind=DriveKind.EFFORT, effort=effort)
 
     def _decide_effort(self, now_ns: int, push: Vector) -> Drive:
         command = None if self.commander_conflict else self._commands.fresh(now_ns)
@@ -482,6 +508,7 @@ class PlantSupervisor:
     def _release(self, mode: Mode, reason: str, now_ns: int) -> None:
         self._trajectory = None
         self._handover = None
+        self._stop = None
         self._applied = self._last_effort = self._nothing
         self._enter(mode, reason, now_ns)
 

@@ -150,7 +150,9 @@ def cut_cable(folder: Path, durations: Sequence[float]) -> list[CutReport]:
     with two_machines() as (plant, peer, _), processes:
         processes.namespace = plant
         start_recorder(processes, bag, "/sim", folder / "metadata.json", "mcap")
-        processes.start_node(graph.simulator("/sim", initial_theta=math.pi, effort_limit=_EFFORT_LIMIT))
+        processes.start_node(
+            graph.simulator("/sim", initial_theta=math.pi, effort_limit=_EFFORT_LIMIT, start_effort_limit=0.0)
+        )
         processes.namespace = peer
         for program in (graph.controller("/sim"), graph.disturbance("/sim", autostart=True, hold_time=0.01)):
             processes.start_node(program)

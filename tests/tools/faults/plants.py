@@ -43,14 +43,17 @@ class Plant:
 
     def program(self, address: str = "", **changes: ParameterArgument) -> NodeProgram:
         """Return the program of its node; the bridge finds its module at ``address``."""
+        values: dict[str, ParameterArgument]
         if self.has_module:
-            values: dict[str, ParameterArgument] = {
+            values = {
                 "backend": "emulator_process",
                 "emulator_address": address,
                 "effort_limit": EFFORT_LIMIT,
             }
             return graph.bridge(self.namespace, **{**values, **changes})
-        return graph.simulator(self.namespace, initial_theta=math.pi, effort_limit=EFFORT_LIMIT, **changes)
+        # A pendulum that fell while its controller was away is commanded again where it hangs.
+        values = {"initial_theta": math.pi, "effort_limit": EFFORT_LIMIT, "start_effort_limit": 0.0}
+        return graph.simulator(self.namespace, **{**values, **changes})
 
 
 SIMULATOR = Plant("simulator", "/sim", 500.0, has_module=False)

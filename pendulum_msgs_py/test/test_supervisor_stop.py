@@ -1,0 +1,154 @@
+"""A stop of category 0 cuts the torque; one of category 1 lets it fade within the stated time, and a fault cuts it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from pendulum_msgs_py.contract.supervisor import DriveKind, Input, Mode, PlantLimits, PlantSupervisor
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
+from pendulum_msgs_py.errors import ParameterError
+from tests.trajectories import from_points
+
+_PERIOD_NS = NANOSECONDS // 100
+_STOPS: dict[str, Callable[[PlantSupervisor, int], None]] = {
+    "e-stop": lambda supervisor, now_ns: supervisor.e_stop(now_ns),
+    "disarmed": lambda supervisor, now_ns: supervisor.disarm(now_ns),
+}
+
+
+class Plant:
+    """A plant at 100 Hz that stays where it is, commanded with 8 N m."""
+
+    def __init__(self, stop_time: float) -> None:
+        self.now_ns = 1000 * NANOSECONDS
+        self.supervisor = PlantSupervisor(PlantLimits(effort=(13.0,), stop_time=stop_time, feedback_timeout=0.1))
+        self.measured = True
+        self.sample = self._measure()
+        assert self.supervisor.arm(self.now_ns, self.sample) == ""
+
+    def _measure(self) -> JointSample:
+        return JointSample.of_one(self.now_ns, 0.0, 0.0, 0.0)
+
+    def period(self, command: float | None = 8.0) -> tuple[DriveKind, float]:
+        self.now_ns += _PERIOD_NS
+        if self.measured:
+            self.sample = self._measure()
+        if command is not None:
+            self.supervisor.offer(Input.EFFORT_COMMAND, JointCommand.of_one(self.now_ns, command, "lqr"), self.now_ns)
+            self.supervisor.offer(Input.DISTURBANCE, JointCommand.of_one(self.now_ns, 1.0, "noise"), self.now_ns)
+        drive = self.supervisor.decide(self.now_ns, self.sample)
+        self.supervisor.report_applied(drive.effort)
+        return drive.kind, drive.effort[0]
+
+    def drive(self) -> None:
+        for _ in range(5):
+            assert self.period() == (DriveKind.EFFORT, 9.0)
+
+    def fade(self, periods: int) -> list[float]:
+        return [self.period()[1] for _ in range(periods)]
+
+
+@pytest.mark.parametrize("stop", _STOPS)
+def test_category_0_is_the_default_and_cuts_the_torque_at_once(stop: str) -> None:
+    assert PlantLimits(effort=(13.0,)).stop_time == 0.0
+    plant = Plant(0.0)
+    plant.drive()
+    _STOPS[stop](plant.supervisor, plant.now_ns)
+    assert plant.period() == (DriveKind.OFF, 0.0)
+
+
+@pytest.mark.parametrize("stop", _STOPS)
+def test_category_1_fades_from_what_acted_in_the_stated_time_whatever_is_commanded(stop: str) -> None:
+    plant = Plant(0.1)
+    plant.drive()
+    _STOPS[stop](plant.supervisor, plant.now_ns)
+    assert not plant.supervisor.mode.armed
+    assert plant.fade(9) == pytest.approx([9.0 * left / 10 for left in range(9, 0, -1)])
+    assert plant.period() == (DriveKind.OFF, 0.0)
+    assert plant.fade(20) == [0.0] * 20
+
+
+def test_a_position_that_is_held_fades_too() -> None:
+    plant = Plant(0.1)
+    hold = from_points([0.0, 10.0], [0.0, 0.0], [0.0, 0.0])
+    assert plant.supervisor.accept_trajectory(hold, plant.now_ns, plant.sample) == ""
+    assert plant.period()[0] is DriveKind.POSITION
+    plant.supervisor.report_applied((4.0,))
+    plant.supervisor.e_stop(plant.now_ns)
+    assert plant.period() == (DriveKind.EFFORT, pytest.approx(3.6))
+
+
+def test_a_fault_cuts_the_torque_of_a_plant_that_drives_and_of_one_that_fades() -> None:
+    for stops_first in (False, True):
+        plant = Plant(0.5)
+        plant.drive()
+        if stops_first:
+            plant.supervisor.disarm(plant.now_ns)
+            assert plant.period()[1] > 8.0
+        plant.supervisor.fault("something broke", plant.now_ns)
+        assert plant.period() == (DriveKind.OFF, 0.0)
+    # One behind a latched e-stop likewise.
+    plant = Plant(0.5)
+    plant.drive()
+    plant.supervisor.e_stop(plant.now_ns)
+    plant.supervisor.fault("something broke", plant.now_ns)
+    assert plant.period() == (DriveKind.OFF, 0.0)
+    assert plant.supervisor.mode is Mode.E_STOP
+
+
+def test_without_measurements_nothing_fades() -> None:
+    plant = Plant(1.0)
+    plant.drive()
+    plant.supervisor.e_stop(plant.now_ns)
+    plant.measured = False
+    assert [effort > 0.0 for effort in plant.fade(11)] == [True] * 10 + [False]
+    plant.measured = True
+    assert plant.period() == (DriveKind.OFF, 0.0)
+
+
+@pytest.mark.parametrize("again", [*_STOPS, "reset"])
+def test_a_second_stop_does_not_lengthen_the_first(again: str) -> None:
+    plant = Plant(0.1)
+    plant.drive()
+    plant.supervisor.e_stop(plant.now_ns) if again == "reset" else plant.supervisor.disarm(plant.now_ns)
+    plant.fade(4)
+    if again == "reset":
+        assert plant.supervisor.e_stop_reset(plant.now_ns) == ""
+    else:
+        _STOPS[again](plant.supervisor, plant.now_ns)
+    assert plant.fade(6) == pytest.approx([4.5, 3.6, 2.7, 1.8, 0.9, 0.0])
+
+
+def test_arming_ends_what_is_left_of_a_stop() -> None:
+    plant = Plant(1.0)
+    plant.drive()
+    plant.supervisor.disarm(plant.now_ns)
+    plant.fade(2)
+    plant.now_ns += NANOSECONDS // 10
+    plant.sample = JointSample.of_one(plant.now_ns, 0.0, 0.0, 0.0)
+    assert plant.supervisor.arm(plant.now_ns, plant.sample) == ""
+    assert plant.period(command=None) == (DriveKind.EFFORT, 0.0)
+    plant.supervisor.e_stop(plant.now_ns)
+    assert plant.period() == (DriveKind.OFF, 0.0) or plant.period()[1] == 0.0
+
+
+def test_a_clock_that_steps_lengthens_no_stop() -> None:
+    plant = Plant(0.1)
+    plant.drive()
+    plant.supervisor.e_stop(plant.now_ns)
+    plant.now_ns += NANOSECONDS
+    assert plant.period() == (DriveKind.OFF, 0.0)
+    plant = Plant(0.1)
+    plant.drive()
+    plant.supervisor.e_stop(plant.now_ns)
+    plant.now_ns -= 10 * NANOSECONDS
+    assert plant.fade(12)[-1] == 0.0
+
+
+@pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
+def test_a_stop_time_that_is_none_is_refused(value: float) -> None:
+    with pytest.raises(ParameterError, match="stop_time is"):
+        PlantLimits(effort=(5.0,), stop_time=value)
