@@ -124,6 +124,15 @@ def passed(found: Checklist) -> dict[str, bool | None]:
     return {item.name: item.passed for item in found.items}
 
 
+def test_the_check_states_what_the_motor_makes_where_it_brakes_beside_the_effort_limit() -> None:
+    limits = replace(SETTINGS.limits, effort=3.0, velocity=1.5)
+    (item,) = [
+        item for item in checklist(settings=replace(SETTINGS, limits=limits)).items if "effort limit" in item.name
+    ]
+    assert item.passed
+    assert item.seen == "3 N m, up to 20.8 N m where the motor brakes at 1.5 rad/s"
+
+
 def test_a_motion_stop_that_is_disabled_as_it_was_set_fails_the_check() -> None:
     limits = replace(SETTINGS.limits, m_stop=MStopAction.DISABLED)
     found = checklist(settings=replace(SETTINGS, limits=limits))

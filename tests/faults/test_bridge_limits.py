@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
+from pathlib import Path
 
 import pytest
 
-from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
+from pendulum_hw_bridge.bridge.node_specs import SPECS
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
+from pendulum_hw_bridge.emulation.parameters import load_emulator
+from pendulum_hw_bridge.emulation.x5 import LinkState
 from pendulum_hw_bridge.port.actuator import Feedback
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
@@ -96,6 +101,64 @@ def test_a_torque_is_what_was_asked_for_up_to_the_limit_at_any_supply(
     )
     assert largest_torque(rig) <= 3.0 + TOLERANCE
     assert rig.outcomes[-1].effort == pytest.approx((wanted,), rel=0.02)
+
+
+SEQUENCES: dict[str, Callable[[int], float]] = {
+    "a torque at the limit": lambda cycle: 3.0,
+    "a step to the limit": lambda cycle: 3.0 if cycle > 40 else 0.0,
+    "reversed each cycle": lambda cycle: 3.0 - 6.0 * (cycle % 2),
+    "reversed each 50 ms": lambda cycle: 3.0 - 6.0 * (cycle // 5 % 2),
+    "reversed each 0.4 s": lambda cycle: 3.0 - 6.0 * (cycle // 40 % 2),
+    "small and reversed each 50 ms": lambda cycle: 1.0 - 2.0 * (cycle // 5 % 2),
+    "far beyond the limit": lambda cycle: 1e6 * (-1.0) ** (cycle // 7),
+}
+
+
+@KINDS
+@pytest.mark.parametrize("sequence", [*SEQUENCES, "regulation under noise", "a ramp"])
+def test_the_motor_drives_with_the_limit_at_most_and_brakes_with_no_more_than_is_stated(
+    kind: EffortStrategy, sequence: str
+) -> None:
+    regulation = sequence == "regulation under noise"
+    rig = Rig(kind=kind, moving=sequence == "a ramp", effort_limit=3.0, start=None if regulation else 0.0)
+    speeds: list[float] = []
+    watch = rig.actuator.trace
+
+    def trace(link: LinkState) -> None:
+        assert watch is not None
+        watch(link)
+        speeds.append(link.motor_velocity)
+
+    rig.actuator.trace = trace
+    rig.duties.clear()
+    if sequence in SEQUENCES:
+        rig.disturbing, cycles, offer = False, count(), rig._send
+
+        def send(answer: JointCommand) -> None:
+            cycle = next(cycles)
+            # A commander begins near zero.
+            effort = max(-0.1 * cycle, min(0.1 * cycle, SEQUENCES[sequence](cycle)))
+            offer(JointCommand.of_one(answer.stamp_ns, effort, answer.source))
+
+        rig.send = send
+    rig.run(1.5)
+    assert rig.supervisor.mode.armed, rig.supervisor.reason
+    assert largest_torque(rig) <= 3.0 + TOLERANCE
+    mapping, before = rig.module.mapping, 0.0
+    for (_, _, torque), speed in zip(rig.duties, speeds, strict=True):
+        # A record shows the torque of the step that ends with its speed.
+        assert abs(torque) <= mapping.largest_effort(max(abs(speed), abs(before))) + TOLERANCE
+        before = speed
+
+
+def test_the_torque_that_is_stated_beside_the_limit_is_that_of_the_drivetrain() -> None:
+    mapping = EffortMapping(EffortStrategy.EFFORT_LOOP, load_emulator("thesis").drivetrain, effort_limit=3.0)
+    readme = (Path(__file__).parents[2] / "pendulum_hw_bridge/README.md").read_text(encoding="utf-8")
+    assert f"{mapping.largest_effort(1.0) - 3.0:.1f} N m at 1 rad/s,\nwhatever its duty" in readme
+    assert f"{mapping.largest_effort(1.5):.1f} N m at a limit of\n3 N m and 1.5 rad/s" in readme
+    (limit,) = [spec for spec in SPECS if spec.name == "effort_limit"]
+    assert f"{mapping.largest_effort(1.0) - 3.0:.1f} N m at 1 rad/s" in limit.description
+    assert mapping.largest_effort(-1.0) == mapping.largest_effort(1.0) > mapping.largest_effort(0.0) == 3.0
 
 
 WRONG_RECORDS: dict[str, Callable[[Feedback], Feedback]] = {

@@ -16,6 +16,7 @@ from pendulum_hw_bridge.checks.check_item import HOST_ITEM, CheckItem, Checklist
 from pendulum_hw_bridge.checks.check_rest import rest_items, sign_item
 from pendulum_hw_bridge.checks.check_timing import PULSE, HostWatch, Punctuality, TimingFigures, measure
 from pendulum_hw_bridge.checks.nudge import Hand
+from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
 from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.port.actuator import (
     ActuatorError,
@@ -91,7 +92,10 @@ def run_checklist(
         info = port.connect()
         items.append(CheckItem("actuator answers", True, identity(info), "the one that is meant"))
         progress("setting and reading back")
-        items += setting_items(port, settings)
+        mapping = None
+        if plant.drivetrain is not None:
+            mapping = EffortMapping(EffortStrategy.DIRECT_PWM, plant.drivetrain, effort_limit=settings.limits.effort)
+        items += setting_items(port, settings, mapping)
         records = listen(port, settings, limits, host or HostWatch(), found, progress)
         items.append(acknowledgement_item(port, settings, found))
         if records:
@@ -121,15 +125,20 @@ def identity(info: ActuatorInfo) -> str:
     return f"{info.backend} {info.family}/{info.name}{serial}{firmware}"
 
 
-def setting_items(port: ActuatorPort, settings: BridgeSettings) -> list[CheckItem]:
-    """Write all settings, and judge whether each reads back."""
+def setting_items(port: ActuatorPort, settings: BridgeSettings, mapping: EffortMapping | None) -> list[CheckItem]:
+    """Write all settings, and judge whether each reads back; with the mapping, what the motor makes at the limit."""
     lifetime = port.set_command_lifetime(settings.command_lifetime)
     rate = port.set_feedback_rate(settings.feedback_rate)
     limits, joint = port.set_limits(settings.limits), settings.limits.joint
+    effort = _equal("effort limit reads back", limits.effort, settings.limits.effort, joint.effort_unit)
+    most = 0.0 if mapping is None else mapping.largest_effort(speed := settings.limits.velocity)
+    if most > settings.limits.effort:
+        beside = f"up to {most:.1f} {joint.effort_unit} where the motor brakes at {speed:g} {joint.velocity_unit}"
+        effort = replace(effort, seen=f"{effort.seen}, {beside}")
     items = [
         _equal("command lifetime reads back", lifetime, settings.command_lifetime, "s"),
         _equal("feedback rate reads back", rate, settings.feedback_rate, "Hz"),
-        _equal("effort limit reads back", limits.effort, settings.limits.effort, joint.effort_unit),
+        effort,
         _equal("velocity limit reads back", limits.velocity, settings.limits.velocity, joint.velocity_unit),
         CheckItem(
             "motion stop does what it should",

@@ -133,7 +133,7 @@ def _check(
     driven = module if isinstance(module, DrivenModule) else None
     progress(f"{joint.name}: setting and reading back")
     if driven is not None:
-        found.items += setting_items(driven.port, settings)
+        found.items += setting_items(driven.port, settings, driven.mapping)
     else:
         rate = module.port.set_feedback_rate(settings.feedback_rate)
         right = math.isclose(rate, settings.feedback_rate, rel_tol=1e-3)

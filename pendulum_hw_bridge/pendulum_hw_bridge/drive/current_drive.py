@@ -44,6 +44,10 @@ class CurrentMapping(EffortMapping):
         effort = command.effort if math.isnan(command.effort) else min(limit, max(-limit, command.effort))
         return replace(Command(), effort=effort)
 
+    def largest_effort(self, speed: float) -> float:
+        """Return the largest torque at a speed [rad/s], which the current loop keeps at the limit [N m]."""
+        return self.effort_limit
+
     def limited_gains(self, voltage: float) -> GainSet:
         """Return the gains as they are: the current loop has none of its own, whatever the voltage [V]."""
         return self.gains

@@ -101,6 +101,14 @@ class EffortMapping:
         """Return the torque at the joint that a duty makes at a motor speed, (u V - K_e N q') K_t N eta / R [N m]."""
         return (pwm - self.back_emf_pwm(velocity, voltage)) / self.pwm_per_torque(voltage)
 
+    def largest_effort(self, speed: float) -> float:
+        """Return the largest torque of the motor at a speed of the joint [rad/s]: limit and braking [N m].
+
+        It drives with the limit at most. A motor that turns brakes without any duty, and a duty that opposes the motion
+        adds to that; no setpoint takes it away.
+        """
+        return self.effort_limit + abs(self.motor_effort(0.0, speed, self.drivetrain.supply_voltage))
+
     # --- effort control -------------------------------------------------------------------------------------
 
     def command(self, effort: float, motor: MotorState) -> Command:

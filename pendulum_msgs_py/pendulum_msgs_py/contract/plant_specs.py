@@ -85,7 +85,8 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         "effort_limit",
         0.0,
         "N m",
-        "Largest torque after the sum of controller and disturbance; 0 takes that of the plant file.",
+        "Largest torque after the sum of controller and disturbance, with which a motor drives; 0 takes that of the "
+        "plant file. A motor that turns brakes on top of it: an X5-9 with 11.9 N m at 1 rad/s.",
         minimum=0.0,
         read_only=True,
     ),
