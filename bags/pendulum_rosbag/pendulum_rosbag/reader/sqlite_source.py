@@ -2,53 +2,57 @@
 
 from __future__ import annotations
 
-import mmap
+import contextlib
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from pendulum_msgs_py.errors import BagError
-from pendulum_rosbag.reader.batches import Batch, Bytes, Stream, joined, within
-from pendulum_rosbag.reader.sqlite_pages import MessageRows, leaf_pages, message_rows, page_size
+from pendulum_rosbag.reader.batches import Batch, Stream, joined
+from pendulum_rosbag.reader.sqlite_salvage import Row, page_size, salvaged_rows
 from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 
 __all__ = ["SqliteSource"]
 
 _ROWS = 8192
+_TRIES = 5
 _LARGEST_SALVAGE = 64 << 30  # a damaged head may claim any size
 # What SQLite and numpy say to a file that is not what it claims to be: SQLite's columns hold values of any type.
 _UNREADABLE = (sqlite3.Error, BagError, ValueError, TypeError, KeyError, IndexError, OverflowError, OSError)
+_IS_MESSAGE = "typeof(topic_id) || typeof(timestamp) || typeof(data) = 'integerintegerblob'"
+"""One condition, so that SQLite reads the whole head of every row and refuses those that are damaged."""
 
 
 class SqliteSource:
     """One ``.db3`` file.
 
     A database whose writer died in a transaction has a journal or a write-ahead log beside it. It is copied with
-    them to a temporary folder, where SQLite brings it back to its last consistent state; the bag stays untouched
-    and ``damage`` says so.
+    them to a temporary folder, where SQLite brings it back to its last consistent state; the bag stays untouched.
 
     Args:
         path: The file.
+        verify: Whether to read all messages now, and to salvage what is whole where one of them cannot be.
 
     Raises:
         BagError: The file cannot be opened or is no rosbag2 database.
     """
 
     compressed = False
-    unclosed = False
     unchecked = "a database has no checksums"
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, verify: bool = False) -> None:
         self.path = path
         self.damage = ""
+        self.unclosed = False
         self._copy: tempfile.TemporaryDirectory[str] | None = None
         self._connection: sqlite3.Connection | None = None
-        self._rows: list[MessageRows] | None = None
-        self._buffer: Bytes = np.empty(0, np.uint8)
+        self._salvaged: list[Row] | None = None
+        self._last_row = 0
+        self._stored: set[int] = set()
         self.start_ns = 0
         self.stop_ns = 0
         if not path.is_file():
@@ -59,9 +63,10 @@ class SqliteSource:
             if left_over:
                 self._open_copy(left_over)
             else:
-                self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
-                self._rows = self._read_pages()
+                self._open()
             self.streams = self._read_streams()
+            if verify:
+                self.connection.execute("SELECT count(substr(data, -1)) FROM messages").fetchone()
         except _UNREADABLE as error:
             self.close()
             if not self._salvage(str(error)):
@@ -70,8 +75,7 @@ class SqliteSource:
 
     def close(self) -> None:
         """Close the database and remove the temporary copy, if there is one."""
-        self._rows = None
-        self._buffer = np.empty(0, np.uint8)
+        self._salvaged = None
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -94,8 +98,14 @@ class SqliteSource:
             raise BagError(f"{self.path} is closed")
         return self._connection
 
+    def _open(self) -> None:
+        self._connection = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
+
     def _open_copy(self, left_over: list[Path]) -> None:
-        self.damage = f"its writer left {', '.join(file.name for file in left_over)} behind"
+        if any(file.name.endswith("-journal") for file in left_over):
+            self.damage = f"its writer left {', '.join(file.name for file in left_over)} behind"
+        else:
+            self.unclosed = True  # a write-ahead log loses nothing
         self._copy = tempfile.TemporaryDirectory(prefix="pendulum_rosbag_")
         target = Path(self._copy.name, self.path.name)
         for file in [self.path, *left_over]:
@@ -105,10 +115,10 @@ class SqliteSource:
     def _salvage(self, reason: str) -> bool:
         """Read what is left of a torn or truncated file: the topics by SQL, the messages page by page."""
         content = self.path.read_bytes()
-        size = page_size(np.frombuffer(content, np.uint8))
+        size = page_size(content)
         if not size:
             return False
-        pages = int.from_bytes(content[28:32], "big")
+        there, pages = len(content) // size, int.from_bytes(content[28:32], "big")
         # SQLite refuses a file that is shorter than its head says, so the copy gets empty pages in place of lost ones.
         missing = max(min(pages, _LARGEST_SALVAGE // size) * size - len(content), -len(content) % size)
         self._copy = tempfile.TemporaryDirectory(prefix="pendulum_rosbag_")
@@ -116,56 +126,42 @@ class SqliteSource:
         with copy.open("wb") as file:
             file.write(content)
             file.truncate(len(content) + missing)  # a hole: it takes neither memory nor disk
-        self._buffer = np.frombuffer(content, np.uint8)
-        starts = np.arange(0, len(content) - size + 1, size)
-        kinds = self._buffer[np.where(starts == 0, 100, starts)]
-        blocks = list(message_rows(self._buffer, size, starts[kinds == 0x0D]))
         try:
             self._connection = sqlite3.connect(copy)
-            self._rows = _first_of_each(blocks)
+            self._salvaged = list(salvaged_rows(content))
             self.streams = self._read_streams()
         except _UNREADABLE:
             return False
-        self.damage = f"SQLite refuses it ({reason}); {len(kinds)} pages of {pages or len(kinds)} are there"
+        self.unclosed = False
+        self.damage = f"SQLite refuses it ({reason}); {there} pages of {pages or there} are there"
+        if there >= pages:
+            with contextlib.suppress(sqlite3.Error):
+                ((total,),) = self._connection.execute("SELECT count(*) FROM messages")
+                self.damage = _left_out(total - len(self._salvaged)) or self.damage
         return True
-
-    def _read_pages(self) -> list[MessageRows] | None:
-        """Read the table of messages from its pages; ``None`` when only SQL can read this file."""
-        run = self.connection.execute
-        if any(hidden for *_, hidden in run("PRAGMA table_xinfo(messages)")):
-            raise BagError(f"{self.path}: the table of messages computes its columns; expected stored ones")
-        columns = [(name, key) for _, name, _, _, _, key in run("PRAGMA table_info(messages)")]
-        if columns != [("id", 1), ("topic_id", 0), ("timestamp", 0), ("data", 0)]:
-            return None
-        with self.path.open("rb") as file:
-            self._buffer = np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
-        size = page_size(self._buffer)
-        ((root,),) = run("SELECT rootpage FROM sqlite_master WHERE type = 'table' AND name = 'messages'")
-        leaves = leaf_pages(self._buffer, size, root) if size else None
-        if leaves is None:
-            return None
-        blocks = list(message_rows(self._buffer, size, leaves))
-        if left_out := sum(block.left_out for block in blocks):
-            self.damage = f"{left_out} rows of the table of messages are damaged and left out"
-        return blocks
 
     def _counts(self) -> dict[int, int]:
         """Return the number of messages by topic id, and note the time span of the file."""
         counts: dict[int, int] = {}
-        if self._rows is not None:
-            filled = [block for block in self._rows if len(block.times)]
-            self.start_ns = min((int(block.times.min()) for block in filled), default=0)
-            self.stop_ns = max((int(block.times.max()) for block in filled), default=0)
-            for block in filled:
-                for topic, count in zip(*np.unique(block.topics, return_counts=True), strict=True):
-                    counts[int(topic)] = counts.get(int(topic), 0) + int(count)
+        if self._salvaged is not None:
+            times = [time for _, _, time, _ in self._salvaged]
+            self.start_ns, self.stop_ns = min(times, default=0), max(times, default=0)
+            for _, topic, _, _ in self._salvaged:
+                counts[topic] = counts.get(topic, 0) + 1
             return counts
-        for topic, count, first, last in self.connection.execute(
-            "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
+        run = self.connection.execute
+        if any(hidden for *_, hidden in run("PRAGMA table_xinfo(messages)")):
+            raise BagError(f"{self.path}: the table of messages computes its columns; expected stored ones")
+        self._last_row, total = run("SELECT ifnull(max(rowid), 0), count(*) FROM messages").fetchone()
+        for topic, count, first, last in run(
+            f"SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages WHERE {_IS_MESSAGE} "  # noqa: S608
+            "GROUP BY topic_id"
         ):
             self.start_ns = first if not counts else min(self.start_ns, first)
             self.stop_ns = max(self.stop_ns, last)
             counts[topic] = count
+        self.damage = _left_out(total - sum(counts.values())) or self.damage
+        self._stored = set(counts)
         return counts
 
     def _read_streams(self) -> list[Stream]:
@@ -226,60 +222,57 @@ class SqliteSource:
         return row[0] if row and isinstance(row[0], str) else ""
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
-        """Yield all messages of some topics with start <= log time < stop, in the order of the file."""
-        if self._rows is not None:
-            for block in self._rows:
-                inside = within(block.times, start, stop)
-                for channel in channels:
-                    wanted = (block.topics == channel) & inside
-                    mine = np.flatnonzero(wanted & block.local)
-                    if len(mine):
-                        yield Batch(channel, self._buffer, block.offsets[mine], block.times[mine], block.sizes[mine])
-                    # Large messages go on elsewhere in the file: SQLite puts them together.
-                    for row_id in block.row_ids[wanted & ~block.local].tolist():
-                        query = "SELECT topic_id, timestamp, data FROM messages WHERE id = ?"
-                        try:
-                            yield from _batches(self.connection.execute(query, (row_id,)).fetchall())
-                        except (sqlite3.Error, ValueError, TypeError) as error:
-                            raise BagError(f"{self.path}: message {row_id} is damaged: {error}") from error
+        """Yield all messages of some topics with start <= log time < stop, in the order of the file.
+
+        Raises:
+            BagError: The file is damaged, or its recorder goes on faster than it can be read.
+        """
+        if self._salvaged is not None:
+            rows = [
+                row[1:]
+                for row in self._salvaged
+                if row[1] in channels and (start is None or row[2] >= start) and (stop is None or row[2] < stop)
+            ]
+            yield from _batches(rows)
             return
-        conditions, values = [], []
-        if channels != {stream.channel for stream in self.streams}:
+        expected = sum(stream.count for stream in self.streams if stream.channel in channels)
+        for _ in range(_TRIES):
+            try:
+                found = self._select(channels, start, stop)
+            except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
+                raise BagError(f"{self.path} is damaged: {error}; try to repair the bag") from error
+            # A recorder that goes on may have moved rows while they were read.
+            if start is not None or stop is not None or sum(len(batch.times) for batch in found) == expected:
+                yield from found
+                return
+            self.connection.close()
+            self._open()
+        raise BagError(f"{self.path} was written to while it was read; expected {expected} messages")
+
+    def _select(self, channels: set[int], start: int | None, stop: int | None) -> list[Batch]:
+        conditions, values = [_IS_MESSAGE, "rowid <= ?"], [self._last_row]
+        if not self._stored <= channels:
             conditions.append(f"topic_id IN ({', '.join('?' * len(channels))})")
             values += sorted(channels)
-        if start is not None:
-            conditions.append("timestamp >= ?")
-            values.append(start)
-        if stop is not None:
-            conditions.append("timestamp < ?")
-            values.append(stop)
-        where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
-        try:
-            cursor = self.connection.execute(f"SELECT topic_id, timestamp, data FROM messages{where}", values)  # noqa: S608 (placeholders)
-            while rows := cursor.fetchmany(_ROWS):
-                yield from _batches(rows)
-        except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
-            raise BagError(f"{self.path} is damaged: {error}; try to repair the bag") from error
+        if start is not None or stop is not None:
+            # The index over time finds the rows, which then come in the order of the file.
+            conditions.append("rowid IN (SELECT rowid FROM messages WHERE timestamp >= ? AND timestamp < ?)")
+            values += [-(2**63) if start is None else start, 2**63 - 1 if stop is None else stop]
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE {' AND '.join(conditions)} ORDER BY rowid"  # noqa: S608 (placeholders)
+        cursor = self.connection.execute(query, values)
+        found: list[Batch] = []
+        while rows := cursor.fetchmany(_ROWS):
+            found += _batches(rows)
+        return found
 
 
-def _first_of_each(blocks: list[MessageRows]) -> list[MessageRows]:
-    """Drop rows that stand on several pages (a writer that moves rows leaves copies behind)."""
-    seen: set[int] = set()
-    kept = []
-    for block in blocks:
-        fresh = np.array([row not in seen for row in block.row_ids.tolist()], bool)
-        _, first = np.unique(block.row_ids, return_index=True)
-        once = np.zeros(len(fresh), bool)
-        once[first] = True
-        # Messages that continue on other pages need SQL, which cannot be asked here.
-        keep = fresh & once & block.local
-        seen.update(block.row_ids[keep].tolist())
-        columns = (block.row_ids, block.topics, block.times, block.offsets, block.sizes, block.local)
-        kept.append(MessageRows(*(column[keep] for column in columns)))
-    return kept
+def _left_out(count: int) -> str:
+    return f"{count} rows of the table of messages are damaged and left out" if count > 0 else ""
 
 
-def _batches(rows: list[tuple[int, int, bytes]]) -> Iterator[Batch]:
+def _batches(rows: Sequence[tuple[int, int, bytes]]) -> Iterator[Batch]:
+    if not rows:
+        return
     topics, times, datas = zip(*rows, strict=True)
     buffer, offsets, sizes = joined(datas)
     topic = np.array(topics)
