@@ -6,9 +6,10 @@ import json
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path, PurePath
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
+import numpy as np
 import yaml
 
 from pendulum_msgs_py.errors import BagError
@@ -22,6 +23,7 @@ __all__ = [
     "BagFolder",
     "damage_of",
     "is_bag_folder",
+    "is_ros1",
     "is_storage_file",
     "open_folder",
     "open_source",
@@ -53,6 +55,12 @@ class BagFolder:
     topic_counts: dict[str, int] = field(default_factory=dict)
     """Messages by topic, as its metadata has it; empty where nothing says so."""
     damage: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    """What was left out because it is there twice, or read without being listed."""
+    unlisted: list[Path] = field(default_factory=list)
+    """Those of the files that no metadata lists."""
+    twins: dict[Path, Path] = field(default_factory=dict)
+    """File -> the same file in its other form, compressed or not, which is not read besides."""
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -63,6 +71,11 @@ class BagFolder:
 def is_storage_file(path: Path) -> bool:
     """Tell whether a file is a storage file by its name, compressed as a whole or not."""
     return _ending(path) in _ENDINGS and not path.name.startswith(".") and path.is_file()
+
+
+def is_ros1(path: Path) -> bool:
+    """Tell whether a file is a bag of ROS 1 by its name; ``.active`` is one whose recorder was killed."""
+    return path.name.removesuffix(".active").endswith(".bag") and path.is_file()
 
 
 def is_bag_folder(path: Path) -> bool:
@@ -99,15 +112,50 @@ def open_folder(path: Path) -> BagFolder:
     except OSError as error:
         raise BagError(f"{path} cannot be read as a bag: {error.strerror or error}") from error
     present = sorted(inside, key=_file_order)
-    listed = [file for file in dict.fromkeys(folder.files) if file.is_file()]
-    if missing := [file.name for file in folder.files if file not in listed]:
+    listed, missing = _listed(folder.files, present)
+    if missing:
         folder.damage.append(f"listed but missing: {', '.join(missing)}")
-    # A file that is not listed yet was begun by a recorder that died before it could say so.
-    folder.files = listed + [file for file in present if file not in listed]
+    _choose_files(folder, listed, present)
     if not folder.files:
         raise BagError(f"{path} is no bag: it has neither {METADATA_NAME} with its files nor any .mcap or .db3 file")
     folder.storage = folder.storage or _ENDINGS[_ending(folder.files[0])]
     return folder
+
+
+def _listed(named: Iterable[Path], present: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Return the files that the metadata name, as they are there, and the names of those that are not."""
+    found, missing = [], []
+    for path in named:
+        names = (path.name, _other_form(path).name)
+        file = next((file for name in names for file in present if file.name == name), path)
+        if file.is_file():
+            found.append(file)
+        else:
+            missing.append(path.name)
+    return found, missing
+
+
+def _choose_files(folder: BagFolder, listed: Sequence[Path], present: Sequence[Path]) -> None:
+    """Take each file once: under one of its names, and compressed or not."""
+    folder.files = []
+    taken: dict[tuple[int, int], Path] = {}
+    for file in dict.fromkeys([*listed, *present]):
+        status, other = file.stat(), _other_form(file)
+        same = taken.setdefault((status.st_dev, status.st_ino), file)
+        if same is not file:
+            folder.notes.append(f"{file.name} is left out: it is {same.name} under another name")
+        elif other in folder.files:
+            folder.twins[other] = file
+            folder.notes.append(f"{file.name} is left out: it is {other.name} in its other form")
+        else:
+            folder.files.append(file)
+            # A file that is not listed yet was begun by a recorder that died before it could say so.
+            if file not in listed:
+                folder.unlisted.append(file)
+
+
+def _other_form(file: Path) -> Path:
+    return file.with_suffix("") if file.suffix == ".zstd" else file.with_name(f"{file.name}.zstd")
 
 
 def _read_metadata(path: Path) -> str:
@@ -145,7 +193,8 @@ def _take_metadata(folder: BagFolder, text: str) -> None:
         version = int(info["version"])
         if version > METADATA_VERSION:
             folder.damage.append(f"metadata version is {version}; expected at most {METADATA_VERSION}")
-        folder.files = [folder.path / PurePath(name).name for name in info["relative_file_paths"]]
+        # (rosbag2 on Windows separates folders by backslashes)
+        folder.files = [folder.path / PureWindowsPath(name).name for name in info["relative_file_paths"]]
         folder.storage = str(info["storage_identifier"])
         custom = info.get("custom_data") or {}
         folder.custom_data = {str(key): str(value) for key, value in custom.items()}
@@ -220,18 +269,61 @@ def open_sources(folder: BagFolder, *, verify: bool | None = None) -> list[Sourc
     errors: list[BagError] = []
     for file in folder.files:
         try:
-            sources.append(open_source(file, verify=verify))
+            sources.append(_open_one_form(file, folder.twins.get(file), verify))
         except BagError as error:
             errors.append(error)
             folder.damage.append(str(error))
     if not sources:
         raise errors[0]
+    _leave_out_copies(folder, sources)
     if not folder.custom_data or folder.message_compression is None:
         _metadata_from_storage(folder, sources[-1])
     folder.damage += _missing_messages(folder, sources)
     if folder.message_compression is None:
         folder.message_compression = holds_packed_messages(sources[0])
     return [UnpackedSource(source) for source in sources] if folder.message_compression else sources
+
+
+def _open_one_form(file: Path, twin: Path | None, verify: bool | None) -> Source:
+    """Open a file, or the same in its other form where that is sound and the file is not."""
+    if twin is None:
+        return open_source(file, verify=verify)
+    try:
+        source = open_source(file, verify=verify)
+        if not source.damage:
+            return source
+    except BagError:
+        return open_source(twin, verify=verify)
+    try:
+        other = open_source(twin, verify=verify)
+    except BagError:
+        return source
+    sound, torn = (source, other) if other.damage else (other, source)
+    torn.close()
+    return sound
+
+
+def _leave_out_copies(folder: BagFolder, sources: list[Source]) -> None:
+    """Close files that nobody lists and whose messages all stand in another file: copies, or what a repair left."""
+    for source in [one for one in sources if one.path in folder.unlisted and one.stop_ns]:
+        for other in sources:
+            inside = other.start_ns <= source.start_ns and source.stop_ns <= other.stop_ns
+            if other is not source and inside and _log_times(source).items() <= _log_times(other).items():
+                folder.notes.append(f"{source.path.name} is left out: all its messages are in {other.path.name}")
+                sources.remove(source)
+                source.close()
+                break
+
+
+def _log_times(source: Source) -> dict[tuple[str, int], int]:
+    """Return how many messages a file has by topic and log time [ns]."""
+    topics = {stream.channel: stream.topic for stream in source.streams}
+    counts: dict[tuple[str, int], int] = {}
+    for batch in source.batches(set(topics), None, None):
+        topic = topics[batch.channel]
+        for time, count in zip(*np.unique(batch.times, return_counts=True), strict=True):
+            counts[topic, int(time)] = counts.get((topic, int(time)), 0) + int(count)
+    return counts
 
 
 def damage_of(folder: BagFolder, sources: Iterable[Source]) -> list[str]:
@@ -241,12 +333,14 @@ def damage_of(folder: BagFolder, sources: Iterable[Source]) -> list[str]:
 
 def open_source(file: Path, *, verify: bool | None = None) -> Source:
     """Open one storage file by its name; files compressed as a whole (``.zstd``) are decompressed first."""
+    if is_ros1(file):
+        raise BagError(f"{file} is a bag of ROS 1; `pendulum convert {file} -o FOLDER` makes one that can be read")
     if _ending(file) not in (".mcap", ".db3"):
         raise BagError(f"{file} is no storage file of a bag; expected .mcap or .db3, or either with .zstd behind")
     if file.suffix == ".mcap":
         return McapSource(file, verify=verify)
     if file.suffix == ".db3":
-        return SqliteSource(file)
+        return SqliteSource(file, verify=verify is True)
     try:
         with file.open("rb") as packed:
             data = decompress_bounded(packed, str(file), max(_LEAST_ROOM, _MAX_RATIO * file.stat().st_size))
@@ -259,7 +353,7 @@ def open_source(file: Path, *, verify: bool | None = None) -> Source:
     folder = tempfile.TemporaryDirectory(prefix="pendulum_rosbag_")
     copy = Path(folder.name, file.with_suffix("").name)
     copy.write_bytes(data)
-    source = SqliteSource(copy)
+    source = SqliteSource(copy, verify=verify is True)
     source.keep(folder)
     return source
 
