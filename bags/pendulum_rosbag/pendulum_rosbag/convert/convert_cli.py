@@ -35,6 +35,8 @@ Compression = Annotated[str, typer.Option(help="zstd or none; by default what th
 Topics = Annotated[list[str] | None, typer.Option("--topic", "-t", help="Topic to keep; several times if wanted.")]
 Regex = Annotated[str, typer.Option(help="Keep topics that match this pattern, too.")]
 Exclude = Annotated[str, typer.Option(help="Leave out topics that match this pattern.")]
+MaxSize = Annotated[float, typer.Option(help="Begin a new file before this one is larger [MB]; 0 for never.")]
+MaxDuration = Annotated[float, typer.Option(help="Begin a new file before this one is longer [s]; 0 for never.")]
 
 convert_app, merge_app, cut_app, filter_app = (
     typer.Typer(add_completion=False, rich_markup_mode=None) for _ in range(4)
@@ -47,15 +49,12 @@ def convert(
     output: Output,
     storage: Storage = "",
     compression: Compression = "",
-    max_size: Annotated[float, typer.Option(help="Begin a new file at this size [MB]; 0 for never.")] = 0.0,
-    max_duration: Annotated[float, typer.Option(help="Begin a new file after this time [s]; 0 for never.")] = 0.0,
+    max_size: MaxSize = 0.0,
+    max_duration: MaxDuration = 0.0,
     as_json: Json = False,
 ) -> None:
     """Write a bag anew: other storage or compression, split or in one file, ordered by log time; ROS 1 bags too."""
-    for name, value in (("max-size", max_size), ("max-duration", max_duration)):
-        if not value >= 0.0:
-            raise ParameterError(f"{name} is {value}; expected >= 0")
-    _run([bag], output, None, storage, compression, as_json, round(max_size * 1e6), max_duration)
+    _run([bag], output, None, storage, compression, as_json, max_size, max_duration)
 
 
 @merge_app.command(epilog="Example: python -m pendulum_rosbag merge runs/today/sim runs/today/hw -o /tmp/both")
@@ -64,12 +63,14 @@ def merge(
     output: Output,
     storage: Storage = "",
     compression: Compression = "",
+    max_size: MaxSize = 0.0,
+    max_duration: MaxDuration = 0.0,
     as_json: Json = False,
 ) -> None:
     """Write several bags to one, ordered by log time; the run metadata of each is kept under its name."""
     if len(bags) < 2:
         raise ParameterError("1 bag was named; expected at least 2 to merge")
-    _run(bags, output, None, storage, compression, as_json)
+    _run(bags, output, None, storage, compression, as_json, max_size, max_duration)
 
 
 @cut_app.command(
@@ -147,10 +148,14 @@ def _run(
     storage: str,
     compression: str,
     as_json: bool,
-    max_size: int = 0,
+    max_size: float = 0.0,
     max_duration: float = 0.0,
 ) -> None:
     from pendulum_rosbag.convert.rewrite import rewrite
+
+    for name, value in (("max-size", max_size), ("max-duration", max_duration)):
+        if not (math.isfinite(value) and value >= 0.0):
+            raise ParameterError(f"{name} is {value}; expected >= 0")
 
     console = make_console(stderr=True, highlight=False)
     with counting_bar(console, TimeRemainingColumn()) as bar:
@@ -161,7 +166,7 @@ def _run(
             choice,
             storage=storage,
             compression=None if compression == "none" else compression,
-            max_size=max_size,
+            max_size=math.ceil(max_size * 1e6),
             max_duration=max_duration,
             on_progress=lambda share: bar.update(task, completed=round(share * _STEPS)),
         )

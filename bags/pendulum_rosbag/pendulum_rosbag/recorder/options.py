@@ -29,8 +29,8 @@ class RecorderOptions:
         exclude: Pattern of topics to leave out.
         storage: ``mcap`` or ``sqlite3``.
         compression: ``None`` or ``zstd``.
-        max_size: Begin a new file at this size [bytes]; 0 for never.
-        max_duration: Begin a new file after this time [s]; 0 for never.
+        max_size: Begin a new file before this one is larger [bytes]; 0 for never.
+        max_duration: Begin a new file before this one is longer [s]; 0 for never.
         duration: Stop after this time [s]; 0 for never.
         metadata: Run metadata to store.
         log_time: ``receive`` or ``header``.

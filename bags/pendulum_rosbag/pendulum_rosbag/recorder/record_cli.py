@@ -30,8 +30,12 @@ def record(
     exclude: Annotated[str, typer.Option(help="Leave out topics that match this pattern.")] = "",
     storage: Annotated[str, typer.Option(help="mcap or sqlite3.")] = "mcap",
     compression: Annotated[str, typer.Option(help="zstd, or none.")] = "none",
-    max_size: Annotated[float, typer.Option(help="Begin a new file at this size [MB]; 0 for never.")] = 0.0,
-    max_duration: Annotated[float, typer.Option(help="Begin a new file after this time [s]; 0 for never.")] = 0.0,
+    max_size: Annotated[
+        float, typer.Option(help="Begin a new file before this one is larger [MB]; 0 for never.")
+    ] = 0.0,
+    max_duration: Annotated[
+        float, typer.Option(help="Begin a new file before this one is longer [s]; 0 for never.")
+    ] = 0.0,
     duration: Annotated[float, typer.Option(help="Stop after this time [s]; 0 for never.")] = 0.0,
     metadata: Annotated[Path | None, typer.Option(help="JSON object to store with the bag.")] = None,
     log_time: Annotated[

@@ -27,6 +27,8 @@ __all__ = ["STORAGES", "BagWriter"]
 
 STORAGES = ("mcap", "sqlite3")
 _COMPRESSIONS = (None, "zstd")
+_SPARE = 256
+"""Bytes by which numbers in the metadata of a file may get longer until it is closed."""
 
 
 class _Channels(dict[str, int]):
@@ -53,8 +55,9 @@ class BagWriter:
         compression: ``None`` or ``"zstd"`` (MCAP only, chunk by chunk).
         metadata: Run metadata; values that are not strings are stored as JSON text.
         chunk_size: Bytes of messages that are sealed together at the latest.
-        max_size: Begin a new storage file at this size [bytes]; 0 for never.
-        max_duration: Begin a new storage file after this time of messages [s]; 0 for never.
+        max_size: Begin a new storage file with the message that would make this one, closed, larger [bytes]; 0 for
+            never. An empty file may take half of it at most, else as much besides.
+        max_duration: Begin a new storage file with the message that would make this one longer [s]; 0 for never.
         ros_distro: What ``metadata.yaml``, and a database, name as distribution.
         file_stem: Beginning of the names of storage files; by default the name of the folder.
 
@@ -91,6 +94,9 @@ class BagWriter:
         self._chunk_size = chunk_size
         self._max_size = max_size
         self._max_duration_ns = round(max_duration * 1e9)
+        self._most = 0
+        self._closing = 0
+        self._span: tuple[int, int] | None = None
         self._ros_distro = ros_distro
         self._custom = encode_custom_data(metadata)
         self._topics: dict[str, TopicEntry] = {}
@@ -186,8 +192,36 @@ class BagWriter:
         messages = iter(items)
         with self._lock:
             self._require_open()
+            if self._max_size or self._max_duration_ns:
+                for topic, log_time_ns, data in messages:
+                    self._write_within_limits(topic, log_time_ns, data)
+                return
             while self._file.write_many(messages, self._ids, self._written, self._chunk_size):
-                self.seal()  # which may begin the next file
+                self.seal()
+
+    def _write_within_limits(self, topic: str, log_time_ns: int, data: bytes) -> None:
+        first, last = self._span or (log_time_ns, log_time_ns)
+        span = min(first, log_time_ns), max(last, log_time_ns)
+        if self._span and self._ids[topic]:
+            too_long = 0 < self._max_duration_ns < span[1] - span[0]
+            if too_long or (self._max_size and self._is_full(len(data))):
+                self._split()
+                span = log_time_ns, log_time_ns
+        if self._file.write_many(iter(((topic, log_time_ns, data),)), self._ids, self._written, self._chunk_size):
+            self.seal()
+        self._span = span
+
+    def _is_full(self, size: int) -> bool:
+        """Tell whether the storage file has no room for one more message of some size."""
+        if not self._closing:
+            self._closing = len(self._metadata.render(*self._described)) + _SPARE
+            self._most = max(self._max_size, self._file.size_with(0, empty=True) + self._closing + self._max_size // 2)
+        if self._file.size_with(size) + self._closing <= self._most:
+            return False
+        if not self._compression:
+            return True
+        self._file.settle()  # compressed, it takes less
+        return self._file.size_with(size) + self._closing > self._most
 
     def keep(self, record: Attachment | Metadata) -> None:
         """Put an attachment, or metadata of somebody else, into the storage file that is open now (MCAP only).
@@ -215,8 +249,6 @@ class BagWriter:
         if self._file.count != before:
             self._note_sealed()
             self._update_metadata()
-        if self._is_due():
-            self._split()
 
     def sync(self) -> None:
         """Seal, and wait until what was sealed has reached the disk (it survives a power failure).
@@ -299,10 +331,12 @@ class BagWriter:
 
             file = SealedSqliteFile(self._folder / f"{name}.db3", ros_distro=self._ros_distro)
         self._files.append(FileEntry(file.path.name))
+        self._closing, self._span = 0, None
         return file
 
     def _add_channel(self, name: str) -> None:
         topic = self._topics[name]
+        self._closing = 0  # (what is written when the file is closed gets longer)
         self._file.add_channel(self._ids[name], name, topic.type, qos_yaml(topic.qos).strip())
 
     def _note_sealed(self) -> None:
@@ -318,12 +352,6 @@ class BagWriter:
 
     def _update_metadata(self) -> None:
         self._metadata.update(*self._described)
-
-    def _is_due(self) -> bool:
-        if not self._file.count:
-            return False
-        by_size = 0 < self._max_size <= self._file.data_size
-        return by_size or 0 < self._max_duration_ns <= self._file.stop_ns - self._file.start_ns
 
     def _split(self) -> None:
         self._close_file()

@@ -24,6 +24,10 @@ __all__ = ["SealedMcapFile"]
 _LARGEST_NUMBER = 256
 """Staged chunks that become one at the latest, so that rare messages do not make a long index either."""
 _NO_SPAN = (2**63 - 1, 0)
+_LEAST_SIZE = 576
+"""Bytes of the records of a closed file that hold no message, topic or metadata, at most."""
+_CHANNEL_SIZE = 35
+"""Bytes by which a topic makes the index of a chunk, and the statistics, longer."""
 
 
 class SealedMcapFile:
@@ -57,6 +61,7 @@ class SealedMcapFile:
         # The same of those that are staged.
         self._group: list[bytes] = []
         self._group_size = 0
+        self._group_count = 0
         self._group_index: dict[int, list[bytes]] = {}
         self._group_span = _NO_SPAN
         self._stale = False
@@ -78,10 +83,22 @@ class SealedMcapFile:
         """Last log time of the sealed messages [ns]."""
         return self._summary.stop_ns
 
-    @property
-    def data_size(self) -> int:
-        """Bytes of data so far, sealed or not (the file itself may end later)."""
-        return self._layout.settled_end + self._group_size + self._pending_size
+    def size_with(self, size: int, *, empty: bool = False) -> int:
+        """Return what the closed file would take with one more message [bytes], metadata not counted.
+
+        Args:
+            size: Of that message [bytes].
+            empty: Leave out all messages so far.
+        """
+        summary = len(self._summary.description) + len(self._summary.settled) + _CHANNEL_SIZE * len(self._sequences)
+        if empty:
+            return _LEAST_SIZE + summary
+        # What is pending are pairs: head and content of a message, schema and channel.
+        entries = 16 * (self._group_count + len(self._pending) // 2)
+        message = size + 47 if size else 0
+        return (
+            _LEAST_SIZE + summary + self._layout.settled_end + self._group_size + self._pending_size + entries + message
+        )
 
     def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None:
         """Describe a topic before its first message (ids from 1; QoS profiles as YAML text)."""
@@ -260,6 +277,7 @@ class SealedMcapFile:
         self._group_span = _union(self._group_span, self._pending_span)
         counts = {channel: len(entries) // 2 for channel, entries in self._pending_index.items()}
         self._summary.add_messages(counts, self._pending_span)
+        self._group_count += sum(counts.values())
         self._pending.clear()
         self._pending_size = 0
         self._pending_index.clear()
@@ -269,7 +287,7 @@ class SealedMcapFile:
     def _finish_group(self, record: bytes) -> None:
         self._summary.settle(record)
         self._group.clear()
-        self._group_size = 0
+        self._group_size = self._group_count = 0
         self._group_index.clear()
         self._group_span = _NO_SPAN
         self._stale = True

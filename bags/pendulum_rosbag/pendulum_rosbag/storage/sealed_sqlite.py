@@ -42,6 +42,7 @@ _TABLES = {
     "data BLOB NOT NULL)",
 }
 _SCHEMA_VERSION = 4
+_EMPTY_PAGES = 20
 _INDEX = "CREATE INDEX timestamp_idx ON messages (timestamp ASC)"
 
 
@@ -83,10 +84,20 @@ class SealedSqliteFile:
             temporary.unlink(missing_ok=True)
             raise
 
-    @property
-    def data_size(self) -> int:
-        """Bytes of data so far, sealed or not."""
-        return self._pages.count * PAGE
+    def size_with(self, size: int, *, empty: bool = False) -> int:
+        """Return what the closed file would take with one more message, at most [bytes], metadata not counted.
+
+        Args:
+            size: Of that message [bytes].
+            empty: Leave out all messages so far.
+        """
+        if empty:
+            return _EMPTY_PAGES * PAGE
+        rows, last = self.count + self._pending + 1, max(self.stop_ns, self._pending_span[1])
+        # A row of the index over time: sizes, time and row id. The message takes a page of its own at worst, and two
+        # above that.
+        entry = 9 + last.bit_length() // 8 + rows.bit_length() // 8
+        return (self._pages.count + rows * entry // (PAGE - 64) + size // (PAGE - 4) + 6) * PAGE
 
     def add_channel(self, channel_id: int, topic: str, type: MessageType, qos: str) -> None:
         """Describe a topic before its first message (ids ascending from 1; QoS profiles as YAML text)."""
