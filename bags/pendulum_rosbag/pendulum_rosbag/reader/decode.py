@@ -36,10 +36,13 @@ def store_for(info: TopicInfo) -> Typestore:
     except Exception as error:  # rosbags raises its own and parser errors
         if info.type in shared.fielddefs:
             return shared  # in a language that rosbags does not read, such as IDL in other clothes
-        reason = " ".join(str(error).split())[:200]
-        raise DataError(f"topic {info.name}: the definition of {info.type} is not readable: {reason}") from error
+        reason = f": {error}" if isinstance(error, DataError) else ""
+        raise DataError(
+            f"topic {info.name}: the definition of {info.type} in the bag is not one of ROS 2 messages{reason}"
+        ) from error
     if info.type not in store.fielddefs:
-        raise DataError(f"topic {info.name} has type {info.type}; expected a type that the bag or ROS 2 defines")
+        held = f"has type {info.type}" if info.type else "has no type in the bag"
+        raise DataError(f"topic {info.name} {held}; expected a type that the bag or ROS 2 defines")
     return store
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -46,7 +47,12 @@ def export(
     elif fps is not None:
         raise ParameterError(f"fps is {fps} Hz for format {format}; expected format {LEROBOT}")
     else:
-        files = export_bag(read_bag(bags[0], topics), output, format)
+        files = export_bag(
+            read_bag(bags[0], topics),
+            output,
+            format,
+            on_left_out=lambda text: print("left out:", text, file=sys.stderr),
+        )
     for path in files:
         print(path)
     return 0

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
-from collections.abc import Iterator, Sequence
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_msgs_py.json_values import without_nan
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_msgs_py.whole_file import writing
@@ -75,13 +78,16 @@ def _joint_columns(values: Sequence[StoredMessage]) -> dict[str, Any]:
     return {**columns, "frame_id": [one.header.frame_id for one in messages]}
 
 
-def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
-    """Write each topic to a file of its own, and the run metadata to ``metadata.json``.
+def export_bag(
+    bag: Bag, folder: Path, format: str = "parquet", *, on_left_out: Callable[[str], None] = lambda sentence: None
+) -> list[Path]:
+    """Write each topic to a file of its own, and the run metadata to ``metadata.json``; all of it or nothing.
 
     Args:
         bag: The bag.
         folder: Folder to create.
         format: ``parquet`` or ``csv``.
+        on_left_out: Called with a sentence for each topic that cannot be read.
 
     Returns:
         The files that were written.
@@ -89,7 +95,7 @@ def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
     Raises:
         ParameterError: Unknown format, or pyarrow is missing.
         BagError: The folder exists or cannot be written.
-        DataError: A topic cannot be read.
+        DataError: No topic can be read.
     """
     if format not in FORMATS:
         raise ParameterError(f"format is {format!r}; expected one of {', '.join((*FORMATS, LEROBOT))}")
@@ -97,26 +103,47 @@ def export_bag(bag: Bag, folder: Path, format: str = "parquet") -> list[Path]:
         require_pyarrow(format)
     if folder.exists():
         raise BagError(f"{folder} exists already; expected a new folder")
-    files = []
+    files: list[Path] = []
+    failed: DataError | None = None
     with writing(f"folder {folder}", BagError):
-        folder.mkdir(parents=True)
-        for topic in bag.topics:
-            table = to_pandas(bag, topic)
-            path = folder / f"{topic.strip('/').replace('/', '__')}.{format}"
-            if format == "csv":
-                for name in table.columns:
-                    if table[name].map(lambda value: isinstance(value, list)).any():
-                        table[name] = table[name].map(_json)
-                table.to_csv(path, index=False)
-            else:
-                _write_parquet(path, table, bag.topics[topic])
-            files.append(path)
-        path = folder / "metadata.json"
-        path.write_text(
-            json.dumps(without_nan(bag.metadata), indent=2, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8"
-        )
-        files.append(path)
-    return files
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as scratch:
+            # The folder appears under its name only when it is whole.
+            place = Path(scratch, folder.name)
+            place.mkdir()
+            for topic in bag.topics:
+                try:
+                    table = to_pandas(bag, topic)
+                except DataError as error:
+                    failed = error
+                    on_left_out(str(error))
+                    continue
+                files.append(_free_path(place, topic, format, files))
+                _write_table(files[-1], table, bag.topics[topic], format)
+            if failed and not files:
+                raise failed
+            files.append(place / "metadata.json")
+            text = json.dumps(without_nan(bag.metadata), indent=2, sort_keys=True, allow_nan=False)
+            files[-1].write_text(text + "\n", encoding="utf-8")
+            os.rename(place, folder)
+    return [folder / path.name for path in files]
+
+
+def _free_path(folder: Path, topic: str, format: str, taken: Sequence[Path]) -> Path:
+    """Return a file for a topic; names that differ in slashes alone are numbered."""
+    stem = topic.strip("/").replace("/", "__")
+    names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+    return next(path for name in names if (path := folder / f"{name}.{format}") not in taken)
+
+
+def _write_table(path: Path, table: pd.DataFrame, info: TopicInfo, format: str) -> None:
+    if format == "parquet":
+        _write_parquet(path, table, info)
+        return
+    for name in table.columns:
+        if table[name].map(lambda value: isinstance(value, list)).any():
+            table[name] = table[name].map(_json)
+    table.to_csv(path, index=False)
 
 
 def _json(value: Any) -> str:

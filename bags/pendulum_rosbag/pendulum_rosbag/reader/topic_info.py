@@ -2,10 +2,30 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["StoredMessage", "TopicInfo"]
+__all__ = ["StoredMessage", "TopicInfo", "ros_topic", "ros_type"]
+
+_DDS_TYPE = re.compile(r"(\w+(?:::\w+)+?)::(?:dds_::)?(\w+?)_?")
+_OLD_TYPE = re.compile(r"(\w+)/(\w+)")
+
+
+def ros_type(name: str) -> str:
+    """Return the ROS 2 name of a message type, such as ``sensor_msgs/msg/JointState``.
+
+    Recorders of DDS call it ``sensor_msgs::msg::dds_::JointState_``, those of ROS 1 ``sensor_msgs/JointState``.
+    """
+    if dds := _DDS_TYPE.fullmatch(name):
+        return "/".join([*dds[1].split("::"), dds[2]])
+    old = _OLD_TYPE.fullmatch(name)
+    return f"{old[1]}/msg/{old[2]}" if old else name
+
+
+def ros_topic(name: str) -> str:
+    """Return the full ROS 2 name of a topic that a recorder noted under a relative name, or under that of DDS."""
+    return name if name.startswith("/") else f"/{name.removeprefix('rt/')}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -136,7 +136,7 @@ def _copy(sources: list[Source], hashes: dict[str, str], writer: BagWriter) -> l
 
 def message_type_of(stream: Stream, type_hash: str) -> MessageType:
     """Return the type of a topic as its file describes it, with what is known of it besides."""
-    if stream.serialization != "cdr":
+    if stream.serialization != "cdr" or stream.type.count("/") != 2:
         return MessageType(stream.type, stream.definition, stream.hash, stream.encoding, stream.serialization)
     if stream.definition:
         known = stream.hash or type_hash or _known_hash(stream.type)
