@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +16,9 @@ from typing import Any
 
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_rosbag.reader.batches import Source
-from pendulum_rosbag.reader.open_source import BagFolder, damage_of, open_folder, open_sources
+from pendulum_rosbag.reader.clock import ClockStep, find_steps
+from pendulum_rosbag.reader.open_source import BagFolder, damage_of, is_ros1, open_folder, open_sources
+from pendulum_rosbag.reader.topic_info import ros_topic
 from pendulum_rosbag.repair.repair import message_type_of
 from pendulum_rosbag.storage.bag_writer import BagWriter
 from pendulum_rosbag.storage.message_types import MessageType
@@ -26,7 +28,6 @@ __all__ = ["Choice", "RewriteReport", "rewrite"]
 
 _WINDOW_BYTES = 64 << 20
 """Bytes of storage files that are sorted at once; what they hold may be five times as much."""
-_ROS1 = ".bag"
 
 
 @dataclass(frozen=True)
@@ -60,12 +61,18 @@ class Choice:
             length = (self.stop_ns - self.start_ns) * 1e-9
             raise ParameterError(f"the span from start to stop is {length:g} s long; expected more than 0 s")
 
+    def holds(self, time_ns: int) -> bool:
+        """Tell whether a log time is in the span [ns]."""
+        return (self.start_ns is None or time_ns >= self.start_ns) and (self.stop_ns is None or time_ns < self.stop_ns)
+
     def wants(self, topic: str) -> bool:
         """Tell whether a topic is to be copied."""
-        if self.exclude and re.search(self.exclude, topic):
+        full = ros_topic(topic)
+        if self.exclude and (re.search(self.exclude, topic) or re.search(self.exclude, full)):
             return False
         if self.topics or self.regex:
-            return topic in self.topics or bool(self.regex and re.search(self.regex, topic))
+            chosen = topic in self.topics or full in self.topics
+            return chosen or bool(self.regex and (re.search(self.regex, topic) or re.search(self.regex, full)))
         return True
 
 
@@ -119,17 +126,20 @@ def rewrite(
         choice: Which messages; by default all.
         storage: ``mcap`` or ``sqlite3``; empty for that of the first bag.
         compression: ``None``, ``zstd``, or empty for what the bags have.
-        max_size: Begin a new storage file at this size [bytes]; 0 for never.
-        max_duration: Begin a new storage file after this time of messages [s]; 0 for never.
+        max_size: Begin a new storage file before this one is larger [bytes]; 0 for never.
+        max_duration: Begin a new storage file before this one is longer [s]; 0 for never.
         on_progress: Called with the share that is done, 0 to 1.
 
     Raises:
         BagError: A bag cannot be read, two have a topic of one name with different types, or the new one cannot be
             written.
         DataError: A topic that was named is in none of them, or no message is left.
-        ParameterError: Unknown storage or compression.
+        ParameterError: Unknown storage or compression, or one bag is named twice.
     """
     choice = choice or Choice()
+    places = [Path(path).resolve() for path in paths]
+    if twice := next((path for number, path in enumerate(places) if path in places[:number]), None):
+        raise ParameterError(f"bag {twice} is named twice; expected each bag once")
     with ExitStack() as stack:
         inputs = [_open(Path(path), stack) for path in paths]
         storage = storage or inputs[0].folder.storage or "mcap"
@@ -156,7 +166,7 @@ def rewrite(
 
 def _open(path: Path, stack: ExitStack) -> _Input:
     place = path
-    if path.suffix == _ROS1 and path.is_file():
+    if is_ros1(path):
         place = _from_ros1(path, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pendulum_rosbag_"))))
     folder = open_folder(place)
     sources = open_sources(folder, verify=True)
@@ -173,13 +183,28 @@ def _from_ros1(path: Path, scratch: Path) -> Path:
     try:
         convert([path], target, "mcap", 9, None, "none", None, None, (), (), (), ())
     except ConverterError as error:
-        raise BagError(f"ROS 1 bag {path} cannot be converted: {error}") from error
+        hint = (
+            f"; was its recorder killed? `rosbag reindex {path}` (of ROS 1) makes its index" if _no_index(path) else ""
+        )
+        raise BagError(f"ROS 1 bag {path} cannot be converted: {error}{hint}") from error
     return target
+
+
+def _no_index(path: Path) -> bool:
+    """Tell whether a ROS 1 bag has no index: the head of its first record says where, 0 until it is closed."""
+    head = path.read_bytes()[:4096]
+    at = head.find(b"index_pos=")
+    return (
+        at < 0
+        or not any(head[at + 10 : at + 18])
+        or int.from_bytes(head[at + 10 : at + 18], "little") >= path.stat().st_size
+    )
 
 
 def _require_topics(inputs: Sequence[_Input], choice: Choice) -> None:
     found = {stream.topic for one in inputs for source in one.sources for stream in source.streams}
-    missing = [topic for topic in choice.topics if topic not in found]
+    offered = found | {ros_topic(topic) for topic in found}
+    missing = [topic for topic in choice.topics if topic not in offered]
     if missing:
         bags = ", ".join(str(one.path) for one in inputs)
         raise DataError(f"{bags}: no topic {missing[0]}; expected one of {', '.join(sorted(found)) or 'none'}")
@@ -219,16 +244,48 @@ def _copy(
                     raise BagError(f"{one.path}: {error}; leave one of them out, or rename it") from error
             chosen.append((source, {stream.channel: stream.topic for stream in streams}))
             _keep_extras(source, writer, report)
+    wanted = [(source, topics) for source, topics in chosen if topics]
+    steps = {id(one): _clock_steps(one, wanted) for one in inputs}
+    if any(steps.values()):
+        _copy_passes(inputs, wanted, choice, steps, writer)
+        return
     windows = list(_windows([source for source, _ in chosen], choice))
     for number, (start, stop) in enumerate(windows, start=1):
         rows: list[tuple[int, str, bytes]] = []
-        for source, topics in chosen:
-            for batch in source.batches(set(topics), start, stop) if topics else ():
+        for source, topics in wanted:
+            for batch in source.batches(set(topics), start, stop):
                 topic = topics[batch.channel]
                 rows += [(time, topic, data) for time, data in batch.payloads()]
         rows.sort(key=lambda row: row[0])  # (stable: what was written first comes first)
         writer.write_many((topic, time, data) for time, topic, data in rows)
         on_progress(number / len(windows))
+
+
+def _clock_steps(one: _Input, wanted: Sequence[tuple[Source, dict[int, str]]]) -> list[ClockStep]:
+    return find_steps([pair for pair in wanted if pair[0] in one.sources], (None, None))
+
+
+def _copy_passes(
+    inputs: Sequence[_Input],
+    wanted: Sequence[tuple[Source, dict[int, str]]],
+    choice: Choice,
+    steps: Mapping[int, Sequence[ClockStep]],
+    writer: BagWriter,
+) -> None:
+    """Copy bags of which the clock stepped back: in order of log time as if it had gone on."""
+    rows: list[tuple[int, int, str, bytes]] = []
+    for one in inputs:
+        seen: dict[str, int] = {}
+        for source, topics in wanted:
+            for batch in source.batches(set(topics), None, None) if source in one.sources else ():
+                topic = topics[batch.channel]
+                for time, data in batch.payloads():
+                    place = seen[topic] = seen.get(topic, 0) + 1
+                    moved = time + sum(step.size_ns for step in steps[id(one)] if place > step.rows.get(topic, place))
+                    if choice.holds(time):
+                        rows.append((moved, time, topic, data))
+    rows.sort(key=lambda row: row[0])
+    writer.write_many((topic, time, data) for _, time, topic, data in rows)
 
 
 def _storable(kind: MessageType, writer: BagWriter) -> MessageType:

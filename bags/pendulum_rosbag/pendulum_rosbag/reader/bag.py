@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ import numpy.typing as npt
 from pendulum_msgs_py.contract.cdr import decode_joint_state
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader.batches import Batch, Int64, Source, Stream
+from pendulum_rosbag.reader.clock import CLOCK_JUMP, ClockStep, find_steps, go_on, pass_order, set_stamps, steps_back
 from pendulum_rosbag.reader.joint_state import JointStateParser
 from pendulum_rosbag.reader.joint_table import JointTable, joint_table
 from pendulum_rosbag.reader.open_source import BagFolder, damage_of, open_folder, open_sources, parsed
-from pendulum_rosbag.reader.topic_info import StoredMessage, TopicInfo
+from pendulum_rosbag.reader.topic_info import StoredMessage, TopicInfo, ros_topic, ros_type
 
 __all__ = ["Bag", "read_bag", "read_bags"]
 
@@ -45,7 +47,9 @@ class Bag(Mapping[str, Any]):
         topics: Topic name -> :class:`TopicInfo`.
         metadata: Run metadata (``custom_data``), values parsed where they are JSON.
         damage: What is wrong with the bag, one sentence per file; empty for a healthy one.
-        notes: What reading cannot find out, one sentence per file that has no checksums.
+        clock_notes: What reading has found out about clocks so far: steps back, and stamps that were never set.
+        cuts_ns: Stamps at which a clock stepped back, in the times of :meth:`array` [ns].
+        notes: Files that were left out as copies, and what reading cannot find out, one sentence each.
     """
 
     def __init__(
@@ -60,7 +64,7 @@ class Bag(Mapping[str, Any]):
         self.storage = folder.storage
         self.metadata: dict[str, Any] = folder.metadata
         self.damage = damage_of(folder, sources)
-        self.notes = [
+        self.notes = folder.notes + [
             f"{source.path.name}: {source.unchecked}, so bytes that changed in messages cannot be told"
             for source in sources
             if source.unchecked
@@ -68,9 +72,19 @@ class Bag(Mapping[str, Any]):
         self._sources = list(sources)
         self._span = (start, stop)
         self._topics, several = _group(sources, folder.topic_hashes)
+        self._also = {stream.topic: name for name, topic in self._topics.items() for _, stream in topic.streams}
         self.damage += several
+        self.notes += [
+            f"topic {name} has no type in the file; its messages are those of {topic.info.type}"
+            for name, topic in self._topics.items()
+            if topic.info.type == _JOINT_STATE and not topic.streams[0][1].type
+        ]
         if topics is not None:
-            self._topics = {topic: self._entry(topic) for topic in topics}
+            self._topics = {entry.info.name: entry for entry in map(self._entry, topics)}
+        self.clock_notes: list[str] = []
+        self.cuts_ns: list[int] = []
+        self._steps: list[ClockStep] | None = None
+        self._stamp_steps: list[tuple[int, int]] = []
         self._arrays: dict[str, npt.NDArray[Any] | list[StoredMessage]] = {}
         self._tables: dict[str, JointTable] = {}
 
@@ -90,18 +104,18 @@ class Bag(Mapping[str, Any]):
         return max((source.stop_ns for source in self._sources), default=0)
 
     def __getitem__(self, topic: str) -> Any:
-        self._entry(topic)
+        topic = self._entry(topic).info.name
         if topic not in self._arrays:
             self._load([topic])
         return self._arrays[topic]
 
     def __contains__(self, topic: object) -> bool:
         # (the mapping's own would read the topic, and expects a KeyError)
-        return topic in self._topics
+        return topic in self._topics or self._also.get(str(topic)) in self._topics
 
     def get(self, topic: str, default: Any = None) -> Any:
         """Return a topic as ``bag[topic]`` does, or a default where the bag has none of that name."""
-        return self[topic] if topic in self._topics else default
+        return self[topic] if topic in self else default  # noqa: SIM401 (this is that method)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._topics)
@@ -110,55 +124,87 @@ class Bag(Mapping[str, Any]):
         return len(self._topics)
 
     def array(self, topic: str) -> npt.NDArray[Any]:
-        """Return a topic of one-joint JointState as an array.
+        """Return a topic of one-joint JointState as an array, with times that can be reckoned with.
+
+        Where a clock stepped back, later times are moved so that they go on; stamps that were never set are those of
+        the log (``clock_notes`` tells).
 
         Raises:
             DataError: The topic is missing, or its messages are something else.
         """
         values = self[topic]
         if not isinstance(values, np.ndarray):
-            held = _held(self._topics[topic].info.type, values)
+            held = _held(self._entry(topic).info.type, values)
             way_out = "; export writes a column for each joint" if " joints (" in held else ""
             raise DataError(
                 f"topic {topic} of bag {self.path} holds {held}; "
                 f"expected sensor_msgs/msg/JointState of one joint{way_out}"
             )
+        recorded = values["log_time_ns"], values["stamp_ns"]
+        log_times, stamps = self._timed(topic, *recorded)
+        if log_times is recorded[0] and stamps is recorded[1]:
+            return values
+        values = values.copy()
+        values["log_time_ns"], values["stamp_ns"] = log_times, stamps
         return values
 
     def joints(self, topic: str) -> JointTable:
         """Return a topic of JointState, of one joint or several, as arrays with one column for each joint.
 
+        Times are as those of :meth:`array`.
+
         Raises:
             DataError: The topic is missing, its messages are something else, or not all of the same joints.
         """
         if topic not in self._tables:
-            self._tables[topic] = joint_table(self.raw(topic), f"topic {topic} of bag {self.path}")
+            table = joint_table(self.raw(topic), f"topic {topic} of bag {self.path}")
+            log_times, stamps = self._timed(topic, table.log_time_ns, table.stamp_ns)
+            self._tables[topic] = replace(table, log_time_ns=log_times, stamp_ns=stamps)
         return self._tables[topic]
 
     def joint_names(self, topic: str) -> tuple[str, ...]:
         """Return the joints that the first message of a topic names; none where it has none or is no JointState."""
-        batches = self._batches({topic})[topic] if self._is_fixed(topic) else []
+        batches = self._batches(topic) if self._is_fixed(topic) else []
         first = next((decode_joint_state(data) for batch in batches for _, data in batch.payloads()), None)
         return () if first is None else first.joints
 
     def load(self) -> Bag:
-        """Read all topics now, in one pass over the files, and return the bag."""
-        self._load([topic for topic in self._topics if topic not in self._arrays])
+        """Read all topics now, in one pass over the files, and return the bag; one that cannot be read is left."""
+        topics = [topic for topic in self._topics if topic not in self._arrays]
+        self._load([topic for topic in topics if self._is_fixed(topic)])
+        for topic in topics:
+            with contextlib.suppress(DataError):
+                self._load([topic] if topic not in self._arrays else [])
         return self
 
     def raw(self, topic: str) -> list[tuple[int, bytes]]:
-        """Return all messages of a topic as (log time [ns], CDR bytes), ordered by log time."""
-        rows = [row for batch in self._batches({topic})[topic] for row in batch.payloads()]
-        rows.sort(key=lambda row: row[0])
-        return rows
+        """Return all messages of a topic as (log time [ns], CDR bytes), ordered by log time.
+
+        Where the recorder's clock stepped back, what came after the step follows what came before.
+        """
+        rows = [row for batch in self._batches(topic) for row in batch.payloads()]
+        order = self._order(topic, np.array([time for time, _ in rows], np.int64))
+        return rows if order is None else [rows[place] for place in order.tolist()]
 
     def log_times(self, topic: str) -> Int64:
-        """Return the log times of a topic in ascending order [ns], shape (n,), without reading its messages."""
-        batches = self._batches({topic})[topic]
+        """Return the log times of a topic in the order of :meth:`raw` [ns], shape (n,); no message is read."""
+        batches = self._batches(topic)
         for batch in batches:
             batch.check_heads()
-        times = [batch.times for batch in batches]
-        return np.sort(np.concatenate(times)) if times else np.empty(0, np.int64)
+        times = np.concatenate([np.empty(0, np.int64), *(batch.times for batch in batches)])
+        order = self._order(topic, times)
+        return times if order is None else times[order]
+
+    def clock_steps(self) -> list[ClockStep]:
+        """Return where the recorder's clock stepped back."""
+        if self._steps is None:
+            self._steps = find_steps(self._wanted(set(self._topics)), self._span)
+            self.clock_notes += [
+                f"log times step back {step.after_ns * 1e-9:.3f} s after the first of them, by "
+                f"{step.size_ns * 1e-9:.3f} s: what follows is read in the order of the file"
+                for step in self._steps
+            ]
+        return self._steps
 
     def messages(self, topic: str) -> list[StoredMessage]:
         """Return all messages of a topic as objects, whatever their type.
@@ -169,12 +215,12 @@ class Bag(Mapping[str, Any]):
         from pendulum_rosbag.reader.decode import decoder_for
 
         rows = self.raw(topic)
-        foreign = {stream.serialization for _, stream in self._topics[topic].streams} - {"cdr"}
+        foreign = {stream.serialization for _, stream in self._entry(topic).streams} - {"cdr"}
         if foreign:
             raise DataError(
                 f"topic {topic} of bag {self.path} is encoded as {foreign.pop()!r}; expected CDR, as of ROS 2"
             )
-        decode = decoder_for(self._topics[topic].info)
+        decode = decoder_for(self._entry(topic).info)
         return [StoredMessage(time, decode(data)) for time, data in rows]
 
     def events(self) -> list[dict[str, Any]]:
@@ -183,19 +229,22 @@ class Bag(Mapping[str, Any]):
         Each event has ``stamp_ns``, ``name``, ``topic``, ``log_time_ns`` and whatever its author added. A text that
         is no JSON object becomes an event with that text as its name.
         """
-        events = []
+        events: list[dict[str, Any]] = []
         for name, topic in self._topics.items():
             if topic.info.type != _STRING or name.rsplit("/", 1)[-1] != "events":
                 continue
-            for time, data in self.raw(name):
+            rows = self.raw(name)
+            times = self._moved(name, np.array([time for time, _ in rows], np.int64)).tolist()
+            for (time, data), moved in zip(rows, times, strict=True):
                 size = int.from_bytes(data[4:8], "little")
                 text = data[8 : 8 + size].split(b"\0")[0].decode("utf-8", "replace")
                 content = parsed(text)
-                event = content if isinstance(content, dict) else {"name": text}
-                events.append({"stamp_ns": time, "name": "", **event, "topic": name, "log_time_ns": time})
-        for event in events:
-            if not isinstance(event["stamp_ns"], int):
-                event["stamp_ns"] = event["log_time_ns"]  # anybody may write there
+                event: dict[str, Any] = content if isinstance(content, dict) else {"name": text}
+                event = {"stamp_ns": time, "name": "", **event, "topic": name, "log_time_ns": time}
+                if not isinstance(event["stamp_ns"], int):
+                    event["stamp_ns"] = time  # anybody may write there
+                event["stamp_ns"] += sum(size for known, size in self._stamp_steps if moved >= known)
+                events.append(event)
         events.sort(key=lambda event: (event["stamp_ns"], event["log_time_ns"]))
         return events
 
@@ -217,17 +266,65 @@ class Bag(Mapping[str, Any]):
     # -- parts -------------------------------------------------------------------------------------------------
 
     def _entry(self, topic: str) -> _Topic:
-        if topic not in self._topics:
+        found = self._topics.get(topic) or self._topics.get(self._also.get(topic, ""))
+        if found is None:
             raise DataError(f"bag {self.path} has no topic {topic}; it has {', '.join(sorted(self._topics)) or 'none'}")
-        return self._topics[topic]
-
-    def _batches(self, topics: set[str]) -> dict[str, list[Batch]]:
-        """Collect the batches of some topics over all files in order."""
-        found: dict[str, list[Batch]] = {topic: [] for topic in topics}
-        for source, wanted in self._wanted(topics):
-            for batch in source.batches(set(wanted), *self._span):
-                found[wanted[batch.channel]].append(batch)
         return found
+
+    def _batches(self, topic: str) -> list[Batch]:
+        """Collect the batches of a topic over all files in order."""
+        return [batch for source, wanted in self._wanted({topic}) for batch in source.batches(set(wanted), *self._span)]
+
+    def _order(self, topic: str, times: Int64) -> Int64 | None:
+        """Return the order of messages that stand in the order of the files; ``None`` where it is that already."""
+        if len(times) < 2 or bool((times[1:] >= times[:-1]).all()):
+            return None
+        # A topic with few messages does not show itself whether its clock stepped, or messages were late.
+        if int(np.diff(times).min()) > -CLOCK_JUMP * 1e9 and not steps_back(times):
+            return np.argsort(times, kind="stable")
+        name = self._entry(topic).info.name
+        return pass_order(times, [step.rows.get(name, 0) for step in self.clock_steps()])
+
+    def _timed(self, topic: str, log_times: Int64, stamps: Int64) -> tuple[Int64, Int64]:
+        """Return log times and stamps of a topic that go on where a clock stepped back, all stamps set."""
+        name = self._entry(topic).info.name
+        if len(log_times) and int(np.diff(log_times).min(initial=0)) < 0:
+            self.clock_steps()
+        log_times = self._moved(name, log_times)
+        is_set = set_stamps(log_times, stamps)
+        if not is_set.all():
+            count = int(np.sum(~is_set))
+            self._note(f"{count} of {len(stamps)} messages on {name} have no stamp: their log times are taken")
+            age = int(np.median((log_times - stamps)[is_set])) if is_set.any() else 0
+            stamps = np.where(is_set, stamps, log_times - age)
+        own = {int(log_times[row]): row for row in steps_back(stamps)}
+        for time, row in own.items():
+            if not any(abs(time - known) < 10**9 for known, _ in self._stamp_steps):
+                size = go_on(stamps, row)
+                self._stamp_steps.append((time, size))
+                self.cuts_ns.append(int(stamps[row]) + size + sum(size for _, size in self._stamp_steps[:-1]))
+                self._note(
+                    f"stamps on {name} step back by {size * 1e-9:.3f} s, {(time - int(log_times[0])) * 1e-9:.3f} s "
+                    "after the first: what follows is taken as going on there"
+                )
+        for known, size in self._stamp_steps:
+            row = next((row for time, row in own.items() if abs(time - known) < 10**9), -1)
+            row = int(np.searchsorted(log_times, known)) if row < 0 else row
+            stamps = stamps.copy()
+            stamps[row:] += size
+        return log_times, stamps
+
+    def _moved(self, name: str, log_times: Int64) -> Int64:
+        """Return the log times of a topic, those after a step of the clock moved so that they go on."""
+        for step in self._steps or []:
+            if step.rows.get(name, len(log_times)) < len(log_times):
+                log_times = log_times.copy()
+                log_times[step.rows[name] :] += step.size_ns
+        return log_times
+
+    def _note(self, sentence: str) -> None:
+        if sentence not in self.clock_notes:
+            self.clock_notes.append(sentence)
 
     def _wanted(self, topics: set[str]) -> Iterator[tuple[Source, dict[int, str]]]:
         streams = {name: self._entry(name).streams for name in topics}
@@ -258,7 +355,11 @@ class Bag(Mapping[str, Any]):
         for source, wanted in self._wanted(set(topics)):
             for batch in source.batches(set(wanted), *self._span):
                 parsers[wanted[batch.channel]].add(batch)
-        return {topic: parser.result() for topic, parser in parsers.items()}
+        return {topic: self._sorted(topic, parser.result()) for topic, parser in parsers.items()}
+
+    def _sorted(self, topic: str, array: npt.NDArray[Any] | None) -> npt.NDArray[Any] | None:
+        order = None if array is None else self._order(topic, array["log_time_ns"])
+        return array if array is None or order is None else array[order]
 
 
 def read_bag(
@@ -321,16 +422,21 @@ def _group(sources: Sequence[Source], hashes: Mapping[str, str]) -> tuple[dict[s
     The type of most messages has the name; others of it are offered as ``NAME (TYPE)``.
     """
     grouped: dict[str, dict[str, list[tuple[Source, Stream]]]] = {}
+    stored = {stream.topic for source in sources for stream in source.streams}
     for source in sources:
         for stream in source.streams:
-            grouped.setdefault(stream.topic, {}).setdefault(stream.type, []).append((source, stream))
+            name = ros_topic(stream.topic)
+            if name != stream.topic and name in stored:
+                name = stream.topic  # another topic has that name
+            kind = ros_type(stream.type) or _type_of_messages(source, stream)
+            grouped.setdefault(name, {}).setdefault(kind, []).append((source, stream))
     topics: dict[str, _Topic] = {}
     sentences = []
     for name, by_type in sorted(grouped.items()):
         kinds = sorted(by_type, key=lambda kind: -sum(stream.count for _, stream in by_type[kind]))
         for kind in kinds:
             offered = name if kind == kinds[0] else f"{name} ({kind})"
-            topics[offered] = _topic(offered, by_type[kind], hashes.get(name, "") if kind == kinds[0] else "")
+            topics[offered] = _topic(offered, kind, by_type[kind], hashes.get(name, "") if kind == kinds[0] else "")
         if len(kinds) > 1:
             others = ", ".join(repr(f"{name} ({kind})") for kind in kinds[1:])
             sentences.append(
@@ -340,11 +446,20 @@ def _group(sources: Sequence[Source], hashes: Mapping[str, str]) -> tuple[dict[s
     return topics, sentences
 
 
-def _topic(name: str, streams: list[tuple[Source, Stream]], type_hash: str) -> _Topic:
+def _type_of_messages(source: Source, stream: Stream) -> str:
+    """Return JointState for a topic without a type whose first message is one; else nothing."""
+    if stream.serialization != "cdr" or not stream.count:
+        return ""
+    batches = source.batches({stream.channel}, None, None)
+    first = next((decode_joint_state(data) for batch in batches for _, data in batch.payloads()), None)
+    return _JOINT_STATE if first is not None and first.joints else ""
+
+
+def _topic(name: str, kind: str, streams: list[tuple[Source, Stream]], type_hash: str) -> _Topic:
     first = next((stream for _, stream in streams if stream.definition), streams[0][1])
     count = sum(stream.count for _, stream in streams)
     hash_told = first.hash or type_hash
-    info = TopicInfo(name, first.type, count, hash_told, first.qos, first.definition, first.serialization)
+    info = TopicInfo(name, kind, count, hash_told, first.qos, first.definition, first.serialization)
     return _Topic(info, streams)
 
 

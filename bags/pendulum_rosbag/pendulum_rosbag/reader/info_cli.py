@@ -28,7 +28,7 @@ def info(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
     as_json: Json = False,
 ) -> int:
-    """Print rates, gaps, jitter, latencies between topics, duplicates and clock jumps of a bag."""
+    """Print whether a bag is good: rates, gaps, jitter, latencies between topics, duplicates and clock jumps."""
     opened = read_bag(bag, verify=True)
     statistics = bag_statistics(opened)
     if as_json:
@@ -46,6 +46,9 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any], notes: list[str]
         highlight=False,
         soft_wrap=True,
     )
+    verdict = f"NOT GOOD: {'; '.join(statistics.problems)}" if statistics.problems else "good"
+    style = "bold red" if statistics.problems else "bold green"
+    console.print(f"recording: {verdict}", style=style, highlight=False, soft_wrap=True, markup=False)
     for sentence in statistics.damage:
         console.print(f"damaged: {sentence}", style="bold red", highlight=False, soft_wrap=True)
     for sentence in notes:

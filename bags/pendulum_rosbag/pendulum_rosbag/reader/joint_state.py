@@ -224,13 +224,13 @@ class JointStateParser:
         self._fixed = _parse_batch(batch, columns)
 
     def result(self) -> npt.NDArray[Any] | None:
-        """Return the messages ordered by log time.
+        """Return the messages in the order in which they were added.
 
         Returns:
             Structured array with the columns :data:`FIELDS`, and ``frame_id`` when any message has one; ``None``
             when a message is no one-joint JointState in little-endian CDR.
         """
-        return _ordered(_with_frames(self._columns)) if self._fixed else None
+        return _with_frames(self._columns) if self._fixed else None
 
 
 def _parse_batch(batch: Batch, columns: _Columns) -> bool:
@@ -376,13 +376,6 @@ def _with_frames(columns: _Columns) -> npt.NDArray[Any]:
         rows: Any = slice(place, place + length) if length >= 0 else place
         wide["frame_id"][rows] = text
     return wide
-
-
-def _ordered(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    times = array["log_time_ns"]
-    if len(times) > 1 and bool((times[1:] < times[:-1]).any()):
-        return array[np.argsort(times, kind="stable")]
-    return array
 
 
 def _message(batch: Batch, offset: int, size: int | None) -> bytes:

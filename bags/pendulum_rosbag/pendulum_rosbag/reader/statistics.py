@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.batches import Int64
+from pendulum_rosbag.reader.clock import CLOCK_JUMP, set_stamps
 from pendulum_rosbag.reader.topic_info import TopicInfo
 from pendulum_rosbag.storage.stamps import stamp_reader
 
@@ -19,8 +22,11 @@ GAP_FACTOR = 1.5
 """An interval counts as a gap when it is longer than this many median intervals."""
 BURST_FACTOR = 2.0
 """Messages without stamps come in bursts when their mean interval is longer than this many median intervals."""
-CLOCK_JUMP = 0.05
-"""A lasting step of the difference between log time and stamp counts as a clock jump from this size [s]."""
+_LEAST_PERIODIC = 0.5
+"""Share of the intervals that are near the median where messages have a period; events have none."""
+_FEWEST_PERIODIC = 10
+TOLERATED = 0.02
+"""Share of messages that may be missing, or come twice, in a good recording."""
 _LASTING = 2.0
 """How long a step has to last [s]: longer than any pause of a machine, after which messages are late, then on time."""
 _LEAST_AFTER = 5
@@ -42,12 +48,13 @@ class TopicStatistics:
         jitter: Standard deviation of the intervals.
         period_p99: 99 % of the intervals are at most that long.
         longest: Longest interval.
-        gaps: Intervals longer than 1.5 median intervals; none where messages come in bursts (see ``time_statistics``).
+        gaps: Intervals longer than 1.5 median intervals; none where messages have no period (see ``time_statistics``).
         missing: Messages that would fill the gaps at the median interval (a late message leaves none behind).
         duplicates: Messages that carry the stamp of an earlier one (of the same sender, where they name it).
         backward: Messages whose stamp lies before that of the message before.
         clock_jumps: Steps of more than 50 ms in the difference between log time and stamp that last, or that no
             delay explains (see ``clock_jumps``).
+        unset: Messages whose stamp was never set; then log times are taken, and there is no age.
         stamped: Whether the intervals are those between stamps; else between log times.
         age: Median of log time minus stamp.
         age_p99: 99 % of the messages are at most that old when logged.
@@ -65,6 +72,7 @@ class TopicStatistics:
     duplicates: int = 0
     backward: int = 0
     clock_jumps: int = 0
+    unset: int = 0
     stamped: bool = False
     age: float = np.nan
     age_p99: float = np.nan
@@ -103,6 +111,8 @@ class BagStatistics:
     latencies: list[Latency] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
     damage: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    """Why it is no good recording, one sentence each; empty for a good one."""
 
 
 def time_statistics(
@@ -111,17 +121,19 @@ def time_statistics(
     """Return the timing of one topic.
 
     Intervals are those between stamps where messages have them (a recorder that reads in batches cannot blur them),
-    else those between log times. Messages without stamps whose mean interval is more than twice the median come in
-    bursts, as events do: they have no period that could leave gaps.
+    else those between log times. Messages of which fewer than half come near the median interval, as events do, or that
+    have no stamps and come in bursts, have no period that could leave gaps.
 
     Args:
         kind: Message type.
         log_times: Log times in ascending order [ns], shape (n,).
-        stamps: Stamps of the messages [ns], shape (n,); zeros count as no stamp.
+        stamps: Stamps of the messages [ns], shape (n,); see ``set_stamps`` for those that were never set.
         senders: Who sent each message, shape (n,), where the messages say so.
     """
     result = TopicStatistics(kind, len(log_times))
-    stamped = stamps is not None and len(stamps) > 0 and bool(stamps.any())
+    if stamps is not None and len(stamps):
+        result.unset = int(np.sum(~set_stamps(log_times, stamps))) if stamps.any() else len(stamps)
+    stamped = stamps is not None and len(stamps) > 0 and not result.unset
     times = stamps if stamped and stamps is not None else log_times
     result.stamped = stamped
     if len(times) == 0:
@@ -139,6 +151,9 @@ def time_statistics(
     result.period_p99 = float(np.quantile(ascending, 0.99)) * _MS
     result.longest = float(ascending.max()) * _MS
     if not stamped and float(np.mean(ascending)) > BURST_FACTOR * median:
+        return result
+    near = np.mean(np.abs(ascending - median) <= (GAP_FACTOR - 1.0) * median)
+    if near < _LEAST_PERIODIC or len(log_times) < _FEWEST_PERIODIC:
         return result
     result.gaps = int(np.sum(ascending > GAP_FACTOR * median))
     # A late message makes a long interval and a short one: together they miss nothing.
@@ -234,7 +249,12 @@ def bag_statistics(bag: Bag) -> BagStatistics:
     echoes: dict[str, tuple[Int64, Int64]] = {}
     for name, info in bag.topics.items():
         is_joint_state = info.type == "sensor_msgs/msg/JointState" and info.serialization == "cdr"
-        values = bag[name] if is_joint_state else None
+        values = None
+        if is_joint_state:
+            # A topic that is no JointState though it says so costs no other; ``array`` finds out about clocks.
+            with contextlib.suppress(DataError):
+                values = bag[name]
+                bag.array(name)
         stamps: Int64 | None
         if isinstance(values, np.ndarray):
             log_times, stamps = values["log_time_ns"], values["stamp_ns"]
@@ -243,8 +263,27 @@ def bag_statistics(bag: Bag) -> BagStatistics:
         else:
             log_times, stamps = _times(bag, info)
             result.topics[name] = time_statistics(info.type, log_times, stamps)
-        if is_joint_state and stamps is not None:
+        if is_joint_state and stamps is not None and result.topics[name].stamped:
             echoes[name] = log_times, stamps
     result.latencies = _latencies(echoes)
     result.events = bag.events()
+    result.problems = [*result.damage, *bag.clock_notes]
+    for name, topic in result.topics.items():
+        result.problems += [f"{name}: {sentence}" for sentence in _problems(topic)]
+    if not total:
+        result.problems.append("there is no message")
     return result
+
+
+def _problems(topic: TopicStatistics) -> list[str]:
+    """Return what is wrong with the timing of a topic, in words."""
+    found = []
+    if topic.missing > TOLERATED * topic.count:
+        found.append(f"{topic.missing} messages are missing between {topic.count}")
+    if topic.gaps and topic.longest > max(10.0 * topic.period, 100.0):
+        found.append(f"nothing for {topic.longest / 1000.0:.3f} s")
+    if topic.duplicates > TOLERATED * topic.count:
+        found.append(f"{topic.duplicates} of {topic.count} messages repeat a stamp")
+    if topic.clock_jumps:
+        found.append(f"log time and stamp step apart {topic.clock_jumps} times")
+    return found
