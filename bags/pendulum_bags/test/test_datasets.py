@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from pendulum_bags.runs.csv_mapping import read_csv
+from pendulum_bags.runs.csv_mapping import MAPPINGS, read_csv
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
@@ -97,7 +97,7 @@ def test_another_delimiter_and_a_file_without_rows_are_named(tmp_path):
     path = tmp_path / "run.csv"
     path.write_text("time;position;torque\n0;0;0\n0.01;0;0\n")
     with refused("a mapping file with `delimiter: ';'` reads it otherwise"):
-        read_recording(path)
+        read_recording(path, {**MAPPINGS["pendulum"], "delimiter": ","})
     path.write_text("time,position,torque\n")
     with refused("has no rows below its header"):
         read_recording(path)

@@ -13,7 +13,9 @@ The unit of ``input`` says what drives the joint: a torque, a voltage, or an ang
 ``input`` the pendulum swings freely. ``hold`` says what the input does between two samples: ``zero`` stays (a
 command), ``linear`` goes straight to the next (a measurement; the default for a torque). ``detrend: constant`` or
 ``linear`` takes a mean or a drift from the input of a bad torque sensor. ``skip`` lines before the header, if any,
-are left out; ``drop_nan: true`` leaves out rows with a NaN. An angle that jumps by whole turns is unwrapped.
+are left out, as are lines that begin with ``#``; ``drop_nan: true`` leaves out rows with a NaN or an empty cell. Where
+each row has the columns of one topic, states are taken from their rows and the input from its own. An angle that jumps
+by whole turns is unwrapped; where the time steps back, the recording is cut.
 """
 
 from __future__ import annotations
@@ -21,15 +23,17 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.runs.datasets import Recording, first_of_each_stamp
+from pendulum_bags.runs.datasets import Recording, continued, first_of_each_stamp
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.parameters import load_yaml, suggestion
 
@@ -72,6 +76,9 @@ MAPPINGS: Mapping[str, Mapping[str, Any]] = {
 """Built-in mappings: ``pendulum`` (the default), ``voltage_40hz`` (a motor-driven disc, no time column), and
 ``free_swing`` (no input)."""
 
+_DELIMITERS = (",", ";", "\t")
+_DECIMAL_COMMA, _DECIMAL_POINT = re.compile(r"\d,\d"), re.compile(r"\d\.\d")
+
 _SECTION_KEYS = {
     "time": {"column", "unit", "period", "start"},
     "position": {"column", "unit", "sign", "offset"},
@@ -101,8 +108,8 @@ def read_csv(
     """
     source = Path(path)
     rules, origin = _load_mapping(mapping)
-    delimiter = rules.get("delimiter", ",")
-    if not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter in '\r\n"':
+    delimiter = rules.get("delimiter", "")
+    if "delimiter" in rules and (not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter in '\r\n"'):
         raise DataError(f"{origin}: delimiter is {delimiter!r}; expected one character")
     skip = rules.get("skip", 0)
     if type(skip) is not int or skip < 0:
@@ -117,25 +124,36 @@ def read_csv(
     meta = {"source": str(source), "mapping": origin, **given}
     if first or last < len(table) + first:
         meta["rows"] = [first, last]
-    if rules.get("drop_nan") is True:
+    by_topic = None if also else _rows_by_topic(rules, names, table)
+    input_table = table
+    if by_topic is not None:
+        table, input_table = by_topic
+        meta["rows_by_topic"] = True
+    elif rules.get("drop_nan") is True:
         whole = np.isfinite(table[:, [name.casefold() in wanted for name in names]]).all(axis=1)
         meta["nan_rows"] = int(np.sum(~whole))
-        table = table[whole]
-    time = _time(rules["time"], names, table, source, origin, first)
+        table = input_table = table[whole]
+    time, steps = continued(_time(rules["time"], names, table, source, origin, first))
+    if steps:
+        meta["clock_notes"] = steps
     position = _column("position", rules["position"], "angle", names, table, source, origin, first)
     assert position is not None
     velocity = None
     if "velocity" in rules:
         velocity = _column("velocity", rules["velocity"], "velocity", names, table, source, origin, first)
-    drive, kind, between = np.zeros_like(time), "none", "linear"
+    drive, kind, between, stamps = np.zeros_like(time), "none", "linear", None
     if "input" in rules:
         section = rules["input"]
         quantity = _quantity_of(section.get("unit"), origin)
-        column = _column("input", section, quantity, names, table, source, origin, first)
+        column = _column("input", section, quantity, names, input_table, source, origin, first)
         assert column is not None
+        if by_topic is not None:
+            stamps, _ = continued(_time(rules["time"], names, input_table, source, origin, first))
+            kept = first_of_each_stamp(stamps)
+            stamps, column = stamps[kept], column[kept]
         drive = _detrended(column, section.get("detrend"), origin)
         kind = {"effort": "effort", "voltage": "voltage", "angle": "position_goal"}[quantity]
-        between = hold or str(section.get("hold", "linear" if kind == "effort" else "zero"))
+        between = hold or str(section.get("hold", "linear" if kind == "effort" and stamps is None else "zero"))
         # Nobody said so of this file: a built-in mapping and a default are guesses.
         if hold is None and ("hold" not in section or origin.startswith("built-in")):
             meta["hold_assumed"] = True
@@ -143,9 +161,30 @@ def read_csv(
     kept = first_of_each_stamp(time)
     if not kept.all():
         meta["repeated_stamps"] = int(np.sum(~kept))
-        time, position, drive = time[kept], position[kept], drive[kept]
+        time, position = time[kept], position[kept]
+        drive = drive[kept] if stamps is None else drive
         velocity = None if velocity is None else velocity[kept]
-    return Recording(time, position, velocity, drive, input_kind=kind, hold=between, meta=meta)
+    return Recording(time, position, velocity, drive, input_kind=kind, hold=between, input_time=stamps, meta=meta)
+
+
+def _rows_by_topic(rules: Mapping[str, Any], names: list[str], table: Array) -> tuple[Array, Array] | None:
+    """Return the rows with a state and those with an input, of a log that has no row with both; else ``None``."""
+    if "input" not in rules:
+        return None
+    has = {key: _finite(rules[key], names, table) for key in ("time", "position", "velocity", "input") if key in rules}
+    states = has["time"] & has["position"]
+    inputs = has["time"] & has["input"]
+    if (states & inputs).any() or not (states.any() and inputs.any()):
+        return None
+    if "velocity" in has and (states & has["velocity"]).any():
+        states &= has["velocity"]
+    return table[states], table[inputs]
+
+
+def _finite(section: Mapping[str, Any], names: list[str], table: Array) -> NDArray[np.bool_]:
+    """Return which rows have a number in the column of a section; all where it names none that is there."""
+    found = _found_column(section, names)
+    return np.ones(len(table), bool) if found is None else np.isfinite(table[:, names.index(found)])
 
 
 def _load_mapping(mapping: str | Path | Mapping[str, Any] | None) -> tuple[Mapping[str, Any], str]:
@@ -206,13 +245,14 @@ def _read_table(source: Path, delimiter: str, skip: int, wanted: set[str]) -> tu
     lines = text.split("\n", skip)
     if len(lines) <= skip:
         raise DataError(f"{source} has {len(lines)} lines; expected a header after the {skip} lines to skip")
-    head, _, body = lines[skip].partition("\n")
+    head, body, line = _head_and_body(lines[skip])
+    delimiter = delimiter or max(_DELIMITERS, key=head.count)
     try:
         cells = next(csv.reader([head.lstrip("# ").strip()], delimiter=delimiter), [])
     except (csv.Error, TypeError) as error:
         raise DataError(f"{source} begins with a line that is no CSV: {error}") from error
     names = [name.strip() for name in cells]
-    others = [mark for mark in (";", "\t", ",") if mark != delimiter and mark in head]
+    others = [mark for mark in _DELIMITERS if mark != delimiter and mark in head]
     if len(names) == 1 and others:
         raise DataError(
             f"{source} has one column, {names[0][:60]!r}, between {delimiter!r}; expected several: a mapping file with "
@@ -225,22 +265,46 @@ def _read_table(source: Path, delimiter: str, skip: int, wanted: set[str]) -> tu
         )
     if not body.strip():
         raise DataError(f"{source} has no rows below its header")
+    if delimiter != "," and _DECIMAL_COMMA.search(body) and not _DECIMAL_POINT.search(body):
+        body = body.replace(",", ".")
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=delimiter, ndmin=2)
     except ValueError as error:
         used = [index for index, name in enumerate(names) if name.casefold() in wanted]
-        if bad := _first_bad_cell(body, names, delimiter, skip, used):
+        if bad := _first_bad_cell(body, names, delimiter, skip + line, used):
             raise DataError(f"{source}: {bad}") from error
         if not used:
             raise DataError(f"{source}: {error}") from error
-        rows = [row for row in csv.reader(io.StringIO(body), delimiter=delimiter) if row]
+        rows = [row for row in csv.reader(io.StringIO(body), delimiter=delimiter) if _is_row(row)]
         table = np.full((len(rows), len(names)), np.nan)
-        table[:, used] = [[float(row[index]) for index in used] for row in rows]
+        table[:, used] = [[float(row[index].strip() or "nan") for index in used] for row in rows]
     if table.size == 0:
         raise DataError(f"{source} has no rows below its header")
     if table.shape[1] != len(names):
-        raise DataError(f"{source} has {table.shape[1]} columns of numbers but {len(names)} names in its header")
+        halves = delimiter == "," and table.shape[1] == 2 * len(names) and not _DECIMAL_POINT.search(body)
+        hint = "; decimal commas cannot be told from those between columns: write points, or `;` between columns"
+        raise DataError(
+            f"{source} has {table.shape[1]} columns of numbers but {len(names)} names in its header{hint * halves}"
+        )
     return names, table
+
+
+def _head_and_body(text: str) -> tuple[str, str, int]:
+    """Return the line that names the columns, what is below it, and the number of lines before it.
+
+    Lines that begin with ``#`` are comments; the last of them names the columns where numbers follow.
+    """
+    lines = text.split("\n")
+    first = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
+    comments = [i for i in range(first) if lines[i].strip()]
+    if comments and (first == len(lines) or _is_number(re.split(r"[,;\t ]", lines[first].strip())[0] or "0")):
+        first = comments[-1]
+    head = min(first, len(lines) - 1)
+    return lines[head], "\n".join(lines[head + 1 :]), head
+
+
+def _is_row(row: Sequence[str]) -> bool:
+    return bool(row) and not row[0].startswith("#")
 
 
 def _first_bad_cell(body: str, names: list[str], delimiter: str, skip: int, used: Sequence[int]) -> str | None:
@@ -249,12 +313,12 @@ def _first_bad_cell(body: str, names: list[str], delimiter: str, skip: int, used
             row = next(csv.reader([line], delimiter=delimiter), [])
         except csv.Error as error:
             return f"line {number} is no CSV: {error}"
-        if not row:
+        if not _is_row(row):
             continue
         if len(row) != len(names):
             return f"line {number} has {len(row)} cells; expected {len(names)} ({', '.join(names)})"
         for index in used:
-            if not _is_number(row[index]):
+            if row[index].strip() and not _is_number(row[index]):
                 return f"line {number}, column {names[index]!r} holds {row[index].strip()!r}; expected a number"
     return None
 
@@ -300,16 +364,10 @@ def _column(
     origin: str,
     first_row: int,
 ) -> Array | None:
-    wanted = section.get("column")
-    candidates = wanted if isinstance(wanted, (list, tuple)) else [wanted] if wanted else []
+    candidates = _candidates(section)
     if not all(isinstance(candidate, str) for candidate in candidates):
-        raise DataError(f"{origin}: column of {name} is {wanted!r}; expected a name or a list of names")
-    found = next((column for column in candidates if column in names), None)
-    if found is None:
-        # Capital letters are no other quantity, as long as only one column can be meant.
-        wanted_names = {str(candidate).casefold() for candidate in candidates}
-        alike = [column for column in names if column.casefold() in wanted_names]
-        found = alike[0] if len(alike) == 1 else None
+        raise DataError(f"{origin}: column of {name} is {section['column']!r}; expected a name or a list of names")
+    found = _found_column(section, names)
     if found is None:
         if section.get("optional"):
             return None
@@ -328,9 +386,26 @@ def _column(
     if bad.size:
         raise DataError(
             f"{source}: column {found!r} is {raw[bad[0]]} in row {bad[0] + first_row} ({bad.size} such rows); "
-            "expected finite numbers: cut with `rows` or repair the file"
+            "expected finite numbers: `drop_nan: true` in the mapping file leaves such rows out"
         )
     return np.asarray(sign * (raw + _number("offset", section, name, origin)) * factor)
+
+
+def _candidates(section: Mapping[str, Any]) -> Sequence[Any]:
+    wanted = section.get("column")
+    return wanted if isinstance(wanted, (list, tuple)) else [wanted] if wanted else []
+
+
+def _found_column(section: Mapping[str, Any], names: list[str]) -> str | None:
+    """Return the first column of a table that a section names."""
+    candidates = _candidates(section)
+    found = next((column for column in candidates if column in names), None)
+    if found is None:
+        # Capital letters are no other quantity, as long as only one column can be meant.
+        wanted_names = {str(candidate).casefold() for candidate in candidates}
+        alike = [column for column in names if column.casefold() in wanted_names]
+        found = alike[0] if len(alike) == 1 else None
+    return found
 
 
 def _time(

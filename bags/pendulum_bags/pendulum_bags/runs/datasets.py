@@ -16,14 +16,17 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_msgs_py.errors import DataError
+from pendulum_rosbag.reader.clock import steps_back
 
 __all__ = [
     "INPUT_KINDS",
     "Recording",
     "check_consistency",
+    "continued",
     "data_notes",
     "distinct_names",
     "first_of_each_stamp",
+    "gap_length",
     "gaps",
     "unwrap",
 ]
@@ -33,6 +36,9 @@ INPUT_KINDS: Mapping[str, str] = {"effort": "N m", "voltage": "V", "position_goa
 
 FASTEST = 300.0
 """Speed that no pendulum on a drive reaches [rad/s]: a faster change of the angle is a jump of the recording."""
+
+_MOST_JOINTS, _LEAST_PIECE, _LEAST_JUMP = 5, 50, 0.3
+"""Jumps of the angle that join recordings: how many at most, samples between two of them, and size [rad] at least."""
 
 _CONSISTENCY_FACTORS = (
     ("deg/s instead of rad/s", 180.0 / np.pi),
@@ -159,7 +165,11 @@ class Recording:
 
 def data_notes(recording: Recording) -> list[str]:
     """Return what was done to a recording while it was read, in words."""
-    notes = []
+    notes = [f"{sentence}." for sentence in recording.meta.get("clock_notes", ())]
+    if recording.meta.get("no_effort"):
+        notes.append("there is no effort in the bag: it is taken for a free swing.")
+    if recording.meta.get("rows_by_topic"):
+        notes.append("no row has both a state and an input: each is taken from its own rows.")
     if recording.meta.get("repeated_stamps"):
         notes.append(f"{recording.meta['repeated_stamps']} samples repeat the stamp before them and are left out.")
     if recording.meta.get("unwrapped"):
@@ -182,22 +192,52 @@ def gaps(recording: Recording) -> list[tuple[float, float]]:
     """
     found = []
     for stamps in {id(s): s for s in (recording.time, recording.input_stamps)}.values():
-        steps = np.diff(stamps)
-        if not steps.size:
-            continue
-        longest = max(10.0 * float(np.median(steps)), 0.1)
-        for i in np.flatnonzero(steps > longest):
+        for i in np.flatnonzero(np.diff(stamps) > _longest_step(stamps)):
             start, stop = float(stamps[i]), float(stamps[i + 1])
             if stop > recording.time[0] and start < recording.time[-1]:
                 found.append((start - float(recording.time[0]), stop - float(recording.time[0])))
     return sorted(found)
 
 
+def _longest_step(stamps: Array) -> float:
+    """Return the longest time between two stamps that is no gap [s]."""
+    return max(10.0 * float(np.median(np.diff(stamps))), 0.1) if stamps.size > 1 else 0.1
+
+
+def gap_length(stamps: Array) -> float:
+    """Return a time that counts as a gap between some stamps [s]."""
+    return 1.2 * _longest_step(stamps)
+
+
+def continued(time: Array) -> tuple[Array, list[str]]:
+    """Return stamps [s] that go on, behind a gap, where a clock stepped back, and a note on each step."""
+    notes = []
+    gap = gap_length(np.sort(time))
+    for row in steps_back(np.round(time * 1e9).astype(np.int64)):
+        size = float(time[row - 1] - time[row])
+        notes.append(f"the time steps back by {size:.3f} s in sample {row}: the recording is cut there")
+        time = np.concatenate([time[:row], time[row:] + size + gap])
+    return time, notes
+
+
+def _cut_at(recording: Recording, rows: NDArray[np.int64]) -> Recording:
+    """Return a recording of which what follows some samples is moved behind a gap."""
+    gap = gap_length(recording.time)
+    time, stamps = recording.time, recording.input_time
+    for row in rows.tolist():
+        at = time[row + 1]
+        stamps = None if stamps is None else np.where(stamps >= at, stamps + gap, stamps)
+        time = np.where(time >= at, time + gap, time)
+    return replace(recording, time=time, input_time=stamps)
+
+
 def unwrap(recording: Recording) -> Recording:
     """Return the recording with a continuous angle, and how often it jumped by a turn as ``unwrapped`` in ``meta``.
 
+    Where the angle jumps once and stays there, as between two recordings that were joined, it is cut.
+
     Raises:
-        DataError: where the angle jumps by something else, faster than any pendulum turns.
+        DataError: where the angle jumps by something else again and again, faster than any pendulum turns.
     """
     position = recording.position
     jumps = np.abs(np.diff(position)) > np.pi
@@ -209,6 +249,16 @@ def unwrap(recording: Recording) -> Recording:
         result = replace(recording, position=position, meta=meta)
     step = np.abs(np.diff(position))
     fast = np.flatnonzero((step > 1.0) & (step > FASTEST * np.diff(recording.time)))
+    near = np.diff(recording.time) <= _longest_step(recording.time)
+    odd = np.flatnonzero(near & (step > _LEAST_JUMP) & (step > 20.0 * float(np.quantile(step, 0.99))))
+    if 0 < odd.size <= _MOST_JOINTS and np.all(np.diff(odd, prepend=0, append=step.size) > _LEAST_PIECE):
+        notes = [
+            f"the angle jumps by {step[i]:.3g} rad {recording.time[i] - recording.time[0]:.2f} s after the start, as "
+            "between two recordings that were joined: the recording is cut there"
+            for i in odd
+        ]
+        meta = {**result.meta, "clock_notes": [*result.meta.get("clock_notes", ()), *notes]}
+        return replace(_cut_at(result, odd), meta=meta)
     if fast.size:
         i = int(fast[0])
         raise DataError(
@@ -242,7 +292,8 @@ def check_consistency(recording: Recording) -> Recording:
     """Return the recording if its velocity is the derivative of its position, else name the likely unit.
 
     The slope of travelled angle against integrated velocity is 1 in consistent units, 57.3 for degrees taken
-    as radians, and so on. Recordings that hardly move (less than 0.2 rad) are not judged.
+    as radians, and so on. Recordings that hardly move (less than 0.2 rad) are not judged, nor is what lies within a
+    gap: nobody knows how the pendulum moved there.
 
     Raises:
         DataError: where the slope lies outside 0.5 to 2.
@@ -254,8 +305,12 @@ def check_consistency(recording: Recording) -> Recording:
     integrated = np.concatenate(([0.0], np.cumsum(travel)))
     # Over stretches of about 0.1 s the quantisation of the angle and the noise of the velocity average out.
     stride = max(1, round(0.1 / recording.period))
-    moved = np.diff(recording.position[::stride])
-    expected = np.diff(integrated[::stride])
+    taken = slice(None, None, stride)
+    moved = np.diff(recording.position[taken])
+    expected = np.diff(integrated[taken])
+    passed = np.concatenate(([0], np.cumsum(step > _longest_step(recording.time))))
+    whole = np.diff(passed[taken]) == 0
+    moved, expected = moved[whole], expected[whole]
     power = float(moved @ moved)
     slope = float(expected @ moved) / power if power > 0.0 else 0.0
     if 0.5 <= slope <= 2.0:

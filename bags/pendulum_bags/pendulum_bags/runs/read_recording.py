@@ -18,6 +18,7 @@ from pendulum_bags.runs.bridge_programs import last_words, run_bridge_program
 from pendulum_bags.runs.csv_mapping import read_csv
 from pendulum_bags.runs.datasets import Recording, check_consistency, first_of_each_stamp, unwrap
 from pendulum_msgs_py.errors import DataError
+from pendulum_rosbag.reader.open_source import is_ros1
 
 __all__ = ["read_recording", "read_servo_log"]
 
@@ -38,7 +39,8 @@ def read_recording(
 
     Args:
         path: ``*.csv`` / ``*.txt``, ``*.json``, ``*.hebilog``, or a bag (folder, ``*.mcap`` or ``*.db3``).
-        mapping: For a HEBI log the lab file, which says zero, sign and tare. For CSV:
+        mapping: For a HEBI log the lab file, which says zero, sign and tare; for a bag nothing but ``free_swing``,
+            which takes no effort from it. For CSV:
             mapping file, name of a built-in mapping or the mapping itself; by default the
             columns must be called as in the built-in mapping ``pendulum``.
         effort: For bags: ``applied`` takes what the plant says it applied (topic ``applied_effort``),
@@ -55,9 +57,14 @@ def read_recording(
         raise DataError(f"{source} does not exist; expected a CSV file, a JSON log or a bag")
     suffix = source.suffix.lower()
     if source.is_dir() or suffix in {".mcap", ".db3"}:
-        return check_consistency(unwrap(read_bag_recording(source, effort=effort, namespace=namespace)))
+        swings_freely = mapping == "free_swing"
+        return check_consistency(
+            unwrap(read_bag_recording(source, effort=effort, namespace=namespace, swings_freely=swings_freely))
+        )
     if suffix == ".json":
         return check_consistency(unwrap(read_servo_log(source)))
+    if is_ros1(source):
+        raise DataError(f"{source} is a bag of ROS 1; `pendulum convert {source} -o FOLDER` makes one that can be read")
     if suffix in {".csv", ".txt"}:
         return check_consistency(unwrap(read_csv(source, mapping, hold=hold)))
     if suffix == ".hebilog":

@@ -215,7 +215,7 @@ def read_run(
         disturbance = _optional(bag, f"{space}/{names.DISTURBANCE}", joint, otherwise_another=True)
         applied = _optional(bag, f"{space}/{names.APPLIED_EFFORT}", joint)
         events = [event for event in bag.events() if event["topic"].startswith(f"{space}/")]
-        metadata, damage = dict(bag.metadata), list(bag.damage)
+        metadata, damage = dict(bag.metadata), [*bag.damage, *bag.clock_notes]
     start, stop = _window(events, disturbance, str(path), start_ns, stop_ns)
     name = label or Path(path).stem
     stamps = states["stamp_ns"]
@@ -379,10 +379,7 @@ def _window(
             active = int(live[0]), int(live[-1])
     start = start_ns if start_ns is not None else (starts[-1] if starts else active[0] if active else None)
     if start is None:
-        raise DataError(
-            f"bag {path} has neither an event {START_EVENT!r} nor a disturbance; "
-            "expected one of them, or a window given by its stamps"
-        )
+        raise DataError(f"bag {path} has neither an event {START_EVENT!r} nor a disturbance; expected one of them")
     after = [stop for stop in stops if stop > start]
     stop = stop_ns if stop_ns is not None else (after[0] if after else active[1] if active else None)
     if stop is None or stop <= start:
