@@ -13,6 +13,7 @@ import pytest
 
 from pendulum_hw_bridge.backends import hebi as backend_module
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
+from pendulum_hw_bridge.backends.hebi_emulated import _holds
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.lab.module_files import (
@@ -24,6 +25,7 @@ from pendulum_hw_bridge.lab.module_files import (
 )
 from pendulum_hw_bridge.port.actuator import ActuatorError, MStopAction
 from pendulum_hw_bridge.port.clocks import SteppedClock
+from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GAIN_FIELDS, LOOPS, load_gains, write_gains
 from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.errors import ParameterError
 
@@ -259,3 +261,59 @@ def test_what_a_killed_backup_left_is_refused_and_makes_way_for_a_new_one(tmp_pa
     assert (said, sent) == ([], [])
     backup_emulator(port, tmp_path / "before")
     assert [path.name for path in tmp_path.iterdir()] == ["before"]
+
+
+def _like_a_module(hebi: Any, info: Any) -> Any:
+    """Return a group whose module takes over each gain and limit that a command holds, and clears none."""
+
+    def take(command: Any, timeout_ms: int) -> bool:
+        for loop in LOOPS:
+            for name in (*(f"{loop}_{gain}" for gain in GAIN_FIELDS), f"{loop}_limit_min", f"{loop}_limit_max"):
+                value = getattr(command, name)[0]
+                if _holds(command, name, hebi):
+                    setattr(info, name, bool(value) if name.endswith("d_on_error") else float(value))
+        return True
+
+    return SimpleNamespace(request_info=lambda timeout_ms: info, send_command_with_acknowledgement=take)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_each_gain_and_limit_comes_back_to_the_last_bit_small_ones_too(tmp_path: Path, seed: int) -> None:
+    hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+    rng = np.random.default_rng(seed)
+    info = hebi.GroupCommand(1)
+    kept: dict[str, float] = {}
+    for loop in LOOPS:
+        for name in (*(f"{loop}_{gain}" for gain in GAIN_FIELDS), f"{loop}_limit_min", f"{loop}_limit_max"):
+            value = float(np.float32(10.0 ** rng.uniform(-12.0, 4.0) * rng.choice([-1.0, 1.0])))
+            setattr(info, name, bool(seed % 2) if name.endswith("d_on_error") else value)
+            kept[name] = float(getattr(info, name)[0])
+    group = _like_a_module(hebi, info)
+    backup_group(group, tmp_path / "before")
+    for name in kept:
+        setattr(info, name, True if name.endswith("d_on_error") else 7.0)
+    restore_group(group, tmp_path / "before", backend_module.new_command, lambda sentence: None)
+    assert {name: float(getattr(info, name)[0]) for name in kept} == kept
+
+
+def test_a_gain_that_comes_back_wrong_by_less_than_six_decimals_is_told(tmp_path: Path) -> None:
+    hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
+    info = hebi.GroupCommand(1)
+    info.position_kp, info.velocity_ki = 1.0, 3e-7
+    group = _like_a_module(hebi, info)
+    backup_group(group, tmp_path / "before")
+    take = group.send_command_with_acknowledgement
+
+    def spoil(command: Any, timeout_ms: int) -> bool:
+        taken = bool(take(command, timeout_ms))
+        info.velocity_ki = 0.0
+        return taken
+
+    group.send_command_with_acknowledgement = spoil
+    with pytest.raises(ActuatorError, match=r"reads back other values .*: velocity ki is 0.0; expected 3"):
+        restore_group(group, tmp_path / "before", backend_module.new_command, lambda sentence: None)
+
+
+def test_an_open_clamp_of_an_emulator_stays_open(tmp_path: Path) -> None:
+    wanted = replace(DEFAULT_GAINS[4], effort=replace(DEFAULT_GAINS[4].effort, min_target=-math.inf, kp=1e-9))
+    assert load_gains(write_gains(tmp_path / "gains.xml", wanted)) == wanted

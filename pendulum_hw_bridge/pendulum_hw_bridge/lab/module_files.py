@@ -1,7 +1,8 @@
 """What a module was set to before us: gains, safety parameters and M-stop action, kept in files and given back.
 
-The files are HEBI's own XML, written and read by hebi-py, so that HEBI Scope reads them too. An emulator keeps its
-gains in the same format and its limits in JSON.
+The files are HEBI's own XML, written and read by hebi-py, so that HEBI Scope reads them too; but hebi-py writes six
+decimals, so numbers are written again with all their digits. An emulator keeps its gains in the same format and its
+limits in JSON.
 """
 
 from __future__ import annotations
@@ -10,12 +11,15 @@ import contextlib
 import errno
 import json
 import math
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
+
+import numpy as np
 
 from pendulum_hw_bridge.backends.hebi_settings import limits_of
 from pendulum_hw_bridge.emulation.wire import limits_from_json, limits_to_json
@@ -34,6 +38,10 @@ ENDS = "position_limit_strategies.json"
 _END_NAMES = ("min_position_limit_strategy", "max_position_limit_strategy")
 _ANSWER_MS = 500
 _ATTEMPTS = 3
+_WRITERS = {GAINS: "write_gains", SAFETY: "write_safety_params"}
+_DECIMAL = re.compile(r"-?\d+\.\d+")
+"""A number of which hebi-py may have left digits out; whole ones are choices."""
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?inf")
 _HALF = ".unfinished"
 """End of the name of a folder that is not whole yet."""
 
@@ -52,8 +60,8 @@ def backup_group(group: Any, folder: Path) -> list[Path]:
     info = _info(group)
     names = (GAINS, SAFETY, ENDS)
     with _new(folder) as half:
-        info.write_gains(str(half / GAINS))
-        info.write_safety_params(str(half / SAFETY))
+        _write(info, half / GAINS)
+        _write(info, half / SAFETY)
         (half / ENDS).write_text(json.dumps(_ends_of(info)) + "\n", encoding="utf-8")
         # hebi-py says nothing where a disk is full.
         if not all((half / name).is_file() and (half / name).stat().st_size for name in names):
@@ -114,12 +122,17 @@ def limits_of_group(group: Any, wanted: HardwareLimits) -> HardwareLimits:
 def _expect_group(info: Any, folder: Path, ends: dict[str, int]) -> None:
     # Not beside the backup, which may lie on a medium that is full or read-only.
     with tempfile.TemporaryDirectory(prefix="pendulum_module_") as temporary:
-        for name, write in ((GAINS, "write_gains"), (SAFETY, "write_safety_params")):
+        for name in (GAINS, SAFETY):
             now = Path(temporary, name)
-            getattr(info, write)(str(now))
-            if now.read_text(encoding="utf-8") != (folder / name).read_text(encoding="utf-8"):
+            _write(info, now)
+            read, kept = _values(now), _values(folder / name)
+            wrong = [where for where in dict.fromkeys([*kept, *read]) if read.get(where) != kept.get(where)]
+            if wrong:
+                where = wrong[0]
                 raise ActuatorError(
-                    "no_acknowledgement", f"HEBI module reads back other values than those of {folder / name}"
+                    "no_acknowledgement",
+                    f"HEBI module reads back other values than those of {folder / name}: {where} is {read.get(where)}; "
+                    f"expected {kept.get(where)}",
                 )
     if ends and _ends_of(info) != ends:
         raise ActuatorError("no_acknowledgement", f"HEBI module reads back {_ends_of(info)}; expected {ends}")
@@ -175,6 +188,42 @@ def _set_open_ends(command: Any, path: Path) -> None:
             raise ParameterError(f"backup {path}: {end}_limit of the position is no number; expected one, or inf")
         if math.isinf(limit):
             setattr(command, f"position_limit_{end}", limit)
+
+
+def _write(info: Any, path: Path) -> None:
+    """Let hebi-py write a file of settings, and give its numbers the digits that hebi-py leaves out."""
+    getattr(info, _WRITERS[path.name])(str(path))
+    if not path.is_file() or not path.stat().st_size:
+        return  # (the caller asks whether there was room)
+    tree = ElementTree.parse(path)
+    for part in tree.getroot():
+        for element in part:
+            field = f"{part.tag}_{element.tag}"
+            # Limits are called "position_limit_min" by hebi-py and "<position><min_limit>" in its file.
+            end = element.tag.removesuffix("_limit")
+            field = f"{part.tag}_limit_{end}" if end != element.tag else field
+            value = getattr(info, field, None)
+            if _is_decimal(element.text) and value is not None and math.isfinite(float(value[0])):
+                element.text = str(np.float32(value[0]))
+    path.write_text(
+        '<?xml version="1.0"?>\n' + ElementTree.tostring(tree.getroot(), encoding="unicode") + "\n", encoding="utf-8"
+    )
+
+
+def _is_decimal(text: str | None) -> bool:
+    return text is not None and _DECIMAL.fullmatch(text.strip()) is not None
+
+
+def _values(path: Path) -> dict[str, Any]:
+    """Return what a file of settings holds by place: single precision where it is a number, as a module keeps it."""
+    found: dict[str, Any] = {}
+    for part in ElementTree.parse(path).getroot():
+        for element in (part, *part):
+            text = (element.text or "").strip()
+            if text:
+                where = part.tag if element is part else f"{part.tag} {element.tag}"
+                found[where] = float(np.float32(text)) if _NUMBER.fullmatch(text) else text
+    return found
 
 
 def _ends_of(info: Any) -> dict[str, int]:

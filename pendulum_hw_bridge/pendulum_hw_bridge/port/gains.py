@@ -191,10 +191,10 @@ def write_gains(path: str | Path, gains: GainSet) -> Path:
         element = ElementTree.SubElement(root, loop)
         for name in GAIN_FIELDS:
             value = getattr(gains.loop(loop), name)
-            if math.isfinite(value):
-                # hebi-py takes a switch for a whole number, and refuses 1.0.
-                text = str(int(value)) if name == "d_on_error" else repr(float(value))
-                ElementTree.SubElement(element, name).text = text
+            # hebi-py takes a switch for a whole number, and refuses 1.0. An open clamp is written as such: left out, it
+            # would be read as the default of the strategy.
+            text = str(int(value)) if name == "d_on_error" else repr(float(value))
+            ElementTree.SubElement(element, name).text = text
     ElementTree.indent(root)
     path = Path(path)
     with writing(f"gains file {path}", ParameterError):
