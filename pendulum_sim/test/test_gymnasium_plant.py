@@ -121,7 +121,7 @@ def test_a_push_acts_past_the_limit_of_commands() -> None:
         ({"angle": {"index": 7}}, r"angle and velocity are not where the adapter says"),
         ({"angle": {"index": 0, "unit": "turns"}}, r"angle: unit is 'turns'; expected rad or deg"),
         ({"torque": {"index": 2}}, r"torque.index is 2, an action has 2 entries"),
-        ({"torque": {"index": 1, "scale": 3.0}}, r"a positive torque does not speed it up; expected torque.sign"),
+        ({"torque": {"index": 1, "scale": 3.0}}, r"a positive torque speeds it up backwards; expected torque.sign"),
         ({"torque": {"index": 1, "scale": 0}}, r"torque.scale is 0; expected a number, not 0"),
         ({"start": None}, r"nothing says how it starts at an angle"),
         ({"period": {"value": 2, "unit": "ms"}}, r"period: unit is 'ms'; expected 's'"),

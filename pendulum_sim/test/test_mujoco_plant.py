@@ -6,6 +6,7 @@ import math
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pendulum_msgs_py.errors import FaultError, ParameterError
@@ -109,6 +110,89 @@ def test_an_exported_model_needs_no_mapping(tmp_path: Path, name: str, write_mod
         assert run(plant, 1.0, 2.0) == pytest.approx(run(ours, 1.0, 2.0), abs=0.05)
 
 
+@pytest.mark.parametrize("delay", [0.01, 0.0113])
+def test_an_exported_delay_is_read_back_and_acts(tmp_path: Path, delay: float) -> None:
+    parameters = load_plant("dfki").with_values(transport_delay=delay)
+    path = tmp_path / "own.xml"
+    path.write_text(mjcf(parameters), encoding="utf-8")
+    plant = load_mujoco_plant(path)
+    assert plant.parameters.transport_delay == delay
+    moves = [plant.step(1.0).theta_dot != 0.0 for _ in range(10)]
+    assert moves.index(True) in {5, 6}
+
+
+def test_an_actuator_with_several_controls_before_the_motor_shifts_no_index(tmp_path: Path) -> None:
+    pid = '<pid name="servo" joint="{joint}" kp="0"/>'
+    plant = load_mujoco_plant(write(tmp_path, actuator=pid + MOTOR), MujocoMapping(actuator="torque"))
+    assert plant.parameters.effort_limit == 8.0
+    alone = load_mujoco_plant(write(tmp_path))
+    assert run(plant, 2.0, 3.0) == run(alone, 2.0, 3.0)
+
+
+def test_damping_and_armature_of_the_motor_are_in_the_equation(tmp_path: Path) -> None:
+    motor = MOTOR.replace("gear", 'damping="0.2" armature="0.05" gear')
+    found = load_mujoco_plant(write(tmp_path, actuator=motor)).parameters
+    assert found.damping == pytest.approx(0.3 + 0.2 * 2.0**2)
+    assert found.inertia == pytest.approx(INERTIA + 0.05 * 2.0**2)
+
+
+@pytest.mark.parametrize(("rest", "springref"), [(0.0, 0.0), (0.7598908, 90.0)])
+def test_a_hinge_with_a_spring_hangs_where_it_comes_to_rest(tmp_path: Path, rest: float, springref: float) -> None:
+    path = tmp_path / "spring.xml"
+    path.write_text(
+        f'<mujoco><worldbody><body><joint name="h" axis="0 1 0" damping="1" stiffness="2" springref="{springref}"/>'
+        '<geom size="0.02" pos="0 0 -0.4" mass="0.6"/></body></worldbody><actuator><motor joint="h" ctrlrange="-8 8"/>'
+        "</actuator></mujoco>",
+        encoding="utf-8",
+    )
+    plant = load_mujoco_plant(path)
+    assert f"it hangs at {rest:.6g}"[:18] in plant.remarks[0]
+    assert abs(plant.reset(0.0).theta) < 1e-9
+    assert max(abs(plant.step(0.0).theta) for _ in range(500)) < 1e-4
+
+
+def test_gravity_compensation_is_no_weight(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    path.write_text(path.read_text(encoding="utf-8").replace('name="pole"', 'name="pole" gravcomp="1"'))
+    plant = load_mujoco_plant(path)
+    assert plant.parameters.gravity == 0.0
+    assert run(plant, 1.0, 0.0)[-1] == pytest.approx(1.0, abs=1e-9)
+
+
+MESH = (
+    '<robot name="bench"><link name="world"/><link name="link"><inertial><origin xyz="0 0 -0.4"/><mass value="0.6"/>'
+    '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.001"/></inertial><collision><geometry>'
+    '<mesh filename="package://bench_description/meshes/link.stl"/></geometry></collision></link>'
+    '<joint name="shoulder" type="continuous"><parent link="world"/><child link="link"/><axis xyz="0 1 0"/>'
+    '<limit effort="8" velocity="20"/></joint></robot>'
+)
+TETRAHEDRON = [[(0, 0, 0), (0, 1, 0), (1, 0, 0)], [(0, 0, 0), (1, 0, 0), (0, 0, 1)]]
+TETRAHEDRON += [[(0, 0, 0), (0, 0, 1), (0, 1, 0)], [(1, 0, 0), (0, 1, 0), (0, 0, 1)]]
+
+
+@pytest.mark.parametrize("place", ["", "bench_description/meshes", "bench_description/urdf/../meshes"])
+def test_meshes_of_a_ros_package_are_found_or_left_out_with_a_word(tmp_path: Path, place: str) -> None:
+    folder = tmp_path / "bench_description" / "urdf"
+    folder.mkdir(parents=True)
+    (folder / "bench.urdf").write_text(MESH, encoding="utf-8")
+    if place:
+        mesh = (tmp_path / place).resolve() / "link.stl"
+        mesh.parent.mkdir(exist_ok=True)
+        faces = [np.array([(0, 0, 0), *face], dtype="<f4").tobytes() + b"\0\0" for face in TETRAHEDRON]
+        mesh.write_bytes(bytes(80) + len(faces).to_bytes(4, "little") + b"".join(faces))
+    plant = load_mujoco_plant(folder / "bench.urdf")
+    assert plant.parameters.gravity == pytest.approx(0.6 * 9.81 * 0.4)
+    told = [remark for remark in plant.remarks if "link.stl is left out" in remark]
+    assert len(told) == (0 if place else 1)
+
+
+def test_a_source_for_xacro_says_how_it_becomes_a_model(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf.xacro"
+    path.write_text('<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="arm"/>', encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"expected the URDF that it makes: xacro arm\.urdf\.xacro > arm\.urdf"):
+        load_mujoco_plant(path)
+
+
 def test_a_timestep_longer_than_our_period_makes_the_rate(tmp_path: Path) -> None:
     path = write(tmp_path, timestep=0.02)
     assert load_mujoco_plant(path).dt == pytest.approx(0.02)
@@ -149,6 +233,11 @@ ARM = '<body name="arm"><joint name="elbow" type="hinge"/><geom type="sphere" si
             "actuator 'servo' of .* is no source of torque .*; expected a motor, or actuator: none",
         ),
         ({"actuator": FREE}, {}, "has no limit of torque at its joint; expected effort_limit"),
+        (
+            {"actuator": MOTOR.replace("-4 4", "0 5")},
+            {},
+            "actuator 'torque' of .* gives 0 to 10 N m; expected torque both ways, or actuator: none and effort_limit",
+        ),
         ({"more": ARM}, {}, r"has 2 hinges \(hinge, elbow\); expected one, or joint in a mapping file"),
         ({"more": ARM}, {"joint": "elbow"}, "has no actuator on joint 'elbow'; .* none, or one of torque"),
         ({}, {"joint": "knee"}, "has no hinge 'knee'; expected one of its hinges: hinge"),

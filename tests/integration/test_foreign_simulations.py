@@ -121,7 +121,9 @@ from gymnasium.envs.classic_control.pendulum import PendulumEnv
 
 
 class Stuck(PendulumEnv):
-    count = 0
+    def reset(self, **options):
+        self.count = 0
+        return super().reset(**options)
 
     def step(self, action):
         self.count += 1
@@ -146,7 +148,7 @@ effort_limit: max_torque
 
 def _environment(folder: Path, what: str) -> tuple[str, ...]:
     """Write an environment that does something odd after some steps; return the parameters that choose it."""
-    # The first 64 steps try it out.
+    # Runs that try it out are shorter.
     (folder / "lab_envs.py").write_text(_STUCK.format(what=what, name="Lab-v0", count=100), encoding="utf-8")
     adapter = folder / "adapter.yaml"
     adapter.write_text(_ADAPTER, encoding="utf-8")

@@ -95,6 +95,38 @@ def test_a_model_that_cannot_take_part_is_refused_before_anything_starts(
         RegulationSettings(simulation=str(model))
 
 
+@pytest.fixture
+def stopped(model: Path) -> Path:
+    """Return a model with an end stop at 170 degrees."""
+    text = model.read_text(encoding="utf-8")
+    path = model.with_name("stopped.xml")
+    path.write_text(text.replace('type="hinge"', 'type="hinge" range="-2.967 2.967"'), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("command", ["lockstep", "thesis"])
+def test_no_controller_is_designed_on_an_equation_that_the_model_does_not_keep(
+    stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    out = ["--bag" if command == "lockstep" else "--out", str(tmp_path / "run")]
+    assert experiment_cli.main([command, *out, "--simulation", str(stopped)]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"simulation {stopped} does not move as its equation: joint pendulum_joint differs by" in told
+    assert "cause: the range of a joint (without:" in told
+    assert "--accept-differences to design on this one all the same" in told
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_difference_that_was_accepted_stands_beside_the_figures(model: Path, stopped: Path, tmp_path: Path) -> None:
+    bags = []
+    for path in (stopped, model):
+        settings = RegulationSettings(noise=SHORT, simulation=str(path))
+        bags.append(record_simulation(tmp_path / path.stem, lockstep_spec(settings, side="sim")))
+    (note,) = compare_runs(*bags).notes
+    assert note.startswith("The simulation, stopped.xml, does not move as its equation")
+    assert compare_runs(bags[1], bags[0]).notes == []
+
+
 def test_a_mapping_without_a_simulation_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"mapping is lab\.yaml without a simulation"):
         RegulationSettings(mapping="lab.yaml")

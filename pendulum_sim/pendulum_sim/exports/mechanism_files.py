@@ -14,7 +14,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import Body
 from pendulum_msgs_py.plants.joint_parameters import JointParameters
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_sim.exports.xml_files import add, document_text, number, safe_name
+from pendulum_sim.exports.xml_files import add, document_text, lateness, number, safe_name
 
 __all__ = ["mechanism_mjcf", "mechanism_urdf"]
 
@@ -23,13 +23,14 @@ _ROD = "0.6 0.62 0.66 1"
 _TIP = "0.85 0.3 0.2 1"
 _CART = "0.25 0.25 0.28 1"
 _FAST = 100.0
+_TIMESTEP = 0.002
 
 
 def mechanism_mjcf(parameters: MechanismParameters) -> str:
     """Return the MJCF of a plant for MuJoCo, with its rotors as armature of tendons.
 
-    What MuJoCo has no word for is left out: Stribeck's curve and transport delay. Its dry friction is regularised: it
-    creeps where ours sticks; its end stops are springs.
+    What MuJoCo has no word for is left out: Stribeck's curve. Its dry friction is regularised: it creeps where ours
+    sticks; its end stops are springs.
 
     Raises:
         ParameterError: A body has no positive inertia about its own centre of mass, which MuJoCo refuses.
@@ -38,7 +39,13 @@ def mechanism_mjcf(parameters: MechanismParameters) -> str:
     bodies = _checked_bodies(parameters)
     model = ElementTree.Element("mujoco", model=safe_name(parameters.name))
     add(model, "compiler", angle="radian", autolimits="true")
-    add(model, "option", gravity=f"0 0 {number(-parameters.value('gravity'))}", timestep="0.002", integrator="RK4")
+    add(
+        model,
+        "option",
+        gravity=f"0 0 {number(-parameters.value('gravity'))}",
+        timestep=number(_TIMESTEP),
+        integrator="RK4",
+    )
     world = add(model, "worldbody")
     add(world, "light", pos="0 -1 1.5", dir="0 0.5 -1")
     size = sum(math.dist(body.tip, (0.0, 0.0, 0.0)) for body in bodies)
@@ -68,12 +75,10 @@ def mechanism_mjcf(parameters: MechanismParameters) -> str:
     _add_rotors(model, parameters)
     actuators = add(model, "actuator")
     for index, actuator in zip(parameters.coordinates.driven, parameters.actuators, strict=True):
-        lag = (
-            {"dyntype": "filterexact", "dynprm": number(actuator.time_constant)} if actuator.time_constant > 0.0 else {}
-        )
+        late = lateness(actuator.time_constant, actuator.transport_delay, _TIMESTEP)
         limit = number(actuator.effort_limit)
         name = mechanism.joints[index].name
-        add(actuators, "general", lag, name=name, joint=name, ctrlrange=f"-{limit} {limit}", biastype="none")
+        add(actuators, "general", late, name=name, joint=name, ctrlrange=f"-{limit} {limit}", biastype="none")
     return document_text(model)
 
 

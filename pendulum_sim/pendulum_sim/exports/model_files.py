@@ -25,12 +25,14 @@ from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.whole_file import write_whole, writing
 from pendulum_sim.exports.mechanism_files import mechanism_mjcf, mechanism_urdf
 from pendulum_sim.exports.ros2_control_tags import add_ros2_control
-from pendulum_sim.exports.xml_files import add, document_text, number, safe_name
+from pendulum_sim.exports.xml_files import add, document_text, lateness, number, safe_name
 
 __all__ = ["LinkShape", "any_urdf", "link_shape", "main", "mjcf", "urdf"]
 
 STANDARD_GRAVITY = 9.80665
 """Acceleration of gravity in the files [m/s^2]."""
+_TIMESTEP, _STIFF_TIMESTEP = 0.002, 0.00025
+"""Timestep of a rigid link, and of one behind a spring [s]."""
 _BOB_SHARE = 0.9
 _FLAT_LENGTH = 0.3
 _ROD_RADIUS = 0.008
@@ -116,8 +118,8 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
 def mjcf(parameters: PlantParameters) -> str:
     """Return the MJCF of the plant for MuJoCo.
 
-    What MuJoCo has no word for is left out: Stribeck's curve, further friction terms, transport delay, and the
-    spring's hysteresis and hardening. Its dry friction is regularised: it creeps where ours sticks.
+    What MuJoCo has no word for is left out: Stribeck's curve, further friction terms, and the spring's hysteresis and
+    hardening. Its dry friction is regularised: it creeps where ours sticks.
 
     Args:
         parameters: The plant; with a drivetrain there is a second joint, the motor's, coupled by a spring.
@@ -131,7 +133,7 @@ def mjcf(parameters: PlantParameters) -> str:
         model,
         "option",
         gravity="0 0 0" if flat else f"0 0 {number(-STANDARD_GRAVITY)}",
-        timestep="0.002" if drive is None else "0.00025",
+        timestep=number(_TIMESTEP if drive is None else _STIFF_TIMESTEP),
         integrator="implicitfast",
     )
     world = add(model, "worldbody")
@@ -201,11 +203,8 @@ def mjcf(parameters: PlantParameters) -> str:
         add(spring, "joint", joint=JOINT, coef="-1")
     actuators = add(model, "actuator")
     limit = f"{number(-parameters.effort_limit)} {number(parameters.effort_limit)}"
-    lag = (
-        {"dyntype": "filterexact", "dynprm": number(parameters.actuator_time_constant)}
-        if parameters.actuator_time_constant > 0.0
-        else {}
-    )
+    timestep = _TIMESTEP if drive is None else _STIFF_TIMESTEP
+    late = lateness(parameters.actuator_time_constant, parameters.transport_delay, timestep)
     add(
         actuators,
         "general",
@@ -214,7 +213,7 @@ def mjcf(parameters: PlantParameters) -> str:
         ctrlrange=limit,
         gainprm=number(gain),
         biastype="none",
-        attributes=lag,
+        attributes=late,
     )
     return document_text(model)
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from xml.etree import ElementTree
 
-__all__ = ["add", "document_text", "number", "safe_name"]
+__all__ = ["add", "document_text", "lateness", "number", "safe_name"]
 
 
 def add(
@@ -18,6 +19,20 @@ def add(
 def number(value: float) -> str:
     """Return a number so that it is read back to the last bit."""
     return repr(float(value))
+
+
+def lateness(lag: float, delay: float, timestep: float) -> dict[str, str]:
+    """Return the attributes of a MuJoCo actuator whose effort comes late.
+
+    Args:
+        lag: Time constant; 0 for none [s].
+        delay: Transport delay, which MuJoCo 4 and later know; 0 for none [s].
+        timestep: Of the model [s].
+    """
+    attributes = {"dyntype": "filterexact", "dynprm": number(lag)} if lag > 0.0 else {}
+    if delay > 0.0:
+        attributes |= {"delay": number(delay), "nsample": str(math.ceil(delay / timestep - 1e-9) + 1)}
+    return attributes
 
 
 def safe_name(name: str) -> str:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from pendulum_msgs_py.errors import FaultError, PendulumError
+from pendulum_msgs_py.errors import FaultError, ParameterError, PendulumError
 from pendulum_sim.stepping.plant import Plant, PlantState
 
-__all__ = ["GuardedPlant", "PaceWatch", "StallWatch"]
+__all__ = ["GuardedPlant", "PaceWatch", "StallWatch", "in_one_sentence"]
 
 _LATEST = 0.5
 """Distance behind the wall's time at which a simulation that is too slow is given up [s]."""
@@ -52,12 +53,8 @@ class GuardedPlant:
         return self._try("step", self._plant.step, effort, push)
 
     def _try(self, what: str, function: Callable[..., PlantState], *arguments: float) -> PlantState:
-        try:
+        with in_one_sentence(f"simulation {self._name}", what, FaultError):
             state = function(*arguments)
-        except PendulumError as error:
-            raise FaultError(f"simulation {self._name}: {error}") from error
-        except Exception as error:
-            raise FaultError(f"simulation {self._name} failed in {what}: {_in_one_line(error)}") from error
         if not (math.isfinite(state.theta) and math.isfinite(state.theta_dot) and math.isfinite(state.effort)):
             raise FaultError(
                 f"simulation {self._name} is at {state.theta} rad, {state.theta_dot} rad/s, {state.effort} N m "
@@ -129,6 +126,26 @@ class StallWatch:
                 return
 
 
-def _in_one_line(error: Exception) -> str:
+@contextmanager
+def in_one_sentence(name: str, what: str, kind: type[PendulumError]) -> Iterator[None]:
+    """Turn whatever code of others raises, an attempt to end the program included, into one sentence.
+
+    Args:
+        name: Whose code it is.
+        what: What it does.
+        kind: What is raised in its place.
+
+    Raises:
+        PendulumError: As said; one of ours keeps its sentence.
+    """
+    try:
+        yield
+    except PendulumError as error:
+        raise error if isinstance(error, kind) and kind is ParameterError else kind(f"{name}: {error}") from error
+    except (Exception, SystemExit) as error:
+        raise kind(f"{name} failed in {what}: {_in_one_line(error)}") from error
+
+
+def _in_one_line(error: BaseException) -> str:
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

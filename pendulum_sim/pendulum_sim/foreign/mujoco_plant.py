@@ -7,6 +7,7 @@ on it takes the contract's command as it is.
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_sim.foreign.mujoco_mapping import NO_ACTUATOR, MujocoMapping
+from pendulum_sim.foreign.mujoco_model import read_model
+from pendulum_sim.foreign.mujoco_switches import CAUSES, switch_off
 from pendulum_sim.stepping.plant import PlantState, check_start, command_within
 
 __all__ = ["MujocoPlant", "load_mujoco_plant"]
@@ -26,10 +29,10 @@ __all__ = ["MujocoPlant", "load_mujoco_plant"]
 CONTRACT_ACTUATOR = "effort"
 PERIOD = 0.002
 """Time between two states, unless the timestep is longer [s]."""
-_NO_PENDULUM = 0.01
-"""Share of the weight's torque that a sine may miss before it is said."""
 _ANGLES = 24
 _ROUNDING = 1e-12
+_REST_ANGLES = 721
+_BISECTIONS = 60
 
 
 def load_mujoco_plant(
@@ -50,11 +53,10 @@ def load_mujoco_plant(
     path = Path(path).expanduser()
     if not path.is_file():
         raise ParameterError(f"model {path} does not exist; expected an MJCF or URDF file")
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise ParameterError(f"MuJoCo refuses model {path}: {' '.join(str(error).split())}") from error
-    return MujocoPlant(mujoco, model, mapping or MujocoMapping(), str(path), rate_hz, effort_limit)
+    model, remarks = read_model(mujoco, path)
+    plant = MujocoPlant(mujoco, model, mapping or MujocoMapping(), str(path), rate_hz, effort_limit)
+    plant.remarks += remarks
+    return plant
 
 
 def _import_mujoco() -> Any:
@@ -91,6 +93,10 @@ class MujocoPlant:
         self._qpos, self._dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         name = self._name("joint", joint)
         self._actuator = self._choose_actuator(mapping.actuator, joint)
+        if self._actuator is not None:
+            # An actuator may have several controls.
+            self._control = int(model.actuator_ctrladr[self._actuator])
+            self._gear = float(model.actuator_gear[model.actuator_outadr[self._actuator], 0])
         self._driven = self._dof if self._actuator is None else self._driven_dof(self._actuator)
         self._driven_qpos = self._qpos if self._driven == self._dof else self._qpos_of(self._driven)
         self._sign = mapping.sign
@@ -100,27 +106,25 @@ class MujocoPlant:
         )
         self._control_per_torque = mapping.control_per_torque or (1.0 if of_contract else 1.0 / per_control)
         gain = per_control * self._control_per_torque
-        weight, hanging, missed = self._weight()
+        weight, hanging = self._weight()
         # Rounding of the fit is no angle, and no half turn the other way round.
         hanging = 0.0 if abs(hanging) < _ROUNDING else hanging
         hanging = math.pi if abs(abs(hanging) - math.pi) < _ROUNDING else hanging
         if mapping.zero is not None:
             self._zero = mapping.zero
         else:
-            self._zero = 0.0 if name == JOINT else hanging
+            self._zero = 0.0 if name == JOINT else self._rest(hanging)
         limit = self._limit(mapping.effort_limit, effort_limit, joint)
         self.parameters = self._describe(weight, hanging, gain, limit)
         driven = (
             "the joint itself" if self._actuator is None else f"actuator {self._name('actuator', self._actuator)!r}"
         )
         turned = ", turned round" if self._sign < 0 else ""
-        angles = f"its {self._zero:.6g} rad are our 0{turned}; it hangs at {hanging:.6g} rad"
+        angles = f"its {self._zero:.6g} rad are our 0{turned}; it hangs at {self._rest(hanging):.6g} rad"
         self.remarks = [
             f"joint {name!r} through {driven}, at most {limit:g} N m; {angles}",
             f"timestep {model.opt.timestep * 1e3:g} ms, {self._substeps} in a period",
         ]
-        if missed > _NO_PENDULUM:
-            self.remarks.append(f"its weight is no sine of the angle: {100.0 * missed:.0f} % of it are left over")
         self._steps = 0
         self.reset()
 
@@ -178,7 +182,7 @@ class MujocoPlant:
         if self._actuator is None:
             applied += command
         else:
-            data.ctrl[self._actuator] = self._sign * command * self._control_per_torque
+            data.ctrl[self._control] = self._sign * command * self._control_per_torque
         data.qfrc_applied[self._dof] = self._sign * applied
         self._mujoco.mj_step(self._model, data, self._substeps)
         self._steps += 1
@@ -189,6 +193,22 @@ class MujocoPlant:
                     f"{self._steps * self.dt:.3f} s; is a timestep of {self._model.opt.timestep * 1e3:g} ms too long?"
                 )
         return self.state
+
+    @property
+    def switches(self) -> tuple[str, ...]:
+        """What :meth:`without` switches off."""
+        return CAUSES
+
+    def without(self, causes: tuple[str, ...]) -> MujocoPlant:
+        """Return a copy with the same joint, zero and limit, in which some of the model is switched off."""
+        other = copy.copy(self)
+        other._model = copy.copy(self._model)
+        dofs = {self._dof, self._driven}
+        for cause in causes:
+            other._substeps *= switch_off(self._mujoco, other._model, cause, dofs, self._actuator)
+        other._data = self._mujoco.MjData(other._model)
+        other.reset()
+        return other
 
     # --- what the file says --------------------------------------------------------------------------------
 
@@ -229,7 +249,7 @@ class MujocoPlant:
         model = self._model
         if wanted == NO_ACTUATOR:
             return None
-        names = {self._name("actuator", i): i for i in range(model.nu)}
+        names = {self._name("actuator", i): i for i in range(model.nactuator)}
         if wanted:
             if wanted not in names:
                 listed = ", ".join(names) or "none"
@@ -237,7 +257,9 @@ class MujocoPlant:
             return names[wanted]
         joints = {int(self._mujoco.mjtTrn.mjTRN_JOINT), int(self._mujoco.mjtTrn.mjTRN_JOINTINPARENT)}
         on_joint = [
-            i for i in range(model.nu) if model.actuator_trntype[i] in joints and model.actuator_trnid[i, 0] == joint
+            i
+            for i in range(model.nactuator)
+            if model.actuator_trntype[i] in joints and model.actuator_trnid[i, 0] == joint
         ]
         if not on_joint and self._name("joint", joint) == JOINT and CONTRACT_ACTUATOR in names:
             # Our own export of a motor behind a spring.
@@ -266,7 +288,7 @@ class MujocoPlant:
 
     def _torque_per_control(self, actuator: int) -> float:
         model, mujoco = self._model, self._mujoco
-        torque = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
+        torque = self._gear * float(model.actuator_gainprm[actuator, 0])
         lags = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
         makes_torque = (
             model.actuator_gaintype[actuator] == int(mujoco.mjtGain.mjGAIN_FIXED)
@@ -285,12 +307,21 @@ class MujocoPlant:
         model, actuator = self._model, self._actuator
         limits = []
         if actuator is not None:
-            gear = abs(float(model.actuator_gear[actuator, 0]))
-            if model.actuator_ctrllimited[actuator]:
-                limits.append(_smaller(model.actuator_ctrlrange[actuator]) / abs(self._control_per_torque))
-            if model.actuator_forcelimited[actuator]:
-                per_control = self._torque_per_control(actuator) * abs(self._control_per_torque)
-                limits.append(_smaller(model.actuator_forcerange[actuator]) * gear / abs(per_control))
+            per_command = abs(self._control_per_torque)
+            per_force = abs(self._torque_per_control(actuator) * self._control_per_torque / self._gear)
+            for limited, bounds, per in (
+                (model.actuator_ctrllimited[self._control], model.actuator_ctrlrange[self._control], per_command),
+                (model.actuator_actlimited[actuator], model.actuator_actrange[actuator], per_command),
+                (model.actuator_forcelimited[actuator], model.actuator_forcerange[actuator], per_force),
+            ):
+                if limited and not bounds[0] < 0.0 < bounds[1]:
+                    low, high = sorted(float(bound) / per for bound in bounds)
+                    raise ParameterError(
+                        f"actuator {self._name('actuator', actuator)!r} of {self._path} gives {low:g} to {high:g} N m; "
+                        "expected torque both ways, or actuator: none and effort_limit in a mapping file"
+                    )
+                if limited:
+                    limits.append(_smaller(bounds) / per)
         if self._driven == self._dof and model.jnt_actfrclimited[joint] and (actuator is not None or not of_mapping):
             limits.append(_smaller(model.jnt_actfrcrange[joint]))
         known = min(limits, default=math.inf)
@@ -307,32 +338,56 @@ class MujocoPlant:
             )
         return limit
 
-    def _weight(self) -> tuple[float, float, float]:
-        """Return G of a weight G sin(q - q_0), q_0 in the file's angle, and the share of it that this leaves over."""
+    def _put(self, angle: float) -> None:
+        """Put the joint, and a motor with it, at rest at an angle of the file's."""
         model, data = self._model, self._data
+        self._mujoco.mj_resetData(model, data)
+        data.qpos[self._qpos] = angle
+        if self._driven != self._dof:
+            data.qpos[self._driven_qpos] += angle - model.qpos0[self._qpos]
+        self._mujoco.mj_forward(model, data)
+
+    def _weight(self) -> tuple[float, float]:
+        """Return G and q_0 of a weight G sin(q - q_0), in the file's angle and torque."""
+        data = self._data
         angles = np.linspace(-math.pi, math.pi, _ANGLES, endpoint=False)
         torques = np.empty(_ANGLES)
         for i, angle in enumerate(angles):
-            self._mujoco.mj_resetData(model, data)
-            data.qpos[self._qpos] = angle
-            if self._driven != self._dof:
-                data.qpos[self._driven_qpos] += angle - model.qpos0[self._qpos]
-            self._mujoco.mj_forward(model, data)
-            torques[i] = data.qfrc_bias[self._dof] - data.qfrc_spring[self._dof]
+            self._put(angle)
+            torques[i] = data.qfrc_bias[self._dof] - data.qfrc_gravcomp[self._dof]
         basis = np.stack([np.sin(angles), np.cos(angles)], axis=1)
         (a, b), *_ = np.linalg.lstsq(basis, torques, rcond=None)
-        weight = float(math.hypot(a, b))
-        largest = float(np.max(np.abs(torques)))
-        if largest < 1e-9:
-            return 0.0, float(model.qpos0[self._qpos]), 0.0
-        missed = float(np.max(np.abs(torques - basis @ (a, b)))) / largest
-        return weight, math.atan2(-b, a), missed
+        if float(np.max(np.abs(torques))) < 1e-9:
+            return 0.0, float(self._model.qpos0[self._qpos])
+        return float(math.hypot(a, b)), math.atan2(-b, a)
+
+    def _rest(self, hanging: float) -> float:
+        """Return where the joint comes to rest: where it hangs, unless a spring pulls it elsewhere."""
+
+        def torque(angle: float) -> float:
+            self._put(angle)
+            return float(data.qfrc_spring[self._dof] - data.qfrc_bias[self._dof] + data.qfrc_gravcomp[self._dof])
+
+        data = self._data
+        self._put(hanging)
+        if not np.any(self._model.jnt_stiffness[[self._model.dof_jntid[self._dof]]]):
+            return hanging
+        angles = hanging + np.linspace(-math.pi, math.pi, _REST_ANGLES)
+        torques = [torque(float(angle)) for angle in angles]
+        falls = [i for i in range(len(angles) - 1) if torques[i] >= 0.0 > torques[i + 1]]
+        if not falls:
+            return hanging
+        nearest = min(falls, key=lambda i: abs(angles[i] - hanging))
+        low, high = float(angles[nearest]), float(angles[nearest + 1])
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if torque(middle) >= 0.0 else (low, middle)
+        rest = 0.5 * (low + high)
+        return 0.0 if abs(rest) < _ROUNDING else rest
 
     def _describe(self, weight: float, hanging: float, gain: float, limit: float) -> PlantParameters:
         model, data, mujoco = self._model, self._data, self._mujoco
-        mujoco.mj_resetData(model, data)
-        data.qpos[self._qpos] = hanging
-        mujoco.mj_forward(model, data)
+        self._put(hanging)
         # A motor behind a spring moves with the link, where motion is slow.
         dofs = sorted({self._dof, self._driven})
         inertia = 0.0
@@ -341,18 +396,24 @@ class MujocoPlant:
             one[dof] = 1.0
             mujoco.mj_mulM(model, data, masses, one)
             inertia += float(masses[dof])
-        lag = 0.0
-        if self._actuator is not None and model.actuator_dyntype[self._actuator] != int(mujoco.mjtDyn.mjDYN_NONE):
-            lag = float(model.actuator_dynprm[self._actuator, 0])
+        damping = sum(float(model.dof_damping[i]) for i in dofs)
+        lag = delay = 0.0
+        if self._actuator is not None:
+            if model.actuator_dyntype[self._actuator] != int(mujoco.mjtDyn.mjDYN_NONE):
+                lag = float(model.actuator_dynprm[self._actuator, 0])
+            delay = float(model.actuator_delay[self._actuator])
+            # The motor's own, which MuJoCo keeps apart from the joint's.
+            damping += float(model.actuator_damping[self._actuator]) * self._gear**2
         gain = abs(gain)
         return PlantParameters(
             inertia=inertia / gain,
-            damping=sum(float(np.ravel(model.dof_damping[i])[0]) for i in dofs) / gain,
+            damping=damping / gain,
             gravity=weight / gain,
             coulomb_friction=sum(float(model.dof_frictionloss[i]) for i in dofs) / gain,
             angle_offset=wrap(self._sign * (hanging - self._zero)),
             effort_limit=limit,
             actuator_time_constant=lag,
+            transport_delay=delay,
             name=Path(self._path).stem,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,13 +12,16 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, is_mechanism
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PLANT_SPECS, PRESET_NAMES, is_mechanism
+from pendulum_msgs_py.plants.quantities import write_quantities
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
-from pendulum_sim.foreign.guarded_plant import GuardedPlant
-from pendulum_sim.foreign.gymnasium_plant import load_adapter, load_gymnasium_plant
+from pendulum_sim.foreign.equation_check import EquationCheck, Switches, check_equation
+from pendulum_sim.foreign.guarded_plant import GuardedPlant, in_one_sentence
+from pendulum_sim.foreign.gymnasium_plant import GymnasiumPlant, load_adapter, load_gymnasium_plant
 from pendulum_sim.foreign.mujoco_mapping import MujocoMapping, load_mujoco_mapping
-from pendulum_sim.foreign.mujoco_plant import load_mujoco_plant
+from pendulum_sim.foreign.mujoco_plant import MujocoPlant, load_mujoco_plant
 from pendulum_sim.stepping.integrators import METHODS
+from pendulum_sim.stepping.joint_plant import joint_plant
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_sim.stepping.plant import Plant
 from pendulum_sim.stepping.plants import make_plant
@@ -34,6 +38,7 @@ class Simulation(NamedTuple):
         method: How it is integrated, in words.
         remarks: What the user should know of what was chosen, one line each.
         sealed: Whether its parameters are nobody's business.
+        check: Runs it against its equation, of a simulation of others; afterwards it is to be reset.
     """
 
     plant: Plant | MechanismPlant
@@ -41,6 +46,7 @@ class Simulation(NamedTuple):
     method: str
     remarks: tuple[str, ...] = ()
     sealed: bool = False
+    check: Callable[[], EquationCheck] | None = None
 
     @property
     def pendulum(self) -> Plant:
@@ -78,6 +84,8 @@ class Engine:
 _RATE = ParameterSpec(
     "rate_hz", 500.0, "Hz", "Rate of states and commands.", minimum=50.0, maximum=2000.0, read_only=True
 )
+_EXACT_STEP = 1e-3
+"""Longest step of the equation that a simulation of others is checked against [s]."""
 _FOREIGN_SPECS = (
     ParameterSpec(
         "step_timeout",
@@ -116,23 +124,46 @@ def _make_mujoco(values: Mapping[str, Any]) -> Simulation:
     model, mapping = values["model"], values["mapping"]
     if not model:
         raise ParameterError("model is missing; expected -p model:=FILE, an MJCF or URDF file")
-    plant = load_mujoco_plant(
-        model,
-        load_mujoco_mapping(mapping) if mapping else MujocoMapping(),
-        rate_hz=values["rate_hz"],
-        effort_limit=values["effort_limit"],
-    )
-    return Simulation(GuardedPlant(plant, Path(model).name), model, plant.description, tuple(plant.remarks))
+    told = load_mujoco_mapping(mapping) if mapping else MujocoMapping()
+    with in_one_sentence(f"model {model}", "loading", ParameterError):
+        plant = load_mujoco_plant(model, told, rate_hz=values["rate_hz"], effort_limit=values["effort_limit"])
+    return _foreign(plant, model, Path(model).name)
 
 
 def _make_gymnasium(values: Mapping[str, Any]) -> Simulation:
     env, mapping = values["env"], values["mapping"]
     if not env:
         raise ParameterError("env is missing; expected -p env:=ID, such as Pendulum-v1")
-    plant = load_gymnasium_plant(
-        env, load_adapter(mapping) if mapping else None, seed=values["seed"], effort_limit=values["effort_limit"]
+    adapter = load_adapter(mapping) if mapping else None
+    with in_one_sentence(f"environment {env}", "loading", ParameterError):
+        plant = load_gymnasium_plant(env, adapter, seed=values["seed"], effort_limit=values["effort_limit"])
+    return _foreign(plant, env, env)
+
+
+def _foreign(plant: MujocoPlant | GymnasiumPlant, name: str, label: str) -> Simulation:
+    guarded = GuardedPlant(plant, label)
+
+    def check() -> EquationCheck:
+        substeps = math.ceil(plant.dt / _EXACT_STEP)
+        equation = joint_plant(make_plant(plant.parameters, plant.dt, substeps=substeps))
+        switches = reseeded = None
+        if isinstance(plant, MujocoPlant):
+            switches = Switches(plant.switches, lambda causes: joint_plant(GuardedPlant(plant.without(causes), label)))
+        else:
+            reseeded = joint_plant(GuardedPlant(plant.reseeded(), label))
+        try:
+            coarse = joint_plant(make_plant(plant.parameters, plant.dt, method="semi_implicit"))
+        except ParameterError:
+            # It would be unstable with that period; so would the simulation be, if it used one.
+            coarse = None
+        return check_equation(joint_plant(guarded), equation, coarse=coarse, switches=switches, reseeded=reseeded)
+
+    numbers = write_quantities(vars(plant.parameters), PLANT_SPECS, {})
+    values = ", ".join(
+        f"{name} {entry['value']:.6g} {entry['unit']}" for name, entry in numbers.items() if entry["value"]
     )
-    return Simulation(GuardedPlant(plant, env), env, plant.description, tuple(plant.remarks))
+    remarks = (*plant.remarks, f"closest equation: {values}")
+    return Simulation(guarded, name, plant.description, remarks, check=check)
 
 
 OWN = Engine(

@@ -92,6 +92,8 @@ class SimulatorNode(PollingNode):
         self._settings = NodeParameters(self, self._specs(engine), self._check_start)
         values = self._settings.values
         self._simulation = engine.make(values)
+        # Before the first reset, which ends what it has begun.
+        self._checked = None if self._simulation.check is None else self._simulation.check()
         self._plant = joint_plant(self._simulation.plant)
         self._coordinates = self._plant.coordinates
         parameters = self._simulation.plant.parameters
@@ -167,6 +169,9 @@ class SimulatorNode(PollingNode):
         )
         for remark in self._simulation.remarks:
             self.get_logger().info(remark)
+        if self._checked is not None:
+            line = f"simulation {self._simulation.name} {self._checked}"
+            (self.get_logger().info if self._checked.agrees else self.get_logger().warning)(line)
 
     def close(self) -> None:
         """Stop the plant: a last zero torque is published, so that a recording shows it."""

@@ -19,7 +19,7 @@ from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests,
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
 from pendulum_bags.runs.run_data import OpenBag, RunData, is_emulated, noise_hold_time, plant_summary, read_run
 from pendulum_bags.runs.run_folder import pair_folders, read_looks, read_stalls
-from pendulum_bags.runs.run_record import run_record
+from pendulum_bags.runs.run_record import DIFFERENCE, STAND_IN, run_record
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_msgs_py.json_values import without_nan
 from pendulum_rosbag.reader import read_bag
@@ -52,6 +52,17 @@ class Comparison:
     looks: Looks = Looks()  # noqa: RUF009 - frozen
     left_out: Sequence[str] = ()
     stalls: Sequence[Mapping[str, str]] = ()
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader should know beside the figures: simulations that are not as their equation, and `left_out`."""
+        told = []
+        for run in (self.pairs[0].simulation, self.pairs[0].hardware):
+            record = run_record(run.metadata)
+            simulation = record.get("simulation") if run.label == "simulation" or STAND_IN in record else None
+            if isinstance(simulation, Mapping) and (difference := simulation.get(DIFFERENCE)):
+                told.append(f"The {run.label}, {simulation.get('name')}, {difference}.")
+        return [*dict.fromkeys(told), *self.left_out]
 
     @property
     def is_emulated(self) -> bool:

@@ -218,7 +218,7 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
         )
     else:
         console.print(f"Not paired: {content['paired']['reason']}.")
-    for note in result.left_out:
+    for note in result.notes:
         console.print(note, style="yellow", highlight=False, markup=False)
     print_tests(console, result)
 

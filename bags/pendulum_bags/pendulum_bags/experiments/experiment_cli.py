@@ -22,6 +22,7 @@ from pendulum_bags.experiments.new_run import new_run
 from pendulum_bags.experiments.operator import ask_for_running, confirmed
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import SIDES
+from pendulum_bags.experiments.session import refuse_existing
 from pendulum_bags.experiments.settings import (
     HARDWARE,
     RAMP_SPEED,
@@ -59,8 +60,12 @@ app = typer.Typer(
     add_completion=False,
 )
 
-Plant = Annotated[
-    str, typer.Option(help="Preset or plant file of the simulated plant, and of the controller's design.")
+ThesisPlant = Annotated[
+    str | None,
+    typer.Option(
+        help="Preset or plant file of the simulated plant, and of the controller's design; default thesis, or with "
+        "--simulation the equation read off it."
+    ),
 ]
 Simulation = Annotated[
     str, typer.Option(help="In the simulator's place: a model file (MJCF or URDF, run by MuJoCo), or gymnasium:ID.")
@@ -80,13 +85,20 @@ Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
 Duration = Annotated[float, typer.Option(help="Length of the noise [s].")]
 Controller = Annotated[str, typer.Option(help="Kind of controller, or a policy file (.npz).")]
+AcceptDifferences = Annotated[
+    bool,
+    typer.Option(
+        "--accept-differences",
+        help="Design on the equation of --simulation even if the simulation does not move as it; the report says so.",
+    ),
+]
 Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
 
 
 _OF_SEVERAL_JOINTS = {"duration", "amplitude", "hold_time"}
 """Options of ``thesis`` whose defaults are others for several joints."""
 _OF_ONE_JOINT = {
-    *("simulation", "mapping", "hardware", "hardware_mapping", "lab", "yes", "domain"),
+    *("simulation", "mapping", "accept_differences", "hardware", "hardware_mapping", "lab", "yes", "domain"),
     *("strategy", "controller", "q", "r", "ramp_speed", "budget"),
 }
 """Options of ``thesis`` that plants of several joints do not have."""
@@ -99,15 +111,10 @@ def thesis(
         Path | None,
         out_option("Folder of the run; it must be new. Default: bags/runs/<UTC>_thesis."),
     ] = None,
-    plant: Annotated[
-        str | None,
-        typer.Option(
-            help="Preset or plant file of the simulated plant, and of the controller's design; default thesis, or with "
-            "--simulation the equation read off it."
-        ),
-    ] = None,
+    plant: ThesisPlant = None,
     simulation: AnySimulation = "",
     mapping: Mapping = None,
+    accept_differences: AcceptDifferences = False,
     hardware: Annotated[
         str,
         typer.Option(
@@ -198,6 +205,8 @@ def thesis(
     )
     margins = Margins.of(margins_file, margin)
     domain = check_domain(domain)
+    if (foreign := settings.foreign) is not None and plant is None and not accept_differences:
+        foreign.require_equation()
     console = make_console(stderr=json_output, highlight=False)
     running = _running(settings, domain, plant)
     ask_for_running(running, domain or 0, _plan(settings), yes=yes)
@@ -205,7 +214,7 @@ def thesis(
         confirmed(settings.machine, settings.bridge_program(), _plan(settings), yes=yes),
         new_run(out, "thesis", console) as folder,
     ):
-        if (foreign := settings.foreign) is not None:
+        if foreign is not None:
             equation = foreign.write_equation(folder)
             settings = settings if plant else replace(settings, plant=str(equation))
         started = time.monotonic()
@@ -241,9 +250,10 @@ def thesis(
 def lockstep(
     bag: Annotated[Path, typer.Option(help="Folder of the bag; it must not exist.")],
     side: Annotated[str, typer.Option(help="sim for the simulator, hw for the emulated hardware.")] = "sim",
-    plant: Plant = "thesis",
+    plant: ThesisPlant = None,
     simulation: Simulation = "",
     mapping: Mapping = None,
+    accept_differences: AcceptDifferences = False,
     strategy: Strategy = "direct_pwm",
     seed: Seed = 1,
     amplitude: Amplitude = 2.5,
@@ -272,7 +282,7 @@ def lockstep(
             f"simulation is {simulation}, which runs already; expected one that this command starts, in its own time"
         )
     settings = RegulationSettings(
-        plant=plant,
+        plant=plant or "thesis",
         simulation=simulation,
         mapping=str(mapping or ""),
         effort_strategy=strategy,
@@ -282,6 +292,11 @@ def lockstep(
         noise=NoiseSettings(seed, amplitude, hold_time or (0.002 if side == "sim" else 0.01), duration),
         storage=storage,
     )
+    if (foreign := settings.foreign) is not None and plant is None:
+        if not accept_differences:
+            foreign.require_equation()
+        refuse_existing(bag)
+        settings = replace(settings, plant=str(foreign.write_equation(bag.parent / "logs" / bag.name)))
     started = time.monotonic()
     run_lockstep(bag, settings, side=side, domain=domain, hosts=kept_pool())
     elapsed = time.monotonic() - started
@@ -376,6 +391,7 @@ def _summary(settings: RegulationSettings, comparison: Comparison, answer: Answe
         "hardware": settings.hardware,
         "seed": settings.noise.seed,
         "strategy": settings.strategy,
+        "notes": comparison.notes,
         "versions": versions(),
         "answer": answer.to_json(),
     }
@@ -405,7 +421,7 @@ def _print_summary(console: Console, summary: dict[str, Any]) -> None:
         console.print("(sim_500hz: simulation by the thesis's own protocol, with new noise every 2 ms)")
     if warning := timing_warning(plants):
         console.print(warning, style="bold red")
-    for note in summary["left_out"]:
+    for note in summary["notes"]:
         console.print(note, style="yellow", markup=False)
 
 

@@ -7,10 +7,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pendulum_bags.runs.run_record import DIFFERENCE
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_differences import describe_plants
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
+from pendulum_sim.foreign.equation_check import EquationCheck
 from pendulum_sim.simulator.engines import find_engine, open_simulation
 from pendulum_sim.stepping.plant import Plant
 
@@ -25,12 +27,14 @@ class _Facts:
     period: float
     method: str
     remarks: tuple[str, ...]
+    check: EquationCheck
 
 
 @cache
 def _facts(name: str, mapping: str) -> _Facts:
     made = open_simulation(name, mapping)
-    return _Facts(made.pendulum.parameters, made.plant.dt, made.method, made.remarks)
+    assert made.check is not None  # of others
+    return _Facts(made.pendulum.parameters, made.plant.dt, made.method, made.remarks, made.check())
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,18 @@ class ForeignSimulation:
                 f"{hold_time * 1e3:g} ms; expected timestep in a mapping file, or --hold-time {self.period:g} and more"
             )
 
+    def require_equation(self) -> None:
+        """Refuse a simulation that does not move as the equation that a controller would be designed on.
+
+        Raises:
+            ParameterError: It does not; the message says by how much, where, and why where that could be tested.
+        """
+        if not (check := _facts(self.name, self.mapping).check).agrees:
+            raise ParameterError(
+                f"simulation {self.name} {check}; expected a model of which that holds, --plant FILE to design on "
+                "another equation, or --accept-differences to design on this one all the same"
+            )
+
     def open(self) -> Plant:
         """Return the simulation in this process."""
         return open_simulation(self.name, self.mapping).pendulum
@@ -99,7 +115,12 @@ class ForeignSimulation:
     def write_equation(self, folder: Path) -> Path:
         """Write the closest equation as a plant file, for a controller to be designed on; return the file."""
         facts = _facts(self.name, self.mapping)
-        provenance = {"simulation": self.name, "engine": facts.method, "remarks": "; ".join(facts.remarks)}
+        provenance = {
+            "simulation": self.name,
+            "engine": facts.method,
+            "remarks": "; ".join(facts.remarks),
+            "check": str(facts.check),
+        }
         return write_plant(folder / EQUATION_FILE, facts.parameters, provenance=provenance)
 
     def to_json(self) -> dict[str, Any]:
@@ -111,4 +132,5 @@ class ForeignSimulation:
             "mapping": Path(self.mapping).name,
             "period": facts.period,
             "equation": describe_plants([facts.parameters]),
+            **({} if facts.check.agrees else {DIFFERENCE: str(facts.check)}),
         }

@@ -117,7 +117,7 @@ def page_of(
             table for table in (provenance_table(data), emulator_table(data), settings_table(data)) if table is not None
         ],
         animation=animation_of(data),
-        notes=[*([warning] if warning else []), *comparison.left_out],
+        notes=[*([warning] if warning else []), *comparison.notes],
         missing=missing,
         runs=len(comparison.pairs),
         unpaired=comparison.unpaired_verdict.sentence,

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["RUN_RECORD", "STAND_IN", "record_named", "run_record"]
+__all__ = ["DIFFERENCE", "RUN_RECORD", "STAND_IN", "record_named", "run_record"]
 
 RUN_RECORD = "pendulum.run"
 """Name of the record among a bag's metadata; ``RunSpec`` and the settings of experiments write it."""
+DIFFERENCE = "difference"
+"""Entry of a record's simulation: how it moves otherwise than the equation of the design."""
 STAND_IN = "stand_in"
 """Entry of the record that says what stood in for the hardware: ``simulation``, where a second one did."""
 

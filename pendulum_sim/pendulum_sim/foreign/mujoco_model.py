@@ -1,0 +1,68 @@
+"""A model file as MuJoCo reads it, meshes of a ROS description included."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pendulum_msgs_py.errors import ParameterError
+
+__all__ = ["read_model"]
+
+_PACKAGE = "package://"
+
+
+def read_model(mujoco: Any, path: Path) -> tuple[Any, list[str]]:
+    """Return the compiled model, and in words what was left out of it.
+
+    Raises:
+        ParameterError: MuJoCo refuses it, or it is a source of a model.
+    """
+    text = path.read_text(encoding="utf-8", errors="replace")
+    if "xmlns:xacro" in text or path.suffix == ".xacro":
+        raise ParameterError(
+            f"model {path} is a source for xacro; expected the URDF that it makes: xacro {path.name} > "
+            f"{path.name.split('.')[0]}.urdf (without ROS: pip install xacro)"
+        )
+    remarks: list[str] = []
+    try:
+        if "<robot" not in text or "<mesh" not in text:
+            return mujoco.MjModel.from_xml_path(str(path)), remarks
+        spec = mujoco.MjSpec.from_file(str(path))
+        for mesh in list(spec.meshes):
+            found = _find(str(mesh.file), path)
+            if found is not None and (problem := _problem(mujoco, found)) == "":
+                mesh.file = str(found)
+                continue
+            # A mesh says nothing of the dynamics where a link has its inertia; where not, MuJoCo says so.
+            for geom in [geom for geom in spec.geoms if geom.meshname == mesh.name]:
+                spec.delete(geom)
+            why = "no such file" if found is None else problem
+            remarks.append(f"mesh {mesh.file} is left out, so its link touches nothing ({why})")
+            spec.delete(mesh)
+        return spec.compile(), remarks
+    except ValueError as error:
+        raise ParameterError(f"MuJoCo refuses model {path}: {' '.join(str(error).split())}") from error
+
+
+def _find(name: str, path: Path) -> Path | None:
+    """Return the file of a mesh: by its path, or in the package that holds the model or lies next to it."""
+    folders = path.resolve().parents
+    if name.startswith(_PACKAGE):
+        inside = Path(name.removeprefix(_PACKAGE))
+        places = [place for folder in folders for place in (folder / Path(*inside.parts[1:]), folder / inside)]
+    else:
+        places = [folders[0] / name.removeprefix("file://")]
+    return next((place for place in places if place.is_file()), None)
+
+
+def _problem(mujoco: Any, mesh: Path) -> str:
+    """Return why MuJoCo cannot read a mesh, or nothing."""
+    spec = mujoco.MjSpec()
+    spec.add_mesh(name="mesh", file=str(mesh))
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+    try:
+        spec.compile()
+    except ValueError as error:
+        return str(error).splitlines()[0].removeprefix("Error: ")
+    return ""

@@ -1,0 +1,64 @@
+"""What of a MuJoCo model can be switched off, to test whether it makes the model differ from a pendulum's equation."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+__all__ = ["CAUSES", "switch_off"]
+
+_FINER = 8
+_LOCKED = 1e6
+"""Inertia that keeps a joint where it is, as a multiple of the largest of the model."""
+_DISABLED = {"contact": "mjDSBL_CONTACT", "an equality constraint": "mjDSBL_EQUALITY"}
+_CLEARED = {
+    "the range of a joint": ("jnt_limited",),
+    "gravity compensation": ("body_gravcomp",),
+    "a tendon": (
+        *("tendon_stiffness", "tendon_stiffnesspoly", "tendon_damping", "tendon_dampingpoly"),
+        *("tendon_frictionloss", "tendon_limited", "tendon_armature"),
+    ),
+    "a spring": ("jnt_stiffness", "jnt_stiffnesspoly"),
+    "polynomial damping": ("dof_dampingpoly", "actuator_dampingpoly"),
+    "damping of the actuator": ("actuator_damping",),
+    "delay of the actuator": ("actuator_delay",),
+    "armature of the actuator": ("actuator_armature",),
+}
+_FLUID, _JOINTS, _ACTUATORS = "the fluid around it", "other joints that move", "other actuators"
+_FLAG, _TIMESTEP = "a flag that disables a part of MuJoCo", "a timestep too long for the integrator"
+CAUSES = (*_DISABLED, *_CLEARED, _FLUID, _JOINTS, _ACTUATORS, _FLAG, _TIMESTEP)
+"""What can be switched off, in words."""
+
+
+def switch_off(mujoco: Any, model: Any, cause: str, dofs: Collection[int], actuator: int | None) -> int:
+    """Switch one of ``CAUSES`` off in a model; return how many steps take the place of one.
+
+    Args:
+        mujoco: The library.
+        model: The model; it is changed.
+        cause: What is switched off.
+        dofs: Degrees of freedom of the joint and of its motor.
+        actuator: Number of its actuator; None for none.
+    """
+    if cause in _DISABLED:
+        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, _DISABLED[cause]))
+    for field in _CLEARED.get(cause, ()):
+        getattr(model, field)[:] = 0
+    if cause == _FLUID:
+        model.opt.density = model.opt.viscosity = 0.0
+        model.opt.wind[:] = 0.0
+    elif cause == _JOINTS:
+        others = [i for i in range(model.nv) if i not in dofs]
+        model.dof_armature[others] += _LOCKED * max(1.0, float(np.max(model.dof_M0)))
+    elif cause == _ACTUATORS:
+        others = [i for i in range(model.nactuator) if i != actuator]
+        for field in ("gainprm", "biasprm", "damping", "dampingpoly"):
+            getattr(model, f"actuator_{field}")[others] = 0.0
+    elif cause == _FLAG:
+        model.opt.disableflags = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    elif cause == _TIMESTEP:
+        model.opt.timestep /= _FINER
+        return _FINER
+    return 1

@@ -1,0 +1,255 @@
+"""A simulation of others is run against its equation: what differs is found, and named only where it is the cause."""
+
+from __future__ import annotations
+
+import math
+import random
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_sim.foreign.equation_check import TOLERANCE, EquationCheck, check_equation
+from pendulum_sim.simulator.engines import open_simulation
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
+
+pytest.importorskip("mujoco")
+
+# --- MuJoCo ----------------------------------------------------------------------------------------------------
+
+AGREES = ""
+FEATURES: dict[str, str] = {
+    "plain": AGREES,
+    "range": "the range of a joint",
+    "contact": "contact",
+    "gravcomp": AGREES,
+    "fluid": "the fluid around it",
+    "tendon": "a tendon",
+    "spring": "a spring",
+    "polynomial": "polynomial damping",
+    "motor_polynomial": "polynomial damping",
+    "motor_damping": AGREES,
+    "motor_delay": AGREES,
+    "motor_armature": AGREES,
+    "motor_lag": AGREES,
+    "equality": "an equality constraint",
+    "elbow": "other joints that move",
+    "free_body": AGREES,
+    "servo_too": "other actuators",
+    "pid_too": "other actuators",
+    "flag": "a flag that disables a part of MuJoCo",
+}
+"""What a model has besides a plain pendulum, and the cause that is to be named; nothing where its equation holds."""
+
+
+def write_model(path: Path, feature: str, seed: int) -> Path:
+    """Write a random pendulum with one feature, which is strong enough to matter."""
+    draw = random.Random(f"{feature} {seed}")
+    length, mass = draw.uniform(0.1, 0.8), 10.0 ** draw.uniform(-1.0, 0.7)
+    weight, inertia = 9.81 * mass * length, 1.05 * mass * length**2
+    rate = math.sqrt(weight / inertia)
+    damping = 10.0 ** draw.uniform(-2.5, 0.5) * inertia * rate
+    friction, gear = draw.choice([0.0, 0.0, 0.03, 0.1]) * weight, draw.choice([1.0, 2.0, 0.5])
+    limit = 10.0 ** draw.uniform(-0.3, 1.0) * weight
+    timestep = draw.choice([0.0005, 0.001, 0.002, 0.005])
+    integrator = draw.choice(["Euler", "implicitfast", "RK4", "implicit"])
+    up = draw.choice([1, -1])
+    damped, joint, body, option = f'damping="{damping}"', "", "", ""
+    flag = world = inner = more = others = ""
+    motor, kind = f'gear="{gear}" ctrlrange="{-limit / gear} {limit / gear}"', "motor"
+    if feature == "range":
+        joint = f'range="-{draw.uniform(60.0, 179.0)} {draw.uniform(60.0, 179.0)}"'
+    elif feature == "contact":
+        angle = draw.uniform(-math.pi, math.pi)
+        place = f"{length * math.sin(angle)} 0 {1.0 + length * math.cos(angle)}"
+        world = f'<geom type="sphere" size="{0.2 * length}" pos="{place}"/>'
+    elif feature == "gravcomp":
+        body = f'gravcomp="{draw.uniform(0.3, 1.2)}"'
+    elif feature == "fluid":
+        option = f'density="{draw.uniform(500.0, 2000.0)}" viscosity="0.1"'
+    elif feature == "tendon":
+        spring = draw.uniform(0.3, 3.0) * weight
+        more = f'<tendon><fixed stiffness="{spring}"><joint joint="hinge" coef="1"/></fixed></tendon>'
+    elif feature == "spring":
+        joint = f'stiffness="{draw.uniform(0.3, 3.0) * weight}" springref="{draw.uniform(-90.0, 90.0)}"'
+    elif feature == "polynomial":
+        damped = f'damping="{damping} {draw.uniform(0.5, 3.0) * inertia}"'
+    elif feature == "motor_polynomial":
+        motor += f' damping="0 {draw.uniform(0.5, 3.0) * inertia / gear**3}"'
+    elif feature == "motor_damping":
+        motor += f' damping="{draw.uniform(0.3, 3.0) * inertia * rate / gear**2}"'
+    elif feature == "motor_delay":
+        steps = draw.randint(2, 10)
+        motor += f' delay="{steps * timestep}" nsample="{steps + 1}"'
+    elif feature == "motor_armature":
+        motor += f' armature="{draw.uniform(0.1, 2.0) * inertia / gear**2}"'
+    elif feature == "motor_lag":
+        kind, motor = "general", motor + f' dyntype="filterexact" dynprm="{draw.uniform(0.005, 0.1)}"'
+    elif feature == "equality":
+        world = f'<body pos="0 0 2"><joint name="other"/><geom size="0.05" mass="{mass}" pos="0.1 0 0"/></body>'
+        more = '<equality><joint joint1="hinge" joint2="other"/></equality>'
+    elif feature == "elbow":
+        inner = f'<body pos="0 0 {up * length}"><joint name="elbow" axis="0 1 0" damping="{0.1 * damping}"/>'
+        inner += f'<geom size="0.02" mass="{draw.uniform(0.3, 1.0) * mass}" pos="0 0 {0.5 * up * length}"/></body>'
+    elif feature == "free_body":
+        world = '<body pos="3 0 3"><freejoint/><geom size="0.1"/></body>'
+    elif feature in {"servo_too", "pid_too"}:
+        name = "position" if feature == "servo_too" else "pid"
+        others = f'<{name} joint="hinge" kp="{draw.uniform(0.3, 3.0) * weight}"/>'
+    elif feature == "flag":
+        flag, friction = '<flag frictionloss="disable"/>', 0.2 * weight
+    path.write_text(
+        f'<mujoco><option timestep="{timestep}" integrator="{integrator}" {option}>{flag}</option><worldbody>{world}'
+        f'<body pos="0 0 1" {body}><joint name="hinge" axis="0 1 0" {damped} frictionloss="{friction}" {joint}/>'
+        f'<geom size="{0.2 * length}" mass="{mass}" pos="0 0 {up * length}"/>{inner}</body></worldbody>{more}'
+        f'<actuator>{others}<{kind} name="motor" joint="hinge" {motor}/></actuator></mujoco>',
+        encoding="utf-8",
+    )
+    return path
+
+
+def check_model(path: Path) -> EquationCheck:
+    mapping = path.with_suffix(".yaml")
+    mapping.write_text("format: pendulum_simulation/1\njoint: hinge\nactuator: motor\n", encoding="utf-8")
+    made = open_simulation(str(path), str(mapping))
+    assert made.check is not None
+    return made.check()
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+def test_a_feature_that_the_equation_lacks_is_named_and_no_other(tmp_path: Path, feature: str) -> None:
+    found = check_model(write_model(tmp_path / "model.xml", feature, 1))
+    assert found.causes == ((FEATURES[feature],) if FEATURES[feature] else ()), str(found)
+    assert found.agrees == (not FEATURES[feature]), str(found)
+    assert found.left is None or found.left <= TOLERANCE
+
+
+@pytest.mark.parametrize("seed", range(2, 8))
+def test_a_plain_pendulum_is_refused_by_no_check(tmp_path: Path, seed: int) -> None:
+    found = check_model(write_model(tmp_path / "model.xml", "plain", seed))
+    assert found.agrees, str(found)
+
+
+def test_two_features_are_both_named(tmp_path: Path) -> None:
+    path = write_model(tmp_path / "model.xml", "spring", 1)
+    path.write_text(path.read_text(encoding="utf-8").replace("<option ", '<option density="1500" viscosity="1" '))
+    assert set(check_model(path).causes) == {"a spring", "the fluid around it"}
+
+
+# --- Gymnasium -------------------------------------------------------------------------------------------------
+
+
+class Odd(gymnasium.Env[Any, Any]):
+    """A pendulum that hangs at 0, with one thing that is odd."""
+
+    action_space = gymnasium.spaces.Box(-5.0, 5.0, (1,), np.float64)
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    dt = 0.01
+
+    def __init__(self, **odd: float) -> None:
+        self.odd = odd
+        self.x = np.zeros(2)
+        self.waiting: list[float] = []
+        self.torque = 0.0
+
+    def _observe(self) -> Any:
+        theta, speed = self.x + self.odd.get("noise", 0.0) * self.np_random.normal(size=2)
+        if wrap := self.odd.get("wrap"):
+            theta = (theta + 0.5 * wrap) % wrap - 0.5 * wrap
+        return np.array([theta, speed * self.odd.get("speed_unit", 1.0)])
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self.x = np.array((options or {}).get("state", [0.0, 0.0]), dtype=float)
+        self.x *= [1.0 - self.odd.get("no_angle", 0.0), 1.0 - self.odd.get("no_speed", 0.0)]
+        self.waiting, self.torque = [0.0] * int(self.odd.get("delay", 0)), 0.0
+        return self._observe(), {}
+
+    def step(self, action: Any) -> Any:
+        odd, dt = self.odd, 0.001
+        self.waiting.append(float(np.clip(action[0], -odd.get("clip", 5.0), odd.get("clip", 5.0))))
+        wanted = self.waiting.pop(0)
+        theta, speed = self.x
+        for _ in range(10 * int(odd.get("skip", 1))):
+            lag = odd.get("lag", 0.0)
+            self.torque += (wanted - self.torque) * (dt / lag if lag else 1.0)
+            force = self.torque - 0.02 * speed - 1.5 * math.sin(theta - odd.get("zero", 0.0))
+            force -= odd.get("drag", 0.0) * speed * abs(speed) + odd.get("dry", 0.0) * math.tanh(100.0 * speed)
+            force -= odd.get("spring", 0.0) * theta + odd.get("constant", 0.0)
+            force -= odd.get("second", 0.0) * math.sin(2.0 * theta)
+            if abs(theta) > (stop := odd.get("stop", math.inf)):
+                force -= 200.0 * math.copysign(abs(theta) - stop, theta) + 2.0 * speed
+            speed += dt * force / 0.05
+            theta += dt * speed
+        self.x = np.array([theta, speed])
+        return self._observe(), 0.0, abs(theta) > odd.get("ends", math.inf), False, {}
+
+
+gymnasium.register("Odd-v0", entry_point=Odd)
+
+
+@pytest.mark.parametrize(
+    ("odd", "cause"),
+    [
+        ({}, ""),
+        ({"noise": 1e-4}, ""),
+        ({"wrap": 2.0 * math.pi}, ""),
+        ({"noise": 0.1}, "noise (with another seed"),
+        ({"wrap": math.pi}, "an angle that jumps by"),
+        ({"no_angle": 1}, "a reset that is ignored"),
+        ({"no_speed": 1}, "a reset that ignores the velocity"),
+        ({"delay": 3}, "a delay (an effort acts 30 ms later)"),
+        ({"lag": 0.05}, "a lag of the effort"),
+        ({"clip": 1.0}, "an action that is clipped (beyond about 1 N m more does nothing; the limit is 5 N m)"),
+        ({"skip": 4}, "a period of 40 ms instead of 10 ms (frame skip)"),
+        ({"skip": 10}, "a period of 100 ms instead of 10 ms (frame skip)"),
+        ({"speed_unit": 180.0 / math.pi}, "or a unit of velocity: its angle moves 0.0175 times as far"),
+        ({"drag": 0.01}, "quadratic damping"),
+        ({"dry": 0.3}, "dry friction"),
+        ({"spring": 0.5}, "a spring"),
+        ({"constant": 0.4}, "a constant torque"),
+        ({"second": 0.4}, "a weight that is no sine of the angle"),
+        ({"zero": 0.2}, "another zero of the angle"),
+        ({"stop": 1.6}, "a stop or a contact (free swings are right from -1.57 to 1.57 rad only)"),
+        ({"ends": 2.0}, "the environment ended its episode"),
+    ],
+)
+def test_an_environment_that_is_odd_is_named_by_what_it_does(tmp_path: Path, odd: dict[str, float], cause: str) -> None:
+    adapter = tmp_path / "adapter.yaml"
+    adapter.write_text(
+        "format: pendulum_simulation/1\nangle: {index: 0}\nvelocity: {index: 1}\ntorque: {index: 0}\n"
+        f"start: {{options: state}}\nperiod: dt\nmake: {{{', '.join(f'{k}: {v}' for k, v in odd.items())}}}\n",
+        encoding="utf-8",
+    )
+    made = open_simulation("gymnasium:Odd-v0", str(adapter))
+    assert made.check is not None
+    found = made.check()
+    assert found.agrees == (not cause), str(found)
+    assert cause in str(found)
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "PendulumX59-v0"])
+def test_environments_that_need_no_adapter_agree_at_their_coarse_period(name: str) -> None:
+    made = open_simulation(f"gymnasium:{name}")
+    assert made.check is not None
+    assert made.check().agrees
+
+
+# --- several joints --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["double_pendulum", "cart_pole", "furuta"])
+def test_several_joints_are_judged_one_by_one(name: str) -> None:
+    parameters = load_mechanism(name)
+    one, other = (MechanismPlant(parameters, 0.002) for _ in range(2))
+    assert check_equation(one, other).agrees
+    joints = list(parameters.joints)
+    last = len(joints) - 1
+    change = {f"{parameters.coordinates.names[last]}.damping": joints[last].damping + 0.05}
+    softer = MechanismPlant(parameters.with_values(change), 0.002)
+    found = check_equation(softer, other)
+    assert not found.agrees
+    assert int(np.argmax(found.errors)) == last
