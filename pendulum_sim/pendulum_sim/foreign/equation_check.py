@@ -245,13 +245,13 @@ def _add(runs: _Runs, equation: JointPlant, coarse: JointPlant | None, probes: S
 
 def _run(plant: JointPlant, probe: _Probe, count: int) -> _Trace:
     """Run a probe; a plant that fails leaves a shorter trace and its sentence."""
-    still = (0.0,) * len(probe.effort)
+    none = (0.0,) * len(probe.position)
     rows = [(probe.position, probe.velocity)]
     fault = ""
     try:
         plant.reset(probe.position, probe.velocity)
         for _ in range(count):
-            _, position, velocity, _ = plant.step(probe.effort, still)
+            _, position, velocity, _ = plant.step(probe.effort, none)
             rows.append((position, velocity))
     except FaultError as error:
         fault = str(error)

@@ -104,7 +104,6 @@ class AdoptNode(PollingNode):
         self._supervisor = SharedSupervisor(limits, self._preflight)
         self._odd: Counter[str] = Counter()
         self._lines = Throttle(1.0)
-        self._applied = 0.0
         self._interface = PlantInterface(
             self, self._supervisor, self._clock_ns, push=False, more_diagnostics=self._diagnostics
         )
@@ -165,7 +164,6 @@ class AdoptNode(PollingNode):
             self._interface.publish_applied(sample.stamp_ns, (effort,))
 
     def _send(self, effort: float) -> None:
-        self._applied = effort
         self._efforts[self._index] = self._sign * effort
         self._commands.publish(Float64MultiArray(data=self._efforts))
 
@@ -184,9 +182,9 @@ class AdoptNode(PollingNode):
             # Theirs may wrap; ours go on.
             before = self._interface.sample.position[0]
             theta = before + wrap(theta - before)
-        # Who measures no torque is taken to make what was asked for.
-        measured = self._sign * effort if math.isfinite(effort) else self._applied
-        sample = JointSample.of_one(now_ns, theta, self._sign * message.velocity[i], measured)
+        if math.isnan(effort) and self._interface.sample is None:
+            self.get_logger().warning(f"states of {self._joint!r} have no effort: measured torque is NaN from here on")
+        sample = JointSample.of_one(now_ns, theta, self._sign * message.velocity[i], self._sign * effort)
         if not sample.is_finite():
             self._refuse("a state is not finite")
             if self._supervisor.mode.armed:
