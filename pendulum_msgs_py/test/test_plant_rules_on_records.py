@@ -78,6 +78,8 @@ _numbers = st.floats(-20.0, 20.0) | st.sampled_from([0.0, -0.0, 10.0, -10.0, 5.0
 @example(later=2 * _MS, behind=0, position=1.0, velocity=5.1, torque=0.0, disturbed=False)
 @example(later=2 * _MS, behind=0, position=10.1, velocity=0.0, torque=0.0, disturbed=False)
 @example(later=2 * _MS, behind=0, position=1.0, velocity=0.0, torque=math.nan, disturbed=False)
+@example(later=2 * _MS, behind=0, position=1.0, velocity=0.0, torque=math.inf, disturbed=False)
+@example(later=2 * _MS, behind=0, position=1.0, velocity=math.nan, torque=0.0, disturbed=False)
 def test_a_decision_is_the_supervisors_or_none(
     later: int, behind: int, position: float, velocity: float, torque: float, disturbed: bool
 ) -> None:

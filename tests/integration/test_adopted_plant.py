@@ -104,6 +104,9 @@ def test_it_is_stamped_armed_driven_limited_moved_and_stopped(adopted: Peer) -> 
     first = peer.states[0]
     assert (list(first.name), first.position[0]) == ([names.JOINT], pytest.approx(0.0, abs=1e-6))
     assert stamp_from_message(first.header.stamp) > 1e18
+    # The robot measures no torque, and what it was sent is not taken for one.
+    assert all(math.isnan(state.effort[0]) for state in peer.states)
+    assert "have no effort: measured torque is NaN" in peer.program.output  # type: ignore[union-attr]
     # Commands before arming move nothing.
     peer.torque = 1.0
     peer.until(lambda: int(peer.diagnostics.get("effort_command.accepted", 0)) > 20, "commands")
@@ -133,6 +136,7 @@ def test_it_is_stamped_armed_driven_limited_moved_and_stopped(adopted: Peer) -> 
     peer.torque = 1.0
     peer.until(lambda: len(peer.sent) > count + 30, "more efforts")
     assert set(peer.sent[count:]) == {0.0}
+    assert all(math.isnan(state.effort[0]) for state in peer.states)
     assert not peer.arm().success
 
 

@@ -58,7 +58,7 @@ def decide(s: Any, now_ns: int) -> bool:
     age = age_of(s.sample_ns, now_ns)
     if age < -r.feedback_timeout or age > r.feedback_timeout:
         return False
-    if not (math.isfinite(s.position) and math.isfinite(s.velocity) and math.isfinite(s.effort)):
+    if not (math.isfinite(s.position) and math.isfinite(s.velocity)) or math.isinf(s.effort):
         return False
     if not is_inside(r.lowest, s.position, r.highest, s.velocity, r.fastest):
         return False
