@@ -1,7 +1,7 @@
 """What ``pip install`` of one of our wheels brings, by what the installed packages say of themselves.
 
 The environment holds the whole lock, so nothing has to be installed anew. The rows of the table in
-``install_on_ros.md``, as they should be::
+``install.md``, as they should be::
 
     python -m tests.wheel_sizes
 """
@@ -21,7 +21,7 @@ from tests.fixtures import PROJECT
 
 __all__ = ["PAGE", "Row", "as_installed", "of_page"]
 
-PAGE = PROJECT / "pendulum_msgs_py" / "docs" / "install_on_ros.md"
+PAGE = PROJECT / "pendulum_msgs_py" / "docs" / "install.md"
 Row = tuple[int, float]
 """Number of packages, and size of their files [MB]."""
 

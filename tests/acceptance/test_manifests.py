@@ -18,7 +18,7 @@ from tests.acceptance.test_packaging import FOLDERS
 from tests.fixtures import PROJECT
 
 KNOWN: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("rosdep_keys.yaml").read_text(encoding="utf-8"))
-PAGE = (PROJECT / "pendulum_msgs_py" / "docs" / "install_on_ros.md").read_text(encoding="utf-8")
+PAGE = (PROJECT / "pendulum_msgs_py" / "docs" / "install.md").read_text(encoding="utf-8")
 _OF_ROS = re.compile(r"rclpy|launch|launch_ros|std_srvs|\w+_interfaces|\w+_msgs|pendulum_\w+")
 
 

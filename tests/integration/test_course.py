@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tests.fixtures import PROJECT
 
-PAGE = PROJECT / "bags" / "pendulum_bags" / "docs" / "course_answers.md"
+PAGE = PROJECT / "bags" / "pendulum_bags" / "docs" / "course.md"
 
 
 def _run(line: str, folder: Path) -> subprocess.CompletedProcess[str]:

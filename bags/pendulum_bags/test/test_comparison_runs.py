@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from pendulum_bags.comparison.compare_cli import main
 from pendulum_bags.experiments.experiment_cli import _print_summary
 from pendulum_bags.report import FIGURES
 from pendulum_bags.report.data import ReportData
+from pendulum_bags.report.report_cli import main as report_main
 from pendulum_bags.report.tables import make_tables
 from pendulum_bags.runs.run_data import missed_periods, timing_warning
 from pendulum_bags.verdict.same_run import seen_note
@@ -302,6 +304,24 @@ def test_command_prints_json_and_writes_files(
     assert printed["verdict"]["outcome"] == "equivalent"
 
 
+def test_a_report_uses_the_margins_that_the_run_was_compared_with(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    monkeypatch.setattr("pendulum_bags.report.figures.FIGURES", [])
+    assert main([str(run / "sim"), str(run / "hw"), "--margin", "delay=17ms", "--margin", "spread_angle=0.5deg"]) == 0
+    assert f"margins {run / 'margins.yaml'} (report uses them)" in capsys.readouterr().out
+    assert report_main([str(run), "--png-only"]) == 0
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert "±17 ms" in page
+    assert "±0.5 deg" in page
+    assert report_main([str(run), "--png-only", "--margin", "delay=9ms"]) == 0
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert "±9 ms" in page
+    assert "±0.5 deg" not in page
+
+
 def test_command_prints_the_verdict_last(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(folder)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
@@ -309,7 +329,7 @@ def test_command_prints_the_verdict_last(folder: Path, capsys: pytest.CaptureFix
     assert question
     assert "distance of velocities less the delay" in table
     assert answer.startswith(" Yes: in this run simulation and the hardware move alike within the default margins")
-    assert "What to do next: - Measure “same plant” and “which controllers”: python -m pendulum_bags" in answer
+    assert "What to do next: - Measure “same for feedback” and “which controllers”: python -m pendulum_bags" in answer
 
 
 @pytest.mark.parametrize(

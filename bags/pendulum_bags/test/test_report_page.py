@@ -31,10 +31,10 @@ from pendulum_bags.report.page import page_of
 from pendulum_bags.report.provenance import emulator_table, provenance_table, settings_table
 from pendulum_bags.report.report_cli import main
 from pendulum_bags.report.tables import make_tables
-from pendulum_bags.report.wording import name_in
 from pendulum_bags.report.write import title_of
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
 from pendulum_bags.verdict.answer import answer_of
+from pendulum_bags.verdict.naming import name_in
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -441,7 +441,8 @@ def test_page_begins_with_the_answer_its_layers_and_what_to_do_next(page: Path) 
     top = text.split("<nav")[0]
     assert "</span>Yes</p>" in top
     assert "In this run simulation and the hardware move alike" in top
-    found = [top.index(title) for title in ("1 same run", "2 same plant", "3 which controllers", "4 same choice")]
+    titles = ("1 same run", "2 same for feedback", "3 which controllers", "4 same choice")
+    found = [top.index(title) for title in titles]
     assert found == sorted(found)
     assert top.index("What to do next") > top.index("4 same choice")
 
@@ -453,7 +454,7 @@ def test_layers_that_a_run_folder_keeps_are_in_its_report(comparison: Comparison
     text = write_report(tmp_path, comparison=comparison, recordings=[], formats=[]).read_text(encoding="utf-8")
     assert "</span>No</p>" in text
     assert "<p>The hardware is 0.31 away." in text
-    assert "Evidence: same plant" in text
+    assert "Evidence: same for feedback" in text
     assert "0.28 to 0.35" in text
     other = tmp_path / "other"
     ranked = LayerResult(Layer.SAME_CHOICE, Mark.YES, "It would.", holds="the simulation's pick is the hardware's")

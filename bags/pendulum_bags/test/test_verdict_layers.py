@@ -43,7 +43,7 @@ def test_yes_needs_all_measured_layers_and_names_those_that_were_not() -> None:
     assert answer.sentence.endswith("Not measured: “which controllers” and “same choice”.")
     assert "Measure “same choice”: python -m pendulum_bags experiment ranking" in answer.next_steps
     one = sum_up([result(Layer.SAME_RUN, Mark.YES)])
-    assert one.sentence.endswith("Not measured: “same plant”, “which controllers” and “same choice”.")
+    assert one.sentence.endswith("Not measured: “same for feedback”, “which controllers” and “same choice”.")
     assert sum_up([result(layer, Mark.YES) for layer in Layer]).sentence.count("Not measured") == 0
 
 

@@ -129,6 +129,9 @@ def compare(
         else:
             results = {"": run()}
         answer, content, certified = _judge(results, kept, machine, design or ())
+    run_folder = paths[0] if len(paths) == 1 else paths[0].parent
+    of_run = len(paths) == 1 or [*paths] == [run_folder / "sim", run_folder / "hw"]
+    margins_kept = margins.keep(run_folder) if margins.stated and of_run else None
     if out is not None:
         _write(out, results, content)
     if json_output:
@@ -142,6 +145,8 @@ def compare(
     if certified:
         console.print(designs_table(certified))
     print_answer(console, answer)
+    if margins_kept:
+        print(f"margins {margins_kept} (report uses them)")
     if out is not None:
         print(f"\nwritten: {out / 'comparison.json'} and figures beside it")
 

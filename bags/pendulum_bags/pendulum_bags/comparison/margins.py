@@ -11,6 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping
 
@@ -146,6 +147,23 @@ class Margins:
         stated = _parse_texts(texts or ())
         return replace(base, **stated, stated=base.stated | frozenset(stated))
 
+    @classmethod
+    def of_run(cls, folder: Path) -> Margins | None:
+        """Return the margins with which a run folder was last compared; None where it keeps none.
+
+        Raises:
+            ParameterError: The file that keeps them is no margins file.
+        """
+        path = folder / _OF_RUN
+        return cls.parse(path) if path.is_file() else None
+
+    def keep(self, folder: Path) -> Path:
+        """Keep the stated margins in a run folder, as a margins file (JSON is YAML, too); return the file."""
+        path = folder / _OF_RUN
+        content = self.as_dict()
+        write_json(path, {"format": FORMAT, "margins": {name: content[name] for name in sorted(self.stated)}})
+        return path
+
     @property
     def whose(self) -> str:
         """Whose margins these are, in words."""
@@ -175,6 +193,7 @@ class Margins:
         return cls.parse({name: f"{content[name]['value']} {content[name]['unit']}" for name in stated})
 
 
+_OF_RUN = "margins.yaml"
 MarginArgument: TypeAlias = "Margins | Mapping[str, Any] | Sequence[str] | os.PathLike[str] | None"
 
 

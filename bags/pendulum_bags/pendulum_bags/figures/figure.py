@@ -152,7 +152,7 @@ class Figure:
     panel_height: int = 190
 
 
-def thinned(x: ArrayLike, y: ArrayLike, most: int = 3000) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def thinned(x: ArrayLike, y: ArrayLike, most: int = 1200) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a curve with at most about ``most`` points that looks the same: first, least, greatest of each bin.
 
     Args:

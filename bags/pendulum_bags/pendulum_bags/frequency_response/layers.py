@@ -14,6 +14,8 @@ __all__ = ["GAP_MARGIN", "LONGER", "same_plant", "which_controllers"]
 
 GAP_MARGIN = 0.2
 """Gap that does not matter: a loop with a margin b(P, K) above it, as an LQR on this plant has, keeps its stability."""
+_CLOSE = {True: "close enough for feedback, not identical", False: "close enough for feedback"}
+"""By whether a difference at single frequencies was found."""
 _WEAK_COHERENCE = 0.5
 LONGER = "python -m pendulum_bags experiment frequency_response --periods 40"
 """Measures the thesis's plant longer than by default."""
@@ -45,10 +47,13 @@ def same_plant(
         if difference.found
         else f"no difference above {100.0 * SMALLEST:g} % was found at any frequency"
     )
-    sentence = (
-        f"The nu-gap between simulation and hardware is {gap.value:.3f} (95 % interval {gap.low:.3f} to "
-        f"{gap.high:.3f}), {where}; {found}."
-    )
+    size = f"nu-gap {gap.value:.3f}, 95 % interval {gap.low:.3f} to {gap.high:.3f}, {margin:g} allowed"
+    heads = {
+        Mark.YES: f"Simulation and hardware are {_CLOSE[difference.found]} ({size})",
+        Mark.NO: f"Simulation and hardware are not close enough for feedback ({size})",
+        Mark.UNDECIDED: f"Whether simulation and hardware are close enough for feedback is open ({size})",
+    }
+    sentence = f"{heads[mark]}, {where}; {found}."
     delay, gain = difference.delay, difference.gain
     told = Mark.YES if mark is Mark.YES else Mark.UNDECIDED
     evidence = [
@@ -83,9 +88,9 @@ def same_plant(
     elif mark is Mark.UNDECIDED:
         steps = (f"measure longer: {longer}",)
     reasons = {
-        Mark.YES: f"the plants are {gap.high:.2g} apart at most in the nu-gap",
-        Mark.NO: f"the plants are {gap.value:.2f} apart in the nu-gap, {where}",
-        Mark.UNDECIDED: f"the nu-gap, {gap.low:.2f} to {gap.high:.2f}, is not measured well enough beside {margin:g}",
+        Mark.YES: f"the plants are {_CLOSE[difference.found]} (nu-gap at most {gap.high:.2g}, {margin:g} allowed)",
+        Mark.NO: f"the plants are {gap.value:.2f} apart in the nu-gap ({margin:g} allowed), {where}",
+        Mark.UNDECIDED: f"the nu-gap, {gap.low:.2f} to {gap.high:.2f}, is measured too roughly ({margin:g} allowed)",
     }
     return LayerResult(Layer.SAME_PLANT, mark, sentence, tuple(evidence), steps, reasons[mark])
 
@@ -103,6 +108,7 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
     bad = [design for design in designs if not design.certified]
     unsure = bool(bad) and all(design.undecided for design in bad)
     mark = Mark.YES if designs and not bad else Mark.UNDECIDED if unsure else Mark.NO
+    count = len(designs)
     rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if d.certified)
     not_rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if not d.certified)
     limit = (
@@ -110,9 +116,12 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
         if profile.value_upper < 1.0
         else "the gap certifies no design by its margin alone"
     )
-    verdict = f"of {len(designs)} designs {rows or 'none'}"
-    if bad:
-        verdict += f"; not {not_rows}"
+    if good and bad:
+        verdict = f"of {count} designs {rows}; not {not_rows}"
+    elif good:
+        verdict = f"all {count} designs" if count > 1 else "the design"
+    else:
+        verdict = f"none of {count} designs"
     evidence = [
         Evidence(
             "nu-gap of model and hardware",
@@ -142,7 +151,7 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
     return LayerResult(
         Layer.WHICH_CONTROLLERS,
         mark,
-        f"Certified for this hardware: {verdict}; {limit}. Torque limits and friction at rest are outside it.",
+        f"Certified for the hardware: {verdict}; {limit}. Torque limits and friction at rest are outside it.",
         tuple(evidence),
         steps,
         limit if mark is Mark.YES else f"{', '.join(d.name for d in bad)} not certified for the hardware",

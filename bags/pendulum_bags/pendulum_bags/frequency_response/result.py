@@ -41,6 +41,11 @@ class Analysis:
     layers: Sequence[LayerResult]
     scaling: SignalScaling = DEFAULT_SCALING
 
+    @property
+    def is_emulated(self) -> bool:
+        """Whether an emulator, or a second simulation, took the place of the hardware."""
+        return any(response.facts.get("emulated") for response in self.responses)
+
     def to_json(self) -> dict[str, Any]:
         """Return the figures as JSON values."""
         return {

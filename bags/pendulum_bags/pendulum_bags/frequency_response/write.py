@@ -15,7 +15,7 @@ from pendulum_bags.frequency_response.figures import response_figures
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.pages.layer_page import write_layer_page
 from pendulum_bags.runs.run_folder import write_json
-from pendulum_bags.verdict import write_layer
+from pendulum_bags.verdict import name_in, write_layer
 from pendulum_lqr.responses.measured_response import write_response
 
 __all__ = ["write_analysis"]
@@ -57,7 +57,7 @@ def write_analysis(
     step("drawing")
     # Thousands of small matrices: threads of the linear algebra would only get into each other's way.
     with threadpool_limits(1):
-        figures = response_figures(analysis)
+        figures = name_in(response_figures(analysis), emulated=analysis.is_emulated)
     write_figures(figures, folder / "figures", formats)
     tables = []
     if analysis.designs:
@@ -71,4 +71,12 @@ def write_analysis(
             )
         )
     page = folder / "frequency_response.html"
-    return write_layer_page(page, "Frequency response", analysis.layers, figures, tables, (_THEOREM, _LIMITS))
+    return write_layer_page(
+        page,
+        "Frequency response",
+        analysis.layers,
+        figures,
+        tables,
+        (_THEOREM, _LIMITS),
+        emulated=analysis.is_emulated,
+    )

@@ -9,7 +9,7 @@ from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
 from pendulum_bags.pages.html import render
-from pendulum_bags.verdict import LayerResult
+from pendulum_bags.verdict import LayerResult, name_in
 from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.whole_file import write_whole, writing
 
@@ -23,6 +23,8 @@ def write_layer_page(
     figures: Sequence[Figure],
     tables: Sequence[Table] = (),
     notes: Sequence[str] = (),
+    *,
+    emulated: bool = False,
 ) -> Path:
     """Write the page and return its path.
 
@@ -33,18 +35,14 @@ def write_layer_page(
         figures: Drawn in order.
         tables: Before the figures, behind the evidence of each layer.
         notes: Sentences at the end.
+        emulated: Whether an emulator took the place of the hardware; all texts say so then.
 
     Raises:
         BagError: The file cannot be written.
     """
-    text = render(
-        "layer.html.j2",
-        figures,
-        title=title,
-        layers=layers,
-        tables=[*(evidence_table(layer) for layer in layers), *tables],
-        notes=notes,
-    )
+    shown = [*(evidence_table(layer) for layer in layers), *tables]
+    figures, layers, shown, notes = name_in((figures, layers, shown, notes), emulated=emulated)
+    text = render("layer.html.j2", figures, title=title, layers=layers, tables=shown, notes=notes, emulated=emulated)
     with writing(f"page {path}", BagError):
         write_whole(path, text)
     return path

@@ -16,7 +16,7 @@ from pendulum_bags.figures.terminal_table import number_table
 from pendulum_bags.pages.layer_page import write_layer_page
 from pendulum_bags.ranking.ranking import Ranking
 from pendulum_bags.runs.run_folder import write_json
-from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer
+from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, name_in, write_layer
 
 __all__ = ["REGRET_MARGIN", "Words", "print_ranking", "same_choice", "write_ranking"]
 
@@ -189,13 +189,24 @@ def write_ranking(
     formats: Sequence[str] = ("png", "pdf"),
     words: Words = Words(),
     notes: Sequence[str] = (),
+    *,
+    emulated: bool = False,
 ) -> Path:
-    """Write numbers, layer, figure and page, with notes at its end, into a folder; return the page."""
+    """Write numbers, layer, figure and page into a folder; return the page.
+
+    Args:
+        folder: Where to.
+        ranking: The ranking.
+        formats: Of the figure.
+        words: How its runs were made.
+        notes: Sentences at the end of the page.
+        emulated: Whether an emulator took the place of the hardware; figure and page say so then.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    layer = same_choice(ranking, words=words)
+    layer = name_in(same_choice(ranking, words=words), emulated=emulated)
     write_json(folder / "ranking.json", ranking.to_json())
     write_layer(folder, layer)
-    figures = [ranking_figure(ranking)]
+    figures = [name_in(ranking_figure(ranking), emulated=emulated)]
     write_figures(figures, folder / "figures", formats)
     tables = [Table("Controllers", words.cost, _HEAD, ranking_rows(ranking))]
     if ranking.wrong:
@@ -214,7 +225,9 @@ def write_ranking(
                 _pair_rows(ranking),
             )
         )
-    return write_layer_page(folder / "ranking.html", "Ranking of controllers", [layer], figures, tables, notes)
+    return write_layer_page(
+        folder / "ranking.html", "Ranking of controllers", [layer], figures, tables, notes, emulated=emulated
+    )
 
 
 def print_ranking(console: Console, ranking: Ranking) -> None:

@@ -105,14 +105,13 @@ def alignment(data: ReportData) -> Figure:
         shift = quantity(1e3 * clock.delay, "ms")
         text = f"The recorded disturbances {same}: correlation {clock.correlation:.3f} at {shift}. "
     sentence = (
-        f"{text}The hardware's velocity follows the simulation's {abs(1e3 * response.delay):.2f} ms "
-        f"{'later' if response.delay >= 0.0 else 'earlier'}, with correlation {response.correlation:.3f} there and "
-        f"{response.correlation_at_zero:.3f} as recorded."
+        f"{text}The cross-correlation of the velocities peaks at a shift of {1e3 * response.delay:.2f} ms, with "
+        f"{response.correlation:.3f} there and {response.correlation_at_zero:.3f} as recorded."
     )
     if data.comparison.is_paired:
         delay = 1e3 * data.comparison.delay
-        told = f"it is {delay:.2f} ms" if math.isfinite(delay) else "there is no peak, and no delay that could be told"
-        sentence += f" Seen at one phase of the noise, as the test of the delay sees it, {told}."
+        told = f"is {delay:.2f} ms" if math.isfinite(delay) else "cannot be determined: there is no peak"
+        sentence += f" The tested delay, at one phase of the noise samples and so without their hold, {told}."
     return Figure(
         "alignment",
         "Alignment of clocks and delay",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -16,7 +15,7 @@ from pendulum_bags.report.analysis_figures import equivalence, timing
 from pendulum_bags.report.animation import joint_animation
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.joint_figures import joint_differences, joint_spectra, joints_together
-from pendulum_bags.report.page import Page
+from pendulum_bags.report.page import Page, facts_of_tests
 from pendulum_bags.report.provenance import provenance_table, seed_of, settings_table
 from pendulum_bags.report.tables import tests_table
 from pendulum_bags.runs.run_data import stand_in_of, timing_warning
@@ -75,15 +74,7 @@ def _facts(comparisons: Mapping[str, Comparison]) -> list[tuple[str, str]]:
     first = next(iter(comparisons.values()))
     facts = [("runs", str(len(first.pairs))), ("seed", seed_of(first.pairs[0].simulation))]
     for joint, comparison in comparisons.items():
-        pair = comparison.pairs[0]
-        sim, hw = pair.simulation.window, pair.hardware.window
-        spreads = " and ".join(f"{float(one.position.std(ddof=1)):.3g}" for one in (sim, hw))
-        facts.append((f"std of {joint}, simulation and hardware", f"{spreads} {sim.unit}"))
-        delay = 1e3 * comparison.delay
-        when = f"{abs(delay):.1f} ms {'later' if delay >= 0.0 else 'earlier'}"
-        facts.append(
-            (f"hardware's {joint} answers", when if math.isfinite(delay) else "with no delay that can be told")
-        )
+        facts += facts_of_tests(comparison, f", {joint}")
     return facts
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+from pendulum_bags.comparison import Comparison
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
@@ -14,12 +15,12 @@ from pendulum_bags.pages.html import render, script_json
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.provenance import emulator_table, provenance_table, seed_of, settings_table
-from pendulum_bags.report.wording import name_in
 from pendulum_bags.runs.run_data import stand_in_of, timing_warning
 from pendulum_bags.verdict import Answer
+from pendulum_bags.verdict.naming import name_in
 from pendulum_bags.verdict.terminal import SIGNS
 
-__all__ = ["Page", "page_of", "render_page"]
+__all__ = ["Page", "facts_of_tests", "page_of", "render_page"]
 
 SECTIONS = (
     "Verdict",
@@ -40,6 +41,13 @@ SECTIONS = (
 
 OF_ONE_RUN = ("Paired comparison", "Plants under noise", "The thesis's analysis", "Dynamic phase", "Timing")
 """Sections that show the first run only, where there are several, and say so."""
+FOLDED = (
+    "Repeated runs", "The thesis's analysis", "Dynamic phase", "Timing", "Experiment 1: inertia and damping",
+    "Experiment 2: gravity", "Model", "A real pendulum",
+)  # fmt: skip
+"""Sections that are closed when the page opens: the answer does not rest on them."""
+_LEADS = ("both_together", "joints_together")
+"""Figures whose first panel stands beside the answer, too."""
 _MOST_SEEDS = 3
 """Seeds at the head of a page; the table of provenance has them all."""
 
@@ -131,6 +139,7 @@ def render_page(page: Page, pictures: Mapping[str, bytes]) -> str:
     figures, tables, facts, noise_note, provenance = name_in(
         (page.figures, page.tables, page.facts, page.noise_note, page.provenance), emulated=page.emulated
     )
+    lead = next((_lead(figure) for figure in figures if figure.name in _LEADS), None)
     sections = []
     named = [figure.section for figure in figures] + [table.section for table in tables]
     for heading in dict.fromkeys((*SECTIONS, *named)):
@@ -139,8 +148,10 @@ def render_page(page: Page, pictures: Mapping[str, bytes]) -> str:
             sections.append({"title": heading, "anchor": _anchor(heading), "figures": shown, "tables": listed})
     return render(
         "report.html.j2",
-        figures,
+        [*figures, *([lead] if lead else [])],
         pictures,
+        lead=lead,
+        folded=FOLDED,
         page=page,
         sentence=_without_mark(page.answer),
         signs=SIGNS,
@@ -153,21 +164,27 @@ def render_page(page: Page, pictures: Mapping[str, bytes]) -> str:
     )
 
 
+def _lead(figure: Figure) -> Figure:
+    """Return the first panel of the motions, small, for the first screen."""
+    return replace(figure, name="lead", title="The motion under one noise", sentence="", panels=figure.panels[:1])
+
+
+def facts_of_tests(comparison: Comparison, of: str = "") -> list[tuple[str, str]]:
+    """Return the tested quantities but distances, each with its margin, as the tests have them."""
+    found = []
+    for test in comparison.verdict.tests:
+        if test.quantity.startswith("distance"):
+            continue
+        unit = "" if test.unit == "-" else f" {test.unit}"
+        value = test.interval.estimate
+        told = f"{quantity(value)}{unit}" if math.isfinite(value) else "–"
+        found.append((f"{test.quantity}{of}", f"{told} ({test.margin_text().removeprefix('margin ')}{unit})"))
+    return found
+
+
 def _facts(data: ReportData) -> list[tuple[str, str]]:
     comparison = data.comparison
-    pair = comparison.pairs[0]
-    plants = comparison.plants
-    facts = [
-        ("runs", str(len(comparison.pairs))),
-        ("std of θ, simulation", quantity(plants["sim"]["std_theta"], "rad")),
-        ("std of θ, hardware", quantity(plants["hw"]["std_theta"], "rad")),
-    ]
-    if comparison.is_paired:
-        of = ", run 1" if len(comparison.pairs) > 1 else ""
-        facts.append((f"paths apart (rms){of}", quantity(float(pair.as_dict()["rms_position"]), "rad")))
-    delay = 1e3 * comparison.delay
-    when = f"{abs(delay):.1f} ms {'later' if delay >= 0.0 else 'earlier'} than the simulation"
-    facts.append(("hardware answers", when if math.isfinite(delay) else "with no delay that could be told"))
+    facts = [("runs", str(len(comparison.pairs))), *facts_of_tests(comparison)]
     seeds = [seed_of(pair.hardware) for pair in comparison.pairs]
     if len(seeds) == 1:
         facts.append(("seed", str(data.summary.get("seed", "unknown"))))

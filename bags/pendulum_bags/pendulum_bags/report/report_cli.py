@@ -64,6 +64,8 @@ def report(
             f"{trials[0]} holds trials and no run; expected a run folder beside it (identify --page shows trials alone)"
         )
     margins = Margins.of(margins_file, margin)
+    if not margins.stated and len(folders) == 1:
+        margins = Margins.of_run(folders[0]) or margins
     if pooled := all((folder / "sim").exists() and (folder / "hw").exists() for folder in folders):
         run = partial(compare_folders, folders)
     elif len(folders) == 2:

@@ -14,8 +14,8 @@ from pendulum_bags.report.figures import make_figures
 from pendulum_bags.report.joint_page import joint_page
 from pendulum_bags.report.page import Page, page_of, render_page
 from pendulum_bags.report.tables import make_tables
-from pendulum_bags.report.wording import name_in
 from pendulum_bags.verdict.answer import answer_of
+from pendulum_bags.verdict.naming import name_in
 from pendulum_msgs_py.errors import BagError, PendulumError
 from pendulum_msgs_py.whole_file import write_whole, writing
 from pendulum_rosbag.reader import read_bag
@@ -137,13 +137,13 @@ def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
 
 
 def _for_paper(path: Path) -> bytes:
-    """Return a figure with as many colours as it needs: a third of its size, and no difference on paper."""
+    """Return a figure with as many colours as it needs: a quarter of its size, and no difference on paper."""
     from PIL import Image
 
     buffer = io.BytesIO()
     with Image.open(path) as picture:
         # The default way to choose colours takes twice as long, and misses some by more.
-        picture.convert("RGB").quantize(64, Image.Quantize.MAXCOVERAGE).save(buffer, "PNG")
+        picture.convert("RGB").quantize(32, Image.Quantize.MAXCOVERAGE).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.runs.correlation import effective_size
 from pendulum_bags.runs.moving_reference import follows_reference, recorded_reference
-from pendulum_bags.runs.run_record import STAND_IN, run_record
+from pendulum_bags.runs.run_record import STAND_IN, run_record, stands_in
 from pendulum_bags.runs.series import Series, Signal, unwrap_near_upright
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -280,8 +280,7 @@ def plant_summary(run: RunData) -> dict[str, Any]:
 
 def is_emulated(run: RunData) -> bool:
     """Return whether the run says that an emulator, or a second simulation, stood in for the hardware."""
-    told = run_record(run.metadata)
-    return told.get("plant") == "emulator" or STAND_IN in told
+    return stands_in(run_record(run.metadata))
 
 
 def stand_in_of(run: RunData) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["DIFFERENCE", "RUN_RECORD", "STAND_IN", "record_named", "run_record"]
+__all__ = ["DIFFERENCE", "RUN_RECORD", "STAND_IN", "record_named", "run_record", "stands_in"]
 
 RUN_RECORD = "pendulum.run"
 """Name of the record among a bag's metadata; ``RunSpec`` and the settings of experiments write it."""
@@ -22,6 +22,11 @@ def run_record(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
         metadata: Metadata of the bag, by name.
     """
     return record_named(metadata, RUN_RECORD)
+
+
+def stands_in(record: Mapping[str, Any]) -> bool:
+    """Return whether an emulator, or a second simulation, took the place of the hardware in a run."""
+    return record.get("plant") == "emulator" or STAND_IN in record
 
 
 def record_named(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any]:

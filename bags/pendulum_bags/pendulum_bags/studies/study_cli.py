@@ -260,8 +260,10 @@ def _analyse(
         from pendulum_bags.ranking.present import print_ranking, write_ranking
         from pendulum_bags.ranking.ranking import rank
 
-        ranked = rank(collect_contenders([folder]))
-        write_ranking(folder, ranked, notes=[f"Left out: {sentence}." for sentence in found.left_out])
+        contenders = collect_contenders([folder])
+        ranked = rank(contenders)
+        notes = [f"Left out: {sentence}." for sentence in found.left_out]
+        write_ranking(folder, ranked, notes=notes, emulated=all(one.emulated for one in contenders))
         key, tell = "ranking", lambda console, _: print_ranking(console, ranked)
         result[key] = ranked.to_json()
     write_json(folder / "results.json", result)

@@ -6,11 +6,11 @@ from pendulum_bags.verdict.layers import (
     Layer,
     LayerResult,
     Mark,
-    name_hardware,
     read_layers,
     sum_up,
     write_layer,
 )
+from pendulum_bags.verdict.naming import name_hardware, name_in
 
 __all__ = [
     "Answer",
@@ -19,6 +19,7 @@ __all__ = [
     "LayerResult",
     "Mark",
     "name_hardware",
+    "name_in",
     "read_layers",
     "sum_up",
     "write_layer",

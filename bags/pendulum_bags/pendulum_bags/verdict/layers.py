@@ -7,14 +7,14 @@ is a value: whoever measures it makes a :class:`LayerResult`, and :func:`sum_up`
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.verdict.naming import name_in
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import without_nan
 
@@ -25,7 +25,6 @@ __all__ = [
     "Layer",
     "LayerResult",
     "Mark",
-    "name_hardware",
     "read_layers",
     "sum_up",
     "write_layer",
@@ -58,7 +57,11 @@ class Layer(Enum):
     question: str
 
     SAME_RUN = ("same_run", "same run", "Do both move alike under one controller and one disturbance?")
-    SAME_PLANT = ("same_plant", "same plant", "Where in frequency do the plants differ, and how surely?")
+    SAME_PLANT = (
+        "same_plant",
+        "same for feedback",
+        "Are both plants close enough for feedback, and where in frequency do they differ?",
+    )
     WHICH_CONTROLLERS = ("which_controllers", "which controllers", "Which designs are safe to carry over?")
     SAME_CHOICE = ("same_choice", "same choice", "Would the simulation have picked the right controller?")
 
@@ -215,7 +218,7 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
 
     Args:
         results: At most one for each layer; the others count as not measured.
-        emulated: Whether an emulator stood in for the hardware; the words then say so.
+        emulated: Whether an emulator took the place of the hardware; the text then says so.
 
     Raises:
         DataError: A layer was given twice.
@@ -224,7 +227,7 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
     for result in results:
         if result.layer in given:
             raise DataError(f"layer {result.layer.title!r} was given twice; expected each once")
-        given[result.layer] = _named(result, emulated=emulated)
+        given[result.layer] = name_in(result, emulated=emulated)
     layers = tuple(given.get(layer) or _not_measured(layer) for layer in Layer)
     by_mark = {mark: [result for result in layers if result.mark is mark] for mark in Mark}
     measured = [result for result in layers if result.mark is not Mark.NOT_MEASURED]
@@ -260,29 +263,6 @@ def _not_measured(layer: Layer) -> LayerResult:
 def _listed(names: Sequence[str]) -> str:
     """Return names as a sentence lists them: a, b and c."""
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-
-
-_HARDWARE = re.compile(r"(?<![-/\w])(?<!emulated )(H|h)ardware\b(?!/)")
-
-
-def name_hardware(text: str, *, emulated: bool) -> str:
-    """Return a text that says ``emulated hardware`` for hardware where an emulator stood in for it."""
-    if not emulated:
-        return text
-    return _HARDWARE.sub(lambda found: "Emulated hardware" if found[1] == "H" else "emulated hardware", text)
-
-
-def _named(result: LayerResult, *, emulated: bool) -> LayerResult:
-    def name(text: str) -> str:
-        return name_hardware(text, emulated=emulated)
-
-    return replace(
-        result,
-        sentence=name(result.sentence),
-        next_steps=tuple(map(name, result.next_steps)),
-        reason=name(result.reason),
-        holds=name(result.holds),
-    )
 
 
 def write_layer(folder: Path, result: LayerResult) -> Path:

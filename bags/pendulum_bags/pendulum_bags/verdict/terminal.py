@@ -12,7 +12,8 @@ from rich.text import Text
 
 from pendulum_bags.comparison import Comparison, Verdict
 from pendulum_bags.figures.terminal_table import number_table
-from pendulum_bags.verdict.layers import Answer, Mark, name_hardware
+from pendulum_bags.verdict.layers import Answer, Mark
+from pendulum_bags.verdict.naming import name_hardware
 from pendulum_bags.verdict.same_run import seen_note
 from pendulum_msgs_py.programs.terminal import WholeTable
 from pendulum_msgs_py.programs.typed_commands import as_typed

@@ -63,9 +63,21 @@
     0: resetAxes,
   };
 
+  const folded = (place) => place.closest("details:not([open])");
+
   async function drawAll() {
     const graphs = read("graphs");
-    for (const place of document.querySelectorAll(".graph")) {
+    await draw(graphs, document);
+    for (const one of document.querySelectorAll("details")) {
+      one.addEventListener("toggle", () => one.open && draw(graphs, one));
+    }
+    document.documentElement.dataset.ready = "true";
+  }
+
+  // What is folded has no width yet: its plots are drawn when it is opened.
+  async function draw(graphs, part) {
+    for (const place of part.querySelectorAll(".graph")) {
+      if (place.firstRanges || folded(place)) continue;
       const { data, layout } = graphs[place.dataset.graph];
       if (window.innerWidth < 700) {
         layout.margin.l = 52;
@@ -95,30 +107,38 @@
         action(place);
       });
     }
+  }
+
+  function fitToPaper() {
     // Paper is narrower than most screens: draw for its width, and go back afterwards.
     window.addEventListener("beforeprint", () => {
-      for (const place of document.querySelectorAll(".graph")) {
+      for (const place of document.querySelectorAll(".js-plotly-plot")) {
         const beside = place.parentElement.classList.contains("side-by-side");
         Plotly.relayout(place, { autosize: false, width: beside ? 325 : 670 });
       }
     });
     window.addEventListener("afterprint", () => {
-      for (const place of document.querySelectorAll(".graph")) Plotly.relayout(place, { autosize: true, width: null });
+      for (const place of document.querySelectorAll(".js-plotly-plot")) Plotly.relayout(place, { autosize: true, width: null });
     });
-    document.documentElement.dataset.ready = "true";
   }
 
   // Paper has nothing to click on.
-  let folded = [];
+  let opened = [];
   window.addEventListener("beforeprint", () => {
-    folded = [...document.querySelectorAll("details:not([open])")];
-    for (const one of folded) one.open = true;
+    opened = [...document.querySelectorAll("details:not([open])")];
+    for (const one of opened) one.open = true;
   });
   window.addEventListener("afterprint", () => {
-    for (const one of folded) one.open = false;
+    for (const one of opened) one.open = false;
   });
+  for (const link of document.querySelectorAll("nav a")) {
+    link.addEventListener("click", () => {
+      const details = document.querySelector(`${link.hash} > details`);
+      if (details) details.open = true;
+    });
+  }
 
-  loadPlotly().then(drawAll).catch((error) => {
+  loadPlotly().then(drawAll).then(fitToPaper).catch((error) => {
     const notice = element("failure");
     notice.hidden = false;
     notice.textContent = `The plots cannot be drawn in this browser (${error.message}); the same figures lie in the folder "figures" beside this page.`;

@@ -1,24 +1,34 @@
-"""Say in every text of a report that an emulator stood in for the hardware, where one did."""
+"""Texts say ``emulated hardware`` where an emulator took the place of the hardware."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
+from enum import Enum
 from typing import Any, TypeVar, cast
 
-from pendulum_bags.verdict import name_hardware
-
-__all__ = ["name_in"]
+__all__ = ["name_hardware", "name_in"]
 
 _T = TypeVar("_T")
+_HARDWARE = re.compile(r"(?<![-/\w])(?<!emulated )(H|h)ardware\b(?!/)")
+
+
+def name_hardware(text: str, *, emulated: bool) -> str:
+    """Return a text that says ``emulated hardware`` for hardware where an emulator stood in for it."""
+    if not emulated:
+        return text
+    return _HARDWARE.sub(lambda found: "Emulated hardware" if found[1] == "H" else "emulated hardware", text)
 
 
 def name_in(value: _T, *, emulated: bool) -> _T:
-    """Return a figure, a table or a part of one whose texts say ``emulated hardware`` where an emulator was used."""
+    """Return a figure, a table, a layer or a part of one with its texts named so."""
     return cast("_T", _named(value)) if emulated else value
 
 
 def _named(value: Any) -> Any:
+    if isinstance(value, Enum):
+        return value
     if isinstance(value, str):
         return name_hardware(value, emulated=True)
     if isinstance(value, (list, tuple)):
