@@ -218,6 +218,17 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(browser: Any, bench:
     popup = phone.locator("#popup").bounding_box()  # says that the connection is lost; it has its place before that
     assert popup["y"] + popup["height"] <= box["y"], (popup, box)
 
+    # Fingers need 44 px (WCAG 2.5.5); the keyboard's place is seen.
+    small = "[...document.querySelectorAll('.card .q-btn')].filter((b) => b.offsetHeight && b.offsetHeight < 44).length"
+    assert phone.evaluate(small) == 0
+    arm = desk.get_by_role("button", name="Arm /sim", exact=True)
+    arm.focus()
+    desk.keyboard.press("Shift+Tab")
+    desk.keyboard.press("Tab")
+    assert arm.evaluate("(it) => getComputedStyle(it).outlineStyle + getComputedStyle(it).outlineWidth") == "solid3px"
+    desk.get_by_role("button", name="Add to each plant").click()
+    desk.locator(".notices", has_text="each plant has a disturbance already").wait_for(timeout=10_000)
+
     # A refused value is explained, and the value in force comes back.
     field = desk.locator("input[aria-label='r of /sim']")
     wait_for(lambda: field.input_value() == "0.1", 20, "the value in force")

@@ -9,6 +9,8 @@ import pytest
 
 from pendulum_bags.console.console_node import main
 from pendulum_bags.console.jobs import Jobs, NewestPage
+from pendulum_msgs_py.errors import FaultError
+from tests.fixtures import wait_for
 
 
 def test_the_newest_page_of_a_kind_is_found_among_all_runs(tmp_path: Path) -> None:
@@ -95,3 +97,14 @@ def test_controllers_are_offered_that_fit_the_plant_and_need_no_file(tmp_path: P
     for plant in ("", "thesis", str(tmp_path / "of_another_machine.yaml")):
         assert {"lqr", "pid", "energy_swing_up"} <= set(offered(plant))
         assert not {"policy", "playback"} & set(offered(plant))
+
+
+def test_a_disturbance_that_is_started_waits_and_ends_with_its_console(tmp_path: Path, domain_id: int) -> None:
+    jobs = Jobs(tmp_path)
+    job = jobs.disturb("/sim")
+    wait_for(lambda: "ready" in job.log.read_text(encoding="utf-8"), 200, "the disturbance")
+    assert "noise_start" not in job.log.read_text(encoding="utf-8")
+    with pytest.raises(FaultError, match="disturb/sim runs already"):
+        jobs.disturb("/sim")
+    jobs.close()
+    assert not job.running

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from pendulum_bags.course import checks, winner
 from pendulum_bags.course.course_cli import main
 from pendulum_bags.course.exercises import answers
 from pendulum_bags.course.tasks import FAULTS, draw_plant, draw_tasks, read_tasks, write_tasks
+from pendulum_bags.experiments.excite_cli import main as excite_main
 from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run, seal_plant
@@ -140,6 +142,17 @@ def test_tasks_are_read_as_they_were_written_and_nonsense_is_refused(tmp_path: P
         write_tasks(path, bad)
         with pytest.raises(ParameterError, match=re.escape(words)):
             read_tasks(path)
+
+
+def test_no_exercise_is_solved_by_copying_its_own_commands(course: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = (course / "exercises.md").read_text(encoding="utf-8").replace("\\\n", " ").splitlines()
+    commands = [shlex.split(line) for line in lines if line.startswith("    python -m ")]
+    checked = [words[5:] for words in commands if words[3:5] == ["course", "check"]]
+    assert [words[0] for words in checked] == ["gains", "plant", "delay", "noise", "winner", "fault"]
+    assert [words for words in checked if main(["check", *words]) == 0] == []
+    (excited,) = [words[4:] for words in commands if words[3] == "excite"]
+    assert excite_main(excited) == 2
+    assert "SECONDS" in capsys.readouterr().err
 
 
 def test_a_check_says_right_or_wrong_by_its_exit_code_too(course: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,6 +40,7 @@ from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.storage import BagWriter
 from tests.fixtures import PROJECT
+from tests.npm import install_packages
 from tests.synthetic_runs import write_run_folder
 
 
@@ -138,7 +139,7 @@ def test_provenance_tells_when_where_and_by_which_command_and_what_every_node_wa
 
 def test_page_is_complete_in_itself_and_small(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    assert page.stat().st_size < 5_000_000
+    assert page.stat().st_size < 3_400_000
     assert not re.search(r"(?:src|href)=\"(?:https?:)?//", text)
     assert "@import" not in text
     assert "url(" not in text.split("</style>")[0]
@@ -575,6 +576,21 @@ def visit(request: pytest.FixtureRequest, browser: Any, page: Path) -> Iterator[
 def test_page_is_whole_and_usable(visit: Any) -> None:
     # One visit for all that is seen at one width: loading takes seconds on a small machine.
     assert visit.messages == []
+
+    # The first screen has the answer, its margins and the motion; what the answer does not rest on is folded.
+    lead = visit.locator("#lead .main-svg").first.bounding_box()
+    if visit.viewport_size["width"] == WIDTHS["desktop"]:
+        assert lead["y"] + lead["height"] <= 500
+    assert " allowed" in visit.locator(".verdict").inner_text()
+    assert "(±5 ms)" in visit.locator(".facts").inner_text()
+    assert "std of" not in visit.locator(".facts").inner_text()
+    folded = visit.locator("section > details")
+    assert {"The thesis's analysis", "Model"} <= set(folded.locator("h2").all_inner_texts())
+    assert visit.locator('[data-graph="unpaired_difference-0"] .main-svg').count() == 0
+    visit.locator("nav a[href='#model']").click()
+    assert visit.locator("#model > details").get_attribute("open") is not None
+    visit.evaluate("document.querySelectorAll('section > details').forEach((one) => { one.open = true; })")
+    visit.wait_for_function("[...document.querySelectorAll('.graph')].every((one) => one.querySelector('.main-svg'))")
     plots = visit.locator(".graph")
     assert plots.count() >= 20
     assert visit.locator(".graph .main-svg").count() >= plots.count()
@@ -609,6 +625,7 @@ def test_page_is_whole_and_usable(visit: Any) -> None:
     assert (tests.locator("table").evaluate(heading) < 5.0) == narrow
 
     # Long tables open at a click, and not before.
+    visit.evaluate("document.querySelectorAll('section > details').forEach((one) => { one.open = false; })")
     metrics = visit.locator("figure.table", has=visit.locator("h3:text-is('Metrics of the regulation')"))
     assert metrics.locator("table").is_hidden()
     assert tests.locator("table").is_visible()
@@ -644,6 +661,18 @@ def test_page_is_whole_and_usable(visit: Any) -> None:
     visit.keyboard.press("Enter")
     visit.wait_for_function("document.getElementById('play').innerText === 'Play'")
     assert visit.messages == []
+
+
+@needs_browser
+def test_axe_finds_nothing_on_a_report(visit: Any) -> None:
+    axe = PROJECT / "tests" / "axe"
+    install_packages(axe, "axe-core")
+    visit.add_script_tag(path=str(axe / "node_modules" / "axe-core" / "axe.min.js"))
+    visit.evaluate("document.querySelectorAll('section > details').forEach((one) => { one.open = true; })")
+    visit.wait_for_function("[...document.querySelectorAll('.graph')].every((one) => one.querySelector('.main-svg'))")
+    found = visit.evaluate("axe.run(document)")
+    assert len(found["passes"]) > 15, "axe saw next to nothing"
+    assert {it["id"]: it["nodes"][0]["html"][:120] for it in found["violations"]} == {}
 
 
 @needs_browser

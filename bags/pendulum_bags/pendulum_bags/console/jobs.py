@@ -121,6 +121,15 @@ class Jobs:
         arguments += [item for name, value in given.items() for item in ("-p", f"{name}:={value}")]
         return self._start(f"control{namespace}", arguments, "", os.environ, package="pendulum_lqr")
 
+    def disturb(self, namespace: str) -> Job:
+        """Start a disturbance beside a plant; it waits to be started.
+
+        Args:
+            namespace: Of the plant.
+        """
+        arguments = ["disturbance", "--ros-args", "-r", f"__ns:={namespace or '/'}"]
+        return self._start(f"disturb{namespace}", arguments, "", os.environ, package="pendulum_lqr")
+
     def _start(
         self,
         kind: str,

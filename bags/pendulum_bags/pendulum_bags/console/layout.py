@@ -17,9 +17,14 @@ from pendulum_bags.console.layers_card import LayersCard
 from pendulum_bags.console.notices import Notices
 from pendulum_bags.console.parameter_table import ParameterTable
 from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.programs.typed_commands import as_typed
 
 __all__ = ["Layout"]
 
+_PLANTS = """\
+python -m pendulum_sim simulator --ros-args -r __ns:=/sim
+python -m pendulum_hw_bridge bridge --ros-args -r __ns:=/hw -p backend:=emulator"""
+"""Commands that start plants."""
 REFRESH_PERIOD = 0.5
 """Time between two looks at what changes by itself [s]."""
 
@@ -78,6 +83,9 @@ class Layout:
                     '<canvas id="plots" role="img" aria-label="angle, velocity and torques of the last 10 s"></canvas>',
                     sanitize=False,
                 )
+        with ui.element("section").classes("card hint").props('aria-label="How to start a plant"') as self._hint:
+            ui.label("Start a plant in a terminal with the same ROS_DOMAIN_ID; it appears here by itself:")
+            ui.html(f"<pre>{as_typed(_PLANTS)}</pre>", sanitize=False)
         self._plants = ui.element("div").classes("cards plants")
         with ui.element("div").classes("cards"):
             with ui.element("section").classes("card wide"):
@@ -87,6 +95,7 @@ class Layout:
                 _heading("Disturbances")
                 self._tables[1].build()
                 with ui.row():
+                    _button("Add to each plant", self._add_disturbances)
                     _button("Start noise", lambda: self._each("disturbance/start"), filled=True)
                     _button("Stop noise", lambda: self._each("disturbance/stop"))
             with ui.element("section").classes("card"):
@@ -177,6 +186,14 @@ class Layout:
         for space in self._graph.plants():
             await self._carefully(self._graph.trigger(f"{space}/{service}"))
 
+    async def _add_disturbances(self) -> None:
+        """Start a disturbance beside each plant that has none; it adds no torque until it is started."""
+        spaces = [space for space in self._graph.plants() if not self._graph.has_node(f"{space}/disturbance")]
+        if not spaces:
+            self._notices.say("each plant has a disturbance already" if self._graph.plants() else "there is no plant")
+        for space in spaces:
+            self._try(partial(self._jobs.disturb, space))
+
     def _ask_to_move(self, space: str, goal: str) -> None:
         """Say what a plant will do, and let it do so when the person agrees."""
         end = "the controller takes over" if goal == "upright" else "the plant is disarmed"
@@ -209,6 +226,7 @@ class Layout:
     async def _refresh(self) -> None:
         """Show the plants that are there, the values in force, and the jobs."""
         plants = self._graph.plants()
+        self._hint.set_visibility(not self._cards and not plants)
         self._show_plants(plants)
         for table in self._tables:
             await table.refresh(sorted(plants))

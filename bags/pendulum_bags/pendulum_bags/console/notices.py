@@ -11,8 +11,8 @@ _NEWEST = 3
 _STAYS = {"bad": 15.0, "good": 4.0}
 """How long a notice stands [s]: a refusal long enough to be read, acted on and read again."""
 
-_LONGEST = 200
-"""Characters of a notice; of a longer one the middle is left out."""
+_LONGEST = 1000
+"""Characters of a notice; of a longer one the middle is left out. No refusal of a plant is so long."""
 
 
 class Notices:

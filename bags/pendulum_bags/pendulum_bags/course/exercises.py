@@ -25,9 +25,10 @@ The plant is `thesis`. Choose Q and R of an LQR so that the time constant of the
 ## 2. Identify an unknown pendulum
 `{course}/hidden.yaml` is a sealed plant: the simulator runs it, and no other program reads it. It resembles `dfki`.
 Design an excitation, play it on the hidden plant, and identify the parameters: inertia and gravity within 3 %,
-damping and Coulomb friction within 15 %.
+damping and Coulomb friction within 15 %. SECONDS and ANGLE are for you to choose: `excite` predicts the half width of
+each parameter's interval before it plays.
 
-    python -m pendulum_bags excite --plant dfki --duration 5 --max-angle 1.2 --out {course}/try.csv \\
+    python -m pendulum_bags excite --plant dfki --duration SECONDS --max-angle ANGLE --out {course}/try.csv \\
         --play --simulate {course}/hidden.yaml
     python -m pendulum_bags identify {course}/try --out {course}/found.yaml
     python -m pendulum_bags course check plant {course}/found.yaml --course {course}
@@ -37,7 +38,7 @@ Plant `thesis`, LQR with Q = diag({q[0]:g}, {q[1]:g}) and R = **{delay_weight:g}
 long a delay of the torque makes the loop unstable (within 5 %)?
 
     python -m pendulum_lqr design --preset thesis --q {q[0]:g},{q[1]:g} --r {delay_weight:g}
-    python -m pendulum_bags course check delay 0.1 --course {course}
+    python -m pendulum_bags course check delay SECONDS --course {course}
 
 ## 4. Explain why noise at 500 Hz looks calmer
 The thesis's simulation gets new noise every 2 ms. Hold the noise for **{hold_ms:g} ms** instead, with the same loop
@@ -49,15 +50,15 @@ theta grow (within 20 %)? And why?
     python -m pendulum_bags experiment lockstep --bag {course}/noise/short --hold-time 0.002 --duration 60
     python -m pendulum_bags experiment lockstep --bag {course}/noise/long --hold-time {hold_s:g} --duration 60
     python -m pendulum_bags analyse {course}/noise --ask metrics
-    python -m pendulum_bags course check noise 1.5 --because a --course {course}
+    python -m pendulum_bags course check noise FACTOR --because LETTER --course {course}
 
 ## 5. Predict the winner
 Two LQRs for the plant `thesis`, both with Q = diag({q[0]:g}, {q[1]:g}): **A** with R = {controller_a:g}, **B** with
 R = {controller_b:g}. In simulation the smaller R wins. Which of them leaves the smaller standard deviation of theta *on
-the machine*, at 100 Hz, under noise of 2.5 N m? Predict before you measure. The check runs both on the
-emulated machine.
+the machine*, at 100 Hz, under noise of 2.5 N m? Predict before you measure: WHICH is a or b. The check runs both
+on the emulated machine.
 
-    python -m pendulum_bags course check winner a --course {course}
+    python -m pendulum_bags course check winner WHICH --course {course}
 
 ## 6. Break the bridge, safely
 Arm the bridge on an emulated actuator, record it, and make it fault for the reason **`{fault}`**. The recording must

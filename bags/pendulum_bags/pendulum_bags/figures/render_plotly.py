@@ -68,7 +68,7 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
             **axis,
             "anchor": f"x{suffix}",
             "domain": [max(0.0, top - share), top],
-            "title": {"text": panel.y_label, "font": {"size": 12}, "standoff": 6},
+            "title": {"text": panel.y_label.replace("\n", "<br>"), "font": {"size": 12}, "standoff": 6},
             "type": "log" if panel.y_log else "linear",
             "automargin": True,
         }

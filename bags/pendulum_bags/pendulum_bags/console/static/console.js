@@ -507,22 +507,23 @@
       if (age > 0.5) return [name, "silent", `no state for ${age.toFixed(0)} s; before that: ${MODES[plant.mode] || plant.mode || "unknown"}`];
       const rate = plant.rate ? ` · ${Number(plant.rate).toFixed(1)} Hz` : "";
       const jitter = plant.jitter ? ` · jitter ${(Number(plant.jitter) / 1000).toFixed(2)} ms (99 %)` : "";
+      if (plant.mode === "armed_effort" && plant.reason.includes("no fresh command")) return [name, plant.mode, `${rate}${jitter}`, "ARMED, no commander: zero torque"];
       return [name, plant.mode, `${plant.reason.replace(`${plant.mode}: `, "")}${rate}${jitter}`];
     });
     if (JSON.stringify(shown) !== described.text) {
       described.text = JSON.stringify(shown);
-      place.replaceChildren(...shown.map(([name, mode, rest]) => {
+      place.replaceChildren(...shown.map(([name, mode, rest, title_ = MODES[mode] || mode]) => {
         const line = document.createElement("div");
         line.dataset.plant = name;
         const place_ = names.indexOf(name), dot = document.createElement("i");
         dot.style.borderTopColor = COLOURS[place_ % COLOURS.length]; dot.className = place_ ? "dashed" : "";
         const title = document.createElement("b"); title.textContent = name || "/";
-        const badge = document.createElement("span"); badge.className = mode; badge.textContent = ` ${MODES[mode] || mode} `;
+        const badge = document.createElement("span"); badge.className = mode; badge.textContent = ` ${title_} `;
         line.append(dot, title, badge, rest);
         return line;
       }));
     }
-    if (!names.length) place.textContent = "No plant in this ROS domain yet.";
+    if (!names.length) place.textContent = "No plant in this ROS domain yet. How to start one is below.";
     if (state.connected) say(`${names.length} plant${names.length === 1 ? "" : "s"} · ${state.fps} pictures/s`, false);
   }
 
