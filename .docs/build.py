@@ -14,9 +14,12 @@ from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[1]
 GATHERED = PROJECT / "build" / "docs"
+REFERENCE = PROJECT / "pendulum_msgs_py" / "docs" / "reference.md"
 PACKAGES = ("pendulum_sim", "pendulum_hw_bridge", "pendulum_lqr", "pendulum_rosbag", "pendulum_bags")
 NODES = (
     ("simulator", "pendulum_sim.simulator.simulator_node", ("SPECS",)),
+    ("mujoco", "pendulum_sim.simulator.engines", ("MUJOCO",)),
+    ("gymnasium", "pendulum_sim.simulator.engines", ("GYMNASIUM",)),
     ("adopt", "pendulum_sim.simulator.adopt_node", ("SPECS",)),
     ("viewer", "pendulum_sim.pictures.viewer_node", ("SPECS",)),
     ("markers", "pendulum_sim.pictures.markers_node", ("SPECS",)),
@@ -27,7 +30,7 @@ NODES = (
     ("recorder", "pendulum_rosbag.recorder.recorder_node", ("SPECS",)),
     ("play", "pendulum_rosbag.player.player_node", ("SPECS",)),
 )
-"""Node, module, its tables of parameters."""
+"""Node, module, its tables of parameters, or what has one as ``specs``."""
 _CODE = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"(?<!!)\[([^\[\]]+)\]\(([^()\s]+)\)")
 _MATHS = re.compile(r"\A```math\n(.*?)\n```\Z", re.DOTALL)
@@ -93,18 +96,24 @@ def for_the_site(text: str, page: str, gathered: set[str]) -> str:
 def reference() -> str:
     """Return the reference page, from the tables that the programs themselves read."""
     from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
+    from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS, joint_controller_class
     from pendulum_lqr.nodes.bringup import ARGUMENTS
     from pendulum_msgs_py.parameters import markdown_table
+    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+    from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS
     from pendulum_msgs_py.programs.executables import summary
 
-    parts = ["# Reference\n\nGenerated from the code: what stands here is what the programs read.\n\n## Programs\n"]
+    parts = [
+        "# Reference\n\nGenerated from the code by `python .docs/build.py --reference`; a test compares it.\n\n## Programs\n"
+    ]
     for package in PACKAGES:
         tables = importlib.import_module(f"{package}.executables")
         for name, target in {**tables.EXECUTABLES, **getattr(tables, "COMMANDS", {})}.items():
             parts.append(f"- `python -m {package} {name}`: {summary(name, target)}.")
     parts.append("\n## Parameters of the nodes\n")
     for name, module, tables in NODES:
-        specs = [spec for table in tables for spec in getattr(importlib.import_module(module), table)]
+        found = [getattr(importlib.import_module(module), table) for table in tables]
+        specs = [spec for table in found for spec in getattr(table, "specs", table)]
         parts.append(f"### {name}\n\n{markdown_table(specs)}\n")
     node = importlib.import_module("pendulum_lqr.nodes.controller_node").NODE_SPECS
     parts.append(f"### controller\n\n{markdown_table([*node, *COMMON_PARAMETERS])}\n\n## Controllers\n")
@@ -112,6 +121,15 @@ def reference() -> str:
         own = controller_class(name)
         table = markdown_table(own.PARAMETERS) if own.PARAMETERS else "No parameters of its own."
         parts.append(f"### {name}\n\n{own.SUMMARY}.\n\n{table}\n")
+    parts.append("## Controllers of several joints\n\nParameters as for the preset `cart_pole`.\n")
+    mechanism = load_mechanism("cart_pole")
+    for name in JOINT_CONTROLLERS:
+        own_joint = joint_controller_class(name, mechanism)
+        specs = own_joint.parameters(mechanism)
+        table = markdown_table(specs) if specs else "No parameters of its own."
+        parts.append(f"### {name}, several joints\n\n{own_joint.SUMMARY}.\n\n{table}\n")
+    parts.append(f"## Plant files\n\n{markdown_table(PLANT_SPECS)}\n")
+    parts.append(f"### Drivetrain\n\n{markdown_table(DRIVETRAIN_SPECS)}\n")
     parts.append("## Arguments of `bringup.launch.py`\n\n| argument | default | choices | meaning |\n|---|---|---|---|")
     parts += [
         f"| `{it.name}` | `{it.default or chr(34) * 2}` | {', '.join(it.choices) or 'any'} | {it.description} |"
@@ -121,7 +139,10 @@ def reference() -> str:
 
 
 def main() -> int:
-    """Gather the pages that git knows, or would add, and run mkdocs on them."""
+    """Gather the pages that git knows, or would add, and run mkdocs on them; ``--reference`` renews that page alone."""
+    if sys.argv[1:] == ["--reference"]:
+        REFERENCE.write_text(reference(), encoding="utf-8")
+        return 0
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard", "*.md", "*.png", "*.svg", "*.gif"],
         cwd=PROJECT,
@@ -141,11 +162,10 @@ def main() -> int:
         target.parent.mkdir(parents=True, exist_ok=True)
         if name.endswith(".md"):
             text = (PROJECT / name).read_text(encoding="utf-8")
-            target.write_text(for_the_site(text, name, {*listed, "reference.md"}), encoding="utf-8")
+            target.write_text(for_the_site(text, name, set(listed)), encoding="utf-8")
         else:
             shutil.copyfile(PROJECT / name, target)
     shutil.copyfile(PROJECT / ".docs" / "formula.css", GATHERED / "formula.css")
-    (GATHERED / "reference.md").write_text(reference(), encoding="utf-8")
     configuration = str(PROJECT / ".docs" / "mkdocs.yml")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--config-file", configuration]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}

@@ -5,10 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pendulum_hw_bridge.bridge.node_specs import SPECS
 from pendulum_hw_bridge.drive.safety import FAULTS
 from pendulum_hw_bridge.port.actuator import FEEDBACK_QUANTITIES
-from pendulum_msgs_py.parameters import markdown_table
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -17,10 +15,6 @@ def between(mark: str) -> str:
     match = re.search(rf"<!-- {mark} -->\n(.*?)<!-- end -->", README, re.DOTALL)
     assert match is not None
     return match[1]
-
-
-def test_the_readme_has_the_parameters_of_the_node() -> None:
-    assert between("parameters: bridge") == markdown_table(SPECS), f"replace by:\n{markdown_table(SPECS)}"
 
 
 def test_the_readme_has_every_fault() -> None:

@@ -5,54 +5,25 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_lqr.controller_interface.controller import (
-    COMMON_PARAMETERS,
-    CONTROLLERS,
-    controller_class,
-    make_controller,
-)
+from pendulum_lqr.controller_interface.controller import CONTROLLERS, controller_class, make_controller
 from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS, joint_controller_class
-from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.nodes.answering import StateRefusal
-from pendulum_msgs_py.parameters import markdown_table
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def table(name: str) -> str:
-    found = re.search(rf"<!-- table: {name} -->\n\n(.*?)\n<!-- end -->", README, re.DOTALL)
-    assert found, f"README.md has no table {name!r}"
-    return found.group(1)
-
-
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_every_controller_is_listed_with_its_parameters(name):
+def test_every_controller_is_listed(name):
     assert f"| `{name}` | {controller_class(name).SUMMARY} |" in README
-    assert table(name) == markdown_table(controller_class(name).PARAMETERS)
 
 
 @pytest.mark.parametrize("name", JOINT_CONTROLLERS)
-def test_every_controller_of_several_joints_is_listed_with_its_parameters(name):
-    plant = load_mechanism("cart_pole")
-    chosen = joint_controller_class(name, plant)
+def test_every_controller_of_several_joints_is_listed(name):
+    chosen = joint_controller_class(name, load_mechanism("cart_pole"))
     assert f"| `{name}` | {chosen.SUMMARY} |" in README
-    if specs := chosen.parameters(plant):
-        assert table(f"joint {name}") == markdown_table(specs)
-
-
-def test_the_tables_of_the_nodes_are_those_of_the_code():
-    pytest.importorskip("rclpy")
-    from pendulum_lqr.disturbances import disturbance_node
-    from pendulum_lqr.nodes import controller_node, effort_adapter_node, trajectory_action_node
-
-    assert table("common") == markdown_table(COMMON_PARAMETERS)
-    assert table("node") == markdown_table(controller_node.NODE_SPECS)
-    assert table("effort_adapter") == markdown_table(effort_adapter_node.NODE_SPECS)
-    assert table("trajectory_action") == markdown_table(trajectory_action_node.NODE_SPECS)
-    assert table("disturbance") == markdown_table(DISTURBANCE_SPECS + disturbance_node.NODE_SPECS)
 
 
 def test_refusals_of_states_are_explained():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -116,9 +117,20 @@ def test_the_site_is_built_and_needs_no_other_server() -> None:
         assert found is None or 'rel="canonical"' in found.group(0), f"{page}: {found and found.group(0)}"
     dead = [f"{page.relative_to(site)}: {link}" for page in pages for link in _dead_links(page)]
     assert dead == []
-    text = (site / "reference.html").read_text(encoding="utf-8")
+    text = (site / "pendulum_msgs_py" / "docs" / "reference.html").read_text(encoding="utf-8")
     for word in ("handover_effort_limit", "energy_swing_up", "bringup.launch.py", "pendulum_bags console"):
         assert word in text
+
+
+def test_the_reference_has_the_parameters_that_the_programs_read() -> None:
+    spec = importlib.util.spec_from_file_location("docs_build", PROJECT / ".docs" / "build.py")
+    assert spec is not None
+    assert spec.loader is not None
+    build = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(build)
+    assert build.REFERENCE.read_text(encoding="utf-8") == build.reference(), (
+        "python .docs/build.py --reference renews it"
+    )
 
 
 def test_layouts_show_signals_that_exist() -> None:
