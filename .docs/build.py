@@ -104,7 +104,8 @@ def reference() -> str:
     from pendulum_msgs_py.programs.executables import summary
 
     parts = [
-        "# Reference\n\nGenerated from the code by `python .docs/build.py --reference`; a test compares it.\n\n## Programs\n"
+        "# Reference\n\nGenerated from the code by `python .docs/build.py --reference`; a test compares it.\n",
+        "## Programs\n",
     ]
     for package in PACKAGES:
         tables = importlib.import_module(f"{package}.executables")

@@ -33,7 +33,9 @@ def _commands() -> list[tuple[str, str]]:
     # What several pages say runs once.
     for page in PAGES:
         for block in _BLOCK.findall(page.read_text(encoding="utf-8")):
-            for line in block.replace("\\\n", " ").splitlines():
+            # Those of the first page run in order, below.
+            lines = [] if page == PROJECT / "README.md" else block.replace("\\\n", " ").splitlines()
+            for line in lines:
                 command = line.split(" #")[0].strip()
                 if command:
                     found.setdefault(command, str(page.relative_to(PROJECT)))
@@ -44,20 +46,40 @@ COMMANDS = _commands()
 FROM_STAIRS = next(command for _, command in COMMANDS if " experiment gravity " in command)
 """From an unknown pendulum to a controller designed for it."""
 TESTED_ELSEWHERE = {
-    "make experiment": "tests/acceptance/test_experiment.py",
-    "make test": "this very run",
     FROM_STAIRS: "tests/integration/test_experiments.py",
 }
 
 
-def test_readme_has_commands() -> None:
-    assert ("README.md", "make experiment") in COMMANDS
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Return a folder that looks like the project's: what a command writes must not land there."""
+    (tmp_path / "shared").symlink_to(PROJECT.parent / "shared")
+    folder = tmp_path / "root"
+    folder.mkdir()
+    for entry in PROJECT.iterdir():
+        if entry.name != "build":
+            (folder / entry.name).symlink_to(entry)
+    return folder
+
+
+@pytest.mark.timeout(600)
+def test_the_first_page_runs_in_a_fresh_shell_as_it_is_printed(root: Path) -> None:
+    blocks = _BLOCK.findall((PROJECT / "README.md").read_text(encoding="utf-8"))
+    assert blocks[0].strip() == "make experiment"
+    script = "set -e\n" + "".join(blocks[1:])
+    assert "pendulum design" in script
+    fresh = {"HOME": str(root), "PATH": "/usr/bin:/bin", "LANG": "C.UTF-8"}
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=root, env=fresh, capture_output=True, text=True, timeout=500, check=False
+    )
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+    assert "33.345265" in done.stdout
 
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("page", "command"), COMMANDS, ids=[f"{page}: {command}" for page, command in COMMANDS])
 def test_command_of_a_page_runs(
-    processes: ProcessGroup, domain_id: int, tmp_path: Path, page: str, command: str
+    processes: ProcessGroup, domain_id: int, tmp_path: Path, root: Path, page: str, command: str
 ) -> None:
     if command in TESTED_ELSEWHERE:
         pytest.skip(f"run by {TESTED_ELSEWHERE[command]}")
@@ -72,13 +94,6 @@ def test_command_of_a_page_runs(
         assert program.wait(60) == 0, program.output
         return
     environment |= {"NO_COLOR": "1", "FORCE_COLOR": "1"}
-    # Pages are written for the project's root; what a command writes must not land there.
-    (tmp_path / "shared").symlink_to(PROJECT.parent / "shared")
-    root = tmp_path / "root"
-    root.mkdir()
-    for entry in PROJECT.iterdir():
-        if entry.name != "build":
-            (root / entry.name).symlink_to(entry)
     done = subprocess.run(
         command, shell=True, cwd=root, env=environment, capture_output=True, text=True, timeout=500, check=False
     )

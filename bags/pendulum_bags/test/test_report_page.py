@@ -263,6 +263,14 @@ def test_quantities_are_written_for_readers(value: float, text: str) -> None:
     assert quantity(value, "rad") == text
 
 
+def test_labels_of_two_lines_are_two_lines_on_the_page() -> None:
+    panel = Panel(
+        "time [s]", "coherence of the angle\nwith the excitation [-]", [Trace(np.arange(3.0), np.ones(3), "", "sim")]
+    )
+    (graph,) = graphs_of(Figure("one", "One", "A sentence.", [panel]))
+    assert graph["layout"]["yaxis"]["title"]["text"] == "coherence of the angle<br>with the excitation [-]"
+
+
 def test_ratios_are_said_in_words() -> None:
     assert ratio_in_words(1.001) == "equal within half a per cent"
     assert ratio_in_words(1.1) == "10 % larger"
