@@ -20,7 +20,7 @@ from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrateg
 from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5, LinkState
-from pendulum_hw_bridge.port.actuator import HardwareLimits
+from pendulum_hw_bridge.port.actuator import HardwareLimits, Strategy
 from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
@@ -37,6 +37,8 @@ _K = (33.345265, 0.158993)
 _NOISE = 2.5
 _ANSWER_DELAY_NS = MILLISECOND
 _COMMAND_LIFE_NS = 50 * MILLISECOND
+_OFF_LATE_NS = (MILLISECOND, 15 * MILLISECOND)
+"""Time from the setpoints of a stop to its change of strategy: a round trip, or one attempt that is lost [ns]."""
 _PARAMETERS = load_emulator("thesis")
 
 
@@ -94,6 +96,9 @@ class Rig:
         voltage: Supply of the emulated actuator; None for the plant file's, which the bridge assumes at first [V].
         start: Angle at the start [rad]; by default close to upright, or 0.5 on a ramp.
         goal: End of the ramp [rad]; by default 1.5 rad further.
+
+    Attributes:
+        stops: When the setpoints of each stop arrived [ns].
     """
 
     loop: SteppedLoop
@@ -131,6 +136,8 @@ class Rig:
         self._last_asked = (-SECOND, 0.0)
         self._build(kind, seed, start, voltage)
         self.actuator.trace = self._watch
+        self.stops: list[int] = []
+        self._slow_down_stops(np.random.Generator(np.random.Philox(key=[seed, 8])))
         while self.module.feedback is None:
             self.loop.turn()
         refusal = self.arm()
@@ -175,6 +182,19 @@ class Rig:
             # Commands come from `answer`: there is nothing to sleep for.
             take_inputs=lambda timeout: None,
         )
+
+    def _slow_down_stops(self, random: np.random.Generator) -> None:
+        """Let time pass between the setpoints of a stop and its change of strategy, as a network does."""
+        configure = self.actuator.configure
+
+        def later(**changes: Any) -> None:
+            if changes.get("strategy") is Strategy.OFF and self.actuator.strategy is not Strategy.OFF:
+                self.stops.append(self.actuator.now_ns)
+                self.clock.wait_until(self.clock.now_ns() + round(random.uniform(*_OFF_LATE_NS)))
+                self.actuator.advance_to(self.clock.now_ns())
+            configure(**changes)
+
+        self.actuator.configure = later  # type: ignore[method-assign]
 
     @property
     def outcomes(self) -> list[Outcome]:

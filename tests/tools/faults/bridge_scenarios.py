@@ -39,6 +39,8 @@ the worst of 20 seeds, without any fault of the drive [N m]."""
 _LOOP_ERROR = 2.0
 """The same under the firmware's torque loop, of its mean: it overshoots where the torque asked for steps [N m]."""
 _LOOP_TIME_NS = 20 * MILLISECOND
+_STEP = 0.01
+"""Torque of a step of the duty [N m]."""
 _NO_TORQUE = 1e-3
 """Torque below which a motor is not driven, whatever its duty: a broken phase carries no current [N m]."""
 _UNSEEN_MOTION = 0.03
@@ -117,6 +119,7 @@ class Reaction:
         beyond_asked: Largest torque of the motor beyond what was rightfully asked for [N m].
         stays_zero: Whether the torque stayed zero to the end.
         turned: How far the link turned while there was torque [rad].
+        beyond_stop: Largest torque of the motor after a stop beyond that before it [N m].
     """
 
     reaction: str
@@ -127,6 +130,7 @@ class Reaction:
     beyond_asked: float
     stays_zero: bool
     turned: float
+    beyond_stop: float
 
     def complaints(self, scenario: Scenario) -> list[str]:
         """Return a sentence for each thing that must hold and did not."""
@@ -140,7 +144,11 @@ class Reaction:
             found.append(f"torque for {lasts:.1f} ms; expected at most {LONGEST_MS:g} ms, and then none")
         # Behind a stuck encoder even the rightful controller does not see what to ask for.
         if not (scenario.own_torque or scenario.by_motion):
-            for what, torque in (("the limit", self.beyond_limit), ("what was asked for", self.beyond_asked)):
+            for what, torque in (
+                ("the limit", self.beyond_limit),
+                ("what was asked for", self.beyond_asked),
+                ("the torque before the stop", self.beyond_stop),
+            ):
                 if torque > 0.0:
                     found.append(f"{torque:.2f} N m beyond {what}")
         return found
@@ -319,6 +327,7 @@ def run_scenario(scenario: Scenario, case: Case, repetition: int) -> Reaction:
             max([0.0, *(excess for _, excess in excesses)]),
             not any(time > begin_ns + 200 * MILLISECOND for time in driven),
             max((abs(position - after[0][1]) for _, position in after), default=0.0),
+            _beyond_stop(torques, [stop_ns for stop_ns in rig.stops if stop_ns > begin_ns]),
         )
     finally:
         rig.end()
@@ -353,6 +362,18 @@ def _torques(rig: Rig) -> list[tuple[int, float]]:
         (time, math.copysign(min(abs(duty) * per_duty, abs(torque)), duty) if duty * torque > 0.0 else 0.0)
         for time, duty, torque in rig.duties
     ]
+
+
+def _beyond_stop(torques: Sequence[tuple[int, float]], stops: Sequence[int]) -> float:
+    """Return by how much the torque after the first stop exceeds that in the cycle before it [N m]."""
+    if not stops:
+        return 0.0
+    # The firmware's cycle in which the setpoints arrive is still one of before.
+    end_ns = stops[0] + MILLISECOND
+    before = [abs(torque) for time, torque in torques if end_ns - 11 * MILLISECOND < time <= end_ns]
+    after = [abs(torque) for time, torque in torques if time > end_ns]
+    excess = max(after, default=0.0) - max(before, default=0.0)
+    return excess if excess > _STEP else 0.0
 
 
 def _excesses(rig: Rig, torques: Sequence[tuple[int, float]], begin_ns: int) -> list[tuple[int, float]]:
