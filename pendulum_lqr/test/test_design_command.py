@@ -130,3 +130,14 @@ def test_a_mistake_ends_with_one_sentence_and_code_2(arguments, message, capsys)
 def test_help_has_an_example(capsys):
     assert main(["--help"]) == 0
     assert "--preset dfki --q 10,1" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_plant_that_its_recordings_do_not_determine_is_refused(tmp_path, capsys):
+    plant = load_plant("dfki")
+    open_ended = write_plant(tmp_path / "open.yaml", plant, intervals={"gravity": (0.0, 2.3e7)})
+    assert main(["--plant", str(open_ended)]) == 2
+    assert "gravity is" in capsys.readouterr().err
+    known = write_plant(
+        tmp_path / "known.yaml", plant, intervals={"gravity": (0.9 * plant.gravity, 1.1 * plant.gravity)}
+    )
+    assert main(["--plant", str(known), "--json"]) == 0

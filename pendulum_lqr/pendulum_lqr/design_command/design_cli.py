@@ -35,6 +35,7 @@ from pendulum_lqr.linear.parameter_box import UNCERTAIN, parse_box, worst_case
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.json_values import json_text
+from pendulum_msgs_py.plants.determined import require_determined
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, is_mechanism, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
@@ -111,6 +112,7 @@ def design(
         python -m pendulum_lqr design --preset cart_pole --q 10,100,1,1 --r 0.1
     """
     chosen_plant = str(plant) if plant is not None else preset
+    require_determined(chosen_plant)
     if is_mechanism(chosen_plant):
         if any((figures, machine, theta != UPRIGHT, effort_limit, row, uncertainty, tracking)):
             raise ParameterError(
