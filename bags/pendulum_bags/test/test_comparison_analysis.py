@@ -239,7 +239,7 @@ def test_verdict_is_the_worst_outcome_in_words() -> None:
     verdict = conclude([good, open_, bad], default, "simulation", "hardware")
     assert verdict.outcome is Outcome.DIFFERENT
     assert "not equivalent within the default margins (none were stated): spread is 3" in verdict.sentence
-    partly = conclude([good], Margins.parse(["delay=8ms", "band=10"]), "simulation", "hardware")
+    partly = conclude([good], Margins.parse(["delay=8ms", "band=10 Hz"]), "simulation", "hardware")
     assert "within the stated margins (delay, band) and the default ones for the rest, in all" in partly.sentence
     whole = Margins.parse({name: 1.0 for name in default.as_dict() if name != "stated"})
     assert "within the stated margins, in all" in conclude([good], whole, "simulation", "hardware").sentence
@@ -249,7 +249,7 @@ def test_verdict_is_the_worst_outcome_in_words() -> None:
 
 
 def test_margins_are_read_as_users_write_them(tmp_path: Path) -> None:
-    texts = Margins.parse(["delay=8 ms", "spread_angle=0.2deg", "path_angle=20"])
+    texts = Margins.parse(["delay=8 ms", "spread_angle=0.2deg", "path_angle=20 %"])
     assert texts.delay.si == pytest.approx(0.008)
     assert (texts.spread_angle.unit, texts.spread_angle.si) == ("deg", pytest.approx(math.radians(0.2)))
     assert str(texts.path_angle) == "20 %"
@@ -278,7 +278,9 @@ def test_margins_come_back_from_a_summary() -> None:
     [
         ({"delay": -1}, "margin delay is -1 ms; expected a finite number > 0"),
         ({"angle": 0.9}, "margin has no 'angle'; expected one of mean_angle, spread_angle"),
-        (["delay=late"], "margin delay is 'late'; expected a number in ms, s"),
+        (["delay=late"], "margin delay is 'late', without a unit; expected a number in ms or s"),
+        (["delay=0.008"], "margin delay is '0.008', without a unit; expected a number in ms or s"),
+        (["delay=late ms"], "margin delay is 'late ms'; expected a number in ms, s"),
         (["0.02"], "margin is '0.02'; expected NAME=VALUE, such as delay=8ms"),
         ({"path_angle": math.nan}, "margin path_angle is nan %; expected a finite number > 0"),
         ({"delay": {"value": 3, "unit": "deg"}}, "margin delay has unit 'deg'; expected one of ms, s"),

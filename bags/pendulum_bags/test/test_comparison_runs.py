@@ -295,7 +295,15 @@ def test_command_prints_json_and_writes_files(
     # The others are drawn by the tests of the report, and take seconds.
     own = [(title, maker) for title, maker in FIGURES if title in {"Equivalence tests", "Distributions"}]
     monkeypatch.setattr("pendulum_bags.report.figures.FIGURES", own)
-    arguments = [str(folder / "sim"), str(folder / "hw"), "--margin", "mean_angle=0.5", "--json", "-o", str(tmp_path)]
+    arguments = [
+        str(folder / "sim"),
+        str(folder / "hw"),
+        "--margin",
+        "mean_angle=0.5deg",
+        "--json",
+        "-o",
+        str(tmp_path),
+    ]
     assert main(arguments) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads((tmp_path / "comparison.json").read_text())
@@ -337,7 +345,7 @@ def test_command_prints_the_verdict_last(folder: Path, capsys: pytest.CaptureFix
     [
         (["nowhere", "nowhere"], "nowhere"),
         (["one"], "got 1 paths"),
-        (["a", "b", "--margin", "wide=1"], "margin has no 'wide'"),
+        (["a", "b", "--margin", "wide=1deg"], "margin has no 'wide'"),
         (["a", "b", "--margin", "delay=8ms", "--margin", "delay=9ms"], "margin delay is stated twice; expected once"),
     ],
 )

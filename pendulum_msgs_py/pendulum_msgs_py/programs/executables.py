@@ -287,7 +287,11 @@ def typed_options(context: typer.Context, names: Collection[str]) -> list[str]:
         names: Names of the options' variables, such as ``effort_limit``.
     """
     typed = {name for name in names if str(context.get_parameter_source(name)).endswith("COMMANDLINE")}
-    return sorted(max(option.opts, key=len) for option in context.command.params if option.name in typed)
+    return sorted(
+        max(option.secondary_opts if context.params[option.name] is False else option.opts, key=len)
+        for option in context.command.params
+        if option.name in typed
+    )
 
 
 def report_error(error: BaseException) -> int:

@@ -117,8 +117,9 @@ def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece
         if not folder.exists():
             raise BagError(f"{folder} does not exist; expected a folder of bags, or a bag")
         for path in bags_below(folder):
-            below = folder.name if path == folder else str(path.relative_to(folder))
-            name = f"{folder.name}/{below}" if len(folders) > 1 and path != folder else below
+            own = folder.resolve().name
+            below = own if path == folder else str(path.relative_to(folder))
+            name = f"{own}/{below}" if len(folders) > 1 and path != folder else below
             bags.setdefault(path.resolve(), name)
     kinds = {QUESTIONS[question].of_runs for question in questions}
     found: list[Piece] = []

@@ -44,7 +44,7 @@ _UNITS: Mapping[str, tuple[str, ...]] = {
     "band": ("Hz",),
     "mean_position": ("mm", "m"),
 }
-"""Units of each entry; the first is the one of a number that comes without."""
+"""Units of each entry; the first is the one of a number that a program gives without; a text has its unit."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Margins:
 
         Args:
             margin: None for the defaults, the path of a margins file, a mapping of names to values, texts such as
-                ``mean_angle=0.3``, ``delay=8 ms`` or ``spread_angle=0.2 deg``, or margins.
+                ``delay=8 ms`` or ``spread_angle=0.2 deg``, or margins.
 
         Raises:
             ParameterError: An unknown name, a unit of something else, or a value out of domain.
@@ -257,4 +257,8 @@ def _parse_text(text: str) -> tuple[str, Margin]:
     name, sign, value = text.partition("=")
     if not sign:
         raise ParameterError(f"margin is {text!r}; expected NAME=VALUE, such as delay=8ms")
-    return name.strip(), _margin(name.strip(), value)
+    name = name.strip()
+    if name in _UNITS and not any(value.strip().endswith(unit) for unit in _UNITS[name]):
+        units = " or ".join(_UNITS[name])
+        raise ParameterError(f"margin {name} is {value.strip()!r}, without a unit; expected a number in {units}")
+    return name, _margin(name, value)
