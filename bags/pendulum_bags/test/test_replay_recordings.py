@@ -17,7 +17,7 @@ from pendulum_bags.replay.result import fit_percent
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_rosbag.storage import BagWriter
 from pendulum_sim.stepping.plants import make_plant
 from tests.synthetic_runs import regulate, run_metadata, write_bag
@@ -127,6 +127,31 @@ def test_command_shows_a_real_pendulum_in_one_figure(
     assert "windows of 1 s: rms 0.03" in capsys.readouterr().out
     assert (tmp_path / "replay.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "replay.json").read_text())["rms_rad"] == pytest.approx(0.038, rel=0.1)
+
+
+def test_a_bag_given_as_the_folder_itself_has_its_name_and_no_file_is_written_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = write_bag(tmp_path / "monday", regulate(rate=100.0, seed=3, duration=2.0), "/sim", ramps=False)
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.chdir(bag)
+    assert replay_main([".", "--params", "thesis", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["recording"] == "monday"
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_plant_of_another_machine_is_said_to_be_and_ends_with_3(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = swinging(duration=8.0)
+    table = np.column_stack((recording.time, recording.position, recording.input))
+    path = tmp_path / "run.csv"
+    np.savetxt(path, table, delimiter=",", header="time,position,torque", comments="")
+    other = write_plant(tmp_path / "other.yaml", load_plant("dfki").with_values(gravity=0.4, inertia=0.4))
+    assert replay_main([str(path), "--params", "dfki"]) == 0
+    capsys.readouterr()
+    assert replay_main([str(path), "--params", str(other)]) == 3
+    assert "does not describe run.csv" in capsys.readouterr().out
 
 
 def test_command_refuses_bad_files_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

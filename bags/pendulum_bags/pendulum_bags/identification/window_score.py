@@ -43,6 +43,15 @@ class WindowScore:
     windows: NDArray[np.int64]
     states: Array
 
+    @property
+    def lines(self) -> float:
+        """Root mean square error of the best straight line through each window [rad]."""
+        left = self.measured.copy()
+        for first, stop in self.windows:
+            base = np.column_stack((np.ones(stop - first), self.time[first:stop] - self.time[first]))
+            left[first:stop] -= base @ np.linalg.lstsq(base, left[first:stop], rcond=None)[0]
+        return float(np.sqrt(np.mean(left**2)))
+
 
 def window_score(model: FitModel | PlantParameters, recording: Recording, window: float | None = 1.0) -> WindowScore:
     """Simulate a recording in windows, the initial state of each fitted to it, and measure the angle error.

@@ -48,6 +48,7 @@ def replay_fit(recording: Recording, plant: str | Path | PlantParameters, *, win
         plant=replace(to_plant(model), name=name),
         window=window,
         rms=score.rms,
+        lines=score.lines,
         by_window=score.by_window,
         window_time=score.time,
         window_angle=score.simulated,

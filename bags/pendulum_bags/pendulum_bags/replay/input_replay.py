@@ -90,9 +90,10 @@ def replay_input(recording: Recording, parameters: PlantParameters, *, window: f
     if not window > 0.0:
         raise DataError(f"window is {window} s; expected > 0")
     driven = _Driven.of(recording, parameters)
+    lines = math.nan
     if parameters.drivetrain is None:
         score = window_score(parameters, recording, window)
-        overall, by_window = score.rms, score.by_window
+        overall, by_window, lines = score.rms, score.by_window, score.lines
         window_time, window_angle = score.time, score.simulated
         start = tuple(score.states[0])
     else:
@@ -103,6 +104,7 @@ def replay_input(recording: Recording, parameters: PlantParameters, *, window: f
         name=recording.name,
         plant=parameters,
         window=window,
+        lines=lines,
         rms=overall,
         by_window=by_window,
         window_time=window_time,

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pendulum_bags.identification.identify_cli import Hold
+from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, is_mechanism
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
 
 if TYPE_CHECKING:
     from pendulum_bags.replay.controller_replay import ControllerReplay
+    from pendulum_bags.replay.joint_replay import JointReplay
     from pendulum_bags.replay.result import InputReplay
 
 __all__ = ["main"]
@@ -47,7 +49,7 @@ def replay(
     hold: Hold = None,
     effort: Annotated[str, typer.Option(help="Torque of a bag: applied (said by the plant) or measured.")] = "applied",
     prefix: Annotated[str, typer.Option(help="Namespace of a bag's topics, where it holds several plants: /sim.")] = "",
-    out: Annotated[Path | None, out_option("Folder for figure and replay.json.")] = None,
+    out: Annotated[Path | None, out_option("Folder for figure and replay.json; none by default.")] = None,
     json_output: Json = False,
 ) -> None:
     """Drive a plant with a recorded input and compare the motion; or a controller with recorded states.
@@ -57,8 +59,7 @@ def replay(
     from pendulum_bags.figures.render_files import write_figures
     from pendulum_bags.runs.run_folder import write_json
 
-    folder = out or Path("bags", "runs", f"replay_{recording.stem}")
-    result: InputReplay | ControllerReplay
+    result: InputReplay | ControllerReplay | JointReplay
     if controller:
         from pendulum_bags.replay.controller_replay import parse_values, replay_controller
 
@@ -69,6 +70,13 @@ def replay(
             values=parse_values(set_value or []),
             prefix=prefix or None,
         )
+    elif params and Path(params).suffix != ".json" and is_mechanism(params):
+        from pendulum_bags.replay.joint_replay import replay_joints
+
+        given = {"--hold": hold, "--start": start, "--stop": stop, "--prefix": prefix}
+        if unheeded := [name for name, value in given.items() if value not in (None, "")]:
+            raise DataError(f"{', '.join(unheeded)} has no effect with a plant of several joints; expected none of it")
+        result = replay_joints(recording, params, window=window, mapping=mapping or None)
     else:
         from pendulum_bags.replay.input_replay import replay_recording
 
@@ -84,20 +92,28 @@ def replay(
             namespace=prefix or None,
         )
     content = result.as_dict()
-    files = write_figures([result.figure()], folder)
-    write_json(folder / "replay.json", content)
+    objection = None if controller else result.objection
+    content["objection"] = objection
+    if out is not None:
+        files = write_figures([result.figure()], out)
+        write_json(out / "replay.json", content)
     if json_output:
         print(json_text(content))
-        return
-    _print(result, content, chosen=bool(params))
-    print(f"\nfigure  {files[0]}")
+    else:
+        _print(result, content, chosen=bool(params))
+        if out is not None:
+            print(f"\nfigure  {files[0]}")
+    if objection is not None:
+        raise typer.Exit(3)
 
 
-def _print(result: InputReplay | ControllerReplay, content: dict[str, Any], *, chosen: bool) -> None:
+def _print(result: InputReplay | ControllerReplay | JointReplay, content: dict[str, Any], *, chosen: bool) -> None:
     from pendulum_bags.figures.terminal_table import number_table
     from pendulum_msgs_py.programs.terminal import make_console
 
     console = make_console()
+    if content["objection"] is not None:
+        console.print(content["objection"], style="bold red", highlight=False, markup=False)
     if "horizons" in content:
         headings = ("samples", r"time \[s]", r"rms \[rad]", "predictions")
         table = number_table("Error of predictions from measured states, by horizon", *headings, left=0)
@@ -115,8 +131,9 @@ def _print(result: InputReplay | ControllerReplay, content: dict[str, Any], *, c
             highlight=False,
         )
         return
-    console.print(f"{content['controller']}: {content['description']}", highlight=False, markup=False)
-    console.print(result.sentence(), highlight=False)
+    if "controller" in content:
+        console.print(f"{content['controller']}: {content['description']}", highlight=False, markup=False)
+    console.print(result.sentence(), highlight=False, markup=False)
 
 
 main = partial(cli_main, app, name="python -m pendulum_bags replay")

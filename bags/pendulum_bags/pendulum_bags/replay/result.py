@@ -12,6 +12,8 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.statistics import rms
 from pendulum_bags.figures.figure import Figure, Panel, Trace
+from pendulum_bags.identification.explained import LARGEST_SHARE
+from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["HorizonError", "InputReplay", "fit_percent", "horizon_errors"]
@@ -48,6 +50,7 @@ class InputReplay:
         plant: Parameters of the model.
         window: Length of the windows [s].
         rms: Angle error over windows whose initial states are fitted [rad].
+        lines: Error of the best straight line through each window [rad]; NaN where the start is not fitted.
         by_window: The same of each window, shape (w,) [rad].
         window_time, window_angle: Simulated angle in windows, shape (n,) [s], [rad].
         time, measured, free_run: Measured angle, and simulated from the first state alone, shape (n,) [s], [rad].
@@ -59,6 +62,7 @@ class InputReplay:
     plant: PlantParameters
     window: float
     rms: float
+    lines: float
     by_window: Array
     window_time: Array
     window_angle: Array
@@ -107,6 +111,18 @@ class InputReplay:
                 for one in self.horizons
             ],
         }
+
+    @property
+    def objection(self) -> str | None:
+        """That the plant does not describe this motion, in a sentence; None where it may."""
+        share = self.rms / self.lines
+        if not (share > LARGEST_SHARE or (share > DOUBTFUL_SHARE and self.fit < 0.0)):
+            return None
+        return (
+            f"The plant {self.plant.name!r} does not describe {self.name}: it misses {100.0 * share:.0f} % of what "
+            f"straight lines through windows of {self.window:g} s miss, and its free run has a fit of {self.fit:.0f} % "
+            "(0 is the mean of the motion). It is the plant of another machine, or lacks what moves this one."
+        )
 
     def sentence(self) -> str:
         """Return the result in words."""
