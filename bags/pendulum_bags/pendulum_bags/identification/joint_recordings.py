@@ -18,7 +18,7 @@ check of the velocity against the position. Rows with a NaN are left out and cou
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,7 @@ class JointRecording:
         hold: ``zero`` or ``linear``, per joint.
         source: Where it was read.
         left_out: Rows with a NaN or a repeated stamp that were left out.
+        passive_effort: Joints without an actuator in the plant at which an effort was recorded all the same.
     """
 
     name: str
@@ -64,6 +65,7 @@ class JointRecording:
     hold: tuple[str, ...]
     source: str = ""
     left_out: int = 0
+    passive_effort: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that the arrays fit together."""
@@ -124,7 +126,7 @@ def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path 
         return _read_bag(source, coordinates)
     if source.suffix.lower() not in {".csv", ".txt"}:
         raise DataError(f"{source} is neither a bag nor a CSV file; expected a recording of all joints")
-    rules, origin = _rules(coordinates, mapping)
+    rules, origin = _rules(coordinates, mapping, source)
     common = {key: value for key, value in rules.items() if key not in {"format", "joints"}}
     parts: list[Recording] = []
     # A row with a hole in one joint's column is left out for all joints: their rows must stay those of one moment.
@@ -139,11 +141,6 @@ def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path 
         own = {key: value for key, value in section.items() if key != "effort"}
         if "effort" in section:
             own["input"] = section["effort"]
-            if index not in coordinates.driven:
-                raise DataError(
-                    f"{origin}: joints.{joint.name} has an effort, but the plant has no actuator there; expected an "
-                    "actuator in the plant file, or no effort"
-                )
         elif index in coordinates.driven:
             raise DataError(
                 f"{origin}: joints.{joint.name} has no effort, but the plant has an actuator there; expected the "
@@ -159,14 +156,19 @@ def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path 
         part = check_consistency(unwrap(part)) if joint.turns else check_consistency(part)
         parts.append(part)
     return JointRecording(
-        source.name,
+        source.resolve().name,
         parts[0].time,
         np.stack([part.position for part in parts], axis=1),
         np.stack([part.input for part in parts], axis=1),
         tuple(part.hold for part in parts),
         str(source),
         sum(int(parts[0].meta.get(key, 0)) for key in ("repeated_stamps", "nan_rows")),
+        _passive(coordinates, [bool(np.any(part.input)) for part in parts]),
     )
+
+
+def _passive(coordinates: Coordinates, driven: Sequence[bool]) -> tuple[str, ...]:
+    return tuple(name for i, name in enumerate(coordinates.names) if i not in coordinates.driven and driven[i])
 
 
 def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
@@ -189,23 +191,25 @@ def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
     if applied is None:
         effort[:, driven] = states.effort[first][:, driven]
     else:
-        if applied.names != coordinates.driven_names:
+        if not set(coordinates.driven_names) <= set(applied.names) <= set(coordinates.names):
             raise DataError(
                 f"topic {applied_topic} of bag {source} is of {', '.join(applied.names)}; expected the driven joints, "
                 f"{', '.join(coordinates.driven_names)}"
             )
+        driven = [coordinates.names.index(name) for name in applied.names]
         told, rows = np.unique(applied.stamp_ns, return_index=True)
         newest = np.searchsorted(told, stamps, side="right") - 1
         # Before the first of them nothing was applied yet.
         effort[:, driven] = np.where((newest >= 0)[:, None], applied.effort[rows][np.maximum(newest, 0)], 0.0)
     return JointRecording(
-        source.name,
+        source.resolve().name,
         (stamps - stamps[0]) * 1e-9,
         position,
         effort,
         ("linear" if applied is None else "zero",) * len(states.names),
         str(source),
         int(states.stamp_ns.size - stamps.size),
+        _passive(coordinates, np.any(effort, axis=0).tolist()),
     )
 
 
@@ -223,10 +227,12 @@ def _as_turning(own: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _rules(coordinates: Coordinates, mapping: str | Path | None) -> tuple[dict[str, Any], str]:
+def _rules(coordinates: Coordinates, mapping: str | Path | None, source: Path) -> tuple[dict[str, Any], str]:
     names = coordinates.names
     if mapping is None:
         joints: dict[str, Any] = {}
+        with source.open(encoding="utf-8", errors="replace") as file:
+            head = {cell.strip().casefold() for cell in file.readline().lstrip("# ").split(",")}
         for index, joint in enumerate(coordinates.joints):
             joints[joint.name] = {
                 "position": {"column": [f"{joint.name}.position", f"{joint.name}_position"], "unit": joint.unit},
@@ -236,8 +242,8 @@ def _rules(coordinates: Coordinates, mapping: str | Path | None) -> tuple[dict[s
                     "optional": True,
                 },
             }
-            if index in coordinates.driven:
-                columns = [f"{joint.name}.effort", f"{joint.name}_effort"]
+            columns = [f"{joint.name}.effort", f"{joint.name}_effort"]
+            if index in coordinates.driven or head & set(columns):
                 joints[joint.name]["effort"] = {"column": columns, "unit": joint.effort_unit, "hold": "linear"}
         return {"time": {"column": "time", "unit": "s"}, "joints": joints}, "names of the joints"
     rules = load_yaml(Path(mapping), "mapping file")

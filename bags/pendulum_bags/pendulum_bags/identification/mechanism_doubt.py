@@ -17,7 +17,7 @@ from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["Score", "refusal", "unit_hint"]
+__all__ = ["Score", "better_reading", "refusal"]
 
 _BETTER = 0.5
 """Another reading of the recording explains better where it misses less than this share of what the fit misses."""
@@ -25,13 +25,11 @@ _BETTER = 0.5
 _FAR = 10.0
 """Factor beyond which a fitted mass, length or inertia is not that of a machine near the start."""
 
-_SPAN = 50.0
-"""Travel from which on an angle is more likely in degrees: eight turns [rad]."""
+_NUMBERS_OF_DEGREES = 4.0
+"""Travel from which on an angle may be in degrees [rad]: made small enough, any swing is linear."""
 
-_QUESTION = "is the plant's mechanism, a unit, a sign or a column another one?"
-
-_EFFORT = 20.0
-"""Efforts this many times beyond the actuator's limit are in another unit."""
+_QUICK = 6
+"""Windows of each recording that another reading is fitted to."""
 
 
 @dataclass(frozen=True)
@@ -54,61 +52,82 @@ class Score:
     @property
     def share(self) -> float:
         """Error over that of straight lines, of the joint where it is worst."""
-        return float(np.max(self.rms / np.maximum(self.lines, 1e-12)))
+        return float(np.max(self.shares()))
+
+    def shares(self, least: Array | float = 1e-12) -> Array:
+        """Return error over that of straight lines, by joint, shape (n,).
+
+        Args:
+            least: Below which straight lines count as missing nothing, by joint: a joint that hardly moves shows
+                its noise alone [rad or m].
+        """
+        return np.asarray(self.rms / np.maximum(self.lines, least))
 
 
 @dataclass(frozen=True)
 class _Reading:
-    """Another reading of the columns: q' = Q q and u' = U u, in words and what to do about it."""
+    """Another reading of the columns: q' = Q q + s and u' = U u, in words and what to do about it."""
 
     words: str
     advice: str
     position: Array
     effort: Array
+    shift: Array
 
     def of(self, data: Windows) -> Windows:
         """Return the windows as this reading has them."""
         r, half = data.recording, len(self.position)
         states = np.concatenate(
-            (data.states[:, :half] @ self.position.T, data.states[:, half:] @ self.position.T), axis=1
+            (data.states[:, :half] @ self.position.T + self.shift, data.states[:, half:] @ self.position.T), axis=1
         )
-        read = replace(r, position=r.position @ self.position.T, effort=r.effort @ self.effort.T)
+        read = replace(r, position=r.position @ self.position.T + self.shift, effort=r.effort @ self.effort.T)
         return replace(
             data,
             recording=read,
-            position=data.position @ self.position.T,
+            position=data.position @ self.position.T + self.shift,
             states=states,
             area=data.area @ self.effort.T,
         )
 
 
-def _readings(plant: MechanismParameters) -> Iterator[_Reading]:
-    """Yield what a mapping file gets wrong without a trace: order, signs, an angle against the world."""
+def _readings(plant: MechanismParameters, data: Sequence[Windows]) -> Iterator[_Reading]:
+    """Yield what a mapping file gets wrong without a trace: order, signs, units, zeros, an angle against the world."""
     names, driven, count = plant.coordinates.names, plant.coordinates.driven, len(plant.joints)
-    unit = np.eye(count)
+    joints = plant.coordinates.joints
+    unit, zero = np.eye(count), np.zeros(count)
     if count > 1:
         swap = unit[[1, 0, *range(2, count)]]
         words = f"the columns of {names[0]} and {names[1]} exchanged"
         advice = "expected each joint's own columns: correct the mapping file"
-        yield _Reading(words, advice, swap, swap if {0, 1} <= set(driven) else unit)
+        yield _Reading(words, advice, swap, swap if {0, 1} <= set(driven) else unit, zero)
     signs = "expected an effort that is positive where it pushes the joint in its positive direction: correct its sign"
     if driven:
-        yield _Reading(
-            "every effort negated" if len(driven) > 1 else f"the effort of {names[driven[0]]} negated",
-            signs,
-            unit,
-            -unit,
-        )
+        every = "every effort" if len(driven) > 1 else f"the effort of {names[driven[0]]}"
+        yield _Reading(f"{every} negated", signs, unit, -unit, zero)
+        milli = f"expected {plant.coordinates.drive_unit}: correct its unit in the mapping file"
+        yield _Reading(f"{every} in m{plant.coordinates.drive_unit}", milli, unit, 1e-3 * unit, zero)
     for i in driven if len(driven) > 1 else ():
-        yield _Reading(f"the effort of {names[i]} negated", signs, unit, unit - 2.0 * np.diag(unit[i]))
-    joints = plant.coordinates.joints
+        yield _Reading(f"the effort of {names[i]} negated", signs, unit, unit - 2.0 * np.diag(unit[i]), zero)
     for i in range(1, count):
         if joints[i].turns and joints[i - 1].turns:
             relative = unit.copy()
             relative[i, i - 1] = -1.0
             words = f"the angle of {names[i]} less that of {names[i - 1]}"
             advice = f"expected the angle of {names[i]} against the link before it, this one is against the world"
-            yield _Reading(words, advice, relative, unit)
+            yield _Reading(words, advice, relative, unit, zero)
+    turning = [i for i in range(count) if joints[i].turns]
+    degrees = "expected rad: say `unit: deg` in the mapping file"
+    wide = [i for i in turning if max(np.ptp(p.recording.position[:, i]) for p in data) > _NUMBERS_OF_DEGREES]
+    for some in dict.fromkeys([tuple(wide), *((i,) for i in wide)]):
+        scale = unit.copy()
+        scale[some, some] = math.pi / 180.0
+        words = " and ".join(names[i] for i in some)
+        if some:
+            yield _Reading(f"{words} in degrees", degrees, scale, unit, zero)
+    for i in turning:
+        words = f"the angle of {names[i]} measured from the opposite direction"
+        advice = "expected the zero of the mechanism: add half a turn as `offset` in the mapping file"
+        yield _Reading(words, advice, unit, unit, math.pi * unit[i])
 
 
 def refusal(
@@ -127,74 +146,101 @@ def refusal(
         training: Scores of the recordings of the fit, by name.
         held_out: Scores of recordings that took no part, by name.
     """
-    if max(score.share for score in training.values()) > DOUBTFUL_SHARE:
-        better = _better_reading(plant, found, data)
+    far = _far_off(plant, found)
+    if far is not None or max(score.share for score in training.values()) > DOUBTFUL_SHARE:
+        better = better_reading(plant, data, found)
         if better is not None:
-            return f"{REFUSED}: with {better.words} the motion is explained far better; {better.advice}"
-    for name, score in [*training.items(), *((f"{n}, held out", s) for n, s in held_out.items())]:
-        if score.share > LARGEST_SHARE:
-            worst = int(np.argmax(score.rms / np.maximum(score.lines, 1e-12)))
+            return f"{REFUSED}: {better}"
+    noise = 6.0 * np.max([_noise(part.recording) for part in data], axis=0)
+    # What the fit misses in its own data is no fault of a recording in which a joint hardly moves.
+    usual = np.sqrt(np.mean([score.rms**2 for score in training.values()], axis=0))
+    for name, score, least in (
+        *((n, s, noise) for n, s in training.items()),
+        *((f"{n}, held out", s, np.maximum(noise, 4.0 * usual)) for n, s in held_out.items()),
+    ):
+        shares = score.shares(least)
+        worst = int(np.argmax(shares))
+        if shares[worst] > LARGEST_SHARE:
             joint = plant.coordinates.joints[worst]
-            hint = unit_hint(plant, [part.recording for part in data])
             return (
                 f"{REFUSED}: {name}: the model misses {joint.name} by {score.rms[worst]:.3g} {joint.unit}, "
-                f"{100.0 * score.share:.0f} % of what straight lines miss; expected less than "
-                f"{100.0 * LARGEST_SHARE:.0f} %: "
-                f"{hint or _QUESTION}"
+                f"{100.0 * shares[worst]:.0f} % of what straight lines miss; expected less than "
+                f"{100.0 * LARGEST_SHARE:.0f} %. No other order, sign, unit or zero of the columns explains it better: "
+                "something that was not recorded moves the machine, or it is another one"
             )
-    return _far_off(plant, found)
+    return far
+
+
+def _noise(recording: JointRecording) -> Array:
+    """Return the sensor's noise of each joint by third differences, in which a smooth motion all but vanishes."""
+    return np.asarray(np.std(np.diff(recording.position, 3, axis=0), axis=0) / math.sqrt(20.0))
 
 
 def _far_off(plant: MechanismParameters, found: MechanismFit) -> str | None:
     for name in tellable(plant):
         start, value = plant.value(name), found.model[name]
-        if name in found.free and start > 0.0 and value > _FAR * start:
+        if name in found.free and start > 0.0 and not start / _FAR < value < start * _FAR:
             unit = found.model.unit(name)
+            times = f"{value / start:.0f}" if value > start else f"{value / start:.2g}"
             return (
-                f"{REFUSED}: {name} is {value:.4g} {unit}, {value / start:.0f} times the starting plant's {start:.4g} "
-                f"{unit}; expected a plant that is near, or a start that is: is a unit, a sign or a column another one?"
+                f"{REFUSED}: {name} is {value:.4g} {unit}, {times} times the starting plant's {start:.4g} {unit}; "
+                "expected a plant that is near, or a start that is"
             )
     return None
 
 
-def _better_reading(plant: MechanismParameters, found: MechanismFit, data: Sequence[Windows]) -> _Reading | None:
-    """Return the reading that explains best, if far better than the fit, by quick fits to a few windows each."""
-    few = [part.subset(range(0, len(part.time), max(1, len(part.time) // 6))) for part in data]
-    least = _BETTER * float(np.mean([_share(e, p) for e, p in zip(found.residuals, data, strict=True)]))
-    best = None
-    for reading in _readings(plant):
-        others = [reading.of(part) for part in few]
-        weights = 1.0 / np.maximum(np.mean([line_errors(part) for part in others], axis=0), 1e-9)
-        try:
-            quick = fit(MechanismModel.of(plant), others, found.free, weights, most=15, tolerance=1e-3)
-        except (DataError, np.linalg.LinAlgError):
-            continue
-        share = float(np.mean([_share(e, p) for e, p in zip(quick.residuals, others, strict=True)]))
-        if share < least and _far_off(plant, quick) is None:
+def better_reading(
+    plant: MechanismParameters, data: Sequence[Windows], found: MechanismFit | None = None
+) -> str | None:
+    """Return how the columns are to be read, with what mends it, where that alone explains the motion; else None.
+
+    Each reading is fitted to a few short windows, and so is the given one: a fit that ended in a poor minimum is no
+    fault of the columns. What is named has then explained all of the data.
+
+    Args:
+        plant: The start.
+        data: The windows of the fit.
+        found: The fit; None where there is none.
+    """
+    own = math.inf
+    if found is not None:
+        own = float(np.mean([_share(e, p) for e, p in zip(found.residuals, data, strict=True)]))
+        if _far_off(plant, found) is not None:
+            own = math.inf
+    few = [part.subset(range(0, len(part.time), max(1, len(part.time) // _QUICK))) for part in data]
+    unit = np.eye(len(plant.joints))
+    given = _Reading("", "", unit, unit, np.zeros(len(unit)))
+    least, best = math.inf, None
+    for reading in (given, *_readings(plant, data)):
+        share = _fits(plant, reading, few)
+        # Another reading has to be far better than the given one.
+        if share < (least if best is not None or reading is given else _BETTER * least):
             least, best = share, reading
-    return best
+    if best is None or best is given:
+        return None
+    whole = _fits(plant, best, data)
+    if whole > DOUBTFUL_SHARE or whole > _BETTER * own:
+        return None
+    instead = f" instead of {100.0 * own:.2g} %" if math.isfinite(own) else ""
+    return (
+        f"with {best.words} the motion is explained far better (a fit misses {100.0 * whole:.2g} %{instead}); "
+        f"{best.advice}"
+    )
+
+
+def _fits(plant: MechanismParameters, reading: _Reading, data: Sequence[Windows]) -> float:
+    """Return the share that a quick fit under a reading misses, inf where it ends far from the start."""
+    others = [reading.of(part) for part in data]
+    weights = 1.0 / np.maximum(np.mean([line_errors(part) for part in others], axis=0), 1e-9)
+    model = MechanismModel.of(plant)
+    try:
+        quick = fit(model, others, model.fitted(), weights, most=15, tolerance=1e-3)
+    except (DataError, np.linalg.LinAlgError):
+        return math.inf
+    if _far_off(plant, quick) is not None:
+        return math.inf
+    return float(np.mean([_share(e, p) for e, p in zip(quick.residuals, others, strict=True)]))
 
 
 def _share(errors: Array, data: Windows) -> float:
     return Score(rms_by_joint(errors, data), line_errors(data)).share
-
-
-def unit_hint(plant: MechanismParameters, recordings: Sequence[JointRecording]) -> str | None:
-    """Return which column is probably in another unit, in a sentence's part; None where none stands out."""
-    limits = dict(zip(plant.coordinates.driven, plant.effort_limits, strict=True))
-    for recording in recordings:
-        for i, joint in enumerate(plant.coordinates.joints):
-            largest = float(np.max(np.abs(recording.effort[:, i])))
-            if i in limits and largest > _EFFORT * limits[i]:
-                milli = f"m{joint.effort_unit}"
-                return (
-                    f"the effort of {joint.name} reaches {largest:.3g} {joint.effort_unit}, {largest / limits[i]:.0f} "
-                    f"times the actuator's limit; is it in {milli}?"
-                )
-            travel = float(np.ptp(recording.position[:, i]))
-            if joint.turns and travel > _SPAN:
-                return (
-                    f"{joint.name} travels {travel:.3g} rad in {recording.name}, {travel / math.tau:.0f} turns; is it "
-                    "in degrees?"
-                )
-    return None

@@ -21,11 +21,27 @@ from pendulum_bags.identification.mechanism_model import MechanismModel, step_fu
 from pendulum_bags.identification.problem import cut_windows
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["Blocks", "MechanismFit", "Windows", "fit", "line_errors", "prepare_windows", "rms_by_joint", "scores"]
+__all__ = [
+    "Blocks",
+    "MechanismFit",
+    "Windows",
+    "fit",
+    "line_errors",
+    "prepare_windows",
+    "rms_by_joint",
+    "scores",
+    "window_length",
+]
 
+
+_APART = 30.0
+"""Growth of a small difference over a window up to which the window's start determines its end."""
 
 _LONGEST = 0.006
 """Longest step; between samples that lie further apart the motion is simulated in several equal ones [s]."""
+
+
+_AWAY = "the starting plant's motion leaves all bounds within a window; expected a plant that is near"
 
 
 @dataclass(frozen=True)
@@ -217,6 +233,8 @@ class _Simulator:
         return result[:, :, :n]
 
 
+# Far along an unstable motion sensitivities overflow; what is not finite is refused.
+@np.errstate(over="ignore", invalid="ignore")
 def fit(
     model: MechanismModel,
     data: Sequence[Windows],
@@ -248,8 +266,10 @@ def fit(
     damping, k = 1e-4, len(index)
     cost, paths = _simulate(simulator, best, data, x, weights)
     if not np.isfinite(cost):
-        raise DataError("the starting plant's motion leaves all bounds within a window; expected a plant that is near")
+        raise DataError(_AWAY)
     normal, errors = _linearise(simulator, best, data, paths, weights)
+    if not all(np.isfinite(matrix).all() for matrix in normal[0]):
+        raise DataError(_AWAY)
     for _ in range(most):
         step = _step(normal, values[index], size, low, damping)
         trial = values.copy()
@@ -258,10 +278,15 @@ def fit(
         moved = [a + b for a, b in zip(x, step[1], strict=True)]
         new, paths = _simulate(simulator, candidate, data, moved, weights)
         if new < cost:
+            following = _linearise(simulator, candidate, data, paths, weights)
+            if not all(np.isfinite(matrix).all() for matrix in following[0][0]):
+                # So far along an unstable motion the derivatives have no size: a smaller step.
+                damping *= 8.0
+                continue
             done = (cost - new) < tolerance * cost
             values, best, x, cost = trial, candidate, moved, new
             damping = max(0.2 * damping, 1e-9)
-            normal, errors = _linearise(simulator, best, data, paths, weights)
+            normal, errors = following
             if done:
                 break
         else:
@@ -350,11 +375,60 @@ def _step(
     return step, [-(found[:, :, k] + found[:, :, :k] @ step) for found in solved]
 
 
-def scores(model: MechanismModel, data: Sequence[Windows]) -> list[Array]:
-    """Return the rms errors of each joint of each recording with the start of each window fitted, shape (n,)."""
-    weights = np.ones(len(model.plant.joints))
-    found = [fit(model, [part], (), weights, most=12, tolerance=1e-6) for part in data]
-    return [rms_by_joint(one.residuals[0], part) for one, part in zip(found, data, strict=True)]
+def scores(model: MechanismModel, data: Sequence[Windows], weights: Array | None = None) -> list[Array]:
+    """Return the rms errors of each joint of each recording with the start of each window fitted, shape (n,).
+
+    Args:
+        model: The model.
+        data: Windows of each recording.
+        weights: Of each joint's error, shape (n,); by default one over what straight lines miss: metres and radians
+            have no common scale.
+    """
+    found = []
+    for part in data:
+        own = 1.0 / np.maximum(line_errors(part), 1e-9) if weights is None else weights
+        found.append(rms_by_joint(fit(model, [part], (), own, most=12, tolerance=1e-6).residuals[0], part))
+    return found
+
+
+def window_length(model: MechanismModel, recordings: Sequence[JointRecording], longest: float) -> float:
+    """Return the longest window over which motions that begin close to each other stay near, up to ``longest`` [s].
+
+    Along the measured motion the linearised equation carries a small difference on. Where it grows by more than a
+    factor of 30 the start of a window does not determine its end, and a fit to it has many minima: chaotic motion, and
+    motion about an unstable equilibrium.
+
+    Args:
+        model: The start of the fit.
+        recordings: The data.
+        longest: Largest length [s].
+    """
+    derivative = step_functions(model.plant, ())[1]
+    n, lengths = len(model.plant.joints), []
+    for recording in recordings:
+        stride = max(1, round(_LONGEST / float(np.median(np.diff(recording.time)))))
+        time, q = recording.time[::stride], recording.position[::stride]
+        if time.size < 4:
+            continue
+        v, h = np.gradient(q, time, axis=0), np.diff(time)
+        scale = np.maximum(np.std(q, axis=0), 1e-9)
+        states, drive = np.hstack((q, v))[:-1], recording.effort[::stride][:-1]
+        by_x = derivative.map(h.size)(states.T, drive.T, 0.0 * drive.T, np.tile(model.values, (h.size, 1)).T)[0]
+        a = np.array(by_x).reshape(2 * n, h.size, 2 * n).transpose(1, 0, 2) * h[:, None, None]
+        gain = np.eye(2 * n) + a + 0.5 * a @ a + a @ a @ a / 6.0
+        for first in range(0, h.size, max(1, h.size // 12)):
+            product, end = np.eye(2 * n), first
+            while end < h.size and time[end] - time[first] < longest:
+                product = gain[end] @ product
+                end += 1
+                if not np.max(np.abs(product[:n, :n] * scale / scale[:, None])) < _APART:
+                    lengths.append(float(time[end] - time[first]))
+                    break
+            else:
+                # A rest of the recording shows no length.
+                if time[min(end, h.size)] - time[first] >= longest:
+                    lengths.append(longest)
+    return float(np.quantile(lengths, 0.25)) if lengths else longest
 
 
 def line_errors(data: Windows) -> Array:

@@ -27,6 +27,9 @@ def notes_of(
     recordings: Sequence[JointRecording],
     intervals: Mapping[str, Interval],
     training: Mapping[str, Score],
+    *,
+    held: Sequence[str] = (),
+    pushed: Sequence[tuple[str, float, float]] = (),
 ) -> list[str]:
     """Return what there is to say of a fit, most important first.
 
@@ -36,11 +39,26 @@ def notes_of(
         recordings: Its data.
         intervals: By name.
         training: Scores of the recordings, by name.
+        held: Sizes that they do not determine.
+        pushed: Windows left out: recording, start and end from its first sample [s].
     """
     model = found.model
     notes = [
         f"{r.name}: {r.left_out} rows with a NaN or a repeated stamp are left out." for r in recordings if r.left_out
     ]
+    passive = {joint for r in recordings for joint in r.passive_effort}
+    if passive:
+        notes.append(
+            f"The plant has no actuator at {', '.join(sorted(passive))}, yet an effort was recorded there: the fit "
+            "counts it as acting."
+        )
+    if pushed:
+        listing = ", ".join(f"{name} from {first:.2f} to {last:.2f} s" for name, first, last in pushed)
+        notes.append(f"Left out, since something that was not recorded moves the machine there: {listing}.")
+    if held:
+        notes.append(
+            f"The recordings do not determine {', '.join(held)}: held at the starting plant's value, without interval."
+        )
     worst = max(score.share for score in training.values())
     if worst > DOUBTFUL_SHARE:
         notes.append(

@@ -11,24 +11,29 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.explained import REFUSED
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_choice import choose
-from pendulum_bags.identification.mechanism_doubt import Score, refusal, unit_hint
+from pendulum_bags.identification.mechanism_doubt import Score, better_reading, refusal
 from pendulum_bags.identification.mechanism_fit import (
     MechanismFit,
+    Windows,
     fit,
     line_errors,
     prepare_windows,
     rms_by_joint,
     scores,
+    window_length,
 )
-from pendulum_bags.identification.mechanism_model import DELAY, MechanismModel
+from pendulum_bags.identification.mechanism_model import DELAY, MechanismModel, tellable
 from pendulum_bags.identification.mechanism_notes import notes_of
+from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_bags.identification.wording import Interval
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.determined import SPAN, undetermined
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, write_mechanism
 
 __all__ = ["MechanismResult", "Score", "identify_mechanism"]
@@ -36,8 +41,14 @@ __all__ = ["MechanismResult", "Score", "identify_mechanism"]
 FORMAT = "pendulum_mechanism_identification/1"
 
 _WINDOW = (0.5, 5.0)
-"""Shortest and longest window by default [s]. Each window's start takes up two numbers per joint: parameters from long
-windows predict short ones better than those from short ones."""
+"""Shortest and longest window by default [s], where neighbouring motions stay together. Each window's start takes up
+two numbers per joint: parameters from long windows predict short ones better than those from short ones."""
+
+_SHORTEST = 0.2
+"""Shortest window by default, however fast neighbouring motions part [s]."""
+
+_PUSHED = 0.25
+"""Share of the windows that may be left out as pushed."""
 
 _FEWEST = 5
 """Windows below which no fit is tried."""
@@ -80,6 +91,18 @@ class MechanismResult:
     def model(self) -> MechanismModel:
         """The fitted model."""
         return self.fit.model
+
+    @property
+    def verdict(self) -> str:
+        """Whether the fit is a model of the machine, in one sentence."""
+        if self.refusal is not None:
+            return self.refusal
+        worst = max(score.share for score in self.training.values())
+        errors = ", ".join(
+            f"{joint.name} {1e3 * np.sqrt(np.mean([s.rms[i] ** 2 for s in self.training.values()])):.3g} m{joint.unit}"
+            for i, joint in enumerate(self.model.plant.coordinates.joints)
+        )
+        return f"Fits {100.0 * (1.0 - worst):.3g} % of the motion or more, joint by joint: it misses {errors} rms."
 
     def sentences(self) -> list[str]:
         """Return what there is to say, most important first."""
@@ -150,7 +173,7 @@ class MechanismResult:
         intervals = {
             key: (max(found.low, self.model.lowest(key)), found.high)
             for key, found in self.intervals.items()
-            if key != DELAY and not key.endswith("_offset")
+            if key != DELAY and not key.endswith("_offset") and found.low < found.high
         }
         left_out = {
             f"{key} [{self.model.unit(key)}]": self.model[key]
@@ -185,7 +208,8 @@ def identify_mechanism(
         plant: Start, and what is held: lengths, gears, gravity, masses that the motion cannot tell.
         recordings: Data to fit, all of one machine.
         held_out: Recordings to score only.
-        window: Length of the windows [s]; by default a sixth of the data, between 0.5 and 5 s.
+        window: Length of the windows [s]; by default a sixth of the data, between 0.5 and 5 s, or what
+            neighbouring motions stay together for.
         extras: One of ``EXTRAS``; None lets held-out windows choose.
         stride: Take every so manieth position.
 
@@ -194,29 +218,21 @@ def identify_mechanism(
     """
     if window is not None and not (np.isfinite(window) and window > 0.0):
         raise DataError(f"window is {window} s; expected > 0")
-    seconds = sum(float(recording.time[-1] - recording.time[0]) for recording in recordings)
-    length = window or float(np.clip(seconds / 6.0, *_WINDOW))
     for recording in (*recordings, *held_out):
         recording.check(plant.coordinates)
     _check_distinct(recordings, held_out)
-    data = [prepare_windows(recording, length, stride=stride) for recording in recordings]
-    total = sum(len(part.time) for part in data)
-    if total < _FEWEST:
-        raise DataError(
-            f"the recordings hold {total} windows of {length} s; expected at least {_FEWEST}: record for longer, or "
-            "say a shorter --window"
-        )
     start = MechanismModel.of(plant)
-    lines = np.sqrt(np.mean([line_errors(part) ** 2 for part in data], axis=0))
-    try:
-        found, chosen, candidates = choose(start, data, 1.0 / np.maximum(lines, 1e-9), extras)
-    except DataError as error:
-        hint = unit_hint(plant, recordings)
-        raise DataError(f"{error}: {hint}") if hint else error from None
+    seconds = sum(float(recording.time[-1] - recording.time[0]) for recording in recordings)
+    longest = window or float(np.clip(seconds / 6.0, *_WINDOW))
+    length = window or max(window_length(start, recordings, longest), _SHORTEST)
+    search = _Search(plant, recordings, extras, stride)
+    found, chosen, candidates, data, length = search.best(length, fixed=window is not None)
+    found, data, pushed = _without_pushes(found, data)
     # Now that the errors are known, each joint counts by its own.
     errors = [rms_by_joint(left, part) for left, part in zip(found.residuals, data, strict=True)]
-    rms = np.sqrt(np.mean([each**2 for each in errors], axis=0))
-    found = fit(found.model, data, found.free, 1.0 / np.maximum(rms, 1e-9), states=found.states)
+    weights = 1.0 / np.maximum(np.sqrt(np.mean([each**2 for each in errors], axis=0)), 1e-9)
+    found = fit(found.model, data, found.free, weights, states=found.states)
+    found, held = _hold_undetermined(start, found, data, weights)
     names = _names([*recordings, *held_out])
     training = {
         name: Score(rms_by_joint(left, part), line_errors(part))
@@ -225,21 +241,162 @@ def identify_mechanism(
     others = [prepare_windows(recording, length, stride=stride) for recording in held_out]
     outside = {
         n: Score(s, line_errors(p))
-        for n, s, p in zip(names[len(data) :], scores(found.model, others), others, strict=True)
+        for n, s, p in zip(names[len(data) :], scores(found.model, others, weights), others, strict=True)
     }
     intervals = _intervals(found)
     refused = refusal(plant, found, data, training, outside)
-    notes = notes_of(plant, found, recordings, intervals, training)
+    notes = notes_of(plant, found, recordings, intervals, training, held=held, pushed=pushed)
+    if window is None and length < longest:
+        notes.append(f"Windows of {length:.2g} s: over longer ones neighbouring motions part (chaos, or no balance).")
     sources = tuple(recording.source or recording.name for recording in recordings)
     result = MechanismResult(
         found, chosen, candidates, intervals, training, outside, length, refused, tuple(notes), sources
     )
     if refused is None:
         try:
-            result.plant()
+            lost = undetermined(result.plant(), {n: (found.low, found.high) for n, found in intervals.items()})
         except ParameterError as error:
             return replace(result, refusal=f"{REFUSED}: {error}")
+        if lost:
+            listing = ", ".join(f"{name} ({intervals[name].text} {found.model.unit(name)})" for name in lost)
+            return replace(result, refusal=f"{REFUSED}: the recordings do not determine {listing}")
     return result
+
+
+@dataclass(frozen=True)
+class _Search:
+    """A fit from the start, or by way of shorter windows where that ends in a poor minimum."""
+
+    plant: MechanismParameters
+    recordings: Sequence[JointRecording]
+    extras: str | None
+    stride: int
+
+    def best(self, length: float, *, fixed: bool) -> tuple[MechanismFit, str, dict[str, float], list[Windows], float]:
+        """Return the fit, its extras, the candidates, the windows and their length [s].
+
+        Args:
+            length: Length of the windows [s].
+            fixed: Whether it was asked for, and no shorter one is an answer.
+
+        Raises:
+            DataError: There are too few windows, or none is explained.
+        """
+        start = MechanismModel.of(self.plant)
+        data = self._windows(length)
+        tried: list[tuple[float, MechanismFit, str, dict[str, float], list[Windows], float]] = []
+        error = self._attempt(start, data, length, tried)
+        for shorter in (length / 3.0, length / 9.0):
+            if (tried and min(one[0] for one in tried) <= DOUBTFUL_SHARE) or shorter < _SHORTEST:
+                break
+            # Short windows have fewer minima: what they find is another start.
+            near: list[tuple[float, MechanismFit, str, dict[str, float], list[Windows], float]] = []
+            self._attempt(start, self._windows(shorter), shorter, near)
+            if not near or near[0][0] > DOUBTFUL_SHARE:
+                continue
+            self._attempt(near[0][1].model, data, length, tried)
+            if not fixed:
+                tried.extend(near)
+        if not tried:
+            better = better_reading(self.plant, data)
+            raise DataError(better or str(error))
+        return min(tried, key=lambda one: (one[0] > DOUBTFUL_SHARE, -one[5], one[0]))[1:]
+
+    def _windows(self, length: float) -> list[Windows]:
+        data = [prepare_windows(recording, length, stride=self.stride) for recording in self.recordings]
+        total = sum(len(part.time) for part in data)
+        if total < _FEWEST:
+            raise DataError(
+                f"the recordings hold {total} windows of {length:.3g} s; expected at least {_FEWEST}: record for "
+                "longer, or say a shorter --window"
+            )
+        return data
+
+    def _attempt(
+        self,
+        start: MechanismModel,
+        data: list[Windows],
+        length: float,
+        tried: list[tuple[float, MechanismFit, str, dict[str, float], list[Windows], float]],
+    ) -> DataError | None:
+        lines = np.sqrt(np.mean([line_errors(part) ** 2 for part in data], axis=0))
+        try:
+            found, chosen, candidates = choose(start, data, 1.0 / np.maximum(lines, 1e-9), self.extras)
+        except DataError as error:
+            return error
+        tried.append((_worst(found, data), found, chosen, candidates, data, length))
+        return None
+
+
+def _worst(found: MechanismFit, data: Sequence[Windows]) -> float:
+    """Return what a fit misses over what straight lines miss, of the joint and recording where it is worst."""
+    return max(
+        Score(rms_by_joint(left, part), line_errors(part)).share
+        for left, part in zip(found.residuals, data, strict=True)
+    )
+
+
+def _without_pushes(
+    found: MechanismFit, data: list[Windows]
+) -> tuple[MechanismFit, list[Windows], list[tuple[str, float, float]]]:
+    """Return the fit, its windows, and those left out since something else moves the machine there.
+
+    Left out is what makes the difference: without a few windows the fit has to explain the rest.
+    """
+    total = sum(len(part.time) for part in data)
+    if _worst(found, data) <= DOUBTFUL_SHARE or total < 8:
+        return found, data, []
+    lines = np.sqrt(np.mean([line_errors(part) ** 2 for part in data], axis=0))
+    now, kept, out = found, data, []
+    while len(out) < _PUSHED * total:
+        errors = [np.sqrt(np.sum((left / lines) ** 2, axis=(1, 2))) for left in now.residuals]
+        piece = int(np.argmax([np.max(each) for each in errors]))
+        window = int(np.argmax(errors[piece]))
+        part = kept[piece]
+        if len(part.time) < 2:
+            break
+        since = part.recording.time[0]
+        inside = part.time[window][part.inside[window]]
+        out.append((part.recording.name, float(inside[0] - since), float(inside[-1] - since)))
+        rest = np.delete(np.arange(len(part.time)), window)
+        kept = [p.subset(rest) if i == piece else p for i, p in enumerate(kept)]
+        states = [np.delete(x, window, axis=0) if i == piece else x for i, x in enumerate(now.states)]
+        now = fit(now.model, kept, now.free, 1.0 / np.maximum(lines, 1e-9), states=states, most=10, tolerance=1e-3)
+        if _worst(now, kept) <= DOUBTFUL_SHARE:
+            return now, kept, sorted(out)
+    return found, data, []
+
+
+def _hold_undetermined(
+    start: MechanismModel, found: MechanismFit, data: Sequence[Windows], weights: Array
+) -> tuple[MechanismFit, list[str]]:
+    """Return the fit with sizes that the recordings do not determine held at the start's, and their names."""
+    own, held = set(tellable(start.plant)), []
+    if _worst(found, data) > DOUBTFUL_SHARE:
+        return found, held
+    for _ in range(len(own) - 1):
+        intervals = _intervals(found)
+        open_ended = {
+            n: found.relative
+            for n, found in intervals.items()
+            if n in own and (found.low <= 0.0 or found.high > SPAN * found.low)
+        }
+        if not open_ended:
+            break
+        worst = max(open_ended, key=lambda name: open_ended[name])
+        values = found.model.values.copy()
+        values[found.model.index([worst])] = start[worst]
+        free = tuple(name for name in found.free if name != worst)
+        try:
+            trial = fit(found.model.with_values(values), data, free, weights, states=found.states)
+        except DataError:
+            break
+        if trial.cost > 1.1 * found.cost:
+            # The start's value is no answer: the recordings refuse it, though they know no better.
+            break
+        found = trial
+        held.append(worst)
+    return found, held
 
 
 def _names(recordings: Sequence[JointRecording]) -> list[str]:
@@ -266,7 +423,9 @@ def _intervals(found: MechanismFit) -> dict[str, Interval]:
         return {}
     size = np.array([found.model.size(name) for name in free])
     matrix = sum((b.matrices.sum(axis=0) for b in found.blocks), np.zeros((len(free),) * 2)) * np.outer(size, size)
-    inverse = np.linalg.pinv(matrix, rcond=1e-12)
+    level, axes = np.linalg.eigh(matrix)
+    # A direction that the data do not see has a wide interval, not none.
+    inverse = (axes / np.maximum(level, 1e-12 * max(float(level[-1]), 1e-300))) @ axes.T
     scores_by_window = np.concatenate([b.gradients for b in found.blocks]) * size
     samples = sum(b.samples for b in found.blocks)
     windows = len(scores_by_window)
