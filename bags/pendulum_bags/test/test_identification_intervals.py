@@ -1,5 +1,6 @@
 """Intervals of the default path hold what they say, and what they cannot hold is said."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -211,10 +212,11 @@ def test_a_weak_parameter_has_one_interval_everywhere(tmp_path):
     assert not any("(profile" in sentence for sentence in result.sentences())
 
 
-def test_a_parameter_at_its_upper_edge_is_not_said_to_be_wanted_less():
+def test_a_zero_beyond_the_range_of_the_offset_is_named_with_what_mends_it():
     recording = TRUTHS["white noise"].recording(4, period=0.01)
     moved = replace(recording, position=recording.position + 0.56)
-    result = identify([moved], Options(friction="coulomb", multi_start=False, torque_offset=False, folds=2), profiles=0)
-    said = [s for s in result.sentences() if s.startswith("angle_offset ended at the edge")]
-    assert said
-    assert "the data want more than the -0.5 to 0.5" in said[0]
+    options = Options(friction="coulomb", multi_start=False, torque_offset=False, folds=2)
+    said = identify([moved], options, profiles=0).sentences()[0]
+    assert said.startswith("REFUSED: the angle seems to be measured from 0.5")
+    mended = replace(moved, position=moved.position + float(re.search(r"`offset: (\S+)`", said)[1]))
+    assert not identify([mended], options, profiles=0).refused

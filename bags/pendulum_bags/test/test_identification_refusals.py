@@ -314,6 +314,11 @@ def test_each_recording_may_have_a_mapping_of_its_own(tmp_path, capsys):
     assert "--mapping is given 3 times for 2 recordings" in capsys.readouterr().err
 
 
+def test_no_page_is_taken_where_there_is_none_and_named_as_typed_where_it_is_refused(capsys):
+    assert identify_cli.main(["recording.csv", "--plant", "acrobot", "--no-page"]) == 2
+    assert "recording.csv does not exist" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["angle_offset", "torque_offset"])
 def test_each_recording_may_have_a_zero_of_its_own(name):
     plants = [replace(TRUTH, **{name: value}) for value in (0.05, -0.03)]
@@ -356,7 +361,8 @@ def test_a_file_without_a_torque_says_how_a_free_swing_is_read(tmp_path):
     ("way", "unheeded"),
     [
         (["--plant", "acrobot"], ["--friction", "coulomb"]),
-        (["--plant", "acrobot"], ["--no-page"]),
+        (["--plant", "acrobot"], ["--page"]),
+        (["--method", "thesis"], ["--fix-scale"]),
         (["--method", "thesis"], ["--held-out", "other.csv"]),
         (["--method", "thesis"], ["--window", "2"]),
         (["--method", "output_error"], ["--verbose"]),
@@ -366,5 +372,4 @@ def test_a_file_without_a_torque_says_how_a_free_swing_is_read(tmp_path):
 def test_an_option_that_would_change_nothing_is_refused_by_its_name(way, unheeded, capsys):
     assert identify_cli.main(["recording.csv", *way, *unheeded]) == 2
     said = " ".join(capsys.readouterr().err.split())
-    name = unheeded[0].replace("--no-", "--")
-    assert f"{name} has no effect with {way[0]}" in said
+    assert f"{unheeded[0]} has no effect with {way[0]}" in said

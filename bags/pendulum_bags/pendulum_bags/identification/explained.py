@@ -12,14 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pendulum_bags.arrays import Array
+from pendulum_bags.identification.model import to_plant
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE, errors_by_window
 from pendulum_bags.identification.residual_tests import INCOMPLETE
+from pendulum_bags.identification.selection import at_bounds
 from pendulum_bags.identification.solver import residuals
+from pendulum_bags.identification.uncertainty import Uncertainty
+from pendulum_msgs_py.plants.determined import SPAN, undetermined
 
-__all__ = ["REFUSED", "Explained", "explained"]
+__all__ = ["REFUSED", "Explained", "explained", "undetermined_fit"]
 
 REFUSED = "REFUSED"
 """How the sentence begins that a fit is no model of the recorded motion."""
@@ -66,18 +69,17 @@ def explained(fit: OutputErrorFit, outliers: Sequence[tuple[str, float, float, f
     refusal = None
     if fit.reading is not None:
         refusal = f"{REFUSED}: {fit.reading}"
-    elif _is_static(fit, parts):
+    elif share > DOUBTFUL_SHARE and any(piece.recording.meta.get("no_torque") for piece in fit.pieces):
         refusal = (
-            f"{REFUSED}: the recorded torque is a function of the angle alone, as of gravity compensation or a spring, "
-            "and the fit has no inertia left: the motion does not come from this torque (a hand?). Excite the pendulum "
-            "by a torque that does not follow from its angle."
+            f"{REFUSED}: the recorded torque is 0 throughout, yet no free swing explains the motion: it misses "
+            f"{100.0 * share:.0f} % of it. Is the column of the torque another one?"
         )
-    if refusal is None and straight > 3.0 * noise and share > LARGEST_SHARE:
+    elif straight > 3.0 * noise and share > LARGEST_SHARE:
         refusal = (
             f"{REFUSED}: the model explains next to nothing. It misses the angle by {rms:.3g} rad rms over the "
-            f"windows, and straight lines without any model miss it by {straight:.3g} rad. Is the recorded input what "
-            "drives this motion (its unit, its sign, its stamps, a hand, another joint), and is the angle in rad from "
-            "hanging?"
+            f"windows, and straight lines without any model miss it by {straight:.3g} rad. No other unit, zero or sign "
+            "of the angle, no other time of the input and no other length of the windows explains it: something else "
+            "moves this pendulum, or the columns are of something else."
         )
     excess = math.sqrt(max(rms**2 - noise**2, 0.0))
     doubt = None
@@ -90,27 +92,34 @@ def explained(fit: OutputErrorFit, outliers: Sequence[tuple[str, float, float, f
     return Explained(rms, straight, share, refusal, doubt)
 
 
-def _is_static(fit: OutputErrorFit, parts: Sequence[Array]) -> bool:
-    """Return whether angle and input are one function of each other, to 1 %, in a fit without torque of inertia."""
-    if fit.model.input_kind not in {"effort", "voltage"}:
-        return False
-    drive, inertial = [], []
-    angles = []
-    for part, piece in zip(parts, fit.pieces, strict=True):
-        recording = piece.recording
-        inside = piece.mask()
-        u = np.interp(recording.time, recording.input_stamps, recording.input)
-        theta = np.where(inside, part + recording.position, recording.position)
-        speed = np.gradient(theta, recording.time)
-        drive.append(fit.model["input_gain"] * u[inside])
-        inertial.append(fit.model["inertia"] * np.gradient(speed, recording.time)[inside])
-        angles.append(recording.position[inside])
-    u, angle, accelerating = np.concatenate(drive), np.concatenate(angles), np.concatenate(inertial)
-    if np.std(u) <= 0.0 or np.median(np.abs(accelerating)) > 0.02 * np.std(u):
-        return False
-    columns = np.stack((np.ones_like(angle), np.sin(angle), np.cos(angle), angle), axis=1)
-    rest = u - columns @ np.linalg.lstsq(columns, u, rcond=None)[0]
-    return bool(np.std(rest) < 0.1 * np.std(u))
+def undetermined_fit(fit: OutputErrorFit, uncertainty: Uncertainty) -> str | None:
+    """Return the sentence that the recording does not determine what a plant file needs; None where it does.
+
+    Args:
+        fit: The fit.
+        uncertainty: Its intervals.
+    """
+    model = fit.model
+    free = model.input_kind == "none"
+    lost: dict[str, str] = {}
+    # Of a free swing or a voltage only ratios to the inertia are fitted: it has no interval.
+    intervals = {name: (found.low, found.high) for name, found in uncertainty.intervals.items()}
+    for name, (_, high) in undetermined(to_plant(model), intervals).items():
+        # Where the estimate's neighbourhood alone was asked, that it reaches 0 says little of 0.
+        if name in uncertainty.profiles or not 0.0 < high <= SPAN * model[name]:
+            lost[name] = uncertainty.intervals[name].text
+    gain = uncertainty.intervals.get("input_gain")
+    if gain is not None and gain.low <= 0.0 <= gain.high:
+        lost["input_gain"] = gain.text
+    for name in at_bounds(fit.chosen):
+        # A strength of 0 is an answer; the end of a range that was never meant to be reached is none.
+        if name in {"inertia", "gravity", "torque_offset", "angle_offset", "input_gain"} and model[name] != 0.0:
+            lost[name] = "at the end of the range in which it is sought"
+    if not lost:
+        return None
+    listing = ", ".join(f"{name} {model[name]:.4g} {model.units[name]} ({why})" for name, why in lost.items())
+    more = "a swing from a larger angle" if free else "a torque that moves it to and fro through larger angles"
+    return f"{REFUSED}: the recording does not determine {listing}; no plant can be made of it. Record {more}."
 
 
 def _noise(pieces: Sequence[Piece]) -> float:

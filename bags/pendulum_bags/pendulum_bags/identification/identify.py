@@ -9,7 +9,7 @@ from datetime import datetime, timezone
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pendulum_bags.identification.explained import explained
+from pendulum_bags.identification.explained import explained, undetermined_fit
 from pendulum_bags.identification.geometry import check_geometry
 from pendulum_bags.identification.options import DEFAULTS, Options
 from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
@@ -52,6 +52,8 @@ def identify(
     tests = residual_tests(fit)
     account = explained(fit, tests.outliers)
     uncertainty = assess(fit, tests, profiles=0 if account.refusal is not None else profiles)
+    if account.refusal is None and (lost := undetermined_fit(fit, uncertainty)) is not None:
+        account = replace(account, refusal=lost)
     geometry = check_geometry(fit.model, uncertainty, options.geometry)
     scores = {}
     for name, recording in zip(distinct_names(held_out), held_out, strict=True):

@@ -105,7 +105,8 @@ def identify(
     from pendulum_bags.runs.read_recording import read_recording
 
     if plant is not None:
-        _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS)
+        # There is no page with --plant.
+        _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS | (set() if page else {"page"}))
         others = held_out or []
         rules_of = _mappings(mapping, len(data), len(data) + len(others))
         _several_joints(plant, data, rules_of, others, window, out, name, as_json)
@@ -247,18 +248,22 @@ def _narrow(summary: str, width: int = 78) -> str:
 
 
 def _print_result(result: IdentificationResult, out: Path | None) -> None:
-    from pendulum_bags.identification.model import UNITS
+    from pendulum_bags.identification.selection import CHOICE
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
     console = make_console()
+    _print_verdict(console, result.verdict)
+    if result.refused:
+        _print_sentences(console, result.sentences()[1:])
+        return
     predicted = result.predicted
     headings = ("parameter", "value", "95 % interval", *(["predicted"] if predicted else []), "unit")
     table = WholeTable(*headings, title=f"Identified by output error, friction {result.fit.chosen.friction}")
     for key in (*result.fit.chosen.free, "natural_frequency"):
-        unit = UNITS.get(key, "rad/s")
+        unit = result.model.units.get(key, "rad/s")
         interval = result.uncertainty.intervals.get(key)
-        value = result.model[key] if key in UNITS else result.model.natural_frequency
-        cells = [key, f"{value:.5g}", f"{interval.low:.4g} to {interval.high:.4g}" if interval else "-"]
+        value = result.model[key] if key in result.model.units else result.model.natural_frequency
+        cells = [key, f"{value:.5g}", interval.text if interval else "at the edge of its domain"]
         if predicted:
             cells.append(f"+-{predicted[key]:.2g}" if key in predicted else "-")
         table.add_row(*cells, unit)
@@ -269,6 +274,8 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
         mark = "chosen" if candidate is result.fit.chosen else ""
         models.add_row(candidate.friction, held, f"{1e3 * candidate.training_rms:.3f}", mark)
     console.print(models)
+    if len(result.fit.candidates) > 1:
+        console.print(CHOICE, highlight=False)
     for label, score in result.held_out.items():
         console.print(
             f"held out {label}: rms {1e3 * score.rms:.3f} mrad, mean absolute {1e3 * score.mean_absolute:.3f} mrad"
@@ -317,11 +324,15 @@ def _print_mechanism(result: MechanismResult, out: Path | None) -> None:
 
     console = make_console()
     model = result.model
+    _print_verdict(console, result.verdict)
+    if result.refused:
+        _print_sentences(console, result.notes)
+        return
     title = f"{model.plant.mechanism.name}, identified by output error: {result.extras}"
     table = WholeTable("parameter", "value", "95 % interval", "unit", title=title)
     for key in result.fit.free:
         interval = result.intervals[key]
-        table.add_row(key, f"{model[key]:.5g}", f"{interval.low:.4g} to {interval.high:.4g}", model.unit(key))
+        table.add_row(key, f"{model[key]:.5g}", interval.text, model.unit(key))
     console.print(table)
     joints = (f"{joint.name} \\[m{joint.unit}]" for joint in model.plant.coordinates.joints)
     title = f"Free run over windows of {result.window:g} s, the start of each fitted: rms"
@@ -334,6 +345,12 @@ def _print_mechanism(result: MechanismResult, out: Path | None) -> None:
     _print_sentences(console, result.sentences())
     if out is not None and not result.refused:
         console.print(f"wrote {out}", highlight=False)
+
+
+def _print_verdict(console: Console, verdict: str) -> None:
+    from pendulum_bags.identification.explained import REFUSED
+
+    console.print(verdict, style="bold red" if verdict.startswith(REFUSED) else "bold", markup=False, highlight=False)
 
 
 def _print_sentences(console: Console, sentences: Sequence[str]) -> None:

@@ -52,6 +52,13 @@ UNITS: Mapping[str, str] = {
     **{name: quantity.unit for name, (_, quantity) in _FURTHER.items()},
 }
 
+_PER_INERTIA = {
+    "kg m^2": "1",
+    "N m": "1/s^2",
+    "N m s/rad": "1/s",
+    "N m per unit of input": "1/s^2 per unit of input",
+}
+
 BOUNDS: Mapping[str, tuple[float, float]] = {
     "inertia": (1e-7, 1e3),
     "damping": (0.0, 1e4),
@@ -143,6 +150,13 @@ class FitModel:
     def natural_frequency(self) -> float:
         """w0 = sqrt(G / J) of small swings [rad/s]."""
         return float(np.sqrt(max(self["gravity"], 0.0) / self["inertia"]))
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Unit of each parameter; without a torque to compare with all are per unit of inertia."""
+        if self.input_kind not in {"none", "voltage"} or self["inertia"] != 1.0:
+            return UNITS
+        return {name: _PER_INERTIA.get(unit, unit) for name, unit in UNITS.items()}
 
     def with_vector(self, vector: Array) -> FitModel:
         """Return the model with other values."""

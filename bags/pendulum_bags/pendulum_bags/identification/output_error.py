@@ -13,7 +13,7 @@ from pendulum_bags.identification.model import FRICTION_MODELS, FURTHER_TERMS, S
 from pendulum_bags.identification.options import DEFAULTS, Geometry, Options, default_window
 from pendulum_bags.identification.own_zeros import OwnZeros, align
 from pendulum_bags.identification.problem import Piece, prepare
-from pendulum_bags.identification.readings import other_reading
+from pendulum_bags.identification.readings import misfit_cause
 from pendulum_bags.identification.selection import Candidate, choose, effective_samples
 from pendulum_bags.identification.solver import Solution, refine, residuals, robust_cost, solve
 from pendulum_bags.identification.starts import first_models, rank
@@ -99,7 +99,7 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
     if zeros is not None:
         scale = _robust_scale(best, pieces)
         best = solve(best.model, pieces, base, states=best.states, scale=scale, tolerance=1e-7, coarse=COARSE)
-    reading = other_reading(best, pieces, fixed, base, window)
+    reading = misfit_cause(best, pieces, fixed, base, window)
     names = [options.friction]
     if reading is not None:
         # Refused: what follows is only to be shown, not to be believed.
@@ -169,11 +169,13 @@ def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel,
         free = ["damping", "inertia", "input_gain"]
     else:
         free.append("inertia")
-    if options.torque_offset and kind in {"effort", "voltage"}:
+    # A constant input has no delay to be seen, and a gain of its own is an offset.
+    varies = kind != "none" and any(np.ptp(recording.input) > 0.0 for recording in recordings)
+    if options.torque_offset and kind in {"effort", "voltage"} and (varies or "input_gain" not in free):
         free.append("torque_offset")
     if options.angle_offset:
         free.append("angle_offset")
-    if options.delay and kind != "none":
+    if options.delay and varies:
         free.append("transport_delay")
     return FitModel(values, kind, "coulomb", duty_gain), tuple(free)
 

@@ -14,6 +14,7 @@ from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.figures.table import Table
 from pendulum_bags.identification.model import UNITS
 from pendulum_bags.identification.problem import simulate
+from pendulum_bags.identification.selection import CHOICE
 from pendulum_bags.identification.thesis import ThesisResult, trial_part
 from pendulum_bags.identification.thesis_figures import TrialSet, thesis_figures
 from pendulum_bags.pages.sheet import Sentence, write_sheet
@@ -36,12 +37,13 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
     for name in (*chosen.free, "natural_frequency"):
         value = result.model[name] if name in UNITS else result.model.natural_frequency
         interval = result.uncertainty.intervals.get(name)
-        ends = f"{interval.low:.4g} to {interval.high:.4g}" if interval else "at the edge of its domain"
-        parameters.append((name, f"{value:.5g}", ends, UNITS.get(name, "rad/s")))
+        ends = interval.text if interval else "at the edge of its domain"
+        parameters.append((name, f"{value:.5g}", ends, result.model.units.get(name, "rad/s")))
     models = []
     for one in result.fit.candidates:
         held_out = "-" if one.validation is None else f"{1e3 * one.validation.rms:.3f}"
-        models.append((one.friction, held_out, f"{1e3 * one.training_rms:.3f}"))
+        mark = " (chosen)" if one is chosen else ""
+        models.append((f"{one.friction}{mark}", held_out, f"{1e3 * one.training_rms:.3f}"))
     held = [(n, f"{1e3 * s.rms:.3f}", f"{1e3 * s.mean_absolute:.3f}") for n, s in result.held_out.items()]
     names = result.uncertainty.names
     correlation = [
@@ -50,15 +52,18 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
     ]
     tables = [
         Table("Parameters", "", ("parameter", "value", "95 % interval", "unit"), parameters),
-        Table("Friction models", "", ("model", "held-out rms [mrad]", "training rms [mrad]"), models),
+        Table("Friction models", CHOICE, ("model", "held-out rms [mrad]", "training rms [mrad]"), models),
         Table("Other recordings", "", ("recording", "rms [mrad]", "mean absolute [mrad]"), held),
-        Table(
-            f"Correlation (condition number {result.uncertainty.condition_number:.2g})", "", ("", *names), correlation
-        ),
+        Table("Correlation", "", ("", *names), correlation),
     ]
     kicker = f"Friction model {chosen.friction}, {result.created}"
     return write_sheet(
-        target / "index.html", "Identification", _told(result.sentences()), tables, figures, kicker=kicker
+        target / "index.html",
+        "Identification",
+        _told([result.verdict, *result.sentences()]),
+        tables,
+        figures,
+        kicker=kicker,
     )
 
 

@@ -12,6 +12,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import chi_square_tail, student_quantile
 from pendulum_bags.identification.missing import missing_torques
 from pendulum_bags.identification.output_error import OutputErrorFit
+from pendulum_bags.identification.readings import errors_by_window
 from pendulum_bags.identification.selection import effective_samples, implausible_rival
 from pendulum_bags.identification.solver import residuals
 from pendulum_bags.runs.datasets import distinct_names
@@ -20,6 +21,10 @@ __all__ = ["INCOMPLETE", "ResidualTests", "residual_tests"]
 
 INCOMPLETE = "MODEL INCOMPLETE"
 """How the sentence begins that no interval covers what the model lacks."""
+
+
+_NOTHING = 1e-4
+"""Error of a fit over that of straight lines below which nothing is missing, whatever what is left looks like."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +101,15 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     block = int(np.clip(np.ceil(4.0 * memory), 8, max(8, min(len(s) for s in segments) // 2)))
     worst = float(np.max(np.abs(cross[lags:])))
     independent = not any(_depends(inputs, segments, lag, block, lags + 1) for lag in range(lags + 1))
-    missing = (
-        () if fit.pieces[0].recording.input_kind == "position_goal" else missing_torques(fit.model, fit.pieces, parts)
-    )
+    explained, lines = errors_by_window(parts, fit.pieces)
+    # A ten thousandth of the motion is what an integration leaves over: it is no torque of a pendulum.
+    if float(np.sqrt(np.mean(explained**2))) < _NOTHING * float(np.sqrt(np.mean(lines**2))):
+        independent = True
+        missing: Sequence[str] = ()
+    elif fit.pieces[0].recording.input_kind == "position_goal":
+        missing = ()
+    else:
+        missing = missing_torques(fit.model, fit.pieces, parts)
     # Windows at rest fit to the last digit, and would make every motion stand out.
     moving = [value for value in rms if value > 1e-6 * max(rms)]
     middle = float(np.median(moving)) if moving else 0.0
@@ -109,7 +120,8 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     left_out = _left_out(fit)
     if left_out is not None:
         said.insert(0, left_out)
-    said += [_told(stretch, middle) for stretch in _stretches(outliers)]
+    if outliers:
+        said.append(_told(_stretches(outliers), middle))
     bound = 2.576 / float(np.sqrt(samples))
     return ResidualTests(
         auto,
@@ -141,18 +153,17 @@ def _stretches(outliers: Sequence[Outlier]) -> list[list[Outlier]]:
     return stretches
 
 
-def _told(stretch: Sequence[Outlier], middle: float) -> str:
-    name, start = stretch[0][:2]
-    fewest, most = (f"{find(one[3] for one in stretch) / middle:.0f}" for find in (min, max))
-    times = most if fewest == most else f"{fewest} to {most}"
-    if len(stretch) == 1:
-        why = "an outside force (a hand?), or a fault of the recording"
-    else:
-        times = f"in {len(stretch)} windows {times}"
-        why = "an outside force, a fault of the recording, or a motion that shows more of what the model lacks"
+def _told(stretches: Sequence[Sequence[Outlier]], middle: float) -> str:
+    """Return in one sentence which stretches of which recordings stand out."""
+    places: dict[str, list[str]] = {}
+    for stretch in stretches:
+        places.setdefault(stretch[0][0], []).append(f"{stretch[0][1]:.2f} to {stretch[-1][2]:.2f} s after its start")
+    listing = "; ".join(f"{name}, {', '.join(spans)}" for name, spans in places.items())
+    times = [one[3] / middle for stretch in stretches for one in stretch]
+    worse = f"{min(times):.0f} to {max(times):.0f}" if round(min(times)) != round(max(times)) else f"{times[0]:.0f}"
     return (
-        f"{name}, {start:.2f} to {stretch[-1][2]:.2f} s after its start, fits {times} times worse than the median "
-        f"window: {why}; the robust loss limits the weight."
+        f"{listing}: the fit is {worse} times worse there than in the median window, as with an outside force, a fault "
+        "of the recording, or a motion that shows more of what the model lacks; the robust loss limits the weight."
     )
 
 

@@ -101,6 +101,19 @@ class IdentificationResult:
         """Whether the pendulum does something that no candidate model has, or that the fit does not explain."""
         return self.tests.incomplete or self.explained.doubt is not None
 
+    @property
+    def verdict(self) -> str:
+        """Whether the fit is a model of the motion, in one sentence."""
+        if self.explained.refusal is not None:
+            return self.explained.refusal
+        found = self.explained
+        apart = ", apart from the windows named below" if self.tests.outliers else ""
+        lacks = "; the model is incomplete, see below" if self.incomplete else ""
+        return (
+            f"Fits {100.0 * (1.0 - found.share):.3g} % of the motion: it misses {1e3 * found.rms:.3g} mrad rms where "
+            f"straight lines miss {1e3 * found.lines:.3g} mrad{apart}{lacks}."
+        )
+
     def sentences(self) -> list[str]:
         """Return what there is to say about the fit, most important first."""
         if self.explained.refusal is not None:
@@ -156,12 +169,12 @@ class IdentificationResult:
             )
             said.append(
                 f"Each recording has a zero of its own (homing, or the tare of the torque): {zeros.name} is {listing} "
-                f"{UNITS[zeros.name]} beside the common one, which is their mean."
+                f"{self.model.units[zeros.name]} beside the common one, which is their mean."
             )
-        if self.fit.sign_flipped:
+        if self.fit.sign_flipped and not self.refused:
             said.append(
-                "The recorded effort has the opposite sign of the motion that it causes (an external torque?): the fit "
-                "counts it with sign -1."
+                "The recorded effort has the opposite sign of the motion that it causes: the fit counts it with sign "
+                "-1; `sign: -1` of `input` in a mapping file says so."
             )
         return said
 
@@ -214,7 +227,7 @@ class IdentificationResult:
             if self.fit.zeros is None
             else {"name": self.fit.zeros.name, "values": self.fit.zeros.values.tolist()},
             "parameters": {n: self.model[n] for n in UNITS},
-            "units": dict(UNITS),
+            "units": dict(self.model.units),
             "fitted": list(chosen.free),
             "intervals": {name: found.to_json() for name, found in self.uncertainty.intervals.items()},
             "profiles": {n: list(p) for n, p in self.uncertainty.profiles.items()},
@@ -316,7 +329,8 @@ class IdentificationResult:
             # A delay that may be 0 keeps the part of its interval that a plant can have.
             low = max(interval.low, 0.0) if name == "transport_delay" else interval.low
             if low <= value <= interval.high:
-                intervals[name] = (low, interval.high)
+                if low < interval.high < np.inf:
+                    intervals[name] = (low, interval.high)
             else:
                 remarks.append(
                     f"{name} is {value:g} {UNITS[name]} here, and {interval.value:.5g} ({interval.low:.5g} to "

@@ -9,11 +9,12 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.cross_validation import CrossValidation
-from pendulum_bags.identification.model import BOUNDS
+from pendulum_bags.identification.model import BOUNDS, FRICTION_MODELS
 from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.solver import Solution
 
 __all__ = [
+    "CHOICE",
     "Candidate",
     "admissible",
     "akaike_weights",
@@ -23,6 +24,12 @@ __all__ = [
     "implausible_rival",
     "is_plausible",
 ]
+
+CHOICE = (
+    "Chosen: of the models whose held-out error is the least or within one standard error of it, the one of least "
+    "information criterion (Akaike)."
+)
+"""The rule of :func:`choose` in words."""
 
 _CLEARLY = 20.0
 """Lead in the information criterion (a weight of e^-10 for the other) that noise and luck do not explain."""
@@ -115,6 +122,8 @@ def _criterion(candidates: Sequence[Candidate], *, strict: bool = False) -> dict
 
 def admissible(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Return the candidates that held-out windows do not rule out; see :func:`choose`."""
+    # A term that ended at nothing leaves a simpler model, which is a candidate of its own.
+    candidates = [c for c in candidates if not _is_idle(c)] or list(candidates)
     if any(candidate.validation is None for candidate in candidates):
         return list(candidates)
     candidates = [c for c in candidates if is_plausible(c)] or list(candidates)
@@ -128,6 +137,12 @@ def admissible(candidates: Sequence[Candidate]) -> list[Candidate]:
         if float(difference.sum()) <= np.clip(error, 0.02 * least, 0.25 * least):
             found.append(candidate)
     return found
+
+
+def _is_idle(candidate: Candidate) -> bool:
+    """Return whether a friction of the candidate beyond Coulomb's ended at 0."""
+    own = set(FRICTION_MODELS[candidate.friction]) & set(candidate.free) - {"coulomb_friction"}
+    return any(BOUNDS[name][0] == 0.0 and candidate.solution.model[name] <= 0.0 for name in own)
 
 
 def is_plausible(candidate: Candidate) -> bool:

@@ -6,6 +6,7 @@ friction, so starts spread around it in inertia, sign and delay, and a short sea
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ from pendulum_bags.identification.solver import Solution, solve
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["bumps", "equation_error", "first_models", "rank"]
+__all__ = ["bumps", "equation_error", "equation_residual", "first_models", "rank"]
 
 
 def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
@@ -36,6 +37,33 @@ def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
     Source:
         Shinbrot, Trans. ASME 79, 1957; Preisig and Rippin, Computers chem. Engng 17, 1993 (modulating functions).
     """
+    columns, drive = _filtered_equation(recording, window)
+    columns = columns[:, :5]
+    if recording.input_kind == "none":
+        # Nothing drives it: the equation holds per unit of inertia.
+        rest = np.linalg.lstsq(columns[:, 1:], -columns[:, 0], rcond=None)[0]
+        return np.concatenate(([1.0], rest))
+    return np.linalg.lstsq(columns, drive, rcond=None)[0]
+
+
+def equation_residual(recording: Recording, *, window: float = 0.2) -> tuple[float, float]:
+    """Return what :func:`equation_error` leaves over with any zero of the angle, and where that zero lies [rad].
+
+    The rest is rms over rms, of the filtered input or, in a free swing, of the filtered acceleration.
+    """
+    columns, drive = _filtered_equation(recording, window)
+    if recording.input_kind == "none":
+        columns, drive = columns[:, 1:], -columns[:, 0]
+    found = np.linalg.lstsq(columns, drive, rcond=None)[0]
+    rest = drive - columns @ found
+    # G sin(theta - zero) = G cos(zero) sin(theta) - G sin(zero) cos(theta), all of the sign of the inertia.
+    sine, cosine = found[-3], found[-1]
+    sign = 1.0 if recording.input_kind == "none" or found[0] >= 0.0 else -1.0
+    return float(np.std(rest) / max(float(np.std(drive)), 1e-300)), math.atan2(-sign * cosine, sign * sine)
+
+
+def _filtered_equation(recording: Recording, window: float) -> tuple[Array, Array]:
+    """Return the regressors of J, b, c, G, the offset and the cosine, shape (n, 6), and the input, filtered."""
     time, theta = recording.time, recording.position
     stamps = recording.input_stamps
     drive = recording.input if stamps is time else np.interp(time, stamps, recording.input)
@@ -56,12 +84,9 @@ def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
         filtered(direction, bump),
         filtered(np.sin(theta), bump),
         -np.ones(time.size - count + 1),
+        filtered(np.cos(theta), bump),
     )
-    if recording.input_kind == "none":
-        # Nothing drives it: the equation holds per unit of inertia.
-        rest = np.linalg.lstsq(np.stack(columns[1:], axis=1), -columns[0], rcond=None)[0]
-        return np.concatenate(([1.0], rest))
-    return np.linalg.lstsq(np.stack(columns, axis=1), filtered(drive, bump), rcond=None)[0]
+    return np.stack(columns, axis=1), filtered(drive, bump)
 
 
 def bumps(count: int, period: float) -> tuple[Array, Array, Array]:

@@ -10,14 +10,20 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.covariance import FREQUENCY, Errors, candidate_errors, least_scale
-from pendulum_bags.identification.model import BOUNDS, INDEX, FitModel
+from pendulum_bags.identification.model import BOUNDS, INDEX, UNITS, FitModel
 from pendulum_bags.identification.output_error import OFFSETS, OutputErrorFit
 from pendulum_bags.identification.residual_tests import ResidualTests
-from pendulum_bags.identification.selection import Candidate, akaike_weights
+from pendulum_bags.identification.selection import Candidate, akaike_weights, at_bounds
 from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.wording import Interval, plain_sentences
 
 __all__ = ["Uncertainty", "assess", "profile_interval", "unresolved_offset"]
+
+_MOST_PROFILES = 4
+"""Parameters without a useful covariance that get a profile interval at most."""
+
+_LEAST_INDEPENDENT = 5.0
+"""Independent pieces that the residuals count as at least, in a profile."""
 
 RIVAL = 0.02
 """Share of the kept offset's Akaike weight from which on the other one counts as its equal (a difference of 8)."""
@@ -93,12 +99,22 @@ def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2) -> U
     correlation = covariance / np.outer(safe, safe)
     inflation = max((deviation[n] / max(own.white_deviation[n], 1e-150) for n in names), default=1.0)
     signless = [n for n in names if _positive(n)]
-    weak = sorted(signless, key=lambda n: -min(intervals[n].relative, 1e6))[:profiles]
-    found = {name: profile_interval(fit, name, inflation=inflation) for name in weak}
-    for name, (low, high) in found.items():
-        # One interval for everything: what either way of looking at a weak parameter leaves open.
+    weak = sorted(signless, key=lambda n: -min(intervals[n].relative, 1e6))
+    lost = [n for n in weak if intervals[n].relative > 1.0][:_MOST_PROFILES]
+    found = {}
+    for name in dict.fromkeys([*weak[:profiles], *lost]) if profiles else ():
+        raised = deviation[name] / max(own.white_deviation[name], 1e-150)
+        found[name] = low, high = profile_interval(fit, name, inflation=raised)
         held = intervals[name]
-        intervals[name] = replace(held, low=min(held.low, low), high=max(held.high, high))
+        if held.relative <= 1.0:
+            # One interval for everything: what either way of looking at a weak parameter leaves open.
+            low, high = min(held.low, low), max(held.high, high)
+        # Else the estimate's neighbourhood, all that a covariance knows, says nothing about ends that far.
+        intervals[name] = replace(held, low=low, high=high)
+    for name in at_bounds(chosen) if profiles else ():
+        if model[name] <= 0.0 == BOUNDS[name][0]:
+            high = profile_interval(fit, name, inflation=inflation)[1]
+            intervals[name] = Interval(0.0, 0.0, high, 0.5 * high, 0.0)
     sentences = plain_sentences(
         intervals, names, correlation, own.condition, own.singular, fit, unresolved=unresolved_offset(fit)
     )
@@ -114,7 +130,8 @@ def _interval(name: str, model: FitModel, deviation: float, white: float, quanti
         reach = float(np.exp(min(quantile * deviation / value, 100.0)))
         return Interval(value, value / reach, value * reach, deviation, white)
     value, half = model[name], quantile * deviation
-    low, high = BOUNDS[name] if name == "angle_offset" else (0.0 if _positive(name) else -np.inf, np.inf)
+    sought = {"angle_offset", "transport_delay", "load_friction", "drive_load_friction"}
+    low, high = BOUNDS[name] if name in sought else (0.0 if _positive(name) else -np.inf, np.inf)
     return Interval(value, max(value - half, low), min(value + half, high), deviation, white)
 
 
@@ -214,6 +231,16 @@ def _positive(name: str) -> bool:
     return name not in {"torque_offset", "angle_offset", "input_gain", "transport_delay"}
 
 
+def _torque_scale(fit: OutputErrorFit, name: str) -> float:
+    """Return how large a parameter would have to be to do what all torques do, where its unit tells; else 0."""
+    model = fit.model
+    drive = np.concatenate([model["input_gain"] * piece.recording.input for piece in fit.pieces])
+    torque = max(model["gravity"], float(np.std(drive)))
+    speeds = [np.diff(piece.recording.position) / np.diff(piece.recording.time) for piece in fit.pieces]
+    speed = max(float(np.std(np.concatenate(speeds))), 1e-3)
+    return {"N m": torque, "N m s/rad": torque / speed}.get(UNITS[name], 0.0)
+
+
 def profile_interval(fit: OutputErrorFit, name: str, *, inflation: float = 1.0) -> tuple[float, float]:
     """Return the 95 % profile interval of one parameter: where the refitted cost has risen by its share.
 
@@ -229,11 +256,15 @@ def profile_interval(fit: OutputErrorFit, name: str, *, inflation: float = 1.0) 
     best = solution.model
     others = tuple(n for n in fit.chosen.free if n != name)
     samples = sum(piece.samples for piece in fit.pieces)
-    rise = 3.84 * solution.cost / samples * inflation**2
-    unit = max(abs(best[name]), least_scale(name))
+    # However correlated, the folds count as independent: what doubles the cost is excluded, whatever its curvature.
+    rise = 3.84 * solution.cost * min(inflation**2 / samples, 1.0 / _LEAST_INDEPENDENT)
+    unit = max(abs(best[name]), least_scale(name), 1e-3 * _torque_scale(fit, name))
     ends = []
     for direction in (-1.0, 1.0):
         low, high, states, start = 0.0, None, solution.states, best
+        if direction < 0.0 and _positive(name) and best[name] <= 0.0:
+            ends.append(0.0)
+            continue
         step = 0.02 * unit
         for _ in range(12):
             distance = low + step if high is None else 0.5 * (low + high)
@@ -260,7 +291,8 @@ def profile_interval(fit: OutputErrorFit, name: str, *, inflation: float = 1.0) 
                 step *= 3.0
             if high is not None and high - low < 0.05 * high:
                 break
-        reach = low if high is None else 0.5 * (low + high)
+        # What no cost stopped has no end.
+        reach = np.inf if high is None else 0.5 * (low + high)
         value = best[name] + direction * reach
         ends.append(max(value, 0.0) if _positive(name) else value)
     return ends[0], ends[1]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification.model import BOUNDS, UNITS
+from pendulum_bags.identification.model import BOUNDS
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.selection import at_bounds
 
@@ -36,6 +36,13 @@ class Interval:
     def relative(self) -> float:
         """Half width over value, inf at zero."""
         return 0.5 * (self.high - self.low) / abs(self.value) if self.value else float("inf")
+
+    @property
+    def text(self) -> str:
+        """Its ends in words."""
+        if not np.isfinite(self.high):
+            return f"{self.low:.4g} or more" if np.isfinite(self.low) else "anything"
+        return f"{self.low:.4g} to {self.high:.4g}"
 
     def to_json(self) -> dict[str, float]:
         """Return value, ends and standard error as JSON values."""
@@ -95,39 +102,40 @@ def plain_sentences(
             f"{-1e3 * delay.low:.3g} ms): it was stamped late, by a filter or another clock. That belongs to the "
             "recording, not to the pendulum: a plant file gets no delay from it."
         )
+    weak = []
     for name in names:
         interval = intervals[name]
         if interval.relative > 0.3 and name not in {"torque_offset", "angle_offset", "transport_delay"}:
-            ends = f"{interval.low:.3g} to {interval.high:.3g}"
-            text = f"{name} is weakly determined: {interval.value:.3g}, 95 % interval {ends}"
-            if interval.low <= 0.0:
-                text += "; the data are compatible with none at all"
-            said.append(text + ".")
-    said.extend(
-        f"{names[j]} and {first} are correlated by {correlation[i, j]:+.3f}: the data determine a "
-        "combination of them better than either."
+            none = "; the data are compatible with none at all" if interval.low <= 0.0 else ""
+            weak.append(f"{name} ({interval.text}{none})")
+    if weak:
+        said.append(f"Weakly determined: {', '.join(weak)}.")
+    pairs = [
+        f"{names[j]} and {first} ({correlation[i, j]:+.3f})"
         for i, first in enumerate(names)
         for j in range(i)
         if abs(correlation[i, j]) > 0.95
-    )
+    ]
+    if pairs:
+        said.append(f"Correlated: {', '.join(pairs)}; the data determine a combination of them better than either.")
     if condition > 1e8:
         parts = ", ".join(f"{names[i]} ({weakest[i]:+.2f})" for i in np.argsort(-np.abs(weakest))[:3])
-        said.append(
-            f"The condition number is {condition:.1e}: there is a direction that the data do not see, made of {parts}."
-        )
-    said.extend(_edge(name, fit) for name in at_bounds(fit.chosen))
+        said.append(f"There is a direction that the data hardly see, made of {parts}.")
+    edges = [_edge(name, fit, intervals) for name in at_bounds(fit.chosen)]
+    if edges:
+        said.append(f"At the edge of their domain: {'; '.join(edges)}.")
     if unresolved is not None:
         said.append(_unresolved(unresolved, intervals, fit))
     return said
 
 
-def _edge(name: str, fit: OutputErrorFit) -> str:
+def _edge(name: str, fit: OutputErrorFit, intervals: Mapping[str, Interval]) -> str:
     value, (low, high) = fit.model[name], BOUNDS[name]
     if value <= low and low == 0.0:
-        why = "the data want none of it"
-    else:
-        why = f"the data want {'less' if value <= low else 'more'} than the {low:g} to {high:g} in which it is sought"
-    return f"{name} ended at the edge of its domain, {value:.3g} {UNITS[name]}: {why}, and it has no interval."
+        most = f", and allow up to {intervals[name].high:.3g} {fit.model.units[name]}" if name in intervals else ""
+        return f"{name} is 0 (the data want none of it{most})"
+    why = f"the data want {'less' if value <= low else 'more'} than the {low:g} to {high:g} in which it is sought"
+    return f"{name} is {value:.3g} {fit.model.units[name]} ({why}; it has no interval)"
 
 
 def _unresolved(dropped: str, intervals: Mapping[str, Interval], fit: OutputErrorFit) -> str:

@@ -43,9 +43,9 @@ def write_sheet(
     Args:
         path: File.
         title: Heading.
-        sentences: What it says, at the top.
-        tables: Those with rows are shown, before the pictures.
-        pictures: PNG files.
+        sentences: What it says; the first one stands above everything.
+        tables: Those with rows are shown, between the first picture and the others.
+        pictures: PNG files; the first one stands under the first sentence.
         kicker: Line above the heading.
         listings: Heading and text of what another program printed.
         notes: Sentences before the pictures.

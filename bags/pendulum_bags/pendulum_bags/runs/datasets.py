@@ -40,6 +40,9 @@ FASTEST = 300.0
 _MOST_JOINTS, _LEAST_PIECE, _LEAST_JUMP = 5, 50, 0.3
 """Jumps of the angle that join recordings: how many at most, samples between two of them, and size [rad] at least."""
 
+_MOVES = 1e-2
+"""Travel from which on an angle moves [rad]."""
+
 _CONSISTENCY_FACTORS = (
     ("deg/s instead of rad/s", 180.0 / np.pi),
     ("rpm instead of rad/s", 30.0 / np.pi),
@@ -126,7 +129,8 @@ class Recording:
     @property
     def name(self) -> str:
         """Short name for messages and figures: that of the source file."""
-        return Path(str(self.meta.get("source", "recording"))).name
+        # (a bag given as `.` has a name, too)
+        return Path(str(self.meta.get("source", "recording"))).resolve().name
 
     @property
     def input_stamps(self) -> Array:
@@ -298,7 +302,14 @@ def check_consistency(recording: Recording) -> Recording:
     Raises:
         DataError: where the slope lies outside 0.5 to 2.
     """
-    if recording.velocity is None or np.ptp(recording.position) < 0.2:
+    if recording.velocity is None:
+        return recording
+    if not np.any(recording.velocity) and np.ptp(recording.position) >= _MOVES:
+        raise DataError(
+            f"{recording.name}: the velocity is 0 throughout, and the angle travels {np.ptp(recording.position):.2g} "
+            "rad; expected its derivative: name another column in a mapping file, or none"
+        )
+    if np.ptp(recording.position) < 0.2:
         return recording
     step = np.diff(recording.time)
     travel = 0.5 * (recording.velocity[1:] + recording.velocity[:-1]) * step
