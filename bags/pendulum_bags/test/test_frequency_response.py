@@ -1,6 +1,8 @@
 """Frequency responses: estimates against known plants, what tells two plants apart, and what is said of designs."""
 
+import itertools
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -155,10 +157,31 @@ def test_layers_say_yes_for_the_same_plant_and_name_the_designs_that_do_not_carr
     page = write_analysis(tmp_path, same, formats=("png",))
     text = page.read_text(encoding="utf-8")
     assert "Which designs carry over" in text
+    assert "emulated" not in text
+    assert "nu-gap" in same.layers[0].sentence
+    assert "0.2 allowed" in same.layers[0].sentence
+    assert "Certified for the hardware: all 4 designs;" in same.layers[1].sentence
+    # Headings follow each other without a gap in their levels.
+    levels = [int(level) for level in re.findall(r"<h(\d)", text)]
+    assert all(later - level <= 1 for level, later in itertools.pairwise(levels))
     assert "half a period of hold" in text
     drawn = {path.stem for path in (tmp_path / "figures").iterdir()}
     assert drawn == {"bode", "response_quality", "gap", "nyquist", "certified_weights", "certified_gains"}
     assert (tmp_path / "layers" / "which_controllers.json").is_file()
+
+
+def test_a_page_about_emulated_hardware_says_so_in_its_title_and_in_each_text(measured, tmp_path, monkeypatch):
+    monkeypatch.setattr("pendulum_bags.frequency_response.figures._GRID", 3)
+    emulated = replace(measured["hw"], facts={**measured["hw"].facts, "emulated": True})
+    found = analyse_responses([measured["sim"], emulated], "thesis")
+    text = write_analysis(tmp_path, found, formats=()).read_text(encoding="utf-8")
+    assert "<h1>Frequency response of emulated hardware</h1>" in text
+    assert "no machine was measured" in text
+    assert "Certified for the emulated hardware" in text
+    shown = re.sub(r"(?s)<(script|style).*?</\1>", "", text.split('id="terms-title"')[0]).replace(
+        "place of the hardware", ""
+    )
+    assert re.findall(r"(?i)(?<!emulated )\bhardware\b.{40}", shown) == []
 
 
 def test_the_command_reads_bags_of_any_noise(capsys):

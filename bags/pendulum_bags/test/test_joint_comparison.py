@@ -300,7 +300,7 @@ def test_a_report_says_that_an_emulator_stood_in_for_the_machine(
     found = {joint: compare_runs(bags["sim"], other, joint=joint) for joint in JOINTS}
     page = write_joint_report(tmp_path, found, folders=[], formats=(), answer=answer_of_joints(found))
     text = page.read_text(encoding="utf-8")
-    assert "no machine was measured: an emulator stood in for the hardware" in text
+    assert "no machine was measured: an emulator took the place of the hardware" in text
 
 
 def test_a_report_of_several_joints_refuses_what_is_of_one(
@@ -325,7 +325,7 @@ def test_a_report_judges_by_the_margins_that_the_run_was_judged_by_and_says_that
     assert report_main([str(run), "--png-only"]) == 0
     assert capsys.readouterr().out.startswith("No: ")
     text = (run / "report.html").read_text(encoding="utf-8")
-    assert "no machine was measured: a second simulation stood in for the hardware" in text
+    assert "no machine was measured: a second simulation took the place of the hardware" in text
 
 
 def test_the_page_of_several_joints_is_drawn_on_a_phone(report: Path) -> None:
