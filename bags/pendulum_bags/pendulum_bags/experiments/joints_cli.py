@@ -183,7 +183,7 @@ def joints(
                     on_wait=progress.refresh,
                 )
                 words = Words("--rank-seeds 10", f"experiment joints --plant {plant} --periods 40", COST)
-                write_ranking(folder / RANKING, found, words=words)
+                write_ranking(folder / RANKING, found, words=words, emulated=True)
                 write_layer(folder, same_choice(found, words=words))
     if analysis is not None and not json_output:
         console.print(designs_table(analysis.designs))

@@ -48,9 +48,10 @@ def ranking(
 
     contenders = collect_contenders(folders, weights)
     found = rank(contenders)
-    use = any(not one.emulated for one in contenders) if use_simulation is None else use_simulation
+    emulated = all(one.emulated for one in contenders)
+    use = not emulated if use_simulation is None else use_simulation
     narrowed = narrow_all(contenders) if use else {}
-    page = write_ranking(out, found) if out is not None else None
+    page = write_ranking(out, found, emulated=emulated) if out is not None else None
     if json_output:
         content = {**found.to_json(), "layer": same_choice(found).to_json()}
         if use:
