@@ -139,6 +139,14 @@ def test_two_features_are_both_named(tmp_path: Path) -> None:
     assert set(check_model(path).causes) == {"a spring", "the fluid around it"}
 
 
+def test_the_log_holds_the_equation_that_a_controller_is_designed_on(tmp_path: Path) -> None:
+    made = open_simulation(str(write_model(tmp_path / "model.xml", "motor_delay", 1)))
+    found = made.pendulum.parameters
+    (line,) = [remark for remark in made.remarks if remark.startswith("closest equation: ")]
+    for name, unit in (("inertia", "kg m^2"), ("gravity", "N m"), ("transport_delay", "s"), ("effort_limit", "N m")):
+        assert f"{name} {getattr(found, name):.6g} {unit}" in line
+
+
 # --- Gymnasium -------------------------------------------------------------------------------------------------
 
 

@@ -26,7 +26,7 @@ class Broken(RigidPlant):
     odd: object = None
 
     def step(self, effort: float, push: float = 0.0) -> PlantState:
-        if isinstance(self.odd, Exception):
+        if isinstance(self.odd, BaseException):
             raise self.odd
         return PlantState(0.5, *self.odd)  # type: ignore[misc]
 
@@ -35,6 +35,7 @@ class Broken(RigidPlant):
     ("odd", "sentence"),
     [
         (ValueError("shapes\n (2,) and (3,)"), r"simulation lab failed in step: ValueError: shapes \(2,\) and \(3,\)"),
+        (SystemExit("no licence"), "simulation lab failed in step: SystemExit: no licence"),
         (KeyError(), "simulation lab failed in step: KeyError"),
         (
             (math.nan, 0.0, 0.0),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import pytest
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.foreign.gymnasium_plant import GymnasiumPlant, load_adapter, load_gymnasium_plant
+from pendulum_sim.simulator.engines import open_simulation
 from pendulum_sim.stepping.plants import make_plant
 
 
@@ -134,6 +137,56 @@ def test_what_does_not_fit_is_refused_in_one_sentence(changes: dict[str, Any], s
     adapter = {key: value for key, value in {**ADAPTER, **changes}.items() if value is not None}
     with pytest.raises(ParameterError, match=sentence) as refused:
         load_gymnasium_plant("Lab-v0", adapter)
+    assert "\n" not in str(refused.value)
+
+
+class Bad(Lab):
+    """The same, as others write it."""
+
+    def __init__(self, how: str) -> None:
+        super().__init__()
+        self.how = how
+
+    def reset(self, **told: Any) -> Any:
+        observation, more = super().reset(**told)
+        return observation if self.how == "old reset" else (self._spoil(observation), more)
+
+    def _spoil(self, observation: Any) -> Any:
+        if self.how == "mapping":
+            return {"angle": observation[2]}
+        return observation[None] if self.how == "shape" else observation
+
+    def step(self, action: Any) -> Any:
+        observation, *others, more = super().step(action)
+        if self.how == "raises":
+            raise AssertionError("out of the\nworkspace")
+        if self.how == "exits":
+            sys.exit("no licence")
+        if self.how == "nan":
+            observation = observation * math.nan
+        return (observation, *others[:2], more) if self.how == "old step" else (self._spoil(observation), *others, more)
+
+
+gymnasium.register("Bad-v0", entry_point=Bad)
+
+
+@pytest.mark.parametrize(
+    ("how", "sentence"),
+    [
+        ("old step", r"step returns 4 values; expected 5 values \(observation, .* as in Gymnasium 0.26 and later"),
+        ("old reset", "reset returns a ndarray; expected observation and info, as in Gymnasium 0.26 and later"),
+        ("raises", "environment Bad-v0 failed in loading: AssertionError: out of the workspace"),
+        ("exits", "environment Bad-v0 failed in loading: SystemExit: no licence"),
+        ("nan", "it is at nan rad, nan rad/s; expected finite numbers"),
+        ("mapping", "its observation is a dict, expected an array that holds both"),
+        ("shape", r"its observation is of shape \(1, 3\), expected an array that holds both"),
+    ],
+)
+def test_what_foreign_code_does_is_one_sentence_and_no_traceback(tmp_path: Path, how: str, sentence: str) -> None:
+    adapter = tmp_path / "adapter.yaml"
+    adapter.write_text(json.dumps({"format": "pendulum_simulation/1", **ADAPTER, "make": {"how": how}}))
+    with pytest.raises(ParameterError, match=sentence) as refused:
+        open_simulation("gymnasium:Bad-v0", str(adapter))
     assert "\n" not in str(refused.value)
 
 

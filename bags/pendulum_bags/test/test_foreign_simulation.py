@@ -17,6 +17,7 @@ from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.repeats import record_repeat, record_simulation, repeat_folder
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
+from pendulum_bags.experiments.simulation import recorded_difference
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import plant_differences
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
@@ -125,6 +126,15 @@ def test_a_difference_that_was_accepted_stands_beside_the_figures(model: Path, s
     (note,) = compare_runs(*bags).notes
     assert note.startswith("The simulation, stopped.xml, does not move as its equation")
     assert compare_runs(bags[1], bags[0]).notes == []
+
+
+@pytest.mark.parametrize(("damping", "verb"), [(11.77, "It agrees with"), (6.0, "It DIFFERS FROM")])
+def test_a_plant_that_cannot_be_reset_is_checked_by_its_recording(tmp_path: Path, damping: float, verb: str) -> None:
+    bag = record_simulation(tmp_path / "bag", lockstep_spec(RegulationSettings(noise=SHORT, method="etd4"), side="sim"))
+    plant = write_plant(tmp_path / "believed.yaml", load_plant("thesis").with_values(damping=damping))
+    told = recorded_difference(bag, "/sim", str(plant))
+    assert verb in told
+    assert "nothing beyond was checked" in told
 
 
 def test_a_mapping_without_a_simulation_is_refused() -> None:

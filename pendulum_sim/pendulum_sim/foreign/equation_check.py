@@ -20,7 +20,7 @@ from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import FaultError
 from pendulum_sim.stepping.joint_plant import JointPlant
 
-__all__ = ["TOLERANCE", "EquationCheck", "Switches", "check_equation"]
+__all__ = ["TOLERANCE", "EquationCheck", "Switches", "check_equation", "check_recording"]
 
 Array = NDArray[np.float64]
 
@@ -191,6 +191,42 @@ def check_equation(
     where = _describe(runs.probes[int(np.argmax(errors))], plant)
     names = plant.coordinates.names
     return EquationCheck(names, tuple(map(float, per_joint)), len(traces), where, causes, left)
+
+
+def check_recording(position: Array, velocity: Array, effort: Array, equation: JointPlant) -> Array:
+    """Return the error of each joint in every piece of a recording, of a plant that cannot be put anywhere.
+
+    Args:
+        position: At the equation's period, shape (n, joints) [rad or m].
+        velocity: Shape (n, joints) [rad/s or m/s].
+        effort: Held from each state on, shape (n, driven joints) [N m or N].
+        equation: What a controller would be designed on.
+
+    Returns:
+        Shape (pieces, joints), as a share of the largest motion of a piece [-].
+    """
+    count = max(_LEAST_PERIODS, min(_MOST_PERIODS, math.ceil(_WINDOW / equation.dt)))
+    runs, traces = _Runs(), []
+    none = (0.0,) * position.shape[1]
+    for first in range(0, len(position) - count, count):
+        state = equation.reset(tuple(position[first]), tuple(velocity[first]))
+        rows = [(state.position, state.velocity)]
+        for k in range(first, first + count):
+            _, *moved, _ = equation.step(tuple(effort[k]), none)
+            rows.append((moved[0], moved[1]))
+        table = np.array(rows, dtype=float)
+        piece = slice(first, first + count + 1)
+        runs.probes.append(_Probe(_FULL, rows[0][0], rows[0][1], tuple(effort[first])))
+        runs.traces.append(_Trace(table[:, 0], table[:, 1]))
+        traces.append(_Trace(position[piece], velocity[piece]))
+    runs.coarse = runs.traces
+    if not traces:
+        return np.empty((0, position.shape[1]))
+    runs.scales[_FULL] = (
+        np.max([np.max(np.abs(t.position - t.position[0]), axis=0) for t in traces], axis=0),
+        np.max([np.max(np.abs(t.velocity - t.velocity[0]), axis=0) for t in traces], axis=0),
+    )
+    return np.array([_error(runs, i, trace) for i, trace in enumerate(traces)])
 
 
 # --- runs ------------------------------------------------------------------------------------------------------

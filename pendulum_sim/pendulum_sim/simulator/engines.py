@@ -13,7 +13,6 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PLANT_SPECS, PRESET_NAMES, is_mechanism
-from pendulum_msgs_py.plants.quantities import write_quantities
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_sim.foreign.equation_check import EquationCheck, Switches, check_equation
 from pendulum_sim.foreign.guarded_plant import GuardedPlant, in_one_sentence
@@ -84,6 +83,11 @@ class Engine:
 _RATE = ParameterSpec(
     "rate_hz", 500.0, "Hz", "Rate of states and commands.", minimum=50.0, maximum=2000.0, read_only=True
 )
+_OF_EQUATION = (
+    *("inertia", "damping", "gravity", "coulomb_friction", "angle_offset"),
+    *("effort_limit", "actuator_time_constant", "transport_delay"),
+)
+"""What an importer finds of a plant's parameters."""
 _EXACT_STEP = 1e-3
 """Longest step of the equation that a simulation of others is checked against [s]."""
 _FOREIGN_SPECS = (
@@ -158,10 +162,8 @@ def _foreign(plant: MujocoPlant | GymnasiumPlant, name: str, label: str) -> Simu
             coarse = None
         return check_equation(joint_plant(guarded), equation, coarse=coarse, switches=switches, reseeded=reseeded)
 
-    numbers = write_quantities(vars(plant.parameters), PLANT_SPECS, {})
-    values = ", ".join(
-        f"{name} {entry['value']:.6g} {entry['unit']}" for name, entry in numbers.items() if entry["value"]
-    )
+    found = [(spec, getattr(plant.parameters, spec.name)) for spec in PLANT_SPECS if spec.name in _OF_EQUATION]
+    values = ", ".join(f"{spec.name} {value:.6g} {spec.unit}" for spec, value in found)
     remarks = (*plant.remarks, f"closest equation: {values}")
     return Simulation(guarded, name, plant.description, remarks, check=check)
 

@@ -41,6 +41,7 @@ class Comparison:
         unpaired_verdict: Verdict on the unpaired comparison.
         looks: How often the data have been looked at.
         left_out: What was recorded and does not count, and why, in words.
+        unproved: What is believed of a plant without a check, in words.
         stalls: Run folder, reason and logs of each run that a stalled machine broke off before the one that counts.
     """
 
@@ -51,6 +52,7 @@ class Comparison:
     unpaired_verdict: Verdict
     looks: Looks = Looks()  # noqa: RUF009 - frozen
     left_out: Sequence[str] = ()
+    unproved: Sequence[str] = ()
     stalls: Sequence[Mapping[str, str]] = ()
 
     @property
@@ -62,7 +64,7 @@ class Comparison:
             simulation = record.get("simulation") if run.label == "simulation" or STAND_IN in record else None
             if isinstance(simulation, Mapping) and (difference := simulation.get(DIFFERENCE)):
                 told.append(f"The {run.label}, {simulation.get('name')}, {difference}.")
-        return [*dict.fromkeys(told), *self.left_out]
+        return [*dict.fromkeys(told), *self.unproved, *self.left_out]
 
     @property
     def is_emulated(self) -> bool:

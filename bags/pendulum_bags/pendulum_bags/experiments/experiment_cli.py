@@ -30,6 +30,7 @@ from pendulum_bags.experiments.settings import (
     NoiseSettings,
     RegulationSettings,
 )
+from pendulum_bags.experiments.simulation import recorded_difference
 from pendulum_bags.experiments.trials_cli import add_commands as add_trial_commands
 from pendulum_bags.frequency_response.frequency_response_cli import experiment as frequency_response
 from pendulum_bags.runs.run_folder import versions, write_json
@@ -374,6 +375,8 @@ def _analyse(
         on_look=lambda number, duration: progress.phase(f"undecided: {duration:.0f} s more", 4.0 + 0.25 * duration),
         on_wait=progress.refresh,
     )
+    if (space := settings.running("sim")) is not None:
+        comparison = replace(comparison, unproved=[recorded_difference(folder / "sim", space, settings.plant)])
     again = f'make experiment ARGS="--budget {4 * budget:.0f}"' if comparison.is_emulated and budget else ""
     answer = answer_of(comparison, more=again)
     progress.phase("writing the report", 4.0)

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from pendulum_bags.runs.read_recording import read_recording
 from pendulum_bags.runs.run_record import DIFFERENCE
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_differences import describe_plants
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, write_plant
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
-from pendulum_sim.foreign.equation_check import EquationCheck
+from pendulum_sim.foreign.equation_check import TOLERANCE, EquationCheck, check_recording
 from pendulum_sim.simulator.engines import find_engine, open_simulation
+from pendulum_sim.stepping.joint_plant import joint_plant
 from pendulum_sim.stepping.plant import Plant
+from pendulum_sim.stepping.plants import make_plant
 
-__all__ = ["ForeignSimulation"]
+__all__ = ["ForeignSimulation", "recorded_difference"]
 
 EQUATION_FILE = "simulation.yaml"
+_PIECES = 0.9
+"""Share of the pieces of a recording that must agree: a state that came late spoils its piece."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +106,7 @@ class ForeignSimulation:
         """
         if not (check := _facts(self.name, self.mapping).check).agrees:
             raise ParameterError(
-                f"simulation {self.name} {check}; expected a model of which that holds, --plant FILE to design on "
+                f"simulation {self.name} {check}; expected one that does, --plant FILE to design on "
                 "another equation, or --accept-differences to design on this one all the same"
             )
 
@@ -134,3 +142,38 @@ class ForeignSimulation:
             "equation": describe_plants([facts.parameters]),
             **({} if facts.check.agrees else {DIFFERENCE: str(facts.check)}),
         }
+
+
+def recorded_difference(bag: Path, namespace: str, plant: str) -> str:
+    """Say how far a plant that ran already moved as the equation that its user gave, as far as it moved at all.
+
+    Args:
+        bag: Its recording.
+        namespace: Its namespace.
+        plant: Preset or file of the equation.
+
+    Raises:
+        DataError: The recording lacks states.
+    """
+    recording = read_recording(bag, namespace=namespace)
+    period = float(np.median(np.diff(recording.time)))
+    times = np.arange(recording.time[0], recording.time[-1], period)
+    velocity = np.gradient(recording.position, recording.time) if recording.velocity is None else recording.velocity
+    motion = [np.interp(times, recording.time, values)[:, None] for values in (recording.position, velocity)]
+    held = np.maximum(np.searchsorted(recording.input_stamps, times + 1e-9, side="right") - 1, 0)
+    effort = recording.input[held][:, None]
+    parameters = load_plant(plant)
+    substeps = None if parameters.drivetrain is not None else math.ceil(period / 1e-3)
+    errors = check_recording(
+        motion[0], motion[1], effort, joint_plant(make_plant(parameters, period, substeps=substeps))
+    )
+    if not errors.size:
+        return f"{namespace} ran already, and its recording is too short to check {plant} against it."
+    error = float(np.quantile(errors, _PIECES))
+    verb = "agrees with" if error <= TOLERANCE else "DIFFERS FROM"
+    return (
+        f"{namespace} ran already and could be put nowhere: only its recording was compared with {plant}. It {verb} "
+        f"that equation within {100.0 * error:.2g} % of its motion (at most {100.0 * TOLERANCE:g} %) in nine of ten "
+        f"pieces, at {np.min(motion[0]):.2f} to {np.max(motion[0]):.2f} rad, up to "
+        f"{np.max(np.abs(motion[1])):.2g} rad/s and {np.max(np.abs(effort)):.2g} N m; nothing beyond was checked."
+    )
