@@ -540,7 +540,7 @@ def test_a_port_without_a_hand_is_not_pushed() -> None:
 def test_what_is_sent_is_what_the_monitor_compares() -> None:
     rig = Rig().armed()
     rig.drive(1.0)
-    sent_ns, command = rig.monitor._sent[-1]
+    sent_ns, _, command = rig.monitor._sent[-1]
     assert (sent_ns, command.pwm) == (rig.port.time_ns, 0.25)
     assert rig.monitor._strategy is Strategy.DIRECT_PWM
     rig.bridge.release()

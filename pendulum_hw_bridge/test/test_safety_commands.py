@@ -12,6 +12,7 @@ from pendulum_hw_bridge.drive.output_check import OutputCheck
 from pendulum_hw_bridge.drive.safety import SafetyMonitor
 from pendulum_hw_bridge.port.actuator import Command, Strategy
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from tests.feedback_records import feedback_record
 from tests.watched_monitor import DRIVETRAIN, LIMITS, MILLISECOND, PERIOD, STEP, Watched
 
 # --- what the module acts on -----------------------------------------------------------------------------------
@@ -150,6 +151,42 @@ def test_under_strategy_3_the_newest_command_tells_which_loop_counts() -> None:
         watched.now_ns += STEP
         watched.tell(Strategy.PARALLEL_PWM, position=0.5)
         assert not watched.see(0, position_command=0.5, effort_command=0.75)
+
+
+@pytest.mark.parametrize("late", [0, 12 * MILLISECOND, 25 * MILLISECOND])
+def test_a_record_that_a_busy_host_reads_late_is_compared_with_what_had_been_sent_when_it_was_measured(
+    late: int,
+) -> None:
+    """Commands go on while records wait; what the module acts on is the newest that it had."""
+    watched, begin, told = Watched(), 1_000_000_000, 0
+
+    def see(count: int, waits: int, wrong: float = 0.0) -> str:
+        nonlocal told
+        measured = begin + count * STEP
+        # The command that answers record n leaves half a millisecond after it was measured.
+        while begin + told * STEP + MILLISECOND // 2 <= measured + waits:
+            watched.monitor.told(Command(pwm=0.01 * told), Strategy.DIRECT_PWM, begin + told * STEP + MILLISECOND // 2)
+            told += 1
+        record = feedback_record(measured, count, effort=1e-9 * count, pwm_command=0.01 * (count - 1) + wrong)
+        fault = watched.monitor.check(record._replace(stamp_ns=measured + waits))
+        return "" if fault is None else fault.name
+
+    assert not any(see(count, 0) for count in range(1, 10))
+    assert not any(see(count, late) for count in range(10, 30))
+    # The rule is as strict as it was: a setpoint that was never sent is a fault after as many records.
+    assert [see(count, late, wrong=0.5) for count in range(30, 32)] == ["", "command_not_in_force"]
+
+
+def test_setpoints_that_a_stalled_host_sent_late_had_not_arrived_before_they_had_left() -> None:
+    monitor = SafetyMonitor(LIMITS, PERIOD)
+    now = 1_000_000_000
+    monitor.left(now)  # nothing was sent
+    monitor.told(Command(pwm=1.0), Strategy.DIRECT_PWM, now)
+    monitor.told(Command(pwm=2.0), Strategy.DIRECT_PWM, now + STEP)
+    monitor.left(now + 3 * STEP)
+    before, after = now + 3 * STEP - MILLISECOND, now + 3 * STEP + MILLISECOND
+    assert [command.pwm for command in monitor._in_force(before)] == [1.0, 2.0]
+    assert [command.pwm for command in monitor._in_force(after)] == [2.0, 2.0]
 
 
 def test_a_record_may_show_the_newest_command_that_arrived_and_those_around_it() -> None:

@@ -3,6 +3,8 @@
 import json
 import math
 import socket
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +20,11 @@ from pendulum_hw_bridge.emulation import wire
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.server import EmulatorServer
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
-from pendulum_hw_bridge.port.actuator import Command, Feedback, HardwareLimits
+from pendulum_hw_bridge.port.actuator import Command, Feedback, HardwareLimits, Strategy
 from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_hw_bridge.port.feedback_message import QUANTITIES, encode_feedback
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
+from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
 from pendulum_msgs_py.parameters import validate
 from tests.bag_messages import joint_state, write_bag
@@ -108,6 +111,57 @@ def test_after_any_request_of_a_stranger_the_emulator_answers_and_stays_finite(p
     assert not reply.get("error")
     assert SERVED.actuator.push == 0.25
     SERVED.actuator.push = 0.0
+
+
+@pytest.mark.skipif(not hasattr(socket.socket, "recvmsg") or sys.platform != "linux", reason="Linux stamps packets")
+def test_a_module_acts_on_a_packet_when_it_came_though_its_process_ran_later() -> None:
+    """A busy machine keeps an emulator from running; a module on a network of its own is not kept."""
+    clock = SteadyWallClock()
+    server = EmulatorServer(EmulatedX5(load_emulator("thesis"), start_ns=clock()), ("127.0.0.1", 0), clock)
+    actuator, delay_ns = server.actuator, 20_000_000
+    actuator.configure(strategy=Strategy.DIRECT_PWM, command_lifetime=1.0)
+    seen: list[tuple[int, float]] = []
+    actuator.trace = lambda link: seen.append((link.time_ns, link.pwm))
+
+    def starve(packet: bytes) -> int:
+        """Send a packet, and let the server run later; return when it was sent [ns]."""
+        server._turn(0.0)
+        friend.sendto(packet, server.address)
+        sent_ns = clock()
+        while clock() < sent_ns + 5 * delay_ns:
+            time.sleep(0.001)
+        server._turn(0.0)
+        return sent_ns
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as friend:
+        driven_ns = starve(wire.encode_command(Command(pwm=0.25)))
+        assert actuator.last_command_ns is not None
+        assert abs(actuator.last_command_ns - driven_ns) < delay_ns
+        off_ns = starve(wire.encode_json(wire.REQUEST, {"id": 1, "settings": {"strategy": int(Strategy.OFF)}}))
+    assert actuator.strategy is Strategy.OFF
+    driven = [time_ns for time_ns, duty in seen if duty != 0.0]
+    assert abs(driven[0] - driven_ns) < delay_ns
+    assert abs(driven[-1] - off_ns) < delay_ns
+    server._socket.close()
+
+
+@pytest.mark.parametrize("step_ns", [-(10**12), 10**12])
+def test_a_step_of_the_system_clock_moves_no_packet_out_of_its_turn(
+    monkeypatch: pytest.MonkeyPatch, step_ns: int
+) -> None:
+    clock = SteadyWallClock()
+    server = EmulatorServer(EmulatedX5(load_emulator("thesis"), start_ns=clock()), ("127.0.0.1", 0), clock)
+    server._turn(0.0)
+    turned_ns = server.actuator.now_ns
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as friend:
+        friend.sendto(wire.encode_command(Command(effort=0.25)), server.address)
+        now = time.time_ns
+        monkeypatch.setattr(time, "time_ns", lambda: now() + step_ns)
+        server._turn(1.0)
+        server._turn(0.01)
+    assert server.actuator.last_command_ns is not None
+    assert turned_ns <= server.actuator.last_command_ns <= clock()
+    server._socket.close()
 
 
 @pytest.mark.parametrize("address", ["", "localhost", "host:", ":80", "host:x", "host:70000"])

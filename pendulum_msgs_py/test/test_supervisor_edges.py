@@ -506,6 +506,23 @@ def test_compiled_code_begins_behind_a_press() -> None:
         assert supervisor.mode is Mode.E_STOP
 
 
+def test_a_decision_stops_for_a_press_that_no_thread_has_read_yet() -> None:
+    waiting = [(7, "e-stop pressed")]
+    supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+    assert supervisor.arm(0, JointSample.of_one(0, 0.0, 0.0)) == ""
+    supervisor.watch_for_presses(lambda: waiting.pop() if waiting else None)
+    supervisor.decide(8, JointSample.of_one(8, 0.0, 0.0))
+    assert supervisor.transitions[1:] == [(7, Mode.E_STOP, "e-stop pressed")]
+    # Nor is it taken back by a reset, or run past by compiled code.
+    assert supervisor.e_stop_reset(9) == ""
+    waiting.append((9, "once more"))
+    assert supervisor.e_stop_reset(10) == "the e-stop has just been pressed; reset it once more"
+    assert supervisor.e_stop_reset(11) == ""
+    waiting.append((11, "once more"))
+    with supervisor.alone():
+        assert supervisor.mode is Mode.E_STOP
+
+
 def test_the_step_behind_a_press_knows_of_it_though_its_thread_still_waits() -> None:
     for _ in range(20):
         supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import select
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +19,13 @@ from std_srvs.srv import Trigger
 
 from pendulum_hw_bridge.nodes.e_stop_input_node import EStopInputServer
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
+from pendulum_msgs_py.contract.supervisor import Mode, PlantLimits
+from pendulum_msgs_py.contract.values import JointSample
+from pendulum_msgs_py.programs.realtime import NO_REALTIME, may_run_in_real_time, thread_numbers
 from pendulum_msgs_py.ros.e_stop import EStopServer
+from pendulum_msgs_py.ros.plant_interface import PlantInterface
+from pendulum_msgs_py.ros.polled import PollingNode
 
 DEADLINE = 20.0
 
@@ -76,6 +84,57 @@ def test_an_error_in_the_e_stop_is_a_press_and_the_next_press_is_answered(desk: 
     desk.until(answer.done, "answer of the e-stop after an error")
     assert answer.result().success
     assert desk.reasons[1:] == ["e-stop pressed"]
+
+
+def test_a_plant_stops_and_compiled_code_ends_though_the_thread_of_the_e_stop_does_not_run(desk: Desk) -> None:
+    plant = PollingNode("polled", context=desk.context)
+    supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+    interface = PlantInterface(plant, supervisor, time.monotonic_ns, polled=True)
+    plant.poll_services(timer=False)
+    desk.servers.append(interface._e_stop)
+    held, entered = threading.Lock(), threading.Event()
+
+    def kept_waiting(_reason: str) -> None:
+        entered.set()
+        with held:
+            pass
+
+    interface._e_stop._press = kept_waiting
+    client = desk.person.create_client(Trigger, "polled/e_stop")
+    desk.until(client.service_is_ready, "e-stop")
+    called = interface.calls[0]
+    assert supervisor.arm(interface.clock(), JointSample.of_one(interface.clock(), 0.0, 0.0)) == ""
+    with held:
+        first = client.call_async(Trigger.Request())
+        desk.until(entered.is_set, "thread of the e-stop that waits")
+        assert not select.select([called], [], [], 0.0)[0]
+        assert supervisor.mode is Mode.EFFORT
+        second = client.call_async(Trigger.Request())
+        desk.until(lambda: select.select([called], [], [], 0.0)[0], "end of a slice of compiled code")
+        supervisor.decide(interface.clock(), JointSample.of_one(interface.clock(), 0.0, 0.0))
+        assert (supervisor.mode, supervisor.reason) == (Mode.E_STOP, "e-stop pressed")
+        # What was read does not end the next slice.
+        assert not select.select([called], [], [], 0.0)[0]
+    desk.until(lambda: first.done() and second.done(), "answers")
+    plant.destroy_node()
+
+
+@pytest.mark.skipif(not may_run_in_real_time(50), reason="this user may have no real-time priority")
+@pytest.mark.parametrize("forbidden", [False, True])
+def test_the_threads_of_an_e_stop_go_before_ordinary_ones_where_the_user_may(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, forbidden: bool
+) -> None:
+    monkeypatch.delenv(NO_REALTIME, raising=False)
+    if forbidden:
+        monkeypatch.setenv(NO_REALTIME, "1")
+    before = thread_numbers()
+    desk.servers.append(EStopServer(desk.owner, desk.press))
+    # Its own thread, and those of its participant.
+    added = thread_numbers() - before
+    assert len(added) > 3
+    expected = os.SCHED_OTHER if forbidden else os.SCHED_FIFO
+    assert {os.sched_getscheduler(thread) for thread in added} == {expected}
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 def test_a_press_counts_though_the_release_came_before_it_was_read(desk: Desk) -> None:

@@ -6,6 +6,7 @@ import ctypes
 import os
 import resource
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import MagicMock
@@ -67,6 +68,28 @@ def test_plants_go_before_those_who_answer_them_and_both_before_all_else(tmp_pat
         ]
         for child, priority in started:
             wait_for(lambda one=child, p=priority: _policies(one) == _real_time(p), 60.0, child.name)  # type: ignore[misc]
+
+
+@_allowed
+def test_a_bridge_and_an_emulated_module_that_somebody_starts_go_before_all_else_unless_that_is_forbidden(
+    tmp_path: Path, domain_id: int
+) -> None:
+    ordinary = {(os.SCHED_OTHER, 0)}
+    module = [sys.executable, "-m", "pendulum_hw_bridge", "emulator", "--address", "127.0.0.1:0"]
+    lockstep = {"clock": "lockstep", "lockstep_inputs": ["effort_command"]}
+    with ProcessSet(tmp_path, ros_environment(domain_id, tmp_path)) as processes:
+        for name, forbidden in (("may", {}), ("not", {NO_REALTIME: "1"})):
+            child = processes.start(f"module_{name}", module, environment=forbidden)
+            wait_for(lambda one=child: "listens" in one.log.read_text(), 60.0, child.name)  # type: ignore[misc]
+            assert _policies(child) == (ordinary if forbidden else {(os.SCHED_FIFO, PLANT_PRIORITY)})
+            for clock, parameters in (("realtime", {}), ("lockstep", lockstep)):
+                command = graph.bridge(f"/{name}_{clock}", backend="emulator", **parameters).command()  # type: ignore[arg-type]
+                child = processes.start(f"bridge_{name}_{clock}", command, environment=forbidden)
+                wait_for(lambda one=child: "ready" in one.log.read_text(), 60.0, child.name)  # type: ignore[misc]
+                policies = _policies(child)
+                # In lockstep the e-stop's threads alone.
+                behind = ordinary if clock == "lockstep" else {(os.SCHED_FIFO, PLANT_PRIORITY - 1)}
+                assert policies == (ordinary if forbidden else {(os.SCHED_FIFO, PLANT_PRIORITY), *behind})
 
 
 @_allowed

@@ -272,6 +272,8 @@ class Bridge:
             flush = getattr(module.port, "flush", None)
             if flush is not None:
                 flush()
+        for module in self.drives:
+            module.monitor.left(self.now_ns())
 
     def _check_joints(self) -> None:
         coordinates = self.supervisor.coordinates

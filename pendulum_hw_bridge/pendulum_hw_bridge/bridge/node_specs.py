@@ -15,12 +15,15 @@ _HARDWARE_DEFAULTS: dict[str, ParameterValue] = {
     "position_window": [-4.0, 4.0],
     "effort_slew_limit": 2000.0,
     "starvation_limit": 30.0,
+    "realtime_priority": -1,
 }
-"""Limits that a simulated plant can do without and a real one cannot."""
+"""What a simulated plant can do without and a real one cannot."""
 
 SPECS: tuple[ParameterSpec, ...] = (
     *BRIDGE_SPECS,
-    *LOOP_SPECS,
-    *(dataclasses.replace(spec, default=_HARDWARE_DEFAULTS.get(spec.name, spec.default)) for spec in LIMIT_SPECS),
+    *(
+        dataclasses.replace(spec, default=_HARDWARE_DEFAULTS.get(spec.name, spec.default))
+        for spec in (*LOOP_SPECS, *LIMIT_SPECS)
+    ),
 )
 """In the order of the README."""

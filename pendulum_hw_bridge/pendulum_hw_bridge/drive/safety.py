@@ -78,7 +78,7 @@ class SafetyMonitor:
         self._last: Feedback | None = None
         self._last_new_ns: int | None = None
         self._motion: deque[tuple[float, float]] = deque(maxlen=round(_MOTION_TIME / period) + 1)
-        self._sent: deque[tuple[int, Command]] = deque(maxlen=16)
+        self._sent: deque[tuple[int, int, Command]] = deque(maxlen=16)
         self._travelled = 0.0
         self._strategy = Strategy.OFF
         self._strategy_since_ns = 0
@@ -88,6 +88,7 @@ class SafetyMonitor:
         self._wrong_current_ns = 0
         self._unknown_temperatures = 0
         self._clock_offset_ns: int | None = None
+        self._measured_ns = 0
         self._clamped_speed, self._unseen_speed = math.inf, 0.0
         if drivetrain is not None:
             self._unseen_speed = MOTOR_SPEED_LIMIT / drivetrain.gear_ratio
@@ -112,7 +113,13 @@ class SafetyMonitor:
             self._strategy_since_ns = sent_ns
             if self.output is not None:
                 self.output.reset()
-        self._sent.append((sent_ns, command))
+        self._sent.append((sent_ns, sent_ns, command))
+
+    def left(self, left_ns: int) -> None:
+        """Take note of a time at which the newest setpoints had left, and not only begun to [ns]."""
+        if self._sent:
+            sent_ns, _, command = self._sent.pop()
+            self._sent.append((sent_ns, left_ns, command))
 
     def stopped(self) -> None:
         """Take note that nothing is commanded any more."""
@@ -184,6 +191,7 @@ class SafetyMonitor:
     def _check_continuity(self, feedback: Feedback) -> Fault | None:
         last = self._last
         offset = feedback.stamp_ns - feedback.hardware_ns
+        self._measured_ns = feedback.stamp_ns
         if last is not None and feedback.hardware_ns < last.hardware_ns:
             self._clock_offset_ns = None
             return Fault(
@@ -195,6 +203,8 @@ class SafetyMonitor:
             if self._clock_offset_ns is None or offset < self._clock_offset_ns:
                 self._clock_offset_ns = offset
             late = (offset - self._clock_offset_ns) / NANOSECONDS
+            # What the module does is compared with what it had by then: a busy host reads records late.
+            self._measured_ns = feedback.hardware_ns + self._clock_offset_ns
             # Two crystals part by some 50 ppm: let the reference follow slowly.
             self._clock_offset_ns += round(1e-4 * self.period * NANOSECONDS)
             if late > self.timeout:
@@ -303,11 +313,11 @@ class SafetyMonitor:
 
     def _check_command(self, feedback: Feedback) -> Fault | None:
         """Compare what the module acts on with what was sent lately."""
-        settled = feedback.stamp_ns - self._strategy_since_ns > self.timeout * NANOSECONDS
+        settled = self._measured_ns - self._strategy_since_ns > self.timeout * NANOSECONDS
         if self._strategy is Strategy.OFF or not settled:
             self._wrong_commands = 0
             return None
-        recent = self._in_force(feedback.stamp_ns)
+        recent = self._in_force(self._measured_ns)
         if self._strategy is Strategy.DIRECT_PWM:
             acts, candidates, name = feedback.pwm_command, [_or_zero(command.pwm) for command in recent], "PWM"
         elif math.isfinite(recent[-1].position):
@@ -324,9 +334,9 @@ class SafetyMonitor:
             self._wrong_commands = 0
             return None
         if self._wrong_commands == 0:
-            self._wrong_since_ns = feedback.stamp_ns
+            self._wrong_since_ns = self._measured_ns
         self._wrong_commands += 1
-        lasts = (feedback.stamp_ns - self._wrong_since_ns) / NANOSECONDS
+        lasts = (self._measured_ns - self._wrong_since_ns) / NANOSECONDS
         if self._wrong_commands >= _WRONG_COMMANDS and lasts >= _WRONG_COMMAND_TIME:
             return Fault(
                 "command_not_in_force",
@@ -338,16 +348,16 @@ class SafetyMonitor:
     def _check_output(self, feedback: Feedback) -> Fault | None:
         if self.output is None or self._strategy is Strategy.OFF:
             return None
-        if feedback.stamp_ns - self._strategy_since_ns <= round(self.period * NANOSECONDS):
+        if self._measured_ns - self._strategy_since_ns <= round(self.period * NANOSECONDS):
             return None
-        return self.output.check(feedback, self._strategy, self._in_force(feedback.stamp_ns))
+        return self.output.check(feedback, self._strategy, self._in_force(self._measured_ns))
 
-    def _in_force(self, stamp_ns: int) -> list[Command]:
-        """Return the commands that a record with this stamp may show: the newest to have arrived, and neighbours."""
+    def _in_force(self, measured_ns: int) -> list[Command]:
+        """Return the commands that a record may show: the newest to have arrived by its time, and neighbours."""
         window = round((1.2 * self.period + _WAY) * NANOSECONDS)
-        arrived = [command for sent, command in self._sent if sent <= stamp_ns - round(_WAY * NANOSECONDS)]
-        recent = [command for sent, command in self._sent if stamp_ns - window <= sent <= stamp_ns]
-        return (arrived[-1:] + recent) or [self._sent[-1][1]]
+        arrived = [command for _, left, command in self._sent if left <= measured_ns - round(_WAY * NANOSECONDS)]
+        recent = [command for sent, left, command in self._sent if sent <= measured_ns <= left + window]
+        return (arrived[-1:] + recent) or [self._sent[-1][2]]
 
     def _check_current(self, feedback: Feedback) -> Fault | None:
         drive, tolerance = self.drivetrain, self.limits.winding_current

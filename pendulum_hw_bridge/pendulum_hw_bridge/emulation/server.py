@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import select
 import socket
-from collections.abc import Callable
+import struct
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -22,6 +25,10 @@ __all__ = ["EmulatorIdentity", "EmulatorServer"]
 _LEASE = 2.0
 """Time for which a listener gets feedback after its last packet [s]."""
 _BATCH = 64
+_TIMESTAMPS = 35
+"""``SO_TIMESTAMPNS`` of Linux, which :mod:`socket` does not name: the system time at which a packet came."""
+_TIME = struct.Struct("@ll")
+_NOTES = socket.CMSG_SPACE(_TIME.size)
 _UNREACHABLE = {ActuatorFault.COMMANDS_LOST, ActuatorFault.LOCKED_BY_OTHER}
 
 Address = tuple[str, int]
@@ -76,6 +83,10 @@ class EmulatorServer:
             self._socket.close()
             raise PendulumError(f"emulator cannot listen on {address[0]}:{address[1]}: {error.strerror}") from error
         self._socket.setblocking(False)
+        # Of the kernel: a busy machine keeps this process from running, and no packet from reaching a real module.
+        with contextlib.suppress(OSError):
+            self._socket.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
+        self._turned_ns = 0
         self._listeners: dict[Address, int] = {}
 
     @property
@@ -105,10 +116,12 @@ class EmulatorServer:
         if ready:
             for _ in range(_BATCH):
                 try:
-                    packet, sender = self._socket.recvfrom(wire.MAX_PACKET)
+                    packet, notes, _, sender = self._socket.recvmsg(wire.MAX_PACKET, _NOTES)
                 except (BlockingIOError, ConnectionRefusedError):
                     break
-                self._receive(packet, sender, now)
+                # Never before what has been computed, whatever the system clock does.
+                self._receive(packet, sender, min(now, max(self._turned_ns, now - _age_ns(notes))))
+        self._turned_ns = now
         actuator.advance_to(now)
         feedback = actuator.feedback(now)
         if feedback is not None:
@@ -191,3 +204,12 @@ class EmulatorServer:
             self._socket.sendto(packet, receiver)
         except OSError:
             self._listeners.pop(receiver, None)
+
+
+def _age_ns(notes: Sequence[tuple[int, int, bytes]]) -> int:
+    """Return for how long a packet has waited for this process [ns]; 0 where the kernel does not tell."""
+    for level, kind, data in notes:
+        if (level, kind, len(data)) == (socket.SOL_SOCKET, _TIMESTAMPS, _TIME.size):
+            seconds, nanoseconds = _TIME.unpack(data)
+            return time.time_ns() - (seconds * NANOSECONDS + nanoseconds)
+    return 0

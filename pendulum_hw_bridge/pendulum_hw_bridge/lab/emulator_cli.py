@@ -55,6 +55,7 @@ def emulator(
     from pendulum_hw_bridge.emulation.truth_log import truth_log
     from pendulum_hw_bridge.emulation.x5 import EmulatedX5
     from pendulum_msgs_py.contract.timing import SteadyWallClock
+    from pendulum_msgs_py.programs.realtime import run_ahead, thread_numbers
 
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -67,6 +68,8 @@ def emulator(
     identity = EmulatorIdentity(family, name, serial, module_type)
     server = EmulatorServer(actuator, wire.parse_address(address), clock, identity)
     host, port = server.address
+    # No other program keeps a real module from running.
+    run_ahead(thread_numbers())
     print(f"emulated X5-9 ({parameters.plant.name}) listens on {host}:{port}", flush=True)
     with nullcontext() if truth is None else truth_log(truth) as actuator.trace:
         server.serve(lambda: not stopped)

@@ -28,8 +28,9 @@ REALTIME_PRIORITY = ParameterSpec(
     "realtime_priority",
     0,
     "-",
-    "Priority of the process before all ordinary ones, 1 to 99 (SCHED_FIFO); 0 for the usual one.",
-    minimum=0,
+    "Priority of the process before all ordinary ones, 1 to 99 (SCHED_FIFO); 0 for the usual one; -1 for 50 where the "
+    "user may have it and time is that of the wall.",
+    minimum=-1,
     maximum=99,
     read_only=True,
 )

@@ -48,6 +48,7 @@ class SharedSupervisor(PlantSupervisor):
         self._counting = threading.Condition()
         self._waiting = ctypes.c_int64(0)
         self._presses: deque[tuple[int, str]] = deque()
+        self._look_for_press: Callable[[], tuple[int, str] | None] = lambda: None
         self._newest_press: tuple[int, str] | None = None
         self._prepare = prepare
         self._withdraw = withdraw
@@ -59,6 +60,20 @@ class SharedSupervisor(PlantSupervisor):
     def waiting_at(self) -> int:
         """Address of an ``int64`` that counts who waits for :meth:`alone` to end, for compiled code to look at."""
         return ctypes.addressof(self._waiting)
+
+    def watch_for_presses(self, look: Callable[[], tuple[int, str] | None]) -> None:
+        """Look for an e-stop before each decision and each request.
+
+        Args:
+            look: Returns time [ns] and reason of a press that :meth:`e_stop` has not been called for, or None.
+        """
+        self._look_for_press = look
+
+    def _look_then_carry_out(self) -> bool:
+        press = self._look_for_press()
+        if press is not None:
+            self._presses.append(press)
+        return self._carry_out_presses()
 
     def _carry_out_presses(self) -> bool:
         """Latch what e-stops were pressed before, at the beginning of each step; return whether there were any.
@@ -76,7 +91,7 @@ class SharedSupervisor(PlantSupervisor):
     def alone(self) -> Iterator[None]:
         """Keep everybody else from the supervisor; who comes in the meantime is counted, waits, and is next."""
         with self._lock:
-            self._carry_out_presses()
+            self._look_then_carry_out()
             yield
         # A lock is whose who asks first, and we are awake: without this who disarms waits for one more decision.
         if self._waiting.value:
@@ -93,7 +108,7 @@ class SharedSupervisor(PlantSupervisor):
             self._waiting.value += 1
         try:
             with self._lock:
-                yield self._carry_out_presses()
+                yield self._look_then_carry_out()
         finally:
             with self._counting:
                 self._waiting.value -= 1
@@ -161,7 +176,7 @@ class SharedSupervisor(PlantSupervisor):
     def decide(self, now_ns: int, sample: JointSample | None) -> Drive:
         """Return what the plant has to do now."""
         with self._lock:
-            self._carry_out_presses()
+            self._look_then_carry_out()
             return super().decide(now_ns, sample)
 
     def report_applied(self, effort: Vector) -> None:

@@ -9,14 +9,26 @@ import contextlib
 import os
 import resource
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from pendulum_msgs_py.errors import ParameterError
 
-__all__ = ["as_ordinary", "may_run_in_real_time", "priority_kept", "run_in_real_time"]
+__all__ = [
+    "NO_REALTIME",
+    "as_ordinary",
+    "may_run_in_real_time",
+    "priority_kept",
+    "run_ahead",
+    "run_in_real_time",
+    "thread_numbers",
+]
 
 _TASKS = Path("/proc/self/task")
+_AHEAD = 50
+"""Real-time priority that is taken without being given: that of a plant in an experiment."""
+NO_REALTIME = "PENDULUM_NO_REALTIME"
+"""Variable of the environment with which no real-time priority is taken that is not given."""
 
 
 def run_in_real_time(priority: int) -> None:
@@ -30,22 +42,40 @@ def run_in_real_time(priority: int) -> None:
     threads too.)
 
     Args:
-        priority: 1 to 99, a higher one goes first; 0 leaves everything as it is.
+        priority: 1 to 99, a higher one goes first; 0 leaves everything as it is; -1 is 50 where this user may have it.
 
     Raises:
         ParameterError: This user may not have it, or this system knows no such priority.
     """
+    if priority < 0:
+        priority = 0 if os.environ.get(NO_REALTIME) or not may_run_in_real_time(_AHEAD) else _AHEAD
     if not priority:
         return
     if not _is_known():
         raise ParameterError(f"realtime_priority is {priority}; this system has none: expected 0")
     promoted: set[int] = set()
     # A thread that was begun meanwhile by one whose turn had not come is an ordinary one.
-    while waiting := {int(task.name) for task in _TASKS.iterdir()} - promoted:
+    while waiting := thread_numbers() - promoted:
         for thread in waiting:
             _promote(thread, priority)
         promoted |= waiting
     _promote(threading.get_native_id(), max(1, priority - 1))
+
+
+def thread_numbers() -> set[int]:
+    """Return the kernel's numbers of this process's threads; none where it does not tell."""
+    return {int(task.name) for task in _TASKS.iterdir()} if _is_known() else set()
+
+
+def run_ahead(threads: Iterable[int]) -> None:
+    """Run threads that hardly compute before every ordinary one, where this user may; else they stay as they are.
+
+    Args:
+        threads: The kernel's numbers of threads of this process.
+    """
+    for thread in () if os.environ.get(NO_REALTIME) else threads:
+        with contextlib.suppress(ParameterError):
+            _promote(thread, _AHEAD)
 
 
 def may_run_in_real_time(priority: int) -> bool:

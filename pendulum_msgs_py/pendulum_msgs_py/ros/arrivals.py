@@ -49,6 +49,7 @@ class ArrivalSignal:
     def __init__(self, entities: Iterable[Service | Subscription]) -> None:
         self._waiting = select.poll()
         self._look_anyway = 0.0
+        self._counter = -1
         try:
             self._counter = _free.pop() if _free else os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         except (AttributeError, OSError):  # no Linux, or no descriptor left
@@ -56,6 +57,7 @@ class ArrivalSignal:
             return
         weakref.finalize(self, _free.append, self._counter)
         self._waiting.register(self._counter, select.POLLIN)
+        self.counted()  # an earlier signal may have left something in it
         counted = [_count(entity, self._counter) for entity in entities]
         self.works = all(counted) and self._counter <= _LAST_DESCRIPTOR
 
@@ -68,6 +70,13 @@ class ArrivalSignal:
         """Have whoever waits look, though nothing has come; from any thread."""
         if self.works:
             os.eventfd_write(self._counter, 1)
+
+    def counted(self) -> bool:
+        """Return whether the middleware has reported an arrival since this was asked last; from any thread."""
+        try:
+            return self._counter >= 0 and os.eventfd_read(self._counter) > 0
+        except BlockingIOError:
+            return False
 
     def came(self) -> bool:
         """Return whether anything may have come since this was asked last."""

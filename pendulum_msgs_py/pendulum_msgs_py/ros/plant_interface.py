@@ -6,6 +6,7 @@ A plant (simulator, bridge) owns its clock and its loop; it asks ``decide`` what
 from __future__ import annotations
 
 import math
+import select
 import threading
 import time
 from collections import Counter
@@ -37,7 +38,7 @@ from pendulum_msgs_py.ros.convert import (
     problem_of_command,
 )
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
-from pendulum_msgs_py.ros.e_stop import EStopServer
+from pendulum_msgs_py.ros.e_stop import PRESSED, EStopServer
 from pendulum_msgs_py.ros.leaving import wait_until_heard
 from pendulum_msgs_py.ros.polled import REST_AFTER_READING, PolledInput, PollingNode
 from pendulum_msgs_py.ros.timers import create_wall_timer
@@ -117,6 +118,7 @@ class PlantInterface:
         self._seconds_at_check = 0
         self._second_commander = False
         self._stopping = False
+        self._called: select.epoll | None = None
         self.state_publisher = node.create_publisher(JointState, names.JOINT_STATES, qos.STATE)
         self.applied_publisher = node.create_publisher(JointState, names.APPLIED_EFFORT, qos.STATE)
         self._events = node.create_publisher(String, names.EVENTS, qos.EVENTS)
@@ -147,6 +149,7 @@ class PlantInterface:
         create_wall_timer(node, DIAGNOSTICS_PERIOD, self._on_housekeeping)
         self._pressed = threading.Event()
         self._e_stop = EStopServer(node, self.e_stop)
+        supervisor.watch_for_presses(self._unread_press)
         if math.isinf(supervisor.limits.start_effort):
             node.get_logger().warning("start_effort_limit is 0: a commander may begin with any torque")
 
@@ -171,8 +174,13 @@ class PlantInterface:
 
     @property
     def calls(self) -> tuple[int, int]:
-        """Event counters of what ends a slice of compiled code: requests and trajectories; -1 where there is none."""
-        return self.node.request_descriptor, self._trajectories.descriptor
+        """Descriptors of what ends a slice of compiled code: requests and trajectories; -1 where there is none."""
+        if self._called is None and self.node.request_descriptor >= 0:
+            # Readable when one of these is: an e-stop does not wait for its thread to wake the node.
+            self._called = select.epoll()
+            for counter in {self.node.request_descriptor, self._e_stop.arrivals.descriptor} - {-1}:
+                self._called.register(counter, select.EPOLLIN)
+        return -1 if self._called is None else self._called.fileno(), self._trajectories.descriptor
 
     def receive(self, kind: Input, data: bytes, arrived_ns: int) -> None:
         """Receive a torque that somebody else has taken, where inputs are polled."""
@@ -232,6 +240,10 @@ class PlantInterface:
         self.node.wake()
         self.supervisor.e_stop(self.clock(), reason)
         self._pressed.set()
+
+    def _unread_press(self) -> tuple[int, str] | None:
+        """Return a press that has reached this process, though the e-stop's thread has not run since."""
+        return (self.clock(), PRESSED) if self._e_stop.arrivals.counted() else None
 
     def safe_stop(self, reason: str) -> None:
         """Disarm, say so in diagnostics; the plant then applies zero torque and publishes that, to be heard too."""

@@ -155,7 +155,10 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
         check_closed(node.context.get_domain_id())
         # Whoever may not have it is no plant that was ready.
         if node.has_parameter(REALTIME_PRIORITY.name):
-            run_in_real_time(int(node.get_parameter(REALTIME_PRIORITY.name).value))
+            priority = int(node.get_parameter(REALTIME_PRIORITY.name).value)
+            # Simulated time has no deadlines.
+            lockstep = node.has_parameter("clock") and node.get_parameter("clock").value == "lockstep"
+            run_in_real_time(max(0, priority) if lockstep else priority)
         # The first line that rclpy logs takes 30 ms; said now, it does not come in the middle of a loop.
         node.get_logger().info("ready")
         executor.add_node(node)

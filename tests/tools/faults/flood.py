@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import time
@@ -10,21 +11,59 @@ from collections.abc import Callable
 import rclpy
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import ListParameters, SetParameters
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from pendulum_bags.experiments.session import ANSWER_PRIORITY, permitted
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.programs.realtime import run_in_real_time
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
+
+__all__ = ["HELD_EFFORT"]
+
+HELD_EFFORT = 0.45
+"""Torque that a flood of efforts asks for [N m]: a plant lets a commander begin with it."""
 
 
 def _commands(node: Node, namespace: str, _: str) -> Callable[[], None]:
     publisher = node.create_publisher(JointState, f"{namespace}/{names.EFFORT_COMMAND}", qos.COMMAND)
     return lambda: publisher.publish(encode_joint_state(time.time_ns(), frame_id="/stranger", effort=100.0))
+
+
+def _efforts(node: Node, namespace: str, _: str) -> Callable[[], None]:
+    # Of a commander that is rightful and small enough to begin: each of them is accepted, and has the motor driven.
+    publisher = node.create_publisher(JointState, f"{namespace}/{names.EFFORT_COMMAND}", qos.COMMAND)
+    return lambda: publisher.publish(encode_joint_state(time.time_ns(), frame_id="/flood", effort=HELD_EFFORT))
+
+
+def _answers(node: Node, namespace: str, _: str) -> Callable[[], None]:
+    """No flood: answer each state once, as a controller does, with torques that change."""
+    publisher = node.create_publisher(JointState, f"{namespace}/{names.EFFORT_COMMAND}", qos.COMMAND)
+
+    def answer(state: JointState) -> None:
+        effort = HELD_EFFORT - 0.1 * (1.0 + math.sin(2.0 * math.pi * time.monotonic()))
+        command = JointState(name=state.name, effort=[effort] * len(state.name))
+        command.header.stamp, command.header.frame_id = state.header.stamp, "/flood"
+        publisher.publish(command)
+
+    node.create_subscription(JointState, f"{namespace}/{names.JOINT_STATES}", answer, qos.NEWEST_STATE)
+    run_in_real_time(permitted(ANSWER_PRIORITY))
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    return lambda: executor.spin_once(0.1)
+
+
+def _arming(node: Node, namespace: str, plant: str) -> Callable[[], None]:
+    client = node.create_client(SetBool, names.ARM.replace("~", f"{namespace}/{plant}"))
+    client.wait_for_service(20.0)
+    return lambda: client.remove_pending_request(client.call_async(SetBool.Request(data=True)))
 
 
 def _trajectories(points: int) -> Callable[[Node, str, str], Callable[[], None]]:
@@ -68,6 +107,9 @@ _KINDS: dict[str, Callable[[Node, str, str], Callable[[], None]]] = {
     "parameters": _parameters,
     "large_parameters": _large_parameters,
     "calls": _calls,
+    "arming": _arming,
+    "efforts": _efforts,
+    "answers": _answers,
 }
 
 

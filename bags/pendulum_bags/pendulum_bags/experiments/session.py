@@ -17,7 +17,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.errors import BagError, FaultError
 from pendulum_msgs_py.programs.graph import NodeProgram
-from pendulum_msgs_py.programs.realtime import may_run_in_real_time
+from pendulum_msgs_py.programs.realtime import NO_REALTIME, may_run_in_real_time
 
 __all__ = [
     "ANSWER_PRIORITY",
@@ -42,8 +42,6 @@ ANSWER_PRIORITY = PLANT_PRIORITY - 2
 """Real-time priority of who answers a plant's states: behind a plant's loop too, which is one behind its process."""
 RECORDER_PRIORITY = ANSWER_PRIORITY - 2
 """Real-time priority of a recorder: behind who has a deadline, whose messages would be lost for an ordinary one."""
-NO_REALTIME = "PENDULUM_NO_REALTIME"
-"""Variable of the environment with which experiments take no real-time priority."""
 LOOP_NICENESS = -10
 """Priority among ordinary programs of those who keep deadlines, where we may take it."""
 
