@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import rclpy
+from rclpy.client import Client
 from rclpy.clock import ClockType
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import Bool
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from pendulum_hw_bridge.nodes.e_stop_input_node import EStopInputServer
 from pendulum_msgs_py.contract import names
@@ -23,6 +24,7 @@ from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Mode, PlantLimits
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.programs.realtime import NO_REALTIME, may_run_in_real_time, thread_numbers
+from pendulum_msgs_py.ros.answers import answer_who_listens
 from pendulum_msgs_py.ros.e_stop import EStopServer
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.ros.polled import PollingNode
@@ -116,6 +118,38 @@ def test_a_plant_stops_and_compiled_code_ends_though_the_thread_of_the_e_stop_do
         # What was read does not end the next slice.
         assert not select.select([called], [], [], 0.0)[0]
     desk.until(lambda: first.done() and second.done(), "answers")
+    plant.destroy_node()
+
+
+def test_a_reset_or_arming_that_waited_in_a_queue_while_the_e_stop_was_pressed_takes_nothing_back(desk: Desk) -> None:
+    plant = PollingNode("polled", context=desk.context)
+    supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+    interface = PlantInterface(plant, supervisor, time.monotonic_ns, polled=True)
+    answer_who_listens(plant)
+    plant.poll_services(timer=False)
+    desk.servers.append(interface._e_stop)
+    interface.sample = JointSample.of_one(0, 0.0, 0.0)
+    interface.clock = lambda: 0
+    reset = desk.person.create_client(Trigger, "polled/e_stop_reset")
+    arm = desk.person.create_client(SetBool, "polled/arm")
+    desk.until(lambda: reset.service_is_ready() and arm.service_is_ready(), "services")
+
+    def ask(client: Client, request: object, *, before_a_press: bool) -> tuple[bool, str]:
+        future = client.call_async(request)
+        desk.until(lambda: select.select([plant.request_descriptor], [], [], 0.0)[0], "request")
+        if before_a_press:
+            interface.e_stop("meanwhile")
+        desk.until(lambda: (plant.attend(), future.done())[1], "answer")
+        return future.result().success, future.result().message
+
+    told = "asked for before the e-stop was pressed; "
+    interface.e_stop("first")
+    assert ask(reset, Trigger.Request(), before_a_press=True) == (False, f"{told}reset it once more")
+    assert supervisor.mode is Mode.E_STOP
+    assert ask(reset, Trigger.Request(), before_a_press=False) == (True, "disarmed")
+    assert ask(arm, SetBool.Request(data=True), before_a_press=True) == (False, f"{told}ask again")
+    assert ask(reset, Trigger.Request(), before_a_press=False) == (True, "disarmed")
+    assert ask(arm, SetBool.Request(data=True), before_a_press=False) == (True, "armed_effort")
     plant.destroy_node()
 
 

@@ -48,7 +48,7 @@ __all__ = ["PlantInterface"]
 _LEAST_BETWEEN_LINES = 1.0
 """Time between two lines of the log about one mode [s]."""
 _WAITED_NS = 10 * NANOSECONDS
-"""Longest time for which a message may wait while a plant arms [ns]; more is a system clock that was set back."""
+"""Longest time for which a message or a request may wait [ns]; more is a system clock that was set back."""
 _LOOK = 0.02
 """Time between two looks for a press or a trajectory [s]; of trajectories without pause the newest is read then."""
 TRAJECTORY_AGE_LIMIT = 1.0
@@ -103,6 +103,7 @@ class PlantInterface:
         self.sample: JointSample | None = None
         self.published_ns = 0
         self._armed_ns = 0
+        self._pressed_ns = 0
         self.arrived_ns = 0
         self.on_command = on_command
         self.polled = polled
@@ -238,12 +239,20 @@ class PlantInterface:
         """Latch the e-stop; from any thread, waiting for nobody."""
         # Compiled code that waits for an answer has the supervisor, and sees nothing but its counters.
         self.node.wake()
+        self._pressed_ns = time.time_ns()
         self.supervisor.e_stop(self.clock(), reason)
         self._pressed.set()
 
     def _unread_press(self) -> tuple[int, str] | None:
         """Return a press that has reached this process, though the e-stop's thread has not run since."""
-        return (self.clock(), PRESSED) if self._e_stop.arrivals.counted() else None
+        if not self._e_stop.arrivals.counted():
+            return None
+        self._pressed_ns = time.time_ns()
+        return self.clock(), PRESSED
+
+    def _is_outdated(self) -> bool:
+        """Return whether the request being answered came before the e-stop was pressed last, and has waited since."""
+        return bool(self.node.request_ns) and 0 < self._pressed_ns - self.node.request_ns < _WAITED_NS
 
     def safe_stop(self, reason: str) -> None:
         """Disarm, say so in diagnostics; the plant then applies zero torque and publishes that, to be heard too."""
@@ -359,7 +368,9 @@ class PlantInterface:
         )
 
     def _on_arm(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if request.data:
+        if request.data and self._is_outdated():
+            response.success, response.message = False, "asked for before the e-stop was pressed; ask again"
+        elif request.data:
             self.commander_watch.check()
             was_armed = self.supervisor.mode.armed
             refusal = self.supervisor.arm(self.clock(), self.sample)
@@ -376,7 +387,9 @@ class PlantInterface:
         return response
 
     def _on_e_stop_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        refusal = self.supervisor.e_stop_reset(self.clock())
+        refusal = "asked for before the e-stop was pressed; reset it once more"
+        if not self._is_outdated():
+            refusal = self.supervisor.e_stop_reset(self.clock())
         response.success, response.message = not refusal, refusal or "disarmed"
         self.publish_diagnostics()
         return response

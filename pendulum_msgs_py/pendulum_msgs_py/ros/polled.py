@@ -139,6 +139,8 @@ class PollingNode(Node):
     _more_requests = False
     _next_look = 0.0
     _attend_at = 0.0
+    request_ns = 0
+    """System time at which the request being answered reached this process [ns]; 0 where that is not known."""
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
@@ -209,6 +211,7 @@ class PollingNode(Node):
         request, header = take_request(service)
         if header is None:
             return False
+        self.request_ns = header.received_timestamp
         response = service.srv_type.Response()
         if isinstance(request, TooLarge):
             # With an empty answer, so that nobody waits for another.

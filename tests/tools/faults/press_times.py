@@ -48,7 +48,9 @@ _DRIVEN_NS = 50_000_000
 """Time before a press in which the motor must have been driven for the press to count [ns]."""
 _WATCHED = 0.3
 """Time after a press in which a motor that is driven is seen [s]."""
-_ASK_AGAIN = 0.1
+_ANSWER = 5.0
+"""Longest wait for an answer [s]."""
+_LOOK_AGAIN = 0.1
 _LOOKS = 5
 """Looks at a motor after which the plant is armed [-]."""
 _PATIENCE = 120.0
@@ -104,17 +106,11 @@ class _Desk(GraphPeer):
             self._drives.append(Drive(fields.stamp_ns + round(self._plant.period * 1e9), fields.effort[0]))
 
     def _ask(self, name: str, request: Any) -> bool:
-        """Ask for something until it is answered, and return the answer: in a flood a service loses requests."""
-        asked = [self._clients[name].call_async(request)]
-
-        def answered() -> bool:
-            self.spin(_ASK_AGAIN)
-            if not any(future.done() for future in asked):
-                asked.append(self._clients[name].call_async(request))
-            return any(future.done() for future in asked)
-
-        self.until(answered, f"the answer of {name}")
-        return any(future.result().success for future in asked if future.done())
+        """Ask for something, and return whether it was done; in a flood a service loses requests."""
+        future = self._clients[name].call_async(request)
+        with contextlib.suppress(TimeoutError):
+            self.until(future.done, f"the answer of {name}", _ANSWER)
+        return bool(future.done() and future.result().success)
 
     def driven_until_ns(self) -> int:
         """Return when the motor was driven last [ns]."""
@@ -128,7 +124,7 @@ class _Desk(GraphPeer):
 
         def is_driven() -> bool:
             nonlocal looks
-            self.spin(_ASK_AGAIN)
+            self.spin(_LOOK_AGAIN)
             if time.time_ns() - self.driven_until_ns() < _DRIVEN_NS:
                 return True
             looks += 1
