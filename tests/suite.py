@@ -52,6 +52,7 @@ _WAITS = (
     "tests/faults/test_system_faults.py",
     "tests/faults/test_live_machine.py",
     "tests/faults/test_ways_out.py",
+    "tests/faults/test_press_times.py",
     "tests/integration",
 )
 """Other tests with processes that keep a plant's time, longest first: they wait for most of it, two at a time."""

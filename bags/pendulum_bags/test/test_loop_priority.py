@@ -27,6 +27,7 @@ from pendulum_bags.experiments.session import (
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.realtime import may_run_in_real_time
 from tests.fixtures import wait_for
+from tests.udp_address import free_udp_address
 
 _allowed = pytest.mark.skipif(
     not may_run_in_real_time(PLANT_PRIORITY), reason="this user may have no real-time priority"
@@ -75,13 +76,14 @@ def test_a_bridge_and_an_emulated_module_that_somebody_starts_go_before_all_else
     tmp_path: Path, domain_id: int
 ) -> None:
     ordinary = {(os.SCHED_OTHER, 0)}
-    module = [sys.executable, "-m", "pendulum_hw_bridge", "emulator", "--address", "127.0.0.1:0"]
+    module = [sys.executable, "-m", "pendulum_hw_bridge", "emulator", "--address", free_udp_address()]
     lockstep = {"clock": "lockstep", "lockstep_inputs": ["effort_command"]}
     with ProcessSet(tmp_path, ros_environment(domain_id, tmp_path)) as processes:
         for name, forbidden in (("may", {}), ("not", {NO_REALTIME: "1"})):
             child = processes.start(f"module_{name}", module, environment=forbidden)
             wait_for(lambda one=child: "listens" in one.log.read_text(), 60.0, child.name)  # type: ignore[misc]
             assert _policies(child) == (ordinary if forbidden else {(os.SCHED_FIFO, PLANT_PRIORITY)})
+            processes.finish(child)
             for clock, parameters in (("realtime", {}), ("lockstep", lockstep)):
                 command = graph.bridge(f"/{name}_{clock}", backend="emulator", **parameters).command()  # type: ignore[arg-type]
                 child = processes.start(f"bridge_{name}_{clock}", command, environment=forbidden)
