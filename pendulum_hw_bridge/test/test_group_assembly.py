@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 
 from pendulum_hw_bridge.backends.hebi_group import GroupDrive, GroupEncoder
 from pendulum_hw_bridge.bridge.assembly import Assembly, assemble, for_plant
+from pendulum_hw_bridge.bridge.group_assembly import GroupAssembly
 from pendulum_hw_bridge.bridge.module import DrivenModule
 from pendulum_hw_bridge.bridge.node_specs import SPECS
 from pendulum_hw_bridge.port.clocks import SteppedClock
@@ -105,3 +107,16 @@ def test_what_does_not_fit_is_refused_in_a_sentence(plant: str, given: dict[str,
 def test_real_modules_keep_time() -> None:
     with pytest.raises(ParameterError, match="clock is 'lockstep' with backend 'hebi'"):
         assembled(lockstep=True)
+
+
+def test_each_joint_has_its_own_largest_effort_in_its_module_its_mapping_and_its_checks() -> None:
+    assembly = assembled("double_pendulum")
+    limits = replace(assembly.limits, effort=(6.0, 2.0))
+    values = {spec.name: spec.default for spec in for_plant(SPECS, "double_pendulum", "hebi")}
+    values |= {"plant": "double_pendulum", "backend": "hebi"}
+    group = GroupAssembly(values, assembly.coordinates, limits)
+    modules = group.modules(SteppedClock())
+    assert [module.settings.limits.effort for module in modules] == [6.0, 2.0]
+    assert [mapping.effort_limit for mapping in group.mappings] == [6.0, 2.0]
+    first, second = (module.monitor.limits.measured_effort for module in modules)
+    assert first > second > 2.0

@@ -459,6 +459,7 @@ def _wait_for(supervisor: SharedSupervisor, step: Callable[[], object]) -> threa
     thread.start()
     ends = time.monotonic() + 60.0
     while not waiting.value:
+        assert thread.is_alive(), "it did not wait"
         assert time.monotonic() < ends
         time.sleep(0.0)
     return thread
@@ -586,6 +587,18 @@ def test_no_reset_takes_back_a_press_that_nobody_has_carried_out_yet() -> None:
     assert supervisor.e_stop_reset(0) == "the e-stop has just been pressed; reset it once more"
     assert (supervisor.mode, supervisor.reason) == (Mode.E_STOP, "once more")
     assert supervisor.e_stop_reset(0) == ""
+
+
+def test_a_trajectory_waits_for_the_lock_and_takes_no_e_stop_of_meanwhile_back() -> None:
+    supervisor, sample = SharedSupervisor(PlantLimits(effort=(5.0,))), JointSample.of_one(0, 0.0, 0.0)
+    assert supervisor.arm(0, sample) == ""
+    told: list[str] = []
+    with supervisor.alone():
+        follows = _wait_for(supervisor, lambda: told.append(supervisor.accept_trajectory(_hold(), 0, sample)))
+        supervisor._presses.append((1, "meanwhile"))
+    follows.join()
+    assert told[0]
+    assert (supervisor.mode, supervisor.reason) == (Mode.E_STOP, "meanwhile")
 
 
 def test_many_presses_at_once_are_all_carried_out_before_they_return() -> None:

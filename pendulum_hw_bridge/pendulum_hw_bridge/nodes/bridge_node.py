@@ -58,14 +58,8 @@ def _logged(transition: Callable[..., TransitionCallbackReturn]) -> Callable[...
     def guarded(self: BridgeNode, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             return transition(self, state)
-        except PendulumError as error:
-            self.failure = error
-            self.get_logger().error(str(error))
         except Exception as error:  # noqa: BLE001  (a transition may fail for any reason)
-            self.failure = error
-            self.get_logger().error(f"{transition.__name__}: {type(error).__name__}: {error}")
-        self.release_actuator()
-        return TransitionCallbackReturn.FAILURE
+            return self._fail(transition.__name__, error)
 
     return guarded
 
@@ -250,6 +244,14 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._quieten("error in a transition")
         self.release_actuator()
         return TransitionCallbackReturn.SUCCESS
+
+    def _fail(self, transition: str, error: Exception) -> TransitionCallbackReturn:
+        """Log why a transition failed and release the actuator."""
+        self.failure = error
+        known = isinstance(error, PendulumError)
+        self.get_logger().error(str(error) if known else f"{transition}: {type(error).__name__}: {error}")
+        self.release_actuator()
+        return TransitionCallbackReturn.FAILURE
 
     def _tell_connected(self, module: Module, info: ActuatorInfo) -> None:
         driven = isinstance(module, DrivenModule)
