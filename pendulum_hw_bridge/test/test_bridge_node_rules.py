@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -22,10 +24,43 @@ def rig(domain_id: int) -> Iterator[NodeRig]:
         yield rig
 
 
-def test_a_bridge_that_is_deactivated_has_switched_its_drive_off_before_it_replies(rig: NodeRig) -> None:
+def recorded(rig: NodeRig, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return what the node says from now on."""
+    said: list[str] = []
+    monkeypatch.setattr(rig.node, "_tell_pending_stop", lambda: said.append("pending stop"))
+    monkeypatch.setattr(rig.node._interface, "publish_diagnostics", lambda: said.append("diagnostics"))
+    return said
+
+
+@pytest.mark.parametrize("with_loop", [True, False])
+def test_a_bridge_that_lets_its_actuator_go_has_switched_it_off_with_a_thread_and_without(
+    rig: NodeRig, monkeypatch: pytest.MonkeyPatch, with_loop: bool
+) -> None:
+    said = recorded(rig, monkeypatch)
+    lockstep: Any = SimpleNamespace(paused=False)
+    rig.node._lockstep_loop = lockstep
+    if not with_loop:
+        rig.node._loop = None
+    rig.node.release_actuator()
+    rig.node._lockstep_loop = None
+    assert rig.actuator.strategy is Strategy.OFF
+    assert (rig.node._active, rig.node._loop, rig.node._bridge) == (False, None, None)
+    assert lockstep.paused
+    assert said == ["pending stop"]
+
+
+def test_a_bridge_that_is_deactivated_has_switched_its_drive_off_before_it_replies(
+    rig: NodeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No time passes: neither the command lifetime nor a later cycle does it."""
     before_ns = rig.clock.now_ns()
+    said = recorded(rig, monkeypatch)
+    lockstep: Any = SimpleNamespace(paused=False)
+    rig.node._lockstep_loop = lockstep
     rig.node._quieten("deactivated")
+    rig.node._lockstep_loop = None
+    assert said == ["pending stop", "diagnostics"]
+    assert lockstep.paused
     assert rig.actuator.strategy is Strategy.OFF
     assert rig.clock.now_ns() == before_ns
     assert not rig.loop.active

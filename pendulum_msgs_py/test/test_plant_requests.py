@@ -120,3 +120,12 @@ def test_a_request_counts_for_nothing_that_waited_while_the_e_stop_was_pressed(p
     assert plant.arm(wanted=False) == ""
     plant.node.request_ns = 0
     assert plant.arm() == ""
+
+
+def test_a_press_that_was_counted_is_read_once_and_makes_earlier_requests_outdated(plant: Plant) -> None:
+    assert plant.interface._unread_press() is None
+    plant.interface._e_stop.arrivals.wake()
+    assert plant.interface._unread_press() == (NOW, "e-stop pressed")
+    assert plant.interface._unread_press() is None
+    plant.node.request_ns = plant.interface._pressed_ns - 1
+    assert "before the e-stop was pressed" in plant.arm()

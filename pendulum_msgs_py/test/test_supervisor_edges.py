@@ -589,6 +589,36 @@ def test_no_reset_takes_back_a_press_that_nobody_has_carried_out_yet() -> None:
     assert supervisor.e_stop_reset(0) == ""
 
 
+@pytest.mark.parametrize(
+    "step",
+    [
+        lambda plant: plant.offer(Input.EFFORT_COMMAND, JointCommand.of_one(0, 0.0, "/c"), 0),
+        lambda plant: plant.set_commander_conflict(""),
+        lambda plant: plant.accept_trajectory(_hold(), 0, JointSample.of_one(0, 0.0, 0.0)),
+        lambda plant: plant.arm(0, JointSample.of_one(0, 0.0, 0.0)),
+        lambda plant: plant.disarm(0),
+        lambda plant: plant.e_stop(0),
+        lambda plant: plant.e_stop_reset(0),
+        lambda plant: plant.fault("broken", 0),
+        lambda plant: plant.decide(0, None),
+        lambda plant: plant.report_applied((0.0,)),
+        lambda plant: plant.alone().__enter__(),
+    ],
+)
+@pytest.mark.parametrize("armed", [False, True])
+def test_each_step_waits_for_the_lock(step: Callable[[SharedSupervisor], object], armed: bool) -> None:
+    supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+    if armed:
+        assert supervisor.arm(0, JointSample.of_one(0, 0.0, 0.0)) == ""
+    thread = threading.Thread(target=step, args=(supervisor,))
+    with supervisor._lock:
+        thread.start()
+        # It cannot end, however long it is waited for.
+        thread.join(0.02)
+        assert thread.is_alive()
+    thread.join()
+
+
 def test_a_trajectory_waits_for_the_lock_and_takes_no_e_stop_of_meanwhile_back() -> None:
     supervisor, sample = SharedSupervisor(PlantLimits(effort=(5.0,))), JointSample.of_one(0, 0.0, 0.0)
     assert supervisor.arm(0, sample) == ""

@@ -8,10 +8,10 @@ import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from types import CodeType, FunctionType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
-__all__ = ["Mutant", "mutants_of"]
+__all__ = ["Mutant", "mutants_of", "mutants_of_constant"]
 
 _COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),
@@ -54,21 +54,23 @@ _SIGNS: dict[type[ast.AST], str] = {
 
 @dataclass(frozen=True)
 class Mutant:
-    """One broken version of a function.
+    """One broken version of a function, or of a constant that functions read.
 
     Attributes:
         function: Its name with its module's.
         line: Where in the file.
         change: What was changed, such as ``< becomes <=``.
         source: The line as it stands in the file.
-        code: The broken function's code, which takes the place of the whole one's.
+        code: The broken function's code, which takes the place of the whole one's; None for a constant.
+        value: What a constant becomes.
     """
 
     function: str
     line: int
     change: str
     source: str
-    code: CodeType
+    code: CodeType | None
+    value: int | float = 0
 
     @property
     def key(self) -> str:
@@ -106,6 +108,15 @@ def mutants_of(function: FunctionType, name: str) -> Iterator[Mutant]:
         yield Mutant(name, line, change, lines[line - first].strip(), code)
 
 
+def mutants_of_constant(module: ModuleType, name: str) -> Iterator[Mutant]:
+    """Yield a number of a module as one, where it is a count, and else as its double."""
+    whole = getattr(module, name)
+    value = 1 if isinstance(whole, int) else 2.0 * whole
+    lines = inspect.getsource(module).splitlines()
+    line = next(number for number, text in enumerate(lines, 1) if text.startswith(f"{name} = "))
+    yield Mutant(name, line, f"{whole} becomes {value}", lines[line - 1], None, value)
+
+
 def _changes(tree: ast.Module) -> Iterator[Callable[[], tuple[int, str]]]:
     """Yield what makes one change in place and tells its line and what it was."""
     top = tree.body[0]
@@ -118,6 +129,8 @@ def _changes(tree: ast.Module) -> Iterator[Callable[[], tuple[int, str]]]:
         for node in _walk(statement):
             yield from _of_expression(node)
             yield from _of_block(node)
+            if isinstance(node, ast.With):
+                yield from _of_with(node)
     block = top.body
     # At its end a function returns nothing by itself.
     nothing = isinstance(block[-1], ast.Return) and getattr(block[-1].value, "value", 0) in {None, ""}
@@ -156,6 +169,8 @@ def _of_expression(node: ast.AST) -> Iterator[Callable[[], tuple[int, str]]]:
     elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in _OTHER_CALL:
         new_name = _OTHER_CALL[node.func.id]
         yield _set(node.func, "id", new_name, f"{node.func.id} becomes {new_name}")
+    elif isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Name) and isinstance(node.ctx, ast.Load):
+        yield _set(node, "slice", ast.Constant(0), f"[{node.slice.id}] becomes [0]")
     elif isinstance(node, ast.IfExp):
         yield _set(node, "test", ast.UnaryOp(ast.Not(), node.test), "the condition is turned round")
 
@@ -165,6 +180,22 @@ def _of_block(node: ast.AST) -> Iterator[Callable[[], tuple[int, str]]]:
         block = getattr(node, name, None)
         if isinstance(block, list) and block and isinstance(block[0], ast.stmt):
             yield from _of_list(block, None, block)
+
+
+def _of_with(node: ast.With) -> Iterator[Callable[[], tuple[int, str]]]:
+    """Leave a lock or another guard out that nothing is taken from."""
+    for index, item in enumerate(node.items):
+        if item.optional_vars is None:
+
+            def leave_out(at: int = index) -> tuple[int, str]:
+                told = f"with {ast.unparse(node.items[at].context_expr)} is left out"
+                node.items[at].context_expr = ast.Call(
+                    ast.Attribute(ast.Call(ast.Name("__import__", ast.Load()), [ast.Constant("contextlib")], []),
+                                  "nullcontext", ast.Load()), [], [],
+                )  # fmt: skip
+                return node.lineno, told
+
+            yield leave_out
 
 
 def _of_list(

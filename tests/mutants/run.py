@@ -16,9 +16,9 @@ from rich.progress import Progress, TaskID
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
-from tests.mutants.operators import Mutant, mutants_of
+from tests.mutants.operators import Mutant
 from tests.mutants.session import TargetError, try_mutants
-from tests.mutants.targets import TARGETS, functions_of
+from tests.mutants.targets import TARGETS, mutants_of_target
 
 _EQUIVALENT = Path(__file__).with_name("equivalent.yaml")
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -52,7 +52,7 @@ def mutants(
     console = make_console()
     with Progress(console=console, transient=True) as progress:
         for target in targets:
-            found = [mutant for name, function in functions_of(target) for mutant in mutants_of(function, name)]
+            found = mutants_of_target(target)
             row = Row(target.module.removeprefix("pendulum_"), len(found))
             rows.append(row)
             task = progress.add_task(row.module, total=len(found))

@@ -7,6 +7,7 @@ sees only what all others let through.
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import resource
@@ -14,7 +15,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import CodeType, FrameType
@@ -159,7 +160,10 @@ class _Session:
         used = resource.getrusage(resource.RUSAGE_SELF)
         limit = round(used.ru_utime + used.ru_stime) + _PROCESSOR_TIME
         resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
-        dict(functions_of(self.target))[mutant.function].__code__ = mutant.code
+        if mutant.code is None:
+            setattr(importlib.import_module(self.target.module), mutant.function, mutant.value)
+        else:
+            dict(functions_of(self.target))[mutant.function].__code__ = mutant.code
         for _ in self._run(items):
             if self.failed:
                 return 1
@@ -190,8 +194,11 @@ class _Session:
         return Baseline(told["seconds"], told["reached"])
 
     def _measure(self, items: Sequence[Any], pipe: int) -> int:
-        names = {function.__code__: name for name, function in functions_of(self.target)}
-        reached: dict[str, list[int]] = {name: [] for name in names.values()}
+        names = {function.__code__: [name] for name, function in functions_of(self.target)}
+        for code, of_code in names.items():
+            # A constant is tried by the tests that reach a function which reads it.
+            of_code += [name for name in self.target.constants if name in code.co_names]
+        reached: dict[str, list[int]] = {name: [] for of_code in names.values() for name in of_code}
         seconds: list[float] = []
         called: set[CodeType] = set()
         start = time.monotonic()
@@ -200,8 +207,8 @@ class _Session:
                 now = time.monotonic()
                 seconds.append(now - start)
                 start = now
-                for code in called:
-                    reached[names[code]].append(at)
+                for name in {name for code in called for name in names[code]}:
+                    reached[name].append(at)
                 called.clear()
         with os.fdopen(pipe, "w", encoding="utf-8") as out:
             json.dump({"failed": self.failed, "seconds": seconds, "reached": reached}, out)
@@ -209,7 +216,7 @@ class _Session:
 
 
 @contextmanager
-def _profile(names: dict[CodeType, str], called: set[CodeType]) -> Iterator[None]:
+def _profile(names: Mapping[CodeType, object], called: set[CodeType]) -> Iterator[None]:
     """Collect which of some code is called, in any thread."""
 
     def look(frame: FrameType, event: str, _argument: object) -> None:

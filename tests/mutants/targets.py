@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from types import FunctionType
 from typing import Any
 
-__all__ = ["TARGETS", "Target", "functions_of"]
+from tests.mutants.operators import Mutant, mutants_of, mutants_of_constant
+
+__all__ = ["TARGETS", "Target", "functions_of", "mutants_of_target"]
 
 _RULES = (
     "pendulum_msgs_py/test/test_supervisor_stop.py",
@@ -19,6 +21,7 @@ _RULES = (
     "pendulum_msgs_py/test/test_command_gate.py",
     "pendulum_msgs_py/test/test_several_joints.py",
 )
+_MESSAGES = "pendulum_msgs_py/test"
 _BRIDGE = "pendulum_hw_bridge/test"
 _CYCLE = (f"{_BRIDGE}/test_bridge_cycle.py", f"{_BRIDGE}/test_bridge_of_several_modules.py")
 
@@ -32,12 +35,14 @@ class Target:
         names: Functions and methods by qualified name; a class stands for all of its methods.
         tests: Files; of these, the tests that reach a function run, the quickest first.
         choose: Expression of pytest's ``-k`` that chooses among them; empty for all.
+        constants: Numbers of the module that these functions read.
     """
 
     module: str
     names: tuple[str, ...]
     tests: tuple[str, ...]
     choose: str = ""
+    constants: tuple[str, ...] = ()
 
 
 TARGETS: tuple[Target, ...] = (
@@ -199,6 +204,35 @@ TARGETS: tuple[Target, ...] = (
         (f"{_BRIDGE}/test_module_files.py", f"{_BRIDGE}/test_hebi_emulated.py"),
     ),
     Target("pendulum_hw_bridge.nodes.e_stop_input", ("EStopInput",), (f"{_BRIDGE}/test_e_stop_input.py",)),
+    Target(
+        "pendulum_hw_bridge.nodes.e_stop_input_node",
+        ("EStopInputServer.__init__",),
+        ("tests/integration/test_e_stop_threads.py",),
+        choose="release_came_before or clock_that_nobody_sets",
+        constants=("_WAITING",),
+    ),
+    Target(
+        "pendulum_msgs_py.ros.plant_interface",
+        (
+            "PlantInterface._on_trajectory",
+            "PlantInterface._on_arm",
+            "PlantInterface._on_e_stop_reset",
+            "PlantInterface._is_outdated",
+            "PlantInterface._unread_press",
+            "PlantInterface.e_stop",
+        ),
+        (f"{_MESSAGES}/test_plant_requests.py",),
+    ),
+    Target(
+        "pendulum_msgs_py.ros.runner",
+        ("_watch_signals", "_next_stop_signal"),
+        (f"{_MESSAGES}/test_stop_signals.py",),
+    ),
+    Target(
+        "pendulum_hw_bridge.nodes.bridge_node",
+        ("BridgeNode._fail", "BridgeNode._quieten", "BridgeNode.release_actuator"),
+        (f"{_BRIDGE}/test_bridge_node_rules.py",),
+    ),
 )
 
 
@@ -220,6 +254,13 @@ def functions_of(target: Target) -> Iterator[tuple[str, FunctionType]]:
                 yield from _function(f"{name}.{part}", member, target.module)
         else:
             yield from _function(name, found, target.module)
+
+
+def mutants_of_target(target: Target) -> list[Mutant]:
+    """Return every mutant of a target's functions and constants."""
+    module = importlib.import_module(target.module)
+    found = [mutant for name, function in functions_of(target) for mutant in mutants_of(function, name)]
+    return found + [mutant for name in target.constants for mutant in mutants_of_constant(module, name)]
 
 
 def _function(name: str, member: Any, module: str) -> Iterator[tuple[str, FunctionType]]:

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.mutants.operators import Mutant, mutants_of
-from tests.mutants.targets import TARGETS, Target, functions_of
+from tests.mutants.operators import Mutant
+from tests.mutants.targets import TARGETS, Target, functions_of, mutants_of_target
 
 _PROJECT = Path(__file__).parents[2]
 
@@ -37,7 +37,7 @@ def test_the_upper_limit_holds():
 
 @cache
 def _found(target: Target) -> list[Mutant]:
-    return [mutant for name, function in functions_of(target) for mutant in mutants_of(function, name)]
+    return mutants_of_target(target)
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.module)
