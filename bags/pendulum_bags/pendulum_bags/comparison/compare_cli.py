@@ -210,6 +210,9 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
         cells = [f"{block[key][name]:.4g}" for _, block in blocks for key in ("position", "velocity")]
         statistics.add_row(name, *cells)
     console.print(statistics)
+    for name, plant in plants.items():
+        for sentence in dict.fromkeys(plant["damage"]):
+            console.print(f"{name}: {sentence}", style="bold red", highlight=False, markup=False)
     if warning := timing_warning(plants):
         console.print(warning, style="bold red", highlight=False)
     if result.is_paired:

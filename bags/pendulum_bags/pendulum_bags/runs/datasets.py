@@ -235,6 +235,20 @@ def _cut_at(recording: Recording, rows: NDArray[np.int64]) -> Recording:
     return replace(recording, time=time, input_time=stamps)
 
 
+def _joints(time: Array, position: Array) -> NDArray[np.int64]:
+    """Return the samples behind which another recording seems to begin: angle and speed both jump.
+
+    Where the angle alone jumps, the sensor slipped: its zero is another then.
+    """
+    step, intervals = np.diff(position), np.diff(time)
+    ordinary = 20.0 * float(np.quantile(np.abs(step), 0.99))
+    rows = np.flatnonzero((intervals <= _longest_step(time)) & (np.abs(step) > max(_LEAST_JUMP, ordinary)))
+    rows = rows[(rows > 0) & (rows < step.size - 1)]
+    speed = step / intervals
+    usual = float(np.quantile(np.abs(np.diff(speed)), 0.95))
+    return rows[np.abs(speed[rows + 1] - speed[rows - 1]) > 5.0 * usual]
+
+
 def unwrap(recording: Recording) -> Recording:
     """Return the recording with a continuous angle, and how often it jumped by a turn as ``unwrapped`` in ``meta``.
 
@@ -253,8 +267,7 @@ def unwrap(recording: Recording) -> Recording:
         result = replace(recording, position=position, meta=meta)
     step = np.abs(np.diff(position))
     fast = np.flatnonzero((step > 1.0) & (step > FASTEST * np.diff(recording.time)))
-    near = np.diff(recording.time) <= _longest_step(recording.time)
-    odd = np.flatnonzero(near & (step > _LEAST_JUMP) & (step > 20.0 * float(np.quantile(step, 0.99))))
+    odd = _joints(recording.time, position)
     if 0 < odd.size <= _MOST_JOINTS and np.all(np.diff(odd, prepend=0, append=step.size) > _LEAST_PIECE):
         notes = [
             f"the angle jumps by {step[i]:.3g} rad {recording.time[i] - recording.time[0]:.2f} s after the start, as "
