@@ -33,6 +33,8 @@ _BOTTOM = -math.pi
 class Operator(PlantPeer):
     """Client of a plant and its controller that hears what is applied, and why."""
 
+    patience = 120.0
+
     def __init__(self) -> None:
         super().__init__("/lab")
         self.leave_the_command()

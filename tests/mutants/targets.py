@@ -15,6 +15,7 @@ __all__ = ["TARGETS", "Target", "functions_of", "mutants_of_target"]
 
 _RULES = (
     "pendulum_msgs_py/test/test_supervisor_stop.py",
+    "pendulum_msgs_py/test/test_supervisor_enable.py",
     "pendulum_msgs_py/test/test_supervisor_rules.py",
     "pendulum_msgs_py/test/test_supervisor_begin.py",
     "pendulum_msgs_py/test/test_supervisor_edges.py",

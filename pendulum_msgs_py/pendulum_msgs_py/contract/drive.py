@@ -95,6 +95,7 @@ class PlantLimits:
         start_sum: The same for the sum with a disturbance that waits [N m].
         stop_time: Time over which torque fades at an e-stop and at disarming, stop category 1; 0 for category 0 [s].
         starvation: Time without a command after which a plant that is armed for effort disarms [s].
+        enable_timeout: Silence of the hold-to-run switch that disarms; infinity for no such switch [s].
         coordinates: Joints whose units messages have.
     """
 
@@ -114,6 +115,7 @@ class PlantLimits:
     start_sum: float = math.inf
     starvation: float = math.inf
     stop_time: float = 0.0
+    enable_timeout: float = math.inf
     coordinates: Coordinates = field(default=ONE_JOINT, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -134,6 +136,7 @@ class PlantLimits:
             ("start_effort", of_effort),
             ("start_sum", of_effort),
             ("starvation", "s"),
+            ("enable_timeout", "s"),
         ):
             if not getattr(self, name) > 0.0:
                 raise ParameterError(f"{name} is {getattr(self, name)} {unit}; expected > 0")

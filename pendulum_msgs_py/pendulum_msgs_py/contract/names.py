@@ -9,6 +9,7 @@ __all__ = [
     "DIAGNOSTICS",
     "DISTURBANCE",
     "EFFORT_COMMAND",
+    "ENABLE_INPUT",
     "EVENTS",
     "E_STOP",
     "E_STOP_INPUT",
@@ -42,6 +43,8 @@ SIGNALS = (JOINT_STATES, EFFORT_COMMAND, DISTURBANCE, APPLIED_EFFORT)
 EVENTS = "events"
 E_STOP_INPUT = "e_stop_input"
 """``std_msgs/Bool``: true is pressed, false says "not pressed" and has to come all the time."""
+ENABLE_INPUT = "enable_input"
+"""``std_msgs/Bool``: true is held and has to come all the time, false is released."""
 
 # Absolute names, by ROS convention.
 DIAGNOSTICS = "/diagnostics"

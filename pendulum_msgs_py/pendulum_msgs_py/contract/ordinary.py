@@ -65,6 +65,8 @@ def lend(supervisor: PlantSupervisor, record: Any) -> bool:
         and len(supervisor.coordinates.joints) == len(supervisor.limits.effort) == 1
         and supervisor._handover is None
         and not supervisor.commander_conflict
+        # Its silence is looked for at each decision.
+        and math.isinf(supervisor.limits.enable_timeout)
         and commands._newest is not None
         and supervisor._commanding == commands._newest.source
         and supervisor._last_decision_ns is not None

@@ -167,6 +167,15 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         read_only=True,
     ),
     ParameterSpec(
+        "enable_timeout",
+        0.0,
+        "s",
+        "With a hold-to-run switch: silence of `enable_input` that disarms, as its release does; 0 for no such switch.",
+        minimum=0.0,
+        maximum=1.0,
+        read_only=True,
+    ),
+    ParameterSpec(
         "tracking_error_limit",
         0.3,
         "rad",
@@ -237,6 +246,10 @@ def limits_from_parameters(
         (low, high) if low != high else (-unlimited, unlimited)
         for low, high in zip(window[::2], window[1::2], strict=True)
     ]
+    if lockstep and number("enable_timeout"):
+        raise ParameterError(
+            f"enable_timeout is {number('enable_timeout')} s in lockstep; expected 0: a switch is held in real time"
+        )
     start, handover = number("start_effort_limit") or unlimited, number("handover_effort_limit")
     return PlantLimits(
         effort=tuple(min(wanted, limit) if wanted else limit for limit in plant_effort_limits),
@@ -254,5 +267,6 @@ def limits_from_parameters(
         start_sum=unlimited if lockstep else start,
         starvation=number("starvation_limit") or unlimited,
         stop_time=number("stop_time"),
+        enable_timeout=number("enable_timeout") or unlimited,
         coordinates=coordinates,
     )

@@ -93,6 +93,7 @@ class PlantSupervisor:
         self._commanded_ns = 0
         self._gap_from: Vector | None = None
         self._stop: Handover | None = None
+        self._held_ns: int | None = None
 
     # --- messages ------------------------------------------------------------------------------------------
 
@@ -108,6 +109,11 @@ class PlantSupervisor:
         twins nobody's torque is applied.
         """
         self.commander_conflict = conflict
+
+    def hear_enable(self, now_ns: int, *, held: bool) -> None:
+        """Take note of a message of the hold-to-run switch; its release disarms at once."""
+        self._held_ns = now_ns if held else None
+        self._keep_enabled(now_ns)
 
     def accept_trajectory(self, trajectory: Trajectory, now_ns: int, sample: JointSample) -> str:
         """Start to follow a trajectory; return why it is refused, or an empty string."""
@@ -201,6 +207,7 @@ class PlantSupervisor:
             sample: Newest measurement, or None before the first.
         """
         self._keep_pace(now_ns)
+        self._keep_enabled(now_ns)
         push_command = self._pushes.fresh(now_ns)
         push = _clamp(push_command.effort, self._push_limits) if push_command else self._no_push
         if self.mode.armed:
@@ -240,6 +247,23 @@ class PlantSupervisor:
         return f"commanded by {source or 'an unnamed node'}"
 
     # --- inside --------------------------------------------------------------------------------------------
+
+    def _keep_enabled(self, now_ns: int) -> None:
+        if self.mode.armed and (refusal := self._enable_refusal(now_ns)):
+            self.disarm(now_ns, f"disarmed: {refusal}")
+
+    def _enable_refusal(self, now_ns: int) -> str:
+        """Return why the hold-to-run switch does not let the plant be armed, or an empty string."""
+        timeout = self.limits.enable_timeout
+        if math.isinf(timeout):
+            return ""
+        if self._held_ns is None:
+            return "enable switch is not held; expected true on enable_input, all the time"
+        # Either way: a clock that steps back must not keep a switch held.
+        silence = abs(now_ns - self._held_ns) / NANOSECONDS
+        if silence > timeout:
+            return f"enable switch is silent for {1e3 * silence:.0f} ms; expected a message within {timeout:g} s"
+        return ""
 
     def _keep_pace(self, now_ns: int) -> None:
         """Let trajectory and fades wait where the plant itself did not run, or where its clock stepped.
@@ -488,6 +512,8 @@ class PlantSupervisor:
             return f"fault not acknowledged: {self.reason}; disarm first"
         if self.commander_conflict:
             return self.commander_conflict
+        if refusal := self._enable_refusal(now_ns):
+            return refusal
         fault = self._measurement_fault(now_ns, sample)
         if fault:
             return fault

@@ -110,6 +110,8 @@ LAB_ENTRIES: Mapping[str, Mapping[str, LabEntry]] = {
         "command_lifetime": LabEntry("command_lifetime", "s", float),
         "feedback_watchdog": LabEntry("feedback_watchdog", "", int),
         "m_stop_action": LabEntry("m_stop_action"),
+        "enable_timeout": LabEntry("enable_timeout", "s", float, left_out="no such switch"),
+        "stop_time": LabEntry("stop_time", "s", float, left_out="at once"),
         "e_stop_input_timeout": LabEntry("e_stop_input_timeout", "s", float, left_out="no such input"),
     },
     "supply": {

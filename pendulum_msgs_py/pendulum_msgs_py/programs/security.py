@@ -40,7 +40,13 @@ _LOGGER = ("~/get_logger_levels", "~/set_logger_levels")
 _SILENT_PUBLISHER = ("/parameter_events",)
 _EVERY_PUBLISHER = (*_SILENT_PUBLISHER, "/rosout")
 _EVERY_SUBSCRIPTION = (names.CLOCK, "/parameter_events")
-_PLANT_SUBSCRIPTIONS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH, names.JOINT_TRAJECTORY)
+_PLANT_SUBSCRIPTIONS = (
+    names.EFFORT_COMMAND,
+    names.DISTURBANCE,
+    names.PUSH,
+    names.JOINT_TRAJECTORY,
+    names.ENABLE_INPUT,
+)
 _PLANT_PUBLISHERS = (names.JOINT_STATES, names.APPLIED_EFFORT, names.EVENTS, names.DIAGNOSTICS)
 _PLANT_SERVICES = (names.ARM, names.E_STOP_RESET)
 

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
@@ -151,6 +151,10 @@ class PlantInterface:
         self._pressed = threading.Event()
         self._e_stop = EStopServer(node, self.e_stop)
         supervisor.watch_for_presses(self._unread_press)
+        self._enable_topic = ""
+        if math.isfinite(supervisor.limits.enable_timeout):
+            self._enable_topic = node.resolve_topic_name(names.ENABLE_INPUT)
+            node.create_subscription(Bool, self._enable_topic, self._on_enable, qos.COMMAND_INPUT)
         if math.isinf(supervisor.limits.start_effort):
             node.get_logger().warning("start_effort_limit is 0: a commander may begin with any torque")
 
@@ -385,6 +389,11 @@ class PlantInterface:
             response.message = self.supervisor.mode.value
         self.publish_diagnostics()
         return response
+
+    def _on_enable(self, message: Bool) -> None:
+        # Of two switches one would hide that the other is released or silent.
+        alone = self.node.count_publishers(self._enable_topic) == 1
+        self.supervisor.hear_enable(self.clock(), held=message.data and alone)
 
     def _on_e_stop_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         refusal = "asked for before the e-stop was pressed; reset it once more"
