@@ -86,6 +86,7 @@ class Permissions:
 
 
 _RECORDER = Permissions(
+    publish=(names.DIAGNOSTICS,),
     subscribe=(_RECORDED, names.DIAGNOSTICS, names.CLOCK),
     reply=("~/start", "~/stop", "~/annotate", "~/status"),
     request=_READ_PARAMETERS,

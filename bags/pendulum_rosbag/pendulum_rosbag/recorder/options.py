@@ -35,6 +35,8 @@ class RecorderOptions:
         metadata: Run metadata to store.
         log_time: ``receive`` or ``header``.
         wait: Begin only when the service ``~/start`` is called.
+        black_box: Keep the last messages for so long, and write them each time that a plant faults or is stopped [s]; 0
+            to record all.
     """
 
     output: Path
@@ -49,6 +51,7 @@ class RecorderOptions:
     metadata: Mapping[str, Any] = field(default_factory=dict)
     log_time: str = "receive"
     wait: bool = False
+    black_box: float = 0.0
 
     def __post_init__(self) -> None:
         if self.log_time not in LOG_TIMES:
@@ -59,9 +62,12 @@ class RecorderOptions:
             ("max-size", self.max_size),
             ("max-duration", self.max_duration),
             ("duration", self.duration),
+            ("black-box", self.black_box),
         ):
             if not value >= 0:
                 raise ParameterError(f"{name} is {value}; expected >= 0")
+        if self.black_box and self.log_time != "receive":
+            raise ParameterError(f"log time is {self.log_time!r} with a black box; expected 'receive'")
         for name in self.topics:
             if not name.startswith("/"):
                 raise ParameterError(f"topic is {name!r}; expected its full name, such as /{name}")

@@ -42,6 +42,10 @@ def record(
         str, typer.Option(help="receive (time of arrival) or header (stamp of the message).")
     ] = "receive",
     wait: Annotated[bool, typer.Option("--wait", help="Begin when the service ~/start is called.")] = False,
+    black_box: Annotated[
+        float,
+        typer.Option(help="Keep so much in memory [s], and write a bag of it at each fault and e-stop; 0 records all."),
+    ] = 0.0,
 ) -> int:
     """Record topics to a rosbag2 folder that is complete and readable at every instant."""
     options = RecorderOptions(
@@ -57,6 +61,7 @@ def record(
         read_metadata(metadata),
         log_time,
         wait,
+        black_box,
     )
     if output.exists():
         raise BagError(f"bag {output} exists already; expected a new folder (bags are never overwritten)")

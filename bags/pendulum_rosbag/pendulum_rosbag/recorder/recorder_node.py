@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
@@ -18,10 +19,12 @@ from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.convert import event_message
+from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.timers import create_wall_timer
 from pendulum_rosbag import __version__
+from pendulum_rosbag.recorder.black_box import BlackBox
 from pendulum_rosbag.recorder.options import RecorderOptions
 from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
 from pendulum_rosbag.recorder.recorder_tap_node import Tap
@@ -77,7 +80,12 @@ class Recorder(PollingNode):
         self._events = f"{self.get_fully_qualified_name()}/{names.EVENTS}"
         self._settings = NodeParameters(self, SPECS, apply=self._on_parameters)
         self._parameter_reader = ParameterReader(self, self._on_node_parameters)
-        if not options.wait:
+        self._black_box: BlackBox[Tap] | None = None
+        if options.black_box:
+            self._black_box = BlackBox(options.black_box)
+            self._diagnostics = Diagnostics(self, "black box")
+            create_wall_timer(self, DIAGNOSTICS_PERIOD, self._publish_black_box)
+        elif not options.wait:
             self._begin()
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
@@ -172,6 +180,7 @@ class Recorder(PollingNode):
         while not self._leave.wait(POLL_PERIOD):
             with self._lock:
                 self._take_all()
+            self._write_black_box()
             if self._options.duration and time.monotonic() - self._started >= self._options.duration:
                 self._stop()
 
@@ -202,6 +211,11 @@ class Recorder(PollingNode):
         unheard = tap.unheard()
         if session is None:
             self._unstamped.clear()
+            if self._black_box is not None:
+                self._black_box.keep(tap, items)
+                if tap.topic.endswith(f"/{names.EVENTS}"):
+                    for time_ns, data in items:
+                        self._black_box.look(data, time_ns)
             return
         if items or missing:
             self._offer(tap, session, items, missing)
@@ -213,6 +227,27 @@ class Recorder(PollingNode):
             session.note(tap.topic, before=unheard)
         elif unheard:
             self._tell_early(tap, session, unheard)
+
+    def _write_black_box(self) -> None:
+        """Write what the black box holds to a bag of its own, if a plant has faulted or was stopped."""
+        box = self._black_box
+        if box is None or self._session is not None or not box.is_due(time.time_ns()):
+            return
+        with self._lock:
+            self._begin()
+            assert self._session is not None
+            for tap, time_ns, data in box.empty():
+                self._offer(tap, self._session, [(time_ns, data)])
+            self.note("black_box", reason=box.reason)
+            self._end()
+        self._publish_black_box()
+
+    def _publish_black_box(self) -> None:
+        assert self._black_box is not None
+        written = [str(report.path) for report in self.reports]
+        values = {"black_box": written[-1] if written else "", "reason": self._black_box.reason, "bags": len(written)}
+        text = f"wrote {written[-1]}" if written else "waits for a fault or an e-stop"
+        self._diagnostics.publish(time.time_ns(), DiagnosticStatus.OK, text, values)
 
     def _offer(self, tap: Tap, session: RecordingSession, items: Sequence[tuple[int, bytes]], missing: int = 0) -> None:
         tap.announce(session)

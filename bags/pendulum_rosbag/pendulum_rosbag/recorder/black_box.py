@@ -1,0 +1,79 @@
+"""The last messages in bounded memory, and when they are to be written: a plant has faulted or was stopped."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Sequence
+from typing import Generic, TypeVar
+
+from pendulum_msgs_py.contract.names import Event
+from pendulum_msgs_py.contract.supervisor import Mode
+from pendulum_msgs_py.contract.values import NANOSECONDS
+
+__all__ = ["MAX_BYTES", "BlackBox"]
+
+MAX_BYTES = 128 << 20
+"""Memory for messages [bytes]; the oldest are dropped."""
+_AFTER_NS = NANOSECONDS
+"""Time that is awaited after a fault, for the stop that it causes [ns]."""
+_OLDEST_NS = 2 * NANOSECONDS
+"""Age of an event beyond which it is one that its topic kept for latecomers [ns]."""
+_STOPS = {Mode.FAULT.value, Mode.E_STOP.value}
+
+_Source = TypeVar("_Source")
+
+
+class BlackBox(Generic[_Source]):
+    """Messages of the last seconds, whatever their sources are.
+
+    Args:
+        seconds: How long messages are kept [s].
+        max_bytes: Memory for them [bytes].
+    """
+
+    def __init__(self, seconds: float, max_bytes: int = MAX_BYTES) -> None:
+        self._kept_ns = round(seconds * NANOSECONDS)
+        self._max_bytes = max_bytes
+        self._messages: deque[tuple[_Source, int, bytes]] = deque()
+        self._bytes = 0
+        self._due_ns: int | None = None
+        self.reason = ""
+
+    def keep(self, source: _Source, items: Sequence[tuple[int, bytes]]) -> None:
+        """Take messages of a source: time of arrival [ns] and bytes."""
+        for time_ns, data in items:
+            self._messages.append((source, time_ns, data))
+            self._bytes += len(data)
+        while self._messages and self._bytes > self._max_bytes:
+            self._bytes -= len(self._messages.popleft()[2])
+
+    def look(self, event: bytes, now_ns: int) -> None:
+        """Note whether an event tells of a fault or an e-stop.
+
+        Args:
+            event: CDR bytes of a ``std_msgs/String``.
+            now_ns: Time of its arrival [ns].
+        """
+        try:
+            said = json.loads(event[8:].rstrip(b"\0"))
+            stops = said["name"] == Event.PLANT_MODE and said["mode"] in _STOPS
+            recent = abs(now_ns - int(said["stamp_ns"])) <= _OLDEST_NS
+        except (ValueError, KeyError, TypeError):
+            return
+        if stops and recent and self._due_ns is None:
+            self._due_ns, self.reason = now_ns + _AFTER_NS, f"{said['mode']}: {said.get('reason', '')}"
+
+    def is_due(self, now_ns: int) -> bool:
+        """Drop what is too old; return whether the rest is to be written now."""
+        oldest_ns = now_ns - self._kept_ns
+        while self._messages and self._messages[0][1] < oldest_ns:
+            self._bytes -= len(self._messages.popleft()[2])
+        return self._due_ns is not None and now_ns >= self._due_ns
+
+    def empty(self) -> list[tuple[_Source, int, bytes]]:
+        """Return what is kept, in the order of its arrival, and begin with nothing."""
+        messages = sorted(self._messages, key=lambda message: message[1])
+        self._messages.clear()
+        self._bytes, self._due_ns = 0, None
+        return messages
