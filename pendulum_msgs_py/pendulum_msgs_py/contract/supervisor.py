@@ -347,9 +347,7 @@ class PlantSupervisor:
 
     def _stop_drive(self, mode: Mode, reason: str, now_ns: int) -> None:
         """Release the drive, or with stop category 1 let the torque that acts fade to zero first; one fade alone."""
-        stop = self._stop
-        if self.mode.armed and self.limits.stop_time > 0.0:
-            stop = Handover(now_ns, self._applied)
+        stop = Handover(now_ns, self._applied) if self.mode.armed else self._stop
         self._release(mode, reason, now_ns)
         self._stop = stop
 
