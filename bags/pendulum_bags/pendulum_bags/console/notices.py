@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from nicegui import ui
 
 __all__ = ["Notices"]
@@ -11,8 +13,8 @@ _NEWEST = 3
 _STAYS = {"bad": 15.0, "good": 4.0}
 """How long a notice stands [s]: a refusal long enough to be read, acted on and read again."""
 
-_LONGEST = 1000
-"""Characters of a notice; of a longer one the middle is left out. No refusal of a plant is so long."""
+_LONG_WORD = re.compile(r"(\S{60})\S{61,}(\S{60})")
+"""What was typed may be of any length; the words of a refusal, and the remedy in it, are shown whole."""
 
 
 class Notices:
@@ -33,9 +35,7 @@ class Notices:
             text: One sentence.
             bad: It says why something was refused.
         """
-        if len(text) > _LONGEST:
-            # What was typed may be of any length; the reason stands behind it.
-            text = f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 2 :]}"
+        text = _LONG_WORD.sub(r"\1…\2", text)
         count = self._said[text][1] + 1 if text in self._said else 1
         self._forget(text)
         while len(self._said) >= _NEWEST:
