@@ -225,7 +225,8 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(browser: Any, bench:
     arm.focus()
     desk.keyboard.press("Shift+Tab")
     desk.keyboard.press("Tab")
-    assert arm.evaluate("(it) => getComputedStyle(it).outlineStyle + getComputedStyle(it).outlineWidth") == "solid3px"
+    seen = "(it) => [document.activeElement === it, getComputedStyle(it).boxShadow.includes('5px')]"
+    assert arm.evaluate(seen) == [True, True]
     desk.get_by_role("button", name="Add to each plant").click()
     desk.locator(".notices", has_text="each plant has a disturbance already").wait_for(timeout=10_000)
 

@@ -78,14 +78,16 @@ class Layout:
                 ui.html('<canvas id="pendulum" role="img" aria-label="pendulums, drawn live"></canvas>', sanitize=False)
                 ui.html('<div id="plants"></div>', sanitize=False)
                 ui.html('<div id="joints"></div>', sanitize=False)
+                # Beside the plots, where it moves no button when a plant comes.
+                with ui.element("div").classes("hint") as self._hint:
+                    ui.label("Start one in a terminal with the same ROS_DOMAIN_ID; it appears here by itself:")
+                    ui.html(f"<pre>{as_typed(_PLANTS)}</pre>", sanitize=False)
+                self._hint.set_visibility(False)
             with ui.element("section").classes("card wide").props('aria-label="Signals"'):
                 ui.html(
                     '<canvas id="plots" role="img" aria-label="angle, velocity and torques of the last 10 s"></canvas>',
                     sanitize=False,
                 )
-        with ui.element("section").classes("card hint").props('aria-label="How to start a plant"') as self._hint:
-            ui.label("Start a plant in a terminal with the same ROS_DOMAIN_ID; it appears here by itself:")
-            ui.html(f"<pre>{as_typed(_PLANTS)}</pre>", sanitize=False)
         self._plants = ui.element("div").classes("cards plants")
         with ui.element("div").classes("cards"):
             with ui.element("section").classes("card wide"):

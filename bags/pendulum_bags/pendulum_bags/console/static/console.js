@@ -523,7 +523,7 @@
         return line;
       }));
     }
-    if (!names.length) place.textContent = "No plant in this ROS domain yet. How to start one is below.";
+    if (!names.length) place.textContent = "No plant in this ROS domain yet.";
     if (state.connected) say(`${names.length} plant${names.length === 1 ? "" : "s"} · ${state.fps} pictures/s`, false);
   }
 
