@@ -38,6 +38,7 @@ def test_nothing_but_an_effort_leaves_the_bridge() -> None:
     assert math.isnan(mapping().bounded(Command(), MOTOR).effort)
     assert mapping().strategy is Strategy.PARALLEL_PWM
     assert mapping().limited_gains(24.0) is DEFAULT_GAINS[3]
+    assert mapping().largest_effort(9.0) == mapping().effort_limit
 
 
 def faults(check: CurrentCheck, *pairs: tuple[float, float]) -> list[str]:

@@ -69,6 +69,15 @@ def test_each_way_to_make_a_torque_has_its_strategy_and_setpoint() -> None:
     assert math.isnan(command.pwm)
 
 
+@pytest.mark.parametrize("speed", [8.0, -8.0])
+def test_a_motor_makes_the_limit_and_what_it_brakes_with_at_most(speed: float) -> None:
+    # 8 rad/s take a duty of 1/4 at 32 V, which makes 1 N m at standstill.
+    for kind in (PWM, COMPENSATED, LOOP):
+        limited = replace(mapping(kind), effort_limit=2.5)
+        assert limited.largest_effort(speed) == 3.5
+        assert limited.largest_effort(0.0) == 2.5
+
+
 def test_the_torque_that_setpoints_stand_for_is_the_way_back() -> None:
     motor = MotorState(16.0, velocity=8.0)
     for kind in (PWM, COMPENSATED, LOOP):
