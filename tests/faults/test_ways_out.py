@@ -43,6 +43,7 @@ def test_no_way_out_drives_harder_than_before(strategy: Strategy, way: str) -> N
 def test_no_stop_of_a_module_behind_udp_drives_harder_than_before(strategy: Strategy, backend: str) -> None:
     for fate in ("settings 12 ms late", "settings lost once", "setpoints behind settings", "each packet doubled"):
         left = take_way_out(backend, strategy, "hold", "stop", FATES[fate])
+        assert left.torque_before > 1.0
         assert not left.exceeds, (fate, left)
 
 

@@ -51,7 +51,6 @@ _RAMP = 0.4
 _SWING = 0.8
 _PERIOD = 0.01
 _AFTER = 0.1
-_LIFETIME = 0.05
 _PARAMETERS = load_emulator("thesis")
 _DRIVE = _PARAMETERS.drivetrain
 _PER_DUTY = _DRIVE.supply_voltage * _DRIVE.gear_ratio * _DRIVE.torque_constant / _DRIVE.winding_resistance
@@ -152,6 +151,10 @@ class Bench(Protocol):
     def before(self) -> float:
         """Time before a way out whose largest torque is that before it [s]: packets take theirs in real time."""
 
+    @property
+    def lifetime(self) -> float:
+        """Command lifetime [s]; in real time a busy computer must not let commands lapse."""
+
     def reconnect(self) -> ActuatorPort:
         """Return another port of the first module, not connected yet."""
 
@@ -200,6 +203,7 @@ class _SimulatedBench:
     """The backend ``emulator``, in simulated time."""
 
     before = 0.008
+    lifetime = 0.05
 
     def __init__(self) -> None:
         self._clock = SteppedClock(NANOSECONDS)
@@ -272,6 +276,7 @@ class _UdpBench:
     """Modules behind UDP in threads of this process, and one of the backends that speak to them."""
 
     before = 0.15
+    lifetime = 0.3
 
     def __init__(self, backend: str, modules: int) -> None:
         self._clock = SteadyWallClock()
@@ -390,7 +395,7 @@ def _drive(bench: Bench, strategy: Strategy, phase: str, cycles: int) -> None:
         port.connect()
         port.set_strategy(Strategy.OFF)
         port.set_limits(HardwareLimits(effort=13.0))
-        port.set_command_lifetime(_LIFETIME)
+        port.set_command_lifetime(bench.lifetime)
         port.set_gains(DEFAULT_GAINS[int(strategy)])
     for port in bench.ports:
         port.set_strategy(strategy, _setpoints(strategy, phase, 0))
@@ -446,13 +451,13 @@ def _uncertain(bench: Bench, strategy: Strategy) -> int:
 
 def _frozen(bench: Bench, strategy: Strategy) -> int:
     """Stop after a pause in which the command lifetime ended, as after SIGSTOP and SIGCONT."""
-    bench.wait(2.0 * _LIFETIME)
+    bench.wait(2.0 * bench.lifetime)
     return _stop(bench, strategy)
 
 
 def _killed(bench: Bench, strategy: Strategy) -> int:
     """Send nothing any more: the command lifetime ends the torque."""
-    bench.wait(1.1 * _LIFETIME)
+    bench.wait(1.1 * bench.lifetime)
     return bench.now_ns()
 
 
