@@ -12,9 +12,13 @@ import numpy as np
 import pytest
 
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_sim.exports.model_files import mjcf
 from pendulum_sim.foreign.equation_check import TOLERANCE, EquationCheck, check_equation
 from pendulum_sim.simulator.engines import open_simulation
+from pendulum_sim.stepping.joint_plant import joint_plant
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.plants import make_plant
 
 pytest.importorskip("mujoco")
 
@@ -131,6 +135,22 @@ def test_a_feature_that_the_equation_lacks_is_named_and_no_other(tmp_path: Path,
 def test_a_plain_pendulum_is_refused_by_no_check(tmp_path: Path, seed: int) -> None:
     found = check_model(write_model(tmp_path / "model.xml", "plain", seed))
     assert found.agrees, str(found)
+
+
+def test_a_motor_behind_a_spring_is_named_and_not_taken_for_a_delay(tmp_path: Path) -> None:
+    path = tmp_path / "x5_9.xml"
+    path.write_text(mjcf(load_plant("x5_9")), encoding="utf-8")
+    made = open_simulation(str(path))
+    assert made.check is not None
+    assert made.check().causes == ("a spring between motor and joint",)
+
+
+@pytest.mark.parametrize(("inertia", "agrees"), [(1.03, True), (1.1, False), (0.9, False)])
+def test_the_tolerance_is_five_per_cent_of_the_motion(inertia: float, agrees: bool) -> None:
+    parameters = load_plant("dfki").with_values(coulomb_friction=0.0, load_friction=0.0)
+    heavier = parameters.with_values(inertia=inertia * parameters.inertia)
+    one, other = (joint_plant(make_plant(each, 0.002)) for each in (heavier, parameters))
+    assert check_equation(one, other).agrees == agrees
 
 
 def test_two_features_are_both_named(tmp_path: Path) -> None:

@@ -52,6 +52,9 @@ _WORST = 16
 """Runs on which causes are tested."""
 _JUMP = 4.0
 """Times its velocity that an angle may move in a period before it jumps."""
+_LAGS = 40
+_CLOSE = 0.05
+"""What a response may leave over of another that is taken for the same."""
 _LOST = 0.3
 """Share of a start's velocity that is left a period later where it was not taken."""
 _LEAST_JUMP = 0.5
@@ -515,19 +518,33 @@ def _clipped(case: _Case) -> str:
 
 
 def _late(case: _Case) -> str:
-    """Name an effort that comes later than the equation says, at once or bit by bit."""
+    """Name an effort that comes late, if the equation answers to such a one as the plant does."""
     dt = case.plant.dt
     for i, limit in enumerate(case.plant.effort_limits):
         theirs, mine = (_response(case, plant, i, _SMALL * limit) for plant in (case.plant, case.equation))
-        if theirs is None or mine is None or abs(theirs[-1]) < 1e-12 or abs(mine[-1]) < 1e-12:
+        if theirs is None or mine is None or not np.any(theirs) or not np.any(mine):
             continue
-        begins = [int(np.argmax(np.abs(r) > 0.02 * abs(r[-1]))) for r in (theirs, mine)]
-        if (periods := begins[0] - begins[1]) >= 2:
-            return f"a delay (an effort acts {1e3 * periods * dt:.3g} ms later)"
-        ratio = theirs[1:] / np.where(mine[1:] == 0.0, np.inf, mine[1:])
-        if ratio[0] < 0.5 and ratio[-1] > 1.5 * ratio[0] and np.all(np.diff(ratio) > -0.02):
-            return "a lag of the effort"
+        tried = [(_unlike(theirs, mine), "")]
+        for k in range(2, case.count // 2):
+            late = np.concatenate([np.zeros(k), mine[:-k]])
+            tried.append((_unlike(theirs, late), f"a delay (an effort acts {1e3 * k * dt:.3g} ms later)"))
+        for lag in np.geomspace(dt, dt * case.count, _LAGS):
+            weights = np.exp(-dt / lag * np.arange(len(mine))) * (1.0 - math.exp(-dt / lag))
+            late = np.convolve(mine, weights)[: len(mine)]
+            tried.append((_unlike(theirs, late), f"a lag of the effort (of about {1e3 * lag:.1g} ms)"))
+        error, cause = min(tried)
+        if cause and error < _CLOSE < tried[0][0]:
+            return cause
     return ""
+
+
+def _unlike(theirs: Array, mine: Array) -> float:
+    """Return what one curve leaves over of another whatever their sizes [-]."""
+    power = float(np.dot(mine, mine))
+    if power == 0.0:
+        return 1.0
+    scale = float(np.dot(theirs, mine)) / power
+    return float(np.linalg.norm(theirs - scale * mine) / np.linalg.norm(theirs))
 
 
 def _stop(case: _Case) -> str:

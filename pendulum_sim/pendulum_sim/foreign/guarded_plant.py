@@ -128,15 +128,15 @@ class StallWatch:
 
 @contextmanager
 def in_one_sentence(name: str, what: str, kind: type[PendulumError]) -> Iterator[None]:
-    """Turn whatever code of others raises, an attempt to end the program included, into one sentence.
+    """Turn an exception of foreign code, ``SystemExit`` included, into one sentence.
 
     Args:
-        name: Whose code it is.
+        name: Name of the code.
         what: What it does.
-        kind: What is raised in its place.
+        kind: Exception that is raised in its place.
 
     Raises:
-        PendulumError: As said; one of ours keeps its sentence.
+        PendulumError: Of that kind; one of ours keeps its sentence.
     """
     try:
         yield

@@ -26,9 +26,11 @@ _CLEARED = {
     "delay of the actuator": ("actuator_delay",),
     "armature of the actuator": ("actuator_armature",),
 }
+_DRIVE = "a spring between motor and joint"
+_STIFFER = 100.0
 _FLUID, _JOINTS, _ACTUATORS = "the fluid around it", "other joints that move", "other actuators"
 _FLAG, _TIMESTEP = "a flag that disables a part of MuJoCo", "a timestep too long for the integrator"
-CAUSES = (*_DISABLED, *_CLEARED, _FLUID, _JOINTS, _ACTUATORS, _FLAG, _TIMESTEP)
+CAUSES = (*_DISABLED, *_CLEARED, _DRIVE, _FLUID, _JOINTS, _ACTUATORS, _FLAG, _TIMESTEP)
 """What can be switched off, in words."""
 
 
@@ -49,6 +51,9 @@ def switch_off(mujoco: Any, model: Any, cause: str, dofs: Collection[int], actua
     if cause == _FLUID:
         model.opt.density = model.opt.viscosity = 0.0
         model.opt.wind[:] = 0.0
+    elif cause == _DRIVE and len(dofs) > 1:
+        # Of a motor that moves with the link the equation is that of a rigid one.
+        model.tendon_stiffness[:] *= _STIFFER
     elif cause == _JOINTS:
         others = [i for i in range(model.nv) if i not in dofs]
         model.dof_armature[others] += _LOCKED * max(1.0, float(np.max(model.dof_M0)))

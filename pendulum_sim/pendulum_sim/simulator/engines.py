@@ -128,9 +128,9 @@ def _make_mujoco(values: Mapping[str, Any]) -> Simulation:
     model, mapping = values["model"], values["mapping"]
     if not model:
         raise ParameterError("model is missing; expected -p model:=FILE, an MJCF or URDF file")
-    told = load_mujoco_mapping(mapping) if mapping else MujocoMapping()
+    choices = load_mujoco_mapping(mapping) if mapping else MujocoMapping()
     with in_one_sentence(f"model {model}", "loading", ParameterError):
-        plant = load_mujoco_plant(model, told, rate_hz=values["rate_hz"], effort_limit=values["effort_limit"])
+        plant = load_mujoco_plant(model, choices, rate_hz=values["rate_hz"], effort_limit=values["effort_limit"])
     return _foreign(plant, model, Path(model).name)
 
 
@@ -158,7 +158,7 @@ def _foreign(plant: MujocoPlant | GymnasiumPlant, name: str, label: str) -> Simu
         try:
             coarse = joint_plant(make_plant(plant.parameters, plant.dt, method="semi_implicit"))
         except ParameterError:
-            # It would be unstable with that period; so would the simulation be, if it used one.
+            # It is unstable with that period, and so is a simulation that uses one.
             coarse = None
         return check_equation(joint_plant(guarded), equation, coarse=coarse, switches=switches, reseeded=reseeded)
 

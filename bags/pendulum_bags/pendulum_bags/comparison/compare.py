@@ -41,7 +41,7 @@ class Comparison:
         unpaired_verdict: Verdict on the unpaired comparison.
         looks: How often the data have been looked at.
         left_out: What was recorded and does not count, and why, in words.
-        unproved: What is believed of a plant without a check, in words.
+        unproved: What could be checked of a plant only in part, in words.
         stalls: Run folder, reason and logs of each run that a stalled machine broke off before the one that counts.
     """
 
@@ -57,14 +57,14 @@ class Comparison:
 
     @property
     def notes(self) -> list[str]:
-        """What a reader should know beside the figures: simulations that are not as their equation, and `left_out`."""
-        told = []
+        """Sentences for a reader of the figures: simulations that differ from their equation, and `left_out`."""
+        notes = []
         for run in (self.pairs[0].simulation, self.pairs[0].hardware):
             record = run_record(run.metadata)
             simulation = record.get("simulation") if run.label == "simulation" or STAND_IN in record else None
             if isinstance(simulation, Mapping) and (difference := simulation.get(DIFFERENCE)):
-                told.append(f"The {run.label}, {simulation.get('name')}, {difference}.")
-        return [*dict.fromkeys(told), *self.unproved, *self.left_out]
+                notes.append(f"The {run.label}, {simulation.get('name')}, {difference}.")
+        return [*dict.fromkeys(notes), *self.unproved, *self.left_out]
 
     @property
     def is_emulated(self) -> bool:
