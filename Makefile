@@ -5,7 +5,7 @@ SHELL := /bin/sh
 unexport PYTHONDONTWRITEBYTECODE
 .DELETE_ON_ERROR:
 
-PACKAGES := pendulum_msgs_py pendulum_sim pendulum_lqr pendulum_hw_bridge bags/pendulum_rosbag bags/pendulum_bags
+PACKAGES := pendulum_msgs_py pendulum_sim pendulum_lqr pendulum_hw_bridge bags/pendulum_rosbag bags/pendulum_bags tests/pendulum_testing
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet --quiet

@@ -6,13 +6,11 @@ import os
 import sys
 from pathlib import Path
 
-from hypothesis import settings
-
 # What is collected stays: the collector of garbage need not look at thousands of tests, neither while they come nor
 # while they run.
 gc.disable()
 
-pytest_plugins = ["tests.fixtures"]
+pytest_plugins = ["pendulum_testing.fixtures"]
 
 # pytest names a test module after its path, `pendulum_sim.test.test_x`, and would take the repository's folder for the
 # package of that name, unless the package is there already.
@@ -33,12 +31,6 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 # As in an activated environment, where printed commands start with plain `python`.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
-
-# The same examples each time, so that a failure belongs to the change at hand; `--hypothesis-profile=explore` looks for
-# new ones. No deadline: on a busy machine it measures the neighbours.
-settings.register_profile("repeatable", derandomize=True, deadline=None)
-settings.register_profile("explore", max_examples=1000, deadline=None)
-settings.load_profile("repeatable")
 
 
 def pytest_collection_finish() -> None:

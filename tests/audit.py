@@ -25,7 +25,7 @@ from packaging.version import InvalidVersion, Version
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 
 __all__ = ["Finding", "from_advisories", "from_pip_audit", "pinned"]
 

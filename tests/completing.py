@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 
 __all__ = ["completed"]
 

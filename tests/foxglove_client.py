@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.npm import node_process
+from pendulum_testing.npm import node_process
 
 __all__ = ["FoxgloveClient", "foxglove_client"]
 

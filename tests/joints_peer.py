@@ -13,7 +13,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.ros import qos
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
 
 __all__ = ["JointsPeer"]
 

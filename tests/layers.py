@@ -12,7 +12,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 
 __all__ = ["LAYERS", "ROOM", "distributions_of_modules", "environment_of", "pins", "requirements"]
 

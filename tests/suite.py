@@ -23,7 +23,7 @@ import psutil
 import pytest
 
 from pendulum_bags.experiments.session import NO_REALTIME
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 from tests.suite_events import PIPE
 
 __all__ = ["Part", "exit_code", "main", "rooms", "run_parts"]

@@ -17,7 +17,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 
 __all__ = ["PAGE", "Row", "as_installed", "of_page"]
 

@@ -46,6 +46,7 @@ ALL = "pendulum"
 manifest = ElementTree.parse("package.xml")
 name = manifest.findtext("name", "")
 executables = read_executables(Path(name, "executables.py"))
+SCRIPTS = [f"{PREFIX * (program != ALL)}{program} = {target}" for program, target in executables.items()]
 setup(
     name=name,
     version=manifest.findtext("version", ""),
@@ -57,13 +58,9 @@ setup(
     package_data={"": [f"**/*.{ending}" for ending in DATA_ENDINGS] + ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
-        (f"share/{name}", ["package.xml", "LICENSE"]),
+        (f"share/{name}", ["package.xml", "LICENSE", "CHANGELOG.rst"]),
         *share_files(name),
     ],
-    entry_points={
-        "console_scripts": [
-            f"{PREFIX * (program != ALL)}{program} = {target}" for program, target in executables.items()
-        ]
-    },
+    entry_points={"console_scripts": SCRIPTS} if SCRIPTS else {},
     zip_safe=False,
 )

@@ -15,8 +15,8 @@ from pendulum_hw_bridge.port.actuator import ActuatorError, Command, Feedback, H
 from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import Drive, DriveKind
 from pendulum_msgs_py.contract.supervisor import Mode, PlantLimits, PlantSupervisor
-from tests.feedback_records import feedback_record
-from tests.scripted_port import DRIVETRAIN, MILLISECOND, PERIOD, SECOND, STEP, TIMEOUT, Port
+from pendulum_testing.feedback_records import feedback_record
+from pendulum_testing.scripted_port import DRIVETRAIN, MILLISECOND, PERIOD, SECOND, STEP, TIMEOUT, Port
 
 
 class Rig:

@@ -16,8 +16,8 @@ from pendulum_msgs_py.contract.drive import Drive, DriveKind, Mode, PlantLimits
 from pendulum_msgs_py.contract.joints import Coordinates, Joint
 from pendulum_msgs_py.contract.supervisor import PlantSupervisor
 from pendulum_msgs_py.errors import ParameterError
-from tests.feedback_records import feedback_record
-from tests.scripted_port import DRIVETRAIN, PERIOD, STEP, Port
+from pendulum_testing.feedback_records import feedback_record
+from pendulum_testing.scripted_port import DRIVETRAIN, PERIOD, STEP, Port
 
 JOINTS = (Joint("shoulder"), Joint("elbow"))
 BOTH = Coordinates(JOINTS, (0, 1))

@@ -15,7 +15,7 @@ from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
 from pendulum_hw_bridge.port.actuator import Command, Strategy
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_msgs_py.contract.joints import Joint
-from tests.feedback_records import feedback_record
+from pendulum_testing.feedback_records import feedback_record
 
 MOTOR = MotorState(24.0)
 SLIDE = Joint("cart", unit="m", turns=False)

@@ -12,8 +12,8 @@ from pendulum_hw_bridge.lab import guided, lab_cli
 from pendulum_hw_bridge.port.actuator import ActuatorError, Command, Strategy
 from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.plants.lab_file import load_lab
-from tests.feedback_records import feedback_record
-from tests.lab_rig import PARAMETERS, Person, changed, emulator
+from pendulum_testing.feedback_records import feedback_record
+from pendulum_testing.lab_rig import PARAMETERS, Person, changed, emulator
 
 HAND = EmulatedHand(lambda torque: None)
 

@@ -25,7 +25,7 @@ from pendulum_hw_bridge.port.actuator import ActuatorError, Command, HardwareLim
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import ParameterError
-from tests.fixtures import wait_for
+from pendulum_testing.fixtures import wait_for
 
 hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
 

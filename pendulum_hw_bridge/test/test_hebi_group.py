@@ -27,7 +27,7 @@ from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import Drive, DriveKind, Mode, PlantLimits
 from pendulum_msgs_py.contract.joints import Coordinates, Joint
 from pendulum_msgs_py.contract.supervisor import PlantSupervisor
-from tests.scripted_port import DRIVETRAIN, PERIOD, STEP
+from pendulum_testing.scripted_port import DRIVETRAIN, PERIOD, STEP
 
 hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
 

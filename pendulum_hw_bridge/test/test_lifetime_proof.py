@@ -8,7 +8,7 @@ import pytest
 
 from pendulum_hw_bridge.lab import proofs
 from pendulum_hw_bridge.port.settings import BridgeSettings
-from tests.proof_bench import Bench, keeps_its_lifetime
+from pendulum_testing.proof_bench import Bench, keeps_its_lifetime
 
 
 @pytest.mark.parametrize("rate", [20.0, 100.0, 1000.0])

@@ -18,9 +18,9 @@ from pendulum_hw_bridge.port.actuator import (
     MStopAction,
 )
 from pendulum_hw_bridge.port.settings import BridgeSettings
-from tests.feedback_records import feedback_record
-from tests.lab_rig import emulator
-from tests.proof_bench import BOTH, Bench
+from pendulum_testing.feedback_records import feedback_record
+from pendulum_testing.lab_rig import emulator
+from pendulum_testing.proof_bench import BOTH, Bench
 
 
 @pytest.mark.parametrize("lifetime", [0.03, 0.04, 0.05, 0.055, 0.06, 0.07, 0.1, 0.25])

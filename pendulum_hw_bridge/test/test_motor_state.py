@@ -9,7 +9,7 @@ import pytest
 
 from pendulum_hw_bridge.drive.motor_state import MOTOR_SPEED_LIMIT, MotorState, MotorWatch
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
-from tests.feedback_records import feedback_record
+from pendulum_testing.feedback_records import feedback_record
 
 GEAR = 64.0
 STEP = 15_625_000

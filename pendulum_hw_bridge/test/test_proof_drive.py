@@ -21,9 +21,9 @@ from pendulum_hw_bridge.port.actuator import (
     afterwards,
 )
 from pendulum_hw_bridge.port.settings import BridgeSettings
-from tests.feedback_records import feedback_record
-from tests.lab_rig import PARAMETERS, Person, emulator
-from tests.proof_bench import BOTH, Bench
+from pendulum_testing.feedback_records import feedback_record
+from pendulum_testing.lab_rig import PARAMETERS, Person, emulator
+from pendulum_testing.proof_bench import BOTH, Bench
 
 
 def test_the_duty_for_proofs_makes_less_than_half_a_newton_metre() -> None:

@@ -13,8 +13,8 @@ from pendulum_hw_bridge.port.actuator import (
     Feedback,
 )
 from pendulum_hw_bridge.port.settings import BridgeSettings
-from tests.feedback_records import feedback_record
-from tests.proof_bench import Bench
+from pendulum_testing.feedback_records import feedback_record
+from pendulum_testing.proof_bench import Bench
 
 
 def records_of(*given: tuple[float, float]) -> Iterator[Feedback]:

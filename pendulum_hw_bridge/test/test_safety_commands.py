@@ -12,8 +12,8 @@ from pendulum_hw_bridge.drive.output_check import OutputCheck
 from pendulum_hw_bridge.drive.safety import SafetyMonitor
 from pendulum_hw_bridge.port.actuator import Command, Strategy
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
-from tests.feedback_records import feedback_record
-from tests.watched_monitor import DRIVETRAIN, LIMITS, MILLISECOND, PERIOD, STEP, Watched
+from pendulum_testing.feedback_records import feedback_record
+from pendulum_testing.watched_monitor import DRIVETRAIN, LIMITS, MILLISECOND, PERIOD, STEP, Watched
 
 # --- what the module acts on -----------------------------------------------------------------------------------
 

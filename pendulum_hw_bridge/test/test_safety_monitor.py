@@ -10,8 +10,8 @@ import pytest
 
 from pendulum_hw_bridge.drive.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_hw_bridge.port.actuator import CommandLock, LimitState, TemperatureState
-from tests.feedback_records import feedback_record
-from tests.watched_monitor import DRIVETRAIN, MILLISECOND, PERIOD, STEP, TIMEOUT, Watched
+from pendulum_testing.feedback_records import feedback_record
+from pendulum_testing.watched_monitor import DRIVETRAIN, MILLISECOND, PERIOD, STEP, TIMEOUT, Watched
 
 # --- new, old, silent ------------------------------------------------------------------------------------------
 

@@ -27,7 +27,7 @@ from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
 from pendulum_msgs_py.parameters import validate
-from tests.bag_messages import joint_state, write_bag
+from pendulum_testing.bag_messages import joint_state, write_bag
 
 
 def a_record() -> Feedback:

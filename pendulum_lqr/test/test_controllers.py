@@ -25,7 +25,7 @@ from pendulum_lqr.disturbances.disturbance import make_disturbance
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from tests.policies import random_policy
+from pendulum_testing.policies import random_policy
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")

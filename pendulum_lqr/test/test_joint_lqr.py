@@ -19,7 +19,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
-from tests.joint_plants import lagging_plant
+from pendulum_testing.joint_plants import lagging_plant
 
 PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")
 

@@ -19,7 +19,7 @@ from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
-from tests.joint_plants import delayed_plant, near_upright
+from pendulum_testing.joint_plants import delayed_plant, near_upright
 
 PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")
 PERIOD = 0.01

@@ -17,8 +17,8 @@ from pendulum_lqr.policies.policy_file import dumps_policy, load_policy, loads_p
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from tests.joint_plants import delayed_plant
-from tests.policies import random_policy
+from pendulum_testing.joint_plants import delayed_plant
+from pendulum_testing.policies import random_policy
 
 CART_POLE = load_mechanism("cart_pole")
 DOUBLE = load_mechanism("double_pendulum")

@@ -25,9 +25,9 @@ from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.programs.realtime import may_run_in_real_time
 from pendulum_msgs_py.ros import qos
-from tests.graph_peer import GraphPeer
-from tests.policies import linear_policy
-from tests.refusals import Refused, not_refused
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.policies import linear_policy
+from pendulum_testing.refusals import Refused, not_refused
 
 STATE = {"position": math.pi + 0.1, "velocity": 0.2, "effort": 0.0}
 # A busy machine delivers states late; how old is too old is judged by tests that need no middleware.

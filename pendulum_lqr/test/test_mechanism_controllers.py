@@ -35,7 +35,7 @@ from pendulum_msgs_py.dynamics.runge_kutta import along_2, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
-from tests.joint_plants import delayed_plant
+from pendulum_testing.joint_plants import delayed_plant
 
 DT = 0.002
 Q, R = (10.0, 10.0, 1.0, 1.0), 1.0

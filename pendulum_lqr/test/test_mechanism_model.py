@@ -20,7 +20,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
-from tests.joint_plants import lagging_plant, near_upright, without_friction
+from pendulum_testing.joint_plants import lagging_plant, near_upright, without_friction
 
 _PLANTS = ("cart_pole", "acrobot", "pendubot", "double_pendulum", "furuta")
 

@@ -18,7 +18,7 @@ from pendulum_lqr.policies.policy import Network, fingerprint
 from pendulum_lqr.policies.policy_file import LARGEST_FILE, dumps_policy, load_policy, loads_policy, write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from tests.policies import linear_policy, random_policy
+from pendulum_testing.policies import linear_policy, random_policy
 
 DFKI = load_plant("dfki")
 THESIS = load_plant("thesis")

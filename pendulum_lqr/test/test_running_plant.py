@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
 
 _NAME = "/sim/controller: controller"
 

@@ -16,7 +16,7 @@ from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.trajectory import MAX_TRAJECTORY_POINTS, thesis_ramp
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
-from tests.trajectories import from_points
+from pendulum_testing.trajectories import from_points
 
 serialization = pytest.importorskip("rclpy.serialization")
 JointState = pytest.importorskip("sensor_msgs.msg").JointState

@@ -18,7 +18,7 @@ from pendulum_msgs_py.plants.mechanism_parameters import (
 )
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PLANT_SPECS, PRESETS, load_plant, resolve_plant
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
-from tests.joint_plants import without_friction
+from pendulum_testing.joint_plants import without_friction
 
 
 def _changed(tmp_path: Path, old: str, new: str, preset: str = "acrobot") -> Path:

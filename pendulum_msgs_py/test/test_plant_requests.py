@@ -22,7 +22,7 @@ from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message, trajectory_to_message
 from pendulum_msgs_py.ros.plant_interface import TRAJECTORY_AGE_LIMIT, PlantInterface
 from pendulum_msgs_py.ros.polled import PollingNode
-from tests.trajectories import from_points
+from pendulum_testing.trajectories import from_points
 
 NOW = 100 * NANOSECONDS
 

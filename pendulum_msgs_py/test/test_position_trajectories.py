@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pendulum_msgs_py.contract.trajectory import MAX_RAMP_VELOCITY, RAMP_INCREMENT, RAMP_PERIOD, Trajectory, thesis_ramp
 from pendulum_msgs_py.errors import ParameterError
-from tests.trajectories import from_points
+from pendulum_testing.trajectories import from_points
 
 _ANGLES = st.floats(-10.0, 10.0)
 

@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros.parameters import NodeParameters
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
 
 _SPECS = (ParameterSpec("gain", 1.0, "N m/rad", "Gain.", minimum=0.0), ParameterSpec("name", "a", "", "Name."))
 

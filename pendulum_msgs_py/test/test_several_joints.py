@@ -13,7 +13,7 @@ from pendulum_msgs_py.contract.joints import Coordinates, Joint
 from pendulum_msgs_py.contract.supervisor import DriveKind, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
-from tests.trajectories import from_points
+from pendulum_testing.trajectories import from_points
 
 serialization = pytest.importorskip("rclpy.serialization")
 JointState = pytest.importorskip("sensor_msgs.msg").JointState

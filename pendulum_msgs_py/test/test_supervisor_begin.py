@@ -9,7 +9,7 @@ import pytest
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
-from tests.trajectories import from_points
+from pendulum_testing.trajectories import from_points
 
 _MS = 1_000_000
 

@@ -17,7 +17,7 @@ from pendulum_msgs_py.contract.supervisor import Drive, DriveKind, Input, Mode, 
 from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
-from tests.trajectories import from_points
+from pendulum_testing.trajectories import from_points
 
 _MS = 1_000_000
 

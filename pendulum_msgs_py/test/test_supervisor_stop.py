@@ -10,7 +10,7 @@ import pytest
 from pendulum_msgs_py.contract.supervisor import DriveKind, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
-from tests.trajectories import from_points
+from pendulum_testing.trajectories import from_points
 
 _PERIOD_NS = NANOSECONDS // 100
 _STOPS: dict[str, Callable[[PlantSupervisor, int], None]] = {

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from pendulum_msgs_py.programs.typed_commands import as_typed
+from pendulum_testing.fixtures import PROJECT, in_repository
 
 TEXT = "Next: python -m pendulum_lqr design --preset thesis"
 FRESH = "/usr/bin:/bin"
@@ -43,6 +44,7 @@ def test_another_python_first_on_the_path_is_not_taken_for_ours(
     assert as_typed(TEXT) == f"Next: {BIN}/python -m pendulum_lqr design --preset thesis"
 
 
+@in_repository
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -63,12 +65,13 @@ def test_examples_that_a_program_prints_in_a_fresh_shell_name_an_interpreter_tha
     assert [name for name in interpreters if not Path(name.lstrip("<(`")).is_file()] == []
 
 
+@in_repository
 @pytest.mark.parametrize("package", ["pendulum_msgs_py", "pendulum_sim", "pendulum_lqr", "pendulum_hw_bridge"])
 def test_the_systems_python_in_the_projects_folder_says_where_the_programs_are(package: str) -> None:
     start = f"import runpy, sys; sys.path.insert(0, '.'); runpy.run_module('{package}', run_name='__main__')"
     done = subprocess.run(
         [sys.executable, "-S", "-I", "-c", start],
-        cwd=Path(__file__).resolve().parents[2],
+        cwd=PROJECT,
         capture_output=True,
         text=True,
         check=False,

@@ -16,7 +16,7 @@ from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_sim.environments.mechanism_environment import IDS, MechanismEnv, MechanismVectorEnv
 from pendulum_sim.pictures.mechanism_drawing import MechanismPicture
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
-from tests.joint_plants import without_friction
+from pendulum_testing.joint_plants import without_friction
 
 
 @pytest.mark.parametrize("name", IDS)

@@ -14,7 +14,7 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.exports.mechanism_files import mechanism_mjcf
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_sim.stepping.plant import RigidPlant
-from tests.joint_plants import without_friction
+from pendulum_testing.joint_plants import without_friction
 
 _PLANTS = ("cart_pole", "acrobot", "furuta")
 

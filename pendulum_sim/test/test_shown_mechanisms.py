@@ -24,7 +24,7 @@ from pendulum_sim.pictures.joint_frames import joint_frames
 from pendulum_sim.pictures.markers_node import arrow_points, joint_marker
 from pendulum_sim.pictures.mechanism_drawing import MechanismPicture
 from pendulum_sim.pictures.shown_plant import ShownPlant
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
 
 _SIZE = (200, 200)
 

@@ -20,8 +20,8 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message
 from pendulum_sim.stepping.plant import RigidPlant
-from tests.graph_peer import GraphPeer
-from tests.refusals import Refused, not_refused
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.refusals import Refused, not_refused
 
 
 class Peer(GraphPeer):

@@ -17,10 +17,10 @@ from pathlib import Path
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_hw_bridge.port.actuator import Strategy
 from pendulum_msgs_py.plants.lab_file import load_lab, write_lab
+from pendulum_testing.fixtures import PROJECT, wait_for
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.acceptance.first_day_bench import PATIENCE, TRIES, Button, Day
 from tests.acceptance.first_day_page import PAGE, Step, text_of, write_page
-from tests.fixtures import PROJECT, wait_for
-from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = ["live_through"]
 

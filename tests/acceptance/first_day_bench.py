@@ -20,9 +20,9 @@ from std_srvs.srv import Trigger
 
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_hw_bridge.checks.nudge import EMULATED_NUDGE
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.acceptance.first_day_page import Step
-from tests.fixtures import wait_for
-from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = ["PATIENCE", "TRIES", "Button", "Day"]
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from pendulum_testing.fixtures import PROJECT
 from tests.audit import Finding, from_advisories, from_pip_audit, main, pinned
-from tests.fixtures import PROJECT
 
 
 def advisory(name: str, *events: dict[str, str], **more: Any) -> dict[str, Any]:

@@ -26,10 +26,10 @@ import typer.main
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs import completion
+from pendulum_testing.fixtures import PROJECT
 from tests.acceptance.test_packaging import PROGRAMS as INSTALLED
 from tests.acceptance.test_packaging import executables
 from tests.completing import completed
-from tests.fixtures import PROJECT
 
 # ``pendulum`` has no command line of its own: it starts the others (test_pendulum_command.py).
 PROGRAMS = [(package, program) for package, program in INSTALLED if program != "pendulum"]

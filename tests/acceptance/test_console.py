@@ -21,9 +21,9 @@ import pytest
 
 from pendulum_bags.console.security import refusal
 from pendulum_bags.verdict.layers import Layer, LayerResult, Mark, sum_up
-from tests.fixtures import PROJECT, own_domain, wait_for
-from tests.npm import install_packages
-from tests.processes import ProcessGroup, RunningProgram
+from pendulum_testing.fixtures import PROJECT, own_domain, wait_for
+from pendulum_testing.npm import install_packages
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.tools.faults import console_stops
 from tests.tools.faults.console_stops import CHROMIUM, QUIET, SLOW_DISPLAY, STOPS, StopRig
 

@@ -16,7 +16,7 @@ import pytest
 from pendulum_msgs_py.loops.compile_loop import COMMON
 from pendulum_msgs_py.loops.machine_code import keep_loop
 from pendulum_rosbag.reader import read_bag
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 from tests.layers import environment_of
 
 FOLDERS = (

@@ -19,8 +19,8 @@ import yaml
 
 from pendulum_bags.live.foxglove_cli import LAYOUT
 from pendulum_msgs_py.contract import names
-from tests.fixtures import PROJECT
-from tests.processes import ProcessGroup, RunningProgram
+from pendulum_testing.fixtures import PROJECT
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 
 PAGES = sorted(
     PROJECT / name

@@ -18,8 +18,8 @@ from pendulum_bags.experiments.experiment_cli import main
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME
 from pendulum_bags.runs.run_folder import read_stalls
 from pendulum_rosbag.reader import read_bag
-from tests.fixtures import PROJECT
-from tests.processes import ProcessGroup, RunningProgram
+from pendulum_testing.fixtures import PROJECT
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 
 NOISE = 5.0
 RAMP = math.pi / 0.002 / 100.0

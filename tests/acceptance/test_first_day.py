@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from pendulum_testing.processes import ProcessGroup
 from tests.acceptance.first_day import live_through
 from tests.acceptance.first_day_bench import Day
 from tests.acceptance.first_day_page import PAGE, skeleton, steps_of, text_of
-from tests.processes import ProcessGroup
 
 
 @pytest.mark.timeout(600)

@@ -15,8 +15,8 @@ import psutil
 import pytest
 
 from pendulum_bags.experiments.domain import is_unused
-from tests.fixtures import PROJECT, wait_for
-from tests.processes import ProcessGroup
+from pendulum_testing.fixtures import PROJECT, wait_for
+from pendulum_testing.processes import ProcessGroup
 
 
 def python(code: str) -> list[str]:
@@ -36,7 +36,7 @@ def test_a_domain_is_reserved_for_as_long_as_the_test_runs(domain_id: int, tmp_p
         "-q",
         "-s",
         "-p",
-        "tests.fixtures",
+        "pendulum_testing.fixtures",
         "-c",
         str(PROJECT / "pyproject.toml"),
     ]

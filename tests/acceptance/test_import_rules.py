@@ -11,7 +11,7 @@ from pathlib import Path
 import grimp
 import pytest
 
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 from tests.import_rules import RoomsContract
 
 FOLDERS = [

@@ -14,10 +14,10 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from pendulum_msgs_py.programs.extras import extra_of, how_to_install
+from pendulum_testing.fixtures import PROJECT
 from tests import wheel_sizes
 from tests.acceptance.test_manifests import imported
 from tests.acceptance.test_packaging import FOLDERS, PROGRAMS
-from tests.fixtures import PROJECT
 from tests.layers import LAYERS, distributions_of_modules, environment_of, pins, requirements
 
 MACHINES = [

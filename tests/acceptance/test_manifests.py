@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import configparser
 import re
 import shlex
 import sys
@@ -14,8 +15,8 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
+from pendulum_testing.fixtures import PROJECT
 from tests.acceptance.test_packaging import FOLDERS
-from tests.fixtures import PROJECT
 
 KNOWN: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("rosdep_keys.yaml").read_text(encoding="utf-8"))
 PAGE = (PROJECT / "pendulum_msgs_py" / "docs" / "install.md").read_text(encoding="utf-8")
@@ -35,6 +36,13 @@ def imported(package: str) -> frozenset[str]:
     return frozenset(name for name in found if name not in sys.stdlib_module_names and not _OF_ROS.fullmatch(name))
 
 
+def required(package: str) -> set[str]:
+    """Return the distributions that a package cannot do without."""
+    config = configparser.ConfigParser()
+    config.read(PROJECT / FOLDERS[package] / "setup.cfg")
+    return {re.split(r"[\[<>=]", line)[0] for line in config["options"]["install_requires"].split()}
+
+
 def keys(package: str, kind: str) -> set[str]:
     """Return the dependencies of a kind that are no packages of ROS."""
     manifest = ElementTree.parse(PROJECT / FOLDERS[package] / "package.xml")
@@ -48,14 +56,19 @@ def test_the_manifest_names_the_key_of_every_library_and_no_other(package: str) 
     libraries = imported(package)
     unknown = libraries - of_module.keys() - KNOWN["pip_only"].keys()
     assert not unknown, f"look up the rosdep keys of {unknown}, as rosdep_keys.yaml says"
-    assert keys(package, "exec_depend") == {of_module[name] for name in libraries & of_module.keys()}
+    # No package of a distribution may depend on one of pip: such a key stands where nothing runs without its library.
+    wanted = {of_module[name] for name in libraries & of_module.keys()}
+    optional = {key for key in wanted if key.endswith("-pip") and KNOWN["keys"][key]["pip"] not in required(package)}
+    assert keys(package, "exec_depend") == wanted - optional
     assert keys(package, "test_depend") == set(KNOWN["test_keys"])
 
 
 def test_the_page_installs_what_rosdep_has_no_key_for() -> None:
     (line,) = re.findall(r"^.*pip install (.*)$", PAGE, re.MULTILINE)
     named = {re.split("[<>=]", requirement)[0] for requirement in shlex.split(line)}
-    assert named == set(KNOWN["pip_only"].values())
+    needed = set().union(*(required(package) for package in FOLDERS))
+    by_pip = {entry["pip"] for entry in KNOWN["keys"].values() if "pip" in entry}
+    assert named == set(KNOWN["pip_only"].values()) | (by_pip - needed)
     used = frozenset().union(*(imported(package) for package in FOLDERS))
     assert KNOWN["pip_only"].keys() <= used
     assert {entry["module"] for entry in KNOWN["keys"].values()} <= used

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import pytest
 
 from pendulum_msgs_py.programs.executables import summary
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 
 FOLDERS = {
     "pendulum_msgs_py": "pendulum_msgs_py",
@@ -150,7 +150,10 @@ def test_every_program_is_an_entry_point_of_the_installed_distribution(package: 
 
 
 def test_the_build_scripts_are_one_and_the_same_file() -> None:
-    assert len({(PROJECT / folder / "setup.py").read_bytes() for folder in FOLDERS.values()}) == 1
+    assert (
+        len({(PROJECT / folder / "setup.py").read_bytes() for folder in (*FOLDERS.values(), "tests/pendulum_testing")})
+        == 1
+    )
 
 
 @pytest.mark.parametrize("package", FOLDERS)

@@ -11,9 +11,9 @@ import pytest
 from pendulum_bags.pendulum_cli import SECTIONS, main
 from pendulum_msgs_py.programs import completion
 from pendulum_msgs_py.programs.executables import tables_of
+from pendulum_testing.fixtures import PROJECT
 from tests.acceptance.test_packaging import FOLDERS, executables
 from tests.completing import completed
-from tests.fixtures import PROJECT
 
 COMMANDS = {name: target for section in SECTIONS.values() for name, target in section.items()}
 BAG = "bags/examples/regulation_sim"

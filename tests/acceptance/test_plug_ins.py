@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from pendulum_rosbag.reader import read_bag
-from tests.fixtures import PROJECT
-from tests.synthetic_runs import write_run_folder
+from pendulum_testing.fixtures import PROJECT
+from pendulum_testing.synthetic_runs import write_run_folder
 
 PACKAGES = (
     "pendulum_msgs_py/pendulum_msgs_py",

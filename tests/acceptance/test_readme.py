@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from pendulum_hw_bridge.checks.check_cli import EXIT_BUSY
-from tests.fixtures import PROJECT
-from tests.processes import ProcessGroup
+from pendulum_testing.fixtures import PROJECT
+from pendulum_testing.processes import ProcessGroup
 
 PAGES = sorted(
     path

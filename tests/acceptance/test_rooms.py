@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from pendulum_testing.fixtures import PROJECT
 from tests.acceptance.test_packaging import FOLDERS
-from tests.fixtures import PROJECT
 
 _MOST_FILES = 40
 """More modules than this in one folder, and nobody finds the right one by looking."""

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.fixtures import PROJECT, wait_for
-from tests.processes import ProcessGroup
+from pendulum_testing.fixtures import PROJECT, wait_for
+from pendulum_testing.processes import ProcessGroup
 from tests.suite import exit_code, rooms
 
 _RUN = """
 import sys
 from tests.suite import Part, run_parts
-lanes = [[Part(name, ["-p", "tests.fixtures", name], workers=1, nice=nice) for name in lane.split()]
+lanes = [[Part(name, ["-p", "pendulum_testing.fixtures", name], workers=1, nice=nice) for name in lane.split()]
          for lane, nice in zip(sys.argv[1:], (0, 7))]
 raise SystemExit(run_parts(*lanes))
 """
@@ -38,7 +38,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from tests.fixtures import wait_for
+from pendulum_testing.fixtures import wait_for
 
 def test_share() -> None:
     if not Path("/proc/self/autogroup").exists():

@@ -23,8 +23,8 @@ from pendulum_bags.identification.window_score import free_run, window_score
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_rosbag.reader import read_bag, same_messages
+from pendulum_testing.identification_truths import OUTSIDE, TRUTHS, covered, outside
 from tests.benchmarks import Peer, Row, measured, peer
-from tests.benchmarks.identification_truths import OUTSIDE, TRUTHS, covered, outside
 from tests.benchmarks.thesis_trials import hand_recording, staircase_recording
 
 DATA = Path(os.environ.get("PENDULUM_SHARED_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pendulum_bags.comparison import compare_folders
 from pendulum_bags.report import write_report
+from pendulum_testing.synthetic_runs import write_run_folder
 from tests.benchmarks import Row, measured
-from tests.synthetic_runs import write_run_folder
 
 RUNS = 50
 """Runs of the pooled report: two bags each."""

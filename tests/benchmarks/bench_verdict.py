@@ -12,8 +12,8 @@ from pendulum_bags.comparison import Looks, Margins, Outcome
 from pendulum_bags.comparison.equivalence import EquivalenceTest
 from pendulum_bags.comparison.same_run import paired_tests
 from pendulum_bags.runs.series import Series
+from pendulum_testing.plant_pairs import SIMULATED, pair
 from tests.benchmarks import Row, counted
-from tests.plant_pairs import SIMULATED, pair
 
 AT_MARGIN = 300
 """Trials of a machine that lies on every margin at once: 15 false answers of 300 are 5 %."""

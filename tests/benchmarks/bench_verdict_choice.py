@@ -18,8 +18,8 @@ from pendulum_bags.verdict import Mark
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_testing.plant_pairs import K
 from tests.benchmarks import Row, counted
-from tests.plant_pairs import K
 
 TRIALS = 300
 """Trials in which the simulation picks a gain on the margin, or beyond it."""

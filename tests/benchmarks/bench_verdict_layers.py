@@ -34,8 +34,8 @@ from pendulum_lqr.responses.measured_response import MeasuredResponse
 from pendulum_lqr.responses.sampled_response import model_response
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.stepping.sensors import Sensors
+from pendulum_testing.plant_pairs import K as THESIS_GAIN
 from tests.benchmarks import Row, counted, measured
-from tests.plant_pairs import K as THESIS_GAIN
 
 PAIRS, GAINS = 50, 1000
 AT_MARGIN = 300

@@ -13,9 +13,9 @@ import psutil
 
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_msgs_py.programs import graph
+from pendulum_testing.processes import ProcessGroup
 from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment
 from tests.benchmarks.two_plants import patient_watchdog
-from tests.processes import ProcessGroup
 
 __all__ = ["BridgeLoopFigures", "loop_figures"]
 

@@ -18,9 +18,9 @@ from pathlib import Path
 import psutil
 import websockets
 
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.benchmarks.plant_listener import PlantListener, cpu_time
 from tests.benchmarks.two_plants import two_plants
-from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = ["CHROMIUM", "Look", "looks", "start_console"]
 

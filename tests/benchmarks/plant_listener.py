@@ -16,7 +16,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.ros.convert import stamp_from_message
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
 
 __all__ = ["PlantListener", "cpu_time", "domain_environment", "missed_share"]
 

@@ -19,9 +19,9 @@ import psutil
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.benchmarks.limit_loop import build_limit
 from tests.benchmarks.plant_listener import PlantListener, cpu_time, domain_environment, missed_share
-from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = [
     "LimitFigures",

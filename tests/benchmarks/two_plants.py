@@ -12,9 +12,9 @@ from pathlib import Path
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.session import ANSWER_PRIORITY, PLANT_PRIORITY, in_real_time
 from pendulum_msgs_py.programs import graph
+from pendulum_testing.fixtures import PROJECT
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.benchmarks.plant_listener import PlantListener, domain_environment
-from tests.fixtures import PROJECT
-from tests.processes import ProcessGroup, RunningProgram
 
 __all__ = ["PLANTS", "RATE", "TwoPlants", "patient_watchdog", "two_plants"]
 

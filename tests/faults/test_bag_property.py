@@ -16,7 +16,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_messages import JOINT_STATE, STORE, write_bag
+from pendulum_testing.bag_messages import JOINT_STATE, STORE, write_bag
 from tests.tools.faults.bag_property import POSITION_MARK, TorqueRecord, check_bag
 
 _BEGIN = 1_700_000_000_000_000_000

@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 
 
 def test_whatever_ends_a_compiled_loop_leaves_a_healthy_process(domain_id: int) -> None:

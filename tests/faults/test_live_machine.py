@@ -22,7 +22,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import plant_mode, stamp_from_message
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
 
 _LIFETIME_NS = NANOSECONDS // 20
 """Age at which the plant no longer believes a command, and the drive no longer acts on one [ns]."""

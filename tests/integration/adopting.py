@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.exports.model_files import mjcf
-from tests.processes import ProcessGroup, RunningProgram
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 
 __all__ = ["EFFORTS", "adopt", "start_robot", "write_model"]
 

@@ -18,8 +18,8 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_msgs_py.ros import qos
-from tests.plant_peer import PlantPeer
-from tests.processes import ProcessGroup
+from pendulum_testing.plant_peer import PlantPeer
+from pendulum_testing.processes import ProcessGroup
 
 _PLANTS = (
     graph.simulator("/lab", rate_hz=100.0),

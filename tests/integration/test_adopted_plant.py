@@ -17,11 +17,11 @@ from trajectory_msgs.msg import JointTrajectory
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message, trajectory_to_message
-from tests.fixtures import PROJECT, own_domain
+from pendulum_testing.fixtures import PROJECT, own_domain
+from pendulum_testing.plant_peer import PlantPeer
+from pendulum_testing.processes import ProcessGroup, RunningProgram
+from pendulum_testing.trajectories import from_points
 from tests.integration.adopting import EFFORTS, adopt, start_robot
-from tests.plant_peer import PlantPeer
-from tests.processes import ProcessGroup, RunningProgram
-from tests.trajectories import from_points
 
 
 class Peer(PlantPeer):

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from pendulum_msgs_py.ros import arrivals
 from pendulum_msgs_py.ros.answers import answer_who_listens
 from pendulum_msgs_py.ros.polled import PollingNode
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
 
 REQUESTS = 30
 SERVICE = "/server/set_parameters"

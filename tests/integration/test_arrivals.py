@@ -18,8 +18,8 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.ros import arrivals, qos
 from pendulum_msgs_py.ros.arrivals import ArrivalSignal
 from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
-from tests.fixtures import wait_for
-from tests.graph_peer import GraphPeer
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.graph_peer import GraphPeer
 
 ROUNDS = 8
 """Entities that go under fire; 1000 were tried by hand."""

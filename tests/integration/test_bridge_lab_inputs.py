@@ -10,8 +10,8 @@ from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.ros import qos
-from tests.graph_peer import GraphPeer
-from tests.processes import ProcessGroup
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.processes import ProcessGroup
 
 
 class Bench(GraphPeer):

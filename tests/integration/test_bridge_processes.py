@@ -21,10 +21,10 @@ from pendulum_hw_bridge.port.actuator import Strategy
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message
-from tests.fixtures import PROJECT, own_domain
-from tests.graph_peer import GraphPeer
-from tests.processes import ProcessGroup, RunningProgram
-from tests.udp_address import free_udp_address
+from pendulum_testing.fixtures import PROJECT, own_domain
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.processes import ProcessGroup, RunningProgram
+from pendulum_testing.udp_address import free_udp_address
 
 RELEASED_AT_ONCE = 0.15
 """Several times what it takes, and less than a plant waits for its last words to be heard [s]."""

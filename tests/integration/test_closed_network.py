@@ -14,8 +14,8 @@ import pytest
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.ros import middleware
 from pendulum_msgs_py.ros.middleware import check_closed, middleware_defaults, participant_number
-from tests.fixtures import PROJECT
-from tests.processes import ProcessGroup, RunningProgram
+from pendulum_testing.fixtures import PROJECT
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.tools.faults.network import PLANT_ADDRESS, two_machines, why_not
 
 _FAST = "rmw_fastrtps_cpp"

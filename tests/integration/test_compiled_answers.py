@@ -19,8 +19,8 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state, encode_joints
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message
-from tests.graph_peer import GraphPeer
-from tests.processes import ProcessGroup
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.processes import ProcessGroup
 
 STATE: dict[str, Any] = {"position": math.pi + 0.01, "velocity": 0.1, "effort": 0.0}
 SECOND = 1_000_000_000

@@ -12,8 +12,8 @@ from std_msgs.msg import String
 
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.ros import qos
-from tests.graph_peer import GraphPeer
-from tests.processes import ProcessGroup
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.processes import ProcessGroup
 
 _SPACES = ("/a", "/b")
 _MS = 1_000_000

@@ -21,9 +21,9 @@ from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joints
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.ros import qos
-from tests.fixtures import own_domain
-from tests.plant_peer import PlantPeer
-from tests.processes import ProcessGroup
+from pendulum_testing.fixtures import own_domain
+from pendulum_testing.plant_peer import PlantPeer
+from pendulum_testing.processes import ProcessGroup
 
 _STEPS = 240
 _PERIOD_NS = 2_000_000

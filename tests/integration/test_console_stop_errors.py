@@ -19,8 +19,8 @@ from pendulum_bags.console.console_node import Hub
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.ros import qos
-from tests.fixtures import wait_for
-from tests.graph_peer import GraphPeer
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.graph_peer import GraphPeer
 
 FIRST, SECOND = "/first/plant", "/second/plant"
 DEADLINE = 20.0

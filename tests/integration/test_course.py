@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 
 PAGE = PROJECT / "bags" / "pendulum_bags" / "docs" / "course.md"
 

@@ -35,9 +35,9 @@ from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.programs.executables import run_package
 from pendulum_rosbag.reader import read_bag, same_messages
+from pendulum_testing.policies import linear_policy
 from tests.acceptance.test_docs import JOINTS
 from tests.acceptance.test_readme import FROM_STAIRS
-from tests.policies import linear_policy
 
 
 def run_experiment(*arguments: str | Path | float, timeout: float = 150.0) -> subprocess.CompletedProcess[str]:

@@ -13,8 +13,8 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message
 from pendulum_sim.exports.model_files import mjcf
-from tests.plant_peer import PlantPeer
-from tests.processes import ProcessGroup, RunningProgram
+from pendulum_testing.plant_peer import PlantPeer
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 
 pytest.importorskip("mujoco")
 

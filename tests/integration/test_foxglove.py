@@ -15,10 +15,10 @@ import pytest
 
 from pendulum_bags.live.handshake import as_asked, parse, refusal, to_server
 from pendulum_msgs_py.errors import FaultError
-from tests.fixtures import wait_for
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.plant_peer import PlantPeer
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.foxglove_client import FoxgloveClient, foxglove_client
-from tests.plant_peer import PlantPeer
-from tests.processes import ProcessGroup, RunningProgram
 
 
 def head(path: str = "/", **headers: str) -> bytes:

@@ -20,8 +20,8 @@ from std_srvs.srv import SetBool
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.ros import qos
-from tests.graph_peer import GraphPeer
-from tests.udp_address import free_udp_address
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.udp_address import free_udp_address
 
 pytest.importorskip("hebi", reason="hebi-py is not installed")
 

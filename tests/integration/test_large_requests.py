@@ -16,7 +16,7 @@ from pendulum_msgs_py.ros import requests
 from pendulum_msgs_py.ros.answers import answer_who_listens
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.requests import MOST_BYTES, TooLarge, take_request
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_sim.exports import model_files
 from pendulum_sim.pictures import markers_node, viewer_node
 from pendulum_sim.simulator import simulator_node
-from tests.fixtures import PROJECT
+from pendulum_testing.fixtures import PROJECT
 
 LAUNCH_FILES = sorted(PROJECT.glob("pendulum_*/launch/*.launch.py"))
 DEFAULTS = {argument.name: argument.default for argument in ARGUMENTS}

@@ -14,8 +14,8 @@ from rclpy.node import Node
 
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_msgs_py.ros.e_stop import EStopServer
-from tests.fixtures import PROJECT
-from tests.processes import ProcessGroup, RunningProgram
+from pendulum_testing.fixtures import PROJECT
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 
 DEADLINE = 60.0
 _PLANT_NODES = ("simulator", "simulator_e_stop")

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from pendulum_bags.experiments import move_cli
-from tests.processes import ProcessGroup, RunningProgram
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 
 PATIENCE = 60.0
 

@@ -24,10 +24,10 @@ from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message, stamp_to_message, trajectory_to_message
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
-from tests.fixtures import PROJECT, own_domain
-from tests.graph_peer import GraphPeer
-from tests.processes import ProcessGroup, RunningProgram
-from tests.trajectories import from_points
+from pendulum_testing.fixtures import PROJECT, own_domain
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.processes import ProcessGroup, RunningProgram
+from pendulum_testing.trajectories import from_points
 
 PERIODS_TO_ZERO = 15
 """Periods, 10 ms or 5, counted by the plant, in which torque may last: a command counts for 50 ms, and is on its way

@@ -14,9 +14,9 @@ from pendulum_bags.experiments.conductor_node import Conductor
 from pendulum_bags.experiments.graph_plant import join
 from pendulum_msgs_py.errors import FaultError
 from pendulum_rosbag.reader import read_bag
+from pendulum_testing.plant_peer import PlantPeer
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.integration.adopting import adopt, start_robot, write_model
-from tests.plant_peer import PlantPeer
-from tests.processes import ProcessGroup, RunningProgram
 
 pytest.importorskip("mujoco")
 

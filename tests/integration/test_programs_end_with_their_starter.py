@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from pendulum_rosbag.reader.bag import read_bag
-from tests.fixtures import wait_for
-from tests.processes import ProcessGroup
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.processes import ProcessGroup
 
 _PATIENCE = 60.0
 """[s]"""

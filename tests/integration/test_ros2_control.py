@@ -15,9 +15,9 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.exports.model_files import urdf
-from tests.fixtures import PROJECT
-from tests.graph_peer import GraphPeer
-from tests.processes import ProcessGroup
+from pendulum_testing.fixtures import PROJECT
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.processes import ProcessGroup
 
 IN_SIM = ("--ros-args", "-r", "__ns:=/sim")
 PATIENT = ("-p", "command_timeout:=1.0")

@@ -17,8 +17,8 @@ from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 from pendulum_rosbag.reader import read_bag
-from tests.fixtures import wait_for
-from tests.processes import ProcessGroup
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.processes import ProcessGroup
 
 
 def test_an_excitation_is_played_alone_on_a_running_plant_and_ends_at_zero_torque(

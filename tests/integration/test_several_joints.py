@@ -17,9 +17,9 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.ros import qos
 from pendulum_rosbag.reader import read_bag
+from pendulum_testing.policies import lqr_policy
+from pendulum_testing.refusals import Refused, not_refused
 from tests.joints_peer import JointsPeer
-from tests.policies import lqr_policy
-from tests.refusals import Refused, not_refused
 
 JOINTS = ["shoulder", "elbow"]
 

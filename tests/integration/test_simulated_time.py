@@ -13,8 +13,8 @@ from sensor_msgs.msg import JointState
 
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.simulated_time import live_by_stamps
-from tests.fixtures import wait_for
-from tests.graph_peer import GraphPeer
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.graph_peer import GraphPeer
 
 
 @pytest.fixture

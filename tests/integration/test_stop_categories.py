@@ -15,8 +15,8 @@ from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message
-from tests.plant_peer import PlantPeer
-from tests.processes import ProcessGroup
+from pendulum_testing.plant_peer import PlantPeer
+from pendulum_testing.processes import ProcessGroup
 
 _STOP_TIME = 0.8
 """[s]"""

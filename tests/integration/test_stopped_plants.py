@@ -16,10 +16,10 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
-from tests.fixtures import PROJECT, own_domain, wait_for
+from pendulum_testing.fixtures import PROJECT, own_domain, wait_for
+from pendulum_testing.plant_peer import PlantPeer
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.integration.adopting import adopt, start_robot, write_model
-from tests.plant_peer import PlantPeer
-from tests.processes import ProcessGroup, RunningProgram
 
 pytest.importorskip("mujoco")
 

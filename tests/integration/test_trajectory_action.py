@@ -15,8 +15,8 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.trajectory import Trajectory, TrajectoryPoint
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import trajectory_to_message
-from tests.graph_peer import GraphPeer
-from tests.processes import ProcessGroup, RunningProgram
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 
 _WHY = "control_msgs is not among the wheels; it needs a full ROS installation"
 ACTION = pytest.importorskip("control_msgs.action", reason=_WHY).FollowJointTrajectory

@@ -15,8 +15,8 @@ from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import PlantLimits
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.commander_watch import CommanderWatch
-from tests.fixtures import wait_for
-from tests.graph_peer import GraphPeer
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.graph_peer import GraphPeer
 
 _PATIENCE = 30.0
 

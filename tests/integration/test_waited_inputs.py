@@ -13,8 +13,8 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.ros import arrivals, qos
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.turns import Turns
-from tests.fixtures import wait_for
-from tests.graph_peer import GraphPeer
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.graph_peer import GraphPeer
 
 STATE = encode_joint_state(1, position=1.0, velocity=2.0, effort=3.0)
 

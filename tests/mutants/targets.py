@@ -232,7 +232,7 @@ TARGETS: tuple[Target, ...] = (
     Target(
         "pendulum_hw_bridge.nodes.bridge_node",
         ("BridgeNode._fail", "BridgeNode._quieten", "BridgeNode.release_actuator"),
-        (f"{_BRIDGE}/test_bridge_node_rules.py",),
+        ("tests/faults/test_bridge_node_rules.py",),
     ),
 )
 

@@ -19,8 +19,10 @@ from pendulum_bags.runs.run_data import plant_summary, read_run
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.storage import BagWriter
+from pendulum_testing.fixtures import PROJECT, in_repository
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLES = PROJECT / "bags" / "examples"
+pytestmark = in_repository
 
 
 @pytest.fixture

@@ -23,8 +23,8 @@ from pendulum_lqr.responses.gap_metric import Scaling
 from pendulum_lqr.responses.measured_response import MeasuredResponse, read_response, write_response
 from pendulum_lqr.responses.sampled_response import model_response
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from tests.policies import linear_policy
-from tests.synthetic_runs import regulate, run_metadata, write_bag, write_run_folder
+from pendulum_testing.policies import linear_policy
+from pendulum_testing.synthetic_runs import regulate, run_metadata, write_bag, write_run_folder
 
 GOOD, BAD = "q=100,0.01 r=0.1", "k=400,0.1"
 

@@ -26,7 +26,7 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_msgs_py.programs.terminal import make_console
 from pendulum_rosbag.storage import BagWriter
-from tests.synthetic_runs import regulate, run_metadata, write_bag, write_run_folder
+from pendulum_testing.synthetic_runs import regulate, run_metadata, write_bag, write_run_folder
 
 
 @pytest.fixture(scope="module")

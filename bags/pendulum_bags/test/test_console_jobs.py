@@ -10,7 +10,7 @@ import pytest
 from pendulum_bags.console.console_node import main
 from pendulum_bags.console.jobs import Jobs, NewestPage
 from pendulum_msgs_py.errors import FaultError
-from tests.fixtures import wait_for
+from pendulum_testing.fixtures import wait_for
 
 
 def test_the_newest_page_of_a_kind_is_found_among_all_runs(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from pendulum_bags.experiments.excite_cli import main as excite_main
 from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run, seal_plant
-from tests.synthetic_runs import write_events_and_torque
+from pendulum_testing.synthetic_runs import write_events_and_torque
 
 SEEDS = range(6)
 

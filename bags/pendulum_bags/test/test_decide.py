@@ -22,7 +22,7 @@ from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.runs.run_folder import read_looks
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_bags.verdict.same_run import same_run_layer
-from tests.synthetic_runs import regulate, run_metadata, write_bag
+from pendulum_testing.synthetic_runs import regulate, run_metadata, write_bag
 
 NOISE = NoiseSettings(duration=2.0)
 SETTINGS = RegulationSettings(noise=NOISE)

@@ -11,7 +11,7 @@ import pytest
 
 from pendulum_bags.experiments.processes import ProcessSet
 from pendulum_msgs_py.errors import FaultError
-from tests.fixtures import wait_for
+from pendulum_testing.fixtures import wait_for
 
 _LOGS_AND_ENDS = """
 import sys

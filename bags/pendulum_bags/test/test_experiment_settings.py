@@ -21,7 +21,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.stepping.plants import make_plant
-from tests.policies import linear_policy
+from pendulum_testing.policies import linear_policy
 
 # Not those that need a file or a task of their own to be designed.
 _NODE_OWN = {"controller", "plant", "use_sim_time"}

@@ -12,7 +12,7 @@ from pendulum_bags.identification.options import Geometry, Options
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import PendulumError
-from tests.scipy_pendulum import coulomb_pendulum, tones
+from pendulum_testing.scipy_pendulum import coulomb_pendulum, tones
 
 PERIOD, NOISE = 0.01, 5e-4
 QUICK = Options(friction="coulomb", multi_start=False, folds=2)

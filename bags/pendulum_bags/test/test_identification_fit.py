@@ -17,7 +17,7 @@ from pendulum_bags.identification.uncertainty import profile_interval
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant_file
-from tests.synthetic_recordings import multisine, synthetic_recording
+from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
 TRUTH = PlantParameters(
     inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05, angle_offset=0.01, transport_delay=0.006

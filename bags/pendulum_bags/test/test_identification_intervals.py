@@ -19,8 +19,8 @@ from pendulum_bags.identification.uncertainty import unresolved_offset
 from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from tests.benchmarks.identification_truths import OUTSIDE, TRUTHS, covered, outside
-from tests.synthetic_recordings import synthetic_recording
+from pendulum_testing.identification_truths import OUTSIDE, TRUTHS, covered, outside
+from pendulum_testing.synthetic_recordings import synthetic_recording
 
 
 def test_intervals_of_the_default_path_hold_the_truth():

@@ -10,7 +10,7 @@ from pendulum_bags.identification.window_score import free_run, window_score
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from tests.synthetic_recordings import multisine, synthetic_recording
+from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
 PLANT = PlantParameters(
     inertia=0.05,

@@ -16,8 +16,8 @@ from pendulum_bags.runs.datasets import Recording, distinct_names
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from tests.bag_messages import joint_state, write_bag
-from tests.synthetic_recordings import multisine, synthetic_recording
+from pendulum_testing.bag_messages import joint_state, write_bag
+from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
 TRUTH = PlantParameters(inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05, transport_delay=0.006)
 QUICK = Options(friction="coulomb", multi_start=False, folds=2)

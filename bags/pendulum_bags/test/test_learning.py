@@ -25,7 +25,7 @@ from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import DataError, FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.stepping.plants import make_plant
-from tests.policies import random_policy
+from pendulum_testing.policies import random_policy
 
 DFKI = load_plant("dfki")
 FEW_TRIALS, FEW_EPISODES = 3, 2

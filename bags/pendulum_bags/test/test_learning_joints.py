@@ -19,7 +19,7 @@ from pendulum_bags.learning.training import Training, checkpoint_path, train
 from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
-from tests.policies import random_policy
+from pendulum_testing.policies import random_policy
 
 CART_POLE, DOUBLE = load_mechanism("cart_pole"), load_mechanism("double_pendulum")
 QUIET = SwingUpTask(delay=0.0, jitter=0.0, angle_noise=0.0, velocity_noise=0.0, offset=0.0, kick=0.0, kick_rate=0.0)

@@ -21,7 +21,7 @@ from pendulum_bags.studies.mechanism_benchmark import benchmark_plant
 from pendulum_bags.studies.mechanism_benchmark_runs import make_stepper, swing_up
 from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_lqr.swing_up.mechanism_catch import deviation_of
-from tests.policies import random_policy
+from pendulum_testing.policies import random_policy
 
 PENDUBOT = benchmark_plant("pendubot")
 TASK = SwingUpTask(period=0.004, share=0.0, delay=0.0, jitter=0.0, offset=0.0, kick=0.0, episode=0.4)

@@ -26,8 +26,8 @@ from pendulum_bags.experiments.session import (
 )
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.realtime import may_run_in_real_time
-from tests.fixtures import wait_for
-from tests.udp_address import free_udp_address
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.udp_address import free_udp_address
 
 _allowed = pytest.mark.skipif(
     not may_run_in_real_time(PLANT_PRIORITY), reason="this user may have no real-time priority"

@@ -28,7 +28,7 @@ from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from tests.policies import random_policy
+from pendulum_testing.policies import random_policy
 
 T = 0.002 * np.arange(5000)
 ENDS = {

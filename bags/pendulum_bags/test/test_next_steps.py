@@ -23,8 +23,8 @@ from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.next_test import next_test_of, question_of
 from pendulum_bags.verdict.same_run import same_run_layer
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from tests.plant_pairs import SIMULATED, pair
-from tests.synthetic_recordings import multisine, synthetic_recording
+from pendulum_testing.plant_pairs import SIMULATED, pair
+from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
 THESIS = "python -m pendulum_bags experiment thesis"
 QUICK = Options(friction="viscous", folds=2, multi_start=False)

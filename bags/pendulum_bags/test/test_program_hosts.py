@@ -15,7 +15,7 @@ from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, keep_po
 from pendulum_bags.experiments.processes import ProcessSet
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs.realtime import may_run_in_real_time
-from tests.fixtures import wait_for
+from pendulum_testing.fixtures import wait_for
 
 PROGRAMS = """
 import ctypes, gc, os, signal, socket, sys, threading, time

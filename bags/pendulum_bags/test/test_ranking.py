@@ -26,8 +26,8 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader.mcap_source import McapSource
 from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.storage import BagWriter
-from tests.policies import linear_policy
-from tests.synthetic_runs import regulate, run_metadata, write_bag, write_events_and_torque
+from pendulum_testing.policies import linear_policy
+from pendulum_testing.synthetic_runs import regulate, run_metadata, write_bag, write_events_and_torque
 
 COSTS = st.lists(st.tuples(st.floats(0.1, 10.0), st.floats(0.1, 10.0)), min_size=3, max_size=8)
 

@@ -20,7 +20,7 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_rosbag.storage import BagWriter
 from pendulum_sim.stepping.plants import make_plant
-from tests.synthetic_runs import regulate, run_metadata, write_bag
+from pendulum_testing.synthetic_runs import regulate, run_metadata, write_bag
 
 DFKI = Path("dfki_torque_limited_simple_pendulum")
 

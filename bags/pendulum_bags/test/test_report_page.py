@@ -39,9 +39,9 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.storage import BagWriter
-from tests.fixtures import PROJECT
-from tests.npm import install_packages
-from tests.synthetic_runs import write_run_folder
+from pendulum_testing.fixtures import PROJECT, in_repository
+from pendulum_testing.npm import install_packages
+from pendulum_testing.synthetic_runs import write_run_folder
 
 
 @pytest.fixture(scope="module")
@@ -484,6 +484,7 @@ def test_every_text_of_a_report_says_that_the_hardware_was_emulated() -> None:
     )
 
 
+@in_repository
 def test_provenance_names_plant_and_citation_and_the_file_at_the_root_agrees(comparison: Comparison) -> None:
     rows = dict(provenance_table(ReportData(comparison, {"versions": {"pendulum_bags": "0.1.0"}})).rows)
     assert rows["plant of the design"].startswith("thesis: inertia 0.055 kg m², damping 11.77 N m s/rad, gravity 1.6")
@@ -671,6 +672,7 @@ def test_page_is_whole_and_usable(visit: Any) -> None:
     assert visit.messages == []
 
 
+@in_repository
 @needs_browser
 def test_axe_finds_nothing_on_a_report(visit: Any) -> None:
     axe = PROJECT / "tests" / "axe"

@@ -16,7 +16,7 @@ from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty, r
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 from pendulum_msgs_py.programs.terminal import make_console
-from tests.synthetic_runs import write_run_folder
+from pendulum_testing.synthetic_runs import write_run_folder
 
 STALL = PlantStoppedError("/hw", "fault", "host_stalled: bridge did not run for 610 ms; expected at most 500 ms")
 

@@ -14,7 +14,7 @@ from pendulum_bags.studies.study_file import load_study, shipped_studies
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from tests.policies import linear_policy
+from pendulum_testing.policies import linear_policy
 
 HEAD = "format: pendulum_study/1\nname: small\n"
 BODY = "plants:\n  sim: {}\ncontrollers:\n  lqr: {}\n"

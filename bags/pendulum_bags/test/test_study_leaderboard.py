@@ -29,7 +29,8 @@ from pendulum_lqr.controller_interface.controller import CONTROLLERS
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag
-from tests.policies import linear_policy
+from pendulum_testing.fixtures import PROJECT, in_repository
+from pendulum_testing.policies import linear_policy
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -144,8 +145,9 @@ def test_a_policy_file_is_on_the_board_by_its_name(tmp_path: Path, capsys: pytes
     assert main([*arguments, "--controllers", str(tmp_path / "none.npz")]) == 2
 
 
+@in_repository
 def test_a_recorded_run_of_the_machine_is_scored_as_a_simulated_one_is() -> None:
-    example = Path(__file__).parents[2] / "examples" / "regulation_hw"
+    example = PROJECT / "bags" / "examples" / "regulation_hw"
     arrays = arrays_of_bag(example, "/hw")
     assert arrays.stamp_ns.size == arrays.applied.size + 1
     success, uptime, costs = costs_of(arrays)

@@ -20,9 +20,9 @@ from pendulum_bags.studies.monte_carlo import MonteCarlo, sobol
 from pendulum_bags.studies.random_runs import draw_chunk, replay, run_chunk, run_monte_carlo
 from pendulum_bags.studies.uncertain import Uncertainty, parse_uncertainty, uncertainty_of
 from pendulum_msgs_py.errors import BagError, ParameterError
-from tests.fixtures import wait_for
+from pendulum_testing.fixtures import PROJECT, in_repository, wait_for
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLES = PROJECT / "bags" / "examples"
 SMALL = MonteCarlo(runs=700, chunk=300, duration=0.4)
 
 
@@ -105,6 +105,7 @@ def test_an_interrupted_monte_carlo_goes_on_and_workers_change_no_bit(tmp_path: 
 
 
 @arrow
+@in_repository
 def test_a_cluster_that_loses_a_worker_mid_run_gives_the_same_bits(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     settings = replace(SMALL, chunk=50)

@@ -32,7 +32,7 @@ from pendulum_bags.studies.runner import open_study_folder, run_study
 from pendulum_bags.studies.study_file import Study, load_study
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
-from tests.synthetic_runs import write_run_folder
+from pendulum_testing.synthetic_runs import write_run_folder
 
 TEXT = """format: pendulum_study/1
 name: small

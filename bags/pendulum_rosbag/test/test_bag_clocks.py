@@ -14,7 +14,7 @@ from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.clock import steps_back
 from pendulum_rosbag.reader.export_cli import main as export_main
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_readers import JOINT_STATE, STRING, text_message
+from pendulum_testing.bag_readers import JOINT_STATE, STRING, text_message
 
 COUNT = 2000
 STEP_AT = 900

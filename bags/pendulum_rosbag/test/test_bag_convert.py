@@ -24,8 +24,8 @@ from pendulum_rosbag.convert.rewrite import Choice, rewrite
 from pendulum_rosbag.executables import COMMANDS, EXECUTABLES
 from pendulum_rosbag.reader import read_bag, same_messages
 from pendulum_rosbag.storage import BagWriter, QosProfile
-from tests.bag_messages import STORE, mixed_messages
-from tests.bag_readers import JOINT_STATE, STRING, count_everywhere, text_message
+from pendulum_testing.bag_messages import STORE, mixed_messages
+from pendulum_testing.bag_readers import JOINT_STATE, STRING, count_everywhere, text_message
 
 SECOND = 1_000_000_000
 

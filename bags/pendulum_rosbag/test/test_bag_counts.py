@@ -18,7 +18,7 @@ from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.mcap_source import McapSource
 from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_messages import JOINT_STATE, write_bag
+from pendulum_testing.bag_messages import JOINT_STATE, write_bag
 
 TOPICS = ("/a", "/b")
 COUNT = 60

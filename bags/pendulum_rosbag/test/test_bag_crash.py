@@ -21,8 +21,16 @@ from pendulum_rosbag.storage import (
     sealed_mcap,
     storage_file,
 )
-from tests.bag_readers import ENDLESS_WRITER, JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
-from tests.mcap_js_reader import McapJs
+from pendulum_testing.bag_readers import (
+    ENDLESS_WRITER,
+    JOINT_STATE,
+    STRING,
+    count_everywhere,
+    count_in_order,
+    state,
+    text_message,
+)
+from pendulum_testing.mcap_js_reader import McapJs
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

@@ -15,7 +15,7 @@ from pendulum_rosbag.convert.rewrite import rewrite
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_readers import JOINT_STATE, state
+from pendulum_testing.bag_readers import JOINT_STATE, state
 
 COUNT = 200
 

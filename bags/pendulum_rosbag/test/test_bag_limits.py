@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pendulum_rosbag.convert.convert_cli import convert_main, merge_main
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_readers import STRING, count_everywhere, text_message
+from pendulum_testing.bag_readers import STRING, count_everywhere, text_message
 
 KINDS = [("mcap", None), ("mcap", "zstd"), ("sqlite3", None)]
 LEAST = {"mcap": 12_000, "sqlite3": 200_000}

@@ -14,7 +14,7 @@ from pendulum_rosbag.reader.export_cli import main as export_main
 from pendulum_rosbag.reader.info_cli import main as info_main
 from pendulum_rosbag.reader.topic_info import ros_topic, ros_type
 from pendulum_rosbag.storage import message_type
-from tests.bag_readers import JOINT_STATE, state
+from pendulum_testing.bag_readers import JOINT_STATE, state
 
 COUNT = 50
 SERVICE = """service_msgs/ServiceEventInfo info

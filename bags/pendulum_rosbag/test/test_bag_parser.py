@@ -17,7 +17,7 @@ from pendulum_rosbag.reader import Bag, canonical, read_bag, same_messages
 from pendulum_rosbag.reader.batches import Batch
 from pendulum_rosbag.reader.joint_state import JointStateParser, layout_of
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_messages import (
+from pendulum_testing.bag_messages import (
     JOINT_STATE,
     STORE,
     as_rclpy_leaves_it,

@@ -20,7 +20,7 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state, encode_joints
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_rosbag.reader import read_bag, read_bags, same_messages
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_messages import (
+from pendulum_testing.bag_messages import (
     JOINT_STATE,
     STORE,
     assert_equals_rosbags,

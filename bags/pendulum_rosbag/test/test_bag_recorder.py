@@ -32,9 +32,9 @@ from pendulum_rosbag.recorder import recorder_tap_node
 from pendulum_rosbag.recorder.options import RecorderOptions
 from pendulum_rosbag.recorder.recorder_node import Recorder
 from pendulum_rosbag.storage import BagWriter
-from tests.fixtures import wait_for
-from tests.graph_peer import GraphPeer
-from tests.processes import ProcessGroup
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.processes import ProcessGroup
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"

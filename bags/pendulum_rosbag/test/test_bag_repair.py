@@ -29,8 +29,8 @@ from pendulum_rosbag.reader.statistics import bag_statistics
 from pendulum_rosbag.repair.repair import repair_bag
 from pendulum_rosbag.repair.repair_cli import main as repair_main
 from pendulum_rosbag.storage import BagWriter, typestore
-from tests.bag_messages import JOINT_STATE, write_bag
-from tests.mcap_js_reader import McapJs
+from pendulum_testing.bag_messages import JOINT_STATE, write_bag
+from pendulum_testing.mcap_js_reader import McapJs
 
 TOPICS = ("/a", "/b", "/c")
 

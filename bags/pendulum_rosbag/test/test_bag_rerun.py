@@ -12,9 +12,9 @@ from mcap.writer import Writer as McapLibraryWriter
 
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_readers import ENDLESS_WRITER, JOINT_STATE, STRING, state, text_message
-from tests.fixtures import PROJECT
-from tests.rerun_reader import RerunMcap
+from pendulum_testing.bag_readers import ENDLESS_WRITER, JOINT_STATE, STRING, state, text_message
+from pendulum_testing.fixtures import PROJECT, in_repository
+from pendulum_testing.rerun_reader import RerunMcap
 
 PERIOD = 2_000_000
 """Time between two states [ns]."""
@@ -72,6 +72,7 @@ def test_rerun_opens_the_bag_of_a_killed_recorder(tmp_path: Path, rerun_mcap: Re
     assert sum(len(ours.raw(topic)) for topic in ours.topics) > 5000
 
 
+@in_repository
 def test_rerun_takes_the_bags_of_the_examples_and_makes_recordings_of_them(
     tmp_path: Path, rerun_mcap: RerunMcap
 ) -> None:

@@ -26,7 +26,7 @@ from pendulum_rosbag.storage import (
     message_type,
     metadata_file,
 )
-from tests.bag_readers import JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
+from pendulum_testing.bag_readers import JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
 
 JOINT_STATE_HASH = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
 """As Jazzy's own discovery reports it."""

@@ -17,7 +17,7 @@ from pendulum_rosbag.reader.info_cli import main as info_main
 from pendulum_rosbag.reader.statistics import bag_statistics, clock_jumps, time_statistics
 from pendulum_rosbag.reader.tables import export_bag, to_pandas
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_messages import (
+from pendulum_testing.bag_messages import (
     JOINT_STATE,
     STORE,
     joint_state,

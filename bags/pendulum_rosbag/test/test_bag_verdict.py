@@ -15,7 +15,7 @@ from pendulum_rosbag.convert.convert_cli import convert_main
 from pendulum_rosbag.reader.info_cli import main as info_main
 from pendulum_rosbag.reader.statistics import time_statistics
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_readers import JOINT_STATE, STRING, text_message
+from pendulum_testing.bag_readers import JOINT_STATE, STRING, text_message
 
 BEGIN = 1_700_000_000 * 10**9
 PERIOD = 10_000_000

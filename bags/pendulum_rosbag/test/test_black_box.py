@@ -17,8 +17,8 @@ from pendulum_msgs_py.ros.convert import event_message
 from pendulum_rosbag.reader.bag import read_bag
 from pendulum_rosbag.recorder.black_box import BlackBox
 from pendulum_rosbag.recorder.options import RecorderOptions
-from tests.plant_peer import PlantPeer
-from tests.processes import ProcessGroup
+from pendulum_testing.plant_peer import PlantPeer
+from pendulum_testing.processes import ProcessGroup
 
 _S = NANOSECONDS
 _NOW = 1000 * _S

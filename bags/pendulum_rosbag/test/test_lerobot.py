@@ -14,8 +14,8 @@ from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.export_cli import main as export_main
 from pendulum_rosbag.reader.lerobot import episodes_of, export_lerobot
 from pendulum_rosbag.storage import BagWriter
-from tests.bag_messages import JOINT_STATE, joint_state
-from tests.fixtures import PROJECT
+from pendulum_testing.bag_messages import JOINT_STATE, joint_state
+from pendulum_testing.fixtures import PROJECT, in_repository
 
 EXAMPLES = PROJECT / "bags" / "examples"
 PERIOD = 2_000_000
@@ -64,6 +64,7 @@ def test_a_short_hole_is_bridged_by_the_nearest_state_and_a_long_one_ends_the_ep
     assert len(second.state) == 55
 
 
+@in_repository
 def test_recordings_become_one_dataset_that_says_what_its_columns_are(tmp_path: Path) -> None:
     out = tmp_path / "dataset"
     bags = [str(EXAMPLES / name) for name in ("regulation_sim", "regulation_hw")]
@@ -109,6 +110,7 @@ def test_several_joints_are_columns_and_other_joints_no_part_of_the_dataset(tmp_
     assert not (tmp_path / "both").exists()
 
 
+@in_repository
 @pytest.mark.parametrize(
     ("options", "why"),
     [

@@ -18,8 +18,8 @@ from pendulum_rosbag.recorder.record_cli import main as record_main
 from pendulum_rosbag.recorder.session import RecordingSession
 from pendulum_rosbag.storage import BagWriter, mcap_layout, message_type
 from pendulum_rosbag.storage.stamps import stamp_reader
-from tests.fixtures import wait_for
-from tests.graph_peer import GraphPeer
+from pendulum_testing.fixtures import wait_for
+from pendulum_testing.graph_peer import GraphPeer
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"

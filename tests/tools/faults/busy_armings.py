@@ -29,9 +29,9 @@ from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.udp_address import free_udp_address
 from tests.tools.faults.press_times import busy_loops
-from tests.udp_address import free_udp_address
 
 __all__ = ["arm_busy_modules"]
 

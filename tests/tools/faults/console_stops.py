@@ -28,8 +28,8 @@ from std_msgs.msg import String
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
 from pendulum_msgs_py.ros import qos
-from tests.graph_peer import GraphPeer
-from tests.processes import ProcessGroup, RunningProgram
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.processes import ProcessGroup, RunningProgram
 from tests.tools.faults.outcome import Outcome
 
 __all__ = ["CHROMIUM", "MAX_DELAY", "QUIET", "SLOW_DISPLAY", "STOPS", "StopRig"]

@@ -34,9 +34,9 @@ from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.polled import PollingNode
+from pendulum_testing.udp_address import free_udp_address
 from tests.tools.faults.motor import NO_TORQUE, Asked, Drive, ModuleTruth, Witness, beyond_asked
 from tests.tools.faults.plants import EFFORT_LIMIT, SIMULATOR, Plant
-from tests.udp_address import free_udp_address
 
 __all__ = [
     "EFFORT_LIMIT",

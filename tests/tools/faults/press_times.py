@@ -36,10 +36,10 @@ from pendulum_msgs_py.programs.realtime import as_ordinary, run_in_real_time
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.middleware import set_middleware_defaults
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
+from pendulum_testing.udp_address import free_udp_address
 from tests.tools.faults.motor import NO_TORQUE, Drive, ModuleTruth
 from tests.tools.faults.plants import PLANTS, Plant
-from tests.udp_address import free_udp_address
 
 __all__ = ["FLOODS", "PressTimes", "busy_loops", "press_in_flood"]
 

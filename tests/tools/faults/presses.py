@@ -13,7 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import FaultError
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
 from tests.tools.faults.live import START_TIMEOUT, LiveSystem
 from tests.tools.faults.outcome import Fault, Outcome, demand_rest
 

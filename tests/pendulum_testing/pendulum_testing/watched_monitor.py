@@ -9,7 +9,7 @@ from pendulum_hw_bridge.drive.fault_table import FAULTS
 from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.port.actuator import Command, Strategy
 from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
-from tests.feedback_records import feedback_record
+from pendulum_testing.feedback_records import feedback_record
 
 __all__ = ["DRIVETRAIN", "LIMITS", "MILLISECOND", "PERIOD", "STEP", "TIMEOUT", "Watched"]
 

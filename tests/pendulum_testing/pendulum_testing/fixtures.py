@@ -1,4 +1,4 @@
-"""Fixtures and helpers that every test may use; ``conftest.py`` at the root makes them known everywhere.
+"""Fixtures and helpers that every test may use: pytest finds this module where the package is installed.
 
 Tests on the real middleware take ``domain_id``: a ROS domain of their own for as long as they run, also when
 several test runs share the machine. Tests with processes take ``processes``, which leaves none behind.
@@ -11,20 +11,23 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import pytest
+from hypothesis import settings
 
-from pendulum_bags.experiments.domain import reserve_domain
-from pendulum_bags.experiments.host_pool import HostPool
-from tests.mcap_js_reader import McapJs, mcap_js_process
-from tests.processes import ProcessGroup
-from tests.rerun_reader import RerunMcap, find_rerun
+from pendulum_testing.mcap_js_reader import McapJs, mcap_js_process
+from pendulum_testing.rerun_reader import RerunMcap, find_rerun
+
+if TYPE_CHECKING:
+    from pendulum_bags.experiments.host_pool import HostPool
+    from pendulum_testing.processes import ProcessGroup
 
 __all__ = [
     "PROJECT",
     "domain_id",
     "hosts",
+    "in_repository",
     "mcap_js",
     "own_domain",
     "processes",
@@ -33,8 +36,20 @@ __all__ = [
     "wait_for",
 ]
 
-PROJECT = Path(__file__).resolve().parents[1]
-"""The repository."""
+_MARK = Path("requirements", "run.in")
+PROJECT = next(
+    (folder for folder in (Path(__file__).resolve().parents[3], *Path.cwd().parents) if (folder / _MARK).is_file()),
+    Path.cwd(),
+)
+"""The repository; where a package lies by itself, the folder of the tests."""
+in_repository = pytest.mark.skipif(not (PROJECT / _MARK).is_file(), reason="reads files of the repository")
+"""Marks a test that reads what lies beside the packages."""
+
+# The same examples each time, so that a failure belongs to the change at hand; `--hypothesis-profile=explore` looks for
+# new ones. No deadline: on a busy machine it measures the neighbours.
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.register_profile("explore", max_examples=1000, deadline=None)
+settings.load_profile("repeatable")
 
 _T = TypeVar("_T")
 
@@ -94,7 +109,8 @@ def own_domain(folder: Path) -> Iterator[int]:
     Args:
         folder: For the logs of ROS.
     """
-    # Imported late: most tests know nothing of ROS.
+    # Imported late: most tests know nothing of ROS. The recordings' package comes last, after those it depends on.
+    reserve_domain = pytest.importorskip("pendulum_bags.experiments.domain").reserve_domain
     from rclpy.utilities import get_rmw_implementation_identifier
 
     from pendulum_msgs_py.ros.middleware import middleware_defaults
@@ -121,7 +137,7 @@ def domain_id(tmp_path: Path) -> Iterator[int]:
 @pytest.fixture(scope="session")
 def hosts() -> Iterator[HostPool]:
     """Keep the processes in which programs of tests run, one after the other: to start one takes half a second."""
-    with HostPool() as pool:
+    with pytest.importorskip("pendulum_bags.experiments.host_pool").HostPool() as pool:
         yield pool
 
 
@@ -131,6 +147,8 @@ def processes(tmp_path: Path, hosts: HostPool) -> Iterator[ProcessGroup]:
 
     They run in hosts, as those of studies do: a test that looks at how a program starts or ends starts it ``alone``.
     """
+    from pendulum_testing.processes import ProcessGroup
+
     group = ProcessGroup(tmp_path / "processes", PROJECT, hosts)
     yield group
     if leftovers := group.close():

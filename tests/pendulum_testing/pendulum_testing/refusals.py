@@ -34,7 +34,7 @@ def not_refused(cases: Sequence[Refused], *, namespace: str = "/sim") -> list[st
         for program, parameters, _ in cases
     ]
     done = subprocess.run(
-        [sys.executable, "-m", "tests.refusals", json.dumps(asked)],
+        [sys.executable, __file__, json.dumps(asked)],
         capture_output=True, text=True, timeout=60.0 + 20.0 * len(cases), check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr

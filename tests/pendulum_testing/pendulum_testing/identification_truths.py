@@ -13,7 +13,7 @@ from pendulum_bags.identification.model import from_plant
 from pendulum_bags.identification.result import IdentificationResult
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from tests.synthetic_recordings import multisine, synthetic_recording
+from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
 __all__ = ["OUTSIDE", "PLANT", "TRUTHS", "Truth", "covered", "outside"]
 

@@ -16,7 +16,7 @@ from pendulum_hw_bridge.port.actuator import (
     Strategy,
 )
 from pendulum_hw_bridge.port.settings import BridgeSettings
-from tests.lab_rig import Person, emulator
+from pendulum_testing.lab_rig import Person, emulator
 
 __all__ = ["BOTH", "Bench", "keeps_its_lifetime"]
 

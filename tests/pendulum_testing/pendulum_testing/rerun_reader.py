@@ -14,7 +14,7 @@ import pytest
 
 __all__ = ["RerunMcap", "find_rerun"]
 
-_PROJECT = Path(__file__).resolve().parents[1]
+_PROJECT = Path(__file__).resolve().parents[3]
 _PROGRAM = _PROJECT / ".venv" / "readers" / "rerun_cli" / "rerun"
 _LONGEST_FETCH = 120.0
 """Time to fetch 170 MB [s]; `.ci/run` fetches it before, without a limit."""
@@ -69,6 +69,8 @@ class RerunMcap:
 
 def find_rerun() -> RerunMcap:
     """Return the reader, installed from its lock where it is not yet; skip the test where it cannot be had."""
+    if not (_PROJECT / "requirements").is_dir():
+        pytest.skip("Rerun is fetched by the repository's lock, which is not here")
     handle = os.open(_PROJECT / "requirements", os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)

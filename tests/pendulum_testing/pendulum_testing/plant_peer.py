@@ -8,7 +8,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.ros import qos
-from tests.graph_peer import GraphPeer
+from pendulum_testing.graph_peer import GraphPeer
 
 __all__ = ["PlantPeer"]
 
