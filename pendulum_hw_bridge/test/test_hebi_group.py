@@ -636,6 +636,43 @@ def test_the_command_lifetime_is_set_for_all_and_must_read_back() -> None:
 # --- stop ---------------------------------------------------------------------------------------------------------
 
 
+def first_effort(rig: Rig, index: int) -> float:
+    """Stop all modules, and return the effort field of the first packet to one of them."""
+    rig.forget()
+    rig.bridge.drives[0].port.stop()
+    return float(rig.fakes[index].packets[0]["effort"])
+
+
+def test_a_stop_wakes_no_torque_loop_of_a_group_and_is_a_duty_of_zero_where_direct_pwm_is_confirmed() -> None:
+    rig = Rig().armed()
+    first = rig.bridge.drives[0].port
+    first.set_strategy(Strategy.PARALLEL_PWM, Command(position=0.5))
+    assert math.isnan(first_effort(rig, 0))
+    assert rig.fakes[1].packets[0]["effort"] == 0.0
+    rig.forget()
+    first.stop()
+    # Off is confirmed: there is nothing that a first packet could end.
+    assert rig.network.rounds == ["ask"]
+    first.set_strategy(Strategy.PARALLEL_PWM)
+    first.set_strategy(Strategy.DIRECT_PWM)
+    assert first_effort(rig, 0) == 0.0
+
+
+@pytest.mark.parametrize("index", [0, 1])
+@pytest.mark.parametrize("before", [Strategy.DIRECT_PWM, Strategy.PARALLEL_PWM])
+def test_a_stop_wakes_no_loop_of_a_group_where_the_acknowledgement_of_the_strategy_was_lost(
+    before: Strategy, index: int
+) -> None:
+    rig = Rig().armed()
+    port = rig.bridge.drives[index].port
+    port.set_strategy(before)
+    rig.fakes[index].deaf = True
+    with pytest.raises(ActuatorError, match="did not acknowledge its strategy"):
+        port.set_strategy(Strategy.PARALLEL_PWM if before is Strategy.DIRECT_PWM else Strategy.DIRECT_PWM)
+    rig.fakes[index].deaf = False
+    assert math.isnan(first_effort(rig, index))
+
+
 @pytest.mark.parametrize("coordinates", [BOTH, ACROBOT])
 @pytest.mark.parametrize("deaf", [0, 1])
 def test_zero_and_off_are_sent_to_every_module_also_when_one_does_not_acknowledge(

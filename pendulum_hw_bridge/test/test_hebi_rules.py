@@ -363,6 +363,14 @@ def test_a_stop_wakes_no_loop_where_the_acknowledgement_of_the_strategy_was_lost
     assert setpoints(group.sent[-2]).effort == 0.0
 
 
+@pytest.mark.parametrize(("number", "effort"), [(1, 0.0), (3, math.nan)])
+def test_a_module_that_drives_when_it_is_found_is_stopped_in_its_own_strategy(number: int, effort: float) -> None:
+    port, _ = port_on(group := Group(control_strategy=number))
+    port.stop()
+    assert setpoints(group.sent[0]).effort == pytest.approx(effort, nan_ok=True)
+    assert len(group.sent) == 2
+
+
 def test_after_a_stop_that_nobody_confirmed_no_duty_can_be_written() -> None:
     port, _ = port_on(group := Group(), imitation=True)
     port.set_strategy(Strategy.DIRECT_PWM)
