@@ -7,13 +7,7 @@ import pandas as pd
 import pytest
 from scipy import signal, stats
 
-from pendulum_bags.comparison.statistics import (
-    block_length,
-    bootstrap_interval,
-    describe,
-    kolmogorov_smirnov,
-    resample,
-)
+from pendulum_bags.comparison.statistics import Interval, Jackknife, describe, kolmogorov_smirnov
 from pendulum_bags.runs.correlation import effective_size
 from pendulum_msgs_py.errors import DataError
 
@@ -61,53 +55,54 @@ def test_a_common_offset_of_residuals_counts_as_what_all_samples_share() -> None
     assert effective_size(noise + 10.0, noise + 10.0) < 0.01 * effective_size(noise, noise)
 
 
-def test_blocks_grow_with_correlation() -> None:
-    lengths = [
-        np.median([block_length(autoregressive(1000, coefficient, seed)) for seed in range(5)])
-        for coefficient in (0.0, 0.6, 0.95)
-    ]
-    assert lengths[0] <= 8
-    assert lengths[0] < lengths[1] < lengths[2]
+def interval_of_mean(runs: list[np.ndarray], *, runs_differ: bool) -> Interval:
+    """Return the interval of the mean of all samples, by leaving out each of eight blocks of each run."""
+    values = np.concatenate(runs)
+    blocks = [block for run in runs for block in np.array_split(run, 8)]
+    without = np.array([(values.sum() - block.sum()) / (values.size - block.size) for block in blocks])
+    alone = np.array([run.mean() for run in runs]) if runs_differ else None
+    return Jackknife.of(float(values.mean()), without, alone).interval(0.9)
 
 
-def test_interval_of_a_mean_covers_the_truth_as_often_as_it_says_in_spite_of_correlation() -> None:
+def test_interval_of_a_mean_covers_the_truth_as_often_as_stated_in_spite_of_correlation() -> None:
     covered = naive = 0
-    trials = 150
+    trials = 300
     for seed in range(trials):
         values = autoregressive(500, 0.9, seed)
-        interval = bootstrap_interval(resample([values[:, None]], resamples=400, seed=seed), lambda m: m[..., 0])
+        interval = interval_of_mean([values], runs_differ=False)
         covered += interval.low <= 0.0 <= interval.high
         naive += abs(values.mean()) <= 1.645 * values.std() / np.sqrt(values.size)
-    # 90 % is meant; the binomial error of 150 trials is 2.5 %. Counting samples instead of blocks gives about a third.
-    assert covered / trials >= 0.83
+    # 90 % is meant; the binomial error of 300 trials is 1.7 %. Counting samples instead of blocks gives about a third.
+    assert 0.85 <= covered / trials <= 0.95
     assert naive / trials < 0.5
 
 
-def test_interval_of_two_runs_that_differ_owns_that_two_are_few() -> None:
+@pytest.mark.parametrize("count", [2, 8])
+def test_interval_of_few_runs_that_differ_counts_the_runs_and_not_the_blocks(count: int) -> None:
     rng = np.random.default_rng(5)
-    covered = 0
-    trials = 150
-    for seed in range(trials):
-        runs = [(offset + 0.3 * rng.standard_normal(60))[:, None] for offset in rng.standard_normal(2)]
-        interval = bootstrap_interval(resample(runs, resamples=300, seed=seed), lambda m: m[..., 0])
+    covered = ignored = 0
+    trials = 300
+    for _ in range(trials):
+        runs = [offset + 0.3 * rng.standard_normal(60) for offset in rng.standard_normal(count)]
+        interval = interval_of_mean(runs, runs_differ=True)
         covered += interval.low <= 0.0 <= interval.high
-    # 90 % is meant. Drawing runs alone, without Student's t for their number, covers in two thirds of the cases.
-    assert covered / trials >= 0.82
+        interval = interval_of_mean(runs, runs_differ=False)
+        ignored += interval.low <= 0.0 <= interval.high
+    assert 0.85 <= covered / trials <= 0.95
+    assert ignored / trials < 0.8
 
 
-def test_interval_is_the_same_each_time() -> None:
-    values = autoregressive(300, 0.8, 3)[:, None]
-    first, second = (bootstrap_interval(resample([values]), lambda m: m[..., 0]) for _ in range(2))
-    assert first == second
-
-
-def test_interval_of_several_runs_counts_what_differs_between_them() -> None:
-    rng = np.random.default_rng(0)
-    offsets = rng.standard_normal(8)
-    runs = [(offset + 0.01 * rng.standard_normal(200))[:, None] for offset in offsets]
-    interval = bootstrap_interval(resample(runs), lambda m: m[..., 0])
-    assert interval.high - interval.low > 1.5 * offsets.std() / np.sqrt(8)
-    assert interval.estimate == pytest.approx(np.mean([run.mean() for run in runs]))
+def test_the_difference_of_two_sides_has_the_error_of_both() -> None:
+    rng = np.random.default_rng(4)
+    covered = 0
+    for _ in range(300):
+        sides = []
+        for spread in (1.0, 3.0):
+            values = spread * rng.standard_normal(8)
+            sides.append(Jackknife.of(float(values.mean()), (values.sum() - values) / 7))
+        interval = sides[1].less(sides[0]).interval(0.9)
+        covered += interval.low <= 0.0 <= interval.high
+    assert 0.86 <= covered / 300 <= 0.95
 
 
 def test_kolmogorov_smirnov_has_the_distance_of_scipy_and_counts_correlated_samples_less() -> None:

@@ -157,7 +157,15 @@ def test_page_is_complete_in_itself_and_small(page: Path) -> None:
 def test_every_term_that_the_page_links_has_its_sentence_and_every_command_is_set_as_code(page: Path) -> None:
     text = page.read_text(encoding="utf-8").split('<script type="application/json"')[0]
     linked = set(re.findall(r'class="term" href="#(term-[a-z-]+)"', text))
-    assert {"term-margin", "term-delay", "term-std", "term-ks", "term-bootstrap", "term-mean-end"} <= linked
+    assert {
+        "term-margin",
+        "term-delay",
+        "term-std",
+        "term-ks",
+        "term-jackknife",
+        "term-long-run",
+        "term-mean-end",
+    } <= linked
     assert linked == set(re.findall(r'<div id="(term-[a-z-]+)"><dt>', text))
     assert "steady state" not in text  # nothing settles under noise
     assert "python -m" in text

@@ -6,10 +6,10 @@ import numpy as np
 import scipy
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.runs.series import Series, uniform_times
+from pendulum_bags.runs.series import Series
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["BandLimited", "SlowClock", "common_band"]
+__all__ = ["SlowClock", "common_band"]
 
 HIGHEST_SHARE = 0.4
 """Share of the slower rate above which a filter could not keep aliases out."""
@@ -40,7 +40,8 @@ class SlowClock:
     def __init__(self, stamps: Array, band: float) -> None:
         if stamps.size < 10:
             raise DataError(f"two motions share {stamps.size} samples; expected at least 10")
-        period = float(np.median(np.diff(stamps)))
+        self.period = period = float(np.median(np.diff(stamps)))
+        self.band = band
         self.times = stamps
         steps = np.maximum(np.round(np.diff(stamps) / period), 1.0)
         # States that are missing leave a gap, which the filter must not take for one step.
@@ -49,45 +50,27 @@ class SlowClock:
         self._sections = _sections(band, 1.0 / period, "motion")
         self._reach = min(self._even.size - 1, int(np.ceil(3.0 / (period * band))))
 
+    @property
+    def even_times(self) -> Array:
+        """The stamps with those that are missing, shape (m,) [s]."""
+        return np.interp(self._even, self._index, self.times)
+
     def filtered(self, values: Array) -> Array:
-        """Return values at the stamps, shape (n, ...), without what lies above the band; gaps are filled linearly."""
+        """Return values at the stamps, shape (n, ...), without what lies above the band, at the even times.
+
+        Gaps are filled linearly.
+        """
         if self._even.size != self._index.size:
             left = np.clip(np.searchsorted(self._index, self._even, side="right") - 1, 0, self._index.size - 2)
             share = (self._even - self._index[left]) / (self._index[left + 1] - self._index[left])
             share = share.reshape(-1, *(1,) * (values.ndim - 1))
             values = (1.0 - share) * values[left] + share * values[left + 1]
-        return np.asarray(scipy.signal.sosfiltfilt(self._sections, values, axis=0, padlen=self._reach))
+        return self.filtered_even(values)
 
-
-class BandLimited:
-    """A motion without what lies above a band, at any time of its span.
-
-    Butterworth of order 4, forwards and backwards, so without delay; the half-power frequency of one pass is the band.
-
-    Args:
-        series: The motion.
-        band: Band [Hz], below half its rate.
-
-    Raises:
-        DataError: The motion is sampled too slowly for the band, or too short.
-    """
-
-    def __init__(self, series: Series, band: float) -> None:
-        rate = 1.0 / series.period
-        # A plant in real time stamps with jitter and leaves states out: filters need steps of one length.
-        times = uniform_times(float(series.t[0]), float(series.t[-1]), series.period)
-        sections = _sections(band, rate, series.name)
-        reach = min(times.size - 1, int(np.ceil(3.0 * rate / band)))
-        even = series.interpolated(times)
-        columns = np.stack([even.position, even.velocity, even.effort], axis=1)
-        filtered = scipy.signal.sosfiltfilt(sections, columns, axis=0, padlen=reach)
-        self._curve = scipy.interpolate.CubicSpline(times, filtered, axis=0)
-        self._ends = float(times[0]), float(times[-1])
-
-    def at(self, times: Array) -> tuple[Array, Array, Array]:
-        """Return angle, velocity and torque at some times inside the span, each of shape (n,)."""
-        values = self._curve(np.clip(times, *self._ends))
-        return values[:, 0], values[:, 1], values[:, 2]
+    def filtered_even(self, values: Array) -> Array:
+        """Return values at even times, shape (n, ...), without what lies above the band."""
+        reach = min(self._reach, len(values) - 1)
+        return np.asarray(scipy.signal.sosfiltfilt(self._sections, values, axis=0, padlen=reach))
 
 
 def _sections(band: float, rate: float, name: str) -> Array:

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 from pendulum_bags.comparison.band import common_band
 from pendulum_bags.comparison.equivalence import Outcome, Verdict, conclude
 from pendulum_bags.comparison.independence import check_pairs
+from pendulum_bags.comparison.long_run import Disturbance
 from pendulum_bags.comparison.margins import MarginArgument, Margins
 from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
 from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
@@ -39,6 +40,7 @@ class Comparison:
         thesis: The thesis's difference for the first run.
         verdict: Verdict on the paired comparison, or on the unpaired one where the disturbances differ.
         unpaired_verdict: Verdict on the unpaired comparison.
+        tested: The runs that the verdicts rest on; the others are shown.
         looks: How often the data have been looked at.
         left_out: What was recorded and does not count, and why, in words.
         unproved: What could be checked of a plant only in part, in words.
@@ -50,6 +52,7 @@ class Comparison:
     thesis: Difference
     verdict: Verdict
     unpaired_verdict: Verdict
+    tested: Sequence[Pair]
     looks: Looks = Looks()  # noqa: RUF009 - frozen
     left_out: Sequence[str] = ()
     unproved: Sequence[str] = ()
@@ -101,9 +104,9 @@ class Comparison:
     def band(self) -> float:
         """Frequency up to which the tests compare spreads and distances [Hz]."""
         if self.is_tested_in_pairs:
-            series = [one for pair in self.pairs for one in pair.motions]
+            series = [one for pair in self.tested for one in pair.motions]
         else:
-            series = [run.window for run in (*self.own, *(pair.hardware for pair in self.pairs))]
+            series = [run.window for run in (*self.own, *(pair.hardware for pair in self.tested))]
         return common_band(self.verdict.margins.band.si, *series)
 
     @property
@@ -186,6 +189,7 @@ def compare(
     own: Sequence[RunData] = (),
     margin: MarginArgument = None,
     looks: Looks = Looks(),  # noqa: B008 - frozen
+    shown: Sequence[int] = (),
 ) -> Comparison:
     """Compare runs that are in memory.
 
@@ -194,6 +198,7 @@ def compare(
         own: Simulations under the thesis's own protocol.
         margin: What difference does not matter; see :meth:`Margins.parse`.
         looks: How often the data have been looked at, where more are recorded until they decide.
+        shown: Runs, by their place among the pairs, that are shown and not tested; some other run is tested.
 
     Raises:
         DataError: There is nothing to compare, or runs are given that must not be pooled.
@@ -203,24 +208,33 @@ def compare(
     check_pairs(pairs)
     margins = Margins.parse(margin)
     compared = [Pair.of(simulation, hardware) for simulation, hardware in pairs]
-    simulations = list(own) or [pair.simulation for pair in compared]
-    hardware_runs = [pair.hardware for pair in compared]
+    tested = [pair for index, pair in enumerate(compared) if index not in shown]
+    simulations = list(own) or [pair.simulation for pair in tested]
+    hardware_runs = [pair.hardware for pair in tested]
     # Lockstep repeats of an emulator differ by their seeds alone; those of a machine may differ by anything.
     differ = not all(is_emulated(run) for run in hardware_runs)
     names = "simulation", "hardware" if differ else "emulated hardware"
     ones, others = ([run.window for run in runs] for runs in (simulations, hardware_runs))
-    unpaired = conclude(unpaired_tests(ones, others, margins, looks=looks, runs_differ=differ), margins, *names)
+    noises = [_noise(run) for run in simulations], [_noise(run) for run in hardware_runs]
+    unpaired = conclude(
+        unpaired_tests(ones, others, margins, noises=noises, looks=looks, runs_differ=differ), margins, *names
+    )
     verdict = unpaired
     unlike = next((pair.unlike_references for pair in compared if pair.unlike_references), "")
-    if not unlike and all(pair.is_paired for pair in compared):
-        motions = [pair.motions for pair in compared]
-        tests = paired_tests(motions, margins, looks=looks, runs_differ=differ)
+    if not unlike and all(pair.is_paired for pair in tested):
+        motions = [pair.motions for pair in tested]
+        shared = [_noise(pair.simulation) for pair in tested]
+        tests = paired_tests(motions, margins, noises=shared, looks=looks, runs_differ=differ)
         verdict = conclude(tests, margins, *names)
     elif unlike := unlike or next((pair.unlike_noise for pair in compared if pair.unlike_noise), ""):
         sentence = f"Undecided: {unlike}, so that the motions say nothing of the plants."
         verdict = Verdict(Outcome.UNDECIDED, sentence, unpaired.tests, margins, None)
     thesis = interpolated_difference(simulations[0].window, compared[0].hardware.window)
-    return Comparison(compared, simulations, thesis, verdict, unpaired, looks)
+    return Comparison(compared, simulations, thesis, verdict, unpaired, tested, looks)
+
+
+def _noise(run: RunData) -> Disturbance | None:
+    return Disturbance.of(run.disturbance, noise_hold_time(run))
 
 
 def compare_runs(
@@ -268,7 +282,8 @@ def compare_folders(
 ) -> Comparison:
     """Compare and pool run folders, each with ``sim``, ``hw``, and perhaps ``sim_500hz`` and repeats of the run.
 
-    A run in real time that a busy machine disturbed is left out where there are repeats in lockstep, which wait.
+    Where there are repeats in lockstep, they alone are tested: in real time the loops of plant and controller have a
+    phase of their own in each run, which one run does not show. One that a busy machine disturbed is left out.
 
     Args:
         folders: Run folders.
@@ -282,7 +297,7 @@ def compare_folders(
         DataError: Runs are given that must not be pooled.
     """
     margins = Margins.parse(margin)
-    pairs, own, left_out, stalls = [], [], [], []
+    pairs, own, left_out, stalls, shown = [], [], [], [], []
     for folder in map(Path, folders):
         if broken := read_stalls(folder):
             stalls += [{"run": folder.resolve().name, **stall} for stall in broken]
@@ -301,11 +316,22 @@ def compare_folders(
                     "It was repeated in lockstep, which does not depend on the computer's speed."
                 )
             else:
+                if place == folder and len(places) > 1 and is_emulated(pair[1]):
+                    shown.append(len(pairs))
+                    left_out.append(_PHASE)
                 pairs.append(pair)
         if (folder / "sim_500hz").is_dir():
             own.append(_read_own(folder / "sim_500hz", joint, open_bag))
     looked = looks or Looks(max(read_looks(Path(folder)) for folder in folders) if folders else 0)
-    return replace(compare(pairs, own=own, margin=margins, looks=looked), left_out=tuple(left_out), stalls=stalls)
+    return replace(
+        compare(pairs, own=own, margin=margins, looks=looked, shown=shown), left_out=tuple(left_out), stalls=stalls
+    )
+
+
+_PHASE = (
+    "The run in real time is shown and not tested: its loops have a phase of their own. The tests rest on its repeats "
+    "in lockstep, where the phase is fixed."
+)
 
 
 def _in_words(stalls: Sequence[Mapping[str, str]]) -> str:

@@ -110,6 +110,7 @@ def equivalence_test(
     low: float,
     high: float,
     *,
+    outside: Interval | None = None,
     runs: int = 1,
     ratio: bool = False,
 ) -> EquivalenceTest:
@@ -121,6 +122,7 @@ def equivalence_test(
         interval: Estimate and interval.
         low: Lower margin; minus infinity for one-sided.
         high: Upper margin.
+        outside: Interval that shows a difference where it lies beyond a margin; by default the same.
         runs: Runs that the interval rests on.
         ratio: Whether it is a ratio, whose distances are logarithms.
     """
@@ -129,7 +131,7 @@ def equivalence_test(
     bottom, top = (scale(value) for value in (low, high))
     if left > bottom and right < top:
         outcome = Outcome.EQUIVALENT
-    elif left > top or right < bottom:
+    elif scale((outside or interval).low) > top or scale((outside or interval).high) < bottom:
         outcome = Outcome.DIFFERENT
     else:
         outcome = Outcome.UNDECIDED

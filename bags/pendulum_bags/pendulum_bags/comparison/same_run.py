@@ -1,8 +1,14 @@
 """Tests of the first layer: do simulation and hardware move alike under one controller and one disturbance?
 
-Both motions are looked at at the same phases of the disturbance and limited to one band. Every statistic is a function
-of means of columns of those samples, so that one block bootstrap, which draws the same times from both, gives all
-intervals.
+Estimands, each over a run without end under the same noise, both motions at the slower plant's sampling times and
+below one band: the difference of the means; the ratio of the standard deviations; the delay at which the simulation's
+velocity is nearest to the hardware's; the rms distance per standard deviation of the hardware, as it is and less that
+delay.
+
+The long-run variances are estimated as :mod:`pendulum_bags.comparison.long_run` says, all intervals by a jackknife
+over blocks of time. "Equivalent" needs each test's interval inside its margin, which errs with alpha at most whatever
+the number of tests (Berger, Technometrics 24, 1982); one test suffices for "not equivalent", so each has its share of
+alpha (Bonferroni).
 """
 
 from __future__ import annotations
@@ -10,16 +16,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.comparison.band import BandLimited, SlowClock, common_band
+from pendulum_bags.comparison.band import SlowClock, common_band
 from pendulum_bags.comparison.equivalence import EquivalenceTest, Outcome, equivalence_test
+from pendulum_bags.comparison.long_run import Disturbance, covariance, moments
 from pendulum_bags.comparison.margins import Margin, Margins
-from pendulum_bags.comparison.statistics import Interval, Resampled, bootstrap_interval, resample
-from pendulum_bags.runs.series import Series
+from pendulum_bags.comparison.statistics import Interval, Jackknife
+from pendulum_bags.runs.series import Series, uniform_times
 from pendulum_msgs_py.errors import ParameterError
 
 __all__ = ["Looks", "paired_tests", "unpaired_tests"]
@@ -29,14 +37,19 @@ LONGEST_DELAY = 0.1
 LEAST_LIKENESS = 0.5
 """Correlation of the velocities from which a peak is a delay: 0.92 beside 1 N m of dry friction, 0.13 by chance."""
 LAG_STEP = 0.001
-"""Resolution of the lags near the delay; a parabola through three distances tells a fraction of it [s]."""
+"""Resolution of the lags near the delay; between two of them the slope of the distance is interpolated [s]."""
 _AHEAD = LAG_STEP * np.array([1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0])
 _LAGS = np.concatenate((-_AHEAD[::-1], [0.0], _AHEAD))
 _QUANTITIES = ("angle", "velocity", "torque")
-_SIMULATION, _HARDWARE, _LIKENESS = 5, 11, 17
-"""First columns of the moments of either side, and of the products and squares of velocities at each lag."""
+_TESTS = 9
+"""Tests that may each say "not equivalent"."""
+_BLOCKS = (8, 20)
+"""Fewest and most blocks of a run: fewer make wide intervals, and those of short blocks are not independent."""
+_BLOCK_TIME = 2.0
+"""Length of a block between those bounds [s]."""
 
-Statistic = Callable[[Array], Array]
+Statistic = Callable[[Array, Array], Array]
+"""Maps the long-run covariance of the motions, shape (..., m, m), and their means, shape (..., m), to values."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +74,10 @@ class Looks:
         """Probability of the interval of this look, which is two one-sided tests."""
         return 1.0 - 2.0 * self.alpha * 0.5**self.number
 
+    def level_of_each(self, tests: int) -> float:
+        """Return the probability of the interval that shows a difference, where any of so many tests may."""
+        return 1.0 - (1.0 - self.level) / tests
+
 
 @dataclass(frozen=True)
 class _Kind:
@@ -70,20 +87,29 @@ class _Kind:
         looks: How often the data have been looked at.
         runs: Runs that the intervals rest on.
         slides: Whether the motions are those of a joint that slides.
-        driven: Whether any of them had a controller's torque: 0 beside 0 is no test.
+        driven: Whether any of them had a controller's torque: 0 and 0 are no test.
+        runs_differ: Whether runs may differ by more than their seeds.
     """
 
     looks: Looks
     runs: int
     slides: bool
     driven: bool
+    runs_differ: bool
 
     @classmethod
-    def of(cls, motions: Sequence[Series], margins: Margins, looks: Looks, runs: int) -> _Kind:
+    def of(
+        cls,
+        motions: Sequence[Series],
+        margins: Margins,
+        looks: Looks,
+        runs: int,
+        runs_differ: bool,
+    ) -> _Kind:
         slides = any(one.slides for one in motions)
         if slides:
             _refuse_angles(margins)
-        return cls(looks, runs, slides, any(np.ptp(one.effort) > 0.0 for one in motions))
+        return cls(looks, runs, slides, any(np.ptp(one.effort) > 0.0 for one in motions), runs_differ)
 
     def name(self, quantity: str) -> str:
         """Return the field's word for a quantity: what slides has a position, and a force instead of a torque."""
@@ -107,6 +133,7 @@ def paired_tests(
     pairs: Sequence[tuple[Series, Series]],
     margins: Margins,
     *,
+    noises: Sequence[Disturbance | None] = (),
     looks: Looks = Looks(),
     runs_differ: bool = True,
 ) -> list[EquivalenceTest]:
@@ -115,32 +142,28 @@ def paired_tests(
     Args:
         pairs: Simulation and hardware of each run under one disturbance, on one clock.
         margins: The margins.
+        noises: The disturbance of each run on that clock, where it is white and known.
         looks: How often these data have been looked at.
         runs_differ: Whether runs may differ by more than their seeds.
     """
     band = min(common_band(margins.band.si, *pair) for pair in pairs)
     seen = [_Seen(*pair, band) for pair in pairs]
-    # The delay is where the velocities are most alike. That is an extremum: to first order, an error of the delay does
-    # not change the distances that are left, so they may be counted as if it were known.
+    # The delay is where the distance is smallest: to first order, its error does not change the distances that are
+    # left, so they may be counted as if it were known.
     centre = _find_delay(seen)
-    columns = [one.columns(centre or 0.0) for one in seen]
-    resampled = resample(columns, runs_differ=runs_differ)
-    kind = _Kind.of([one for pair in pairs for one in pair], margins, looks, len(pairs))
-    tests = [_mean_test(resampled, lambda means: np.asarray(means[..., 0]), margins, kind)]
-    tests += _spread_tests(resampled, _SIMULATION, _HARDWARE, margins, kind)
-    if centre is None:
-        tests.append(_no_delay(margins, kind))
-    else:
-        tests.append(_within(resampled, "delay", lambda means: centre + _lag(means), margins.delay, kind))
-    for index, what, margin in (
-        (1, "angle", margins.path_angle),
-        (2, "velocity", margins.path_velocity),
-        (3, "angle", margins.path_angle),
-        (4, "velocity", margins.path_velocity),
-    ):
-        if centre is None and index > 2:
+    noises = noises or (None,) * len(pairs)
+    runs = [_Run.of(one.clock, one.motions(centre or 0.0), noise) for one, noise in zip(seen, noises, strict=True)]
+    kind = _Kind.of([one for pair in pairs for one in pair], margins, looks, len(pairs), runs_differ)
+    later = len(_QUANTITIES)
+    tests = [_mean_test([runs], _LATE, _LATE + later, margins, kind)]
+    tests += _spread_tests([runs], _LATE, _LATE + later, margins, kind)
+    tests.append(_no_delay(margins, kind) if centre is None else _delay_test(seen, centre, margins, kind))
+    for first, note in ((0, ""), (_LATE, " less the delay")):
+        if centre is None and first:
             continue  # nothing was taken out
-        tests.append(_path_test(resampled, index, what, margin, kind))
+        step = 2 if first == 0 else later
+        for index, (what, margin) in enumerate((("angle", margins.path_angle), ("velocity", margins.path_velocity))):
+            tests.append(_path_test(runs, (first + index, first + index + step), f"{what}{note}", margin, kind))
     return tests
 
 
@@ -149,41 +172,42 @@ def unpaired_tests(
     hardware: Sequence[Series],
     margins: Margins,
     *,
+    noises: tuple[Sequence[Disturbance | None], Sequence[Disturbance | None]] = ((), ()),
     looks: Looks = Looks(),
     runs_differ: bool = True,
 ) -> list[EquivalenceTest]:
-    """Test means and spreads of runs that share no disturbance; each side is resampled on its own."""
+    """Test means and spreads of runs that share no disturbance, each side by itself.
+
+    Args:
+        simulations: Motions of the simulation.
+        hardware: Motions of the hardware.
+        margins: The margins.
+        noises: The disturbances of both, each on its motion's clock, where they are white and known.
+        looks: How often these data have been looked at.
+        runs_differ: Whether runs may differ by more than their seeds.
+    """
     band = common_band(margins.band.si, *simulations, *hardware)
     period = max(one.period for one in (*simulations, *hardware))
     sides = []
-    for seed, runs in enumerate((simulations, hardware), start=1):
-        columns = []
-        for run in runs:
-            times = np.arange(run.t[0], run.t[-1], period)
-            columns.append(np.stack(_moments(BandLimited(run, band).at(times)), axis=1))
-        sides.append(resample(columns, seed=seed, runs_differ=runs_differ))
-    # One object with the columns of both sides, so that the same statistics apply.
-    joined = Resampled(
-        np.concatenate([side.means for side in sides]),
-        np.concatenate([side.draws for side in sides], axis=1),
-        np.concatenate([side.within for side in sides], axis=1),
-        min(side.blocks for side in sides),
-        min(side.runs for side in sides),
-    )
-    count = sides[0].means.size
-    kind = _Kind.of([*simulations, *hardware], margins, looks, min(len(simulations), len(hardware)))
-    mean = _mean_test(joined, lambda means: np.asarray(means[..., count] - means[..., 0]), margins, kind)
-    return [mean, *_spread_tests(joined, 0, count, margins, kind)]
+    for series, known in zip((simulations, hardware), noises, strict=True):
+        runs = []
+        for one, noise in zip(series, known or (None,) * len(series), strict=True):
+            clock = SlowClock(uniform_times(float(one.t[0]), float(one.t[-1]), period), band)
+            runs.append(_Run.of(clock, clock.filtered(_values(one.interpolated(clock.times))), noise))
+        sides.append(runs)
+    kind = _Kind.of([*simulations, *hardware], margins, looks, min(map(len, sides)), runs_differ)
+    return [_mean_test(sides, 0, 0, margins, kind), *_spread_tests(sides, 0, 0, margins, kind)]
 
 
-# -- columns -----------------------------------------------------------------------------------------------------
+# -- motions -----------------------------------------------------------------------------------------------------
+
+_LATE = 4
+"""First column of the motions with the delay taken out; before it, angles and velocities as they are."""
 
 
-def _moments(values: tuple[Array, Array, Array]) -> list[Array]:
-    """Return value and square of angle, velocity and torque."""
-    position, velocity, effort = values
-    # Around upright, so that x^2 does not drown the variance in the square of the mean.
-    return [column for one in (position - np.pi, velocity, effort) for column in (one, one**2)]
+def _values(motion: Series) -> Array:
+    # Around upright, so that squares do not drown the variance.
+    return np.stack([motion.position - np.pi, motion.velocity, motion.effort], axis=1)
 
 
 class _Seen:
@@ -197,39 +221,87 @@ class _Seen:
         stamps = (simulation if self.is_slower else hardware).t
         self.clock = SlowClock(stamps[(stamps >= start) & (stamps <= stop)], band)
 
-    def both(self, delay: float) -> tuple[Array, Array]:
+    def _both(self, delay: float) -> tuple[Array, Array]:
         """Return simulation and hardware, each with angle, velocity and torque, shape (n, 3), band-limited."""
         times = self.clock.times
         shifts = (0.0, delay) if self.is_slower else (-delay, 0.0)
-        found = []
-        for one, shift in zip((self.simulation, self.hardware), shifts, strict=True):
-            part = one.interpolated(times + shift)
-            values = np.stack([part.position - np.pi, part.velocity, part.effort], axis=1)
-            found.append(self.clock.filtered(values))
-        return found[0], found[1]
+        first, second = (
+            self.clock.filtered(_values(one.interpolated(times + shift)))
+            for one, shift in zip((self.simulation, self.hardware), shifts, strict=True)
+        )
+        return first, second
 
-    def lagged(self, lags: Array) -> tuple[Array, Array]:
-        """Return the simulation's velocity earlier by each lag, shape (n, len(lags)), and the hardware's, shape (n, 1).
+    def motions(self, delay: float) -> Array:
+        """Return angle and velocity of both sides, then all three with the delay taken out, shape (n, 10)."""
+        now, late = self._both(0.0), self._both(delay)
+        return np.concatenate((now[0][:, :2], now[1][:, :2], *late), axis=1)
+
+    def lagged(self, lags: Array) -> tuple[Array, Array, Array]:
+        """Return the simulation's velocity earlier by each lag and its slope, shape (n, len(lags)), and the hardware's.
 
         Where the simulation is the slower one, it is the hardware's that moves, the other way; the sides are exchanged.
+        The slope is that to the sample before: at the times at which the noise changes, the two sides of it differ.
         """
         times = self.clock.times
         moving, still = (self.hardware, self.simulation) if self.is_slower else (self.simulation, self.hardware)
+        curve = scipy.interpolate.CubicSpline(moving.t, moving.velocity)
         grid = times[:, None] + (1.0 if self.is_slower else -1.0) * lags[None, :]
-        values = scipy.interpolate.CubicSpline(moving.t, moving.velocity)(np.clip(grid, moving.t[0], moving.t[-1]))
+        values, before = (
+            self.clock.filtered(curve(np.clip(at, moving.t[0], moving.t[-1]))) for at in (grid, grid - moving.period)
+        )
         own = scipy.interpolate.CubicSpline(still.t, still.velocity)(times)[:, None]
-        return self.clock.filtered(values), self.clock.filtered(own)
+        return values, values - before, self.clock.filtered(own)
 
-    def columns(self, delay: float) -> Array:
-        """Return the columns of which all statistics are functions."""
-        a, b = self.both(0.0)
-        earlier, later = self.both(delay)
-        rows = [b[:, 0] - a[:, 0], (b[:, 0] - a[:, 0]) ** 2, (b[:, 1] - a[:, 1]) ** 2]
-        rows += [(later[:, 0] - earlier[:, 0]) ** 2, (later[:, 1] - earlier[:, 1]) ** 2]
-        # Spreads with the delay taken out: both sides at one phase of the disturbance.
-        rows += [column for side in (earlier, later) for one in side.T for column in (one, one**2)]
-        moving, still = self.lagged(delay + _LAGS)
-        return np.concatenate((np.stack(rows, axis=1), moving * still, moving**2), axis=1)
+
+class _Run(NamedTuple):
+    """The statistics of one run.
+
+    Args:
+        spread: Long-run covariance of the motions; of all samples, then without each block, shape (1 + g, m, m).
+        mean: Means of the motions, shape (1 + g, m).
+        sizes: Samples of each of these, shape (1 + g,).
+    """
+
+    spread: Array
+    mean: Array
+    sizes: Array
+
+    @classmethod
+    def of(cls, clock: SlowClock, motions: Array, noise: Disturbance | None) -> _Run:
+        found = moments(clock, motions, noise, _blocks(clock))
+        products = np.concatenate((np.zeros_like(found.products[:1]), found.products))
+        sizes = np.concatenate(([0.0], found.sizes))
+        left = sizes.sum() - sizes
+        spread, mean = covariance(found.products.sum(axis=0) - products, left, found)
+        return cls(spread, mean, left)
+
+
+def _blocks(clock: SlowClock) -> int:
+    duration = float(clock.times[-1] - clock.times[0])
+    return int(np.clip(duration / _BLOCK_TIME, *_BLOCKS))
+
+
+def _jackknife(runs: Sequence[_Run], statistic: Statistic, kind: _Kind) -> Jackknife:
+    """Return a statistic of all runs together; a run counts by its samples."""
+    sizes = [run.sizes[0] for run in runs]
+    whole = [sum(size * run[i][0] for size, run in zip(sizes, runs, strict=True)) for i in range(2)]
+    without: list[list[Array]] = [[], []]
+    total = []
+    for size, run in zip(sizes, runs, strict=True):
+        left = run.sizes[1:]
+        total.append(sum(sizes) - size + left)
+        for i in range(2):
+            shape = (-1, *(1,) * (run[i].ndim - 1))
+            without[i].append(whole[i] - size * run[i][0] + left.reshape(shape) * run[i][1:])
+    counts = np.concatenate(total)
+    parts = [np.concatenate(one) / counts.reshape((-1, *(1,) * (one[0].ndim - 1))) for one in without]
+    alone = None
+    if kind.runs_differ:
+        alone = np.array([float(statistic(run.spread[0], run.mean[0])) for run in runs])
+    return Jackknife.of(float(statistic(whole[0] / sum(sizes), whole[1] / sum(sizes))), statistic(*parts), alone)
+
+
+# -- the delay ---------------------------------------------------------------------------------------------------
 
 
 def _find_delay(seen: Sequence[_Seen]) -> float | None:
@@ -244,7 +316,7 @@ def _find_delay(seen: Sequence[_Seen]) -> float | None:
     products = squares = np.zeros(lags.size)
     power = 0.0
     for one in seen:
-        moving, still = one.lagged(lags)
+        moving, _, still = one.lagged(lags)
         products = products + (moving * still).sum(axis=0)
         squares = squares + (moving**2).sum(axis=0)
         power += float((still**2).sum())
@@ -259,80 +331,52 @@ def _likeness(products: Array, squares: Array) -> Array:
     return np.asarray(products / np.sqrt(np.maximum(squares, 1e-300)))
 
 
-# -- statistics --------------------------------------------------------------------------------------------------
+def _lag(sums: Array) -> Array:
+    """Return the lag, from the middle one of ``_LAGS``, at which the distance of the velocities is smallest.
 
+    There, what the scaled velocity leaves of the other is orthogonal to its slope. The distance itself would mislead:
+    where the slower plant samples as the noise changes, it rises faster on one side than on the other.
 
-def _variance(means: Array, first: int) -> Array:
-    """Return the variance from the means of x and x^2 in two neighbouring columns."""
-    return np.maximum(np.asarray(means[..., first + 1] - means[..., first] ** 2), 1e-300)
+    Args:
+        sums: Of products, squares, slopes times the other velocity and slopes times the own, shape (..., 4, lags).
 
-
-def _lag(means: Array) -> Array:
-    """Return the lag, from the middle one of ``_LAGS``, at which the velocities are most alike, shape (...).
-
-    The parabola through the highest correlation and its neighbours tells a fraction of a step. More distant ones would
-    mislead: where the slower plant samples as the noise changes, it falls faster on one side than on the other.
+    Returns:
+        Shape (...).
     """
-    first = _LIKENESS
-    alike = _likeness(means[..., first : first + _LAGS.size], means[..., first + _LAGS.size : first + 2 * _LAGS.size])
-    best = np.clip(np.argmax(alike, axis=-1), 1, _LAGS.size - 2)
+    products, squares, crossed, own = (sums[..., i, :] for i in range(4))
+    best = np.clip(np.argmax(_likeness(products, squares), axis=-1), 1, _LAGS.size - 2)
+    rise = crossed - products / np.maximum(squares, 1e-300) * own
     x = [_LAGS[best + i] for i in (-1, 0, 1)]
-    y = [np.take_along_axis(alike, (best + i)[..., None], axis=-1)[..., 0] for i in (-1, 0, 1)]
-    left, right = (y[1] - y[0]) / (x[1] - x[0]), (y[2] - y[1]) / (x[2] - x[1])
-    bend = np.minimum((right - left) / (x[2] - x[0]), -1e-300)
-    return np.asarray(np.clip(0.5 * (x[0] + x[1]) - 0.5 * left / bend, x[0], x[2]))
+    y = [np.take_along_axis(rise, (best + i)[..., None], axis=-1)[..., 0] for i in (-1, 0, 1)]
+    # A later copy of the moving velocity has a slope of the other sign; the zero lies on the side where it changes.
+    ahead = np.asarray(y[1] * y[2] <= 0.0)
+    left, right = np.where(ahead, x[1], x[0]), np.where(ahead, x[2], x[1])
+    low, high = np.where(ahead, y[1], y[0]), np.where(ahead, y[2], y[1])
+    share = np.where(low * high <= 0.0, low / np.where(low == high, 1.0, low - high), np.where(ahead, 0.0, 1.0))
+    return np.asarray(left + np.clip(share, 0.0, 1.0) * (right - left))
 
 
-# -- tests -------------------------------------------------------------------------------------------------------
-
-
-def _mean_test(resampled: Resampled, statistic: Statistic, margins: Margins, kind: _Kind) -> EquivalenceTest:
-    margin = margins.mean_position if kind.slides else margins.mean_angle
-    return _within(resampled, f"mean {kind.name('angle')} difference", statistic, margin, kind)
-
-
-def _within(resampled: Resampled, name: str, statistic: Statistic, margin: Margin, kind: _Kind) -> EquivalenceTest:
-    """Test a statistic in SI units against a margin on both sides."""
-    scale = margin.per_si
-    interval = bootstrap_interval(resampled, lambda means: scale * statistic(means), level=kind.looks.level)
-    return equivalence_test(name, margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
-
-
-def _spread_tests(
-    resampled: Resampled, simulation: int, hardware: int, margins: Margins, kind: _Kind
-) -> list[EquivalenceTest]:
-    """Test the spreads; the moments of the two sides begin at the columns given."""
-    tests = []
-    for index, what in enumerate(_QUANTITIES):
-        if what == "torque" and not kind.driven:
-            continue
-        margin: Margin = getattr(margins, f"spread_{what}")
-        tests.append(_spread_test(resampled, simulation + 2 * index, hardware + 2 * index, what, margin, kind))
-    return tests
-
-
-def _spread_test(
-    resampled: Resampled, below: int, above: int, what: str, margin: Margin, kind: _Kind
-) -> EquivalenceTest:
-    if not margin.is_share:
-
-        def difference(means: Array) -> Array:
-            return np.asarray(np.sqrt(_variance(means, above)) - np.sqrt(_variance(means, below)))
-
-        return _within(resampled, f"spread of {kind.name(what)} difference", difference, margin, kind)
-    interval = bootstrap_interval(
-        resampled,
-        lambda means: np.asarray(np.sqrt(_variance(means, above) / _variance(means, below))),
-        level=kind.looks.level,
+def _delay_test(seen: Sequence[_Seen], centre: float, margins: Margins, kind: _Kind) -> EquivalenceTest:
+    parts, alone = [], []
+    for one in seen:
+        moving, slope, still = one.lagged(centre + _LAGS)
+        columns = np.stack((moving * still, moving**2, slope * still, slope * moving), axis=1)
+        edges = np.linspace(0, len(columns), _blocks(one.clock) + 1).astype(int)
+        blocks = np.add.reduceat(columns, edges[:-1], axis=0)
+        parts.append(blocks)
+        alone.append(float(_lag(blocks.sum(axis=0))))
+    blocks = np.concatenate(parts)
+    whole = blocks.sum(axis=0)
+    found = Jackknife.of(
+        centre + float(_lag(whole)),
+        centre + _lag(whole - blocks),
+        centre + np.array(alone) if kind.runs_differ else None,
     )
-    top = 1.0 + margin.si
-    return equivalence_test(
-        f"spread of {kind.name(what)} (ratio)", "-", interval, 1.0 / top, top, runs=kind.runs, ratio=True
-    )
+    return _within(found, "delay", margins.delay, kind)
 
 
 def _no_delay(margins: Margins, kind: _Kind) -> EquivalenceTest:
-    """Return the test of a delay that the motions do not tell: anything that was looked for may be it."""
+    """Return the test of a delay that the motions do not show: anything in the searched range may be it."""
     margin, scale = margins.delay, margins.delay.per_si
     end = scale * LONGEST_DELAY
     interval = Interval(math.nan, -end, end, kind.looks.level, math.nan, 1)
@@ -341,17 +385,85 @@ def _no_delay(margins: Margins, kind: _Kind) -> EquivalenceTest:
     return replace(test, outcome=Outcome.UNDECIDED, more_runs=None, smallest_margin=math.nan)
 
 
-def _path_test(resampled: Resampled, index: int, what: str, margin: Margin, kind: _Kind) -> EquivalenceTest:
-    own = _HARDWARE + 2 * _QUANTITIES.index(what)
+# -- tests -------------------------------------------------------------------------------------------------------
 
-    def distance(means: Array) -> Array:
-        size = np.sqrt(np.maximum(means[..., index], 0.0))
+
+def _mean_test(
+    sides: Sequence[Sequence[_Run]], below: int, above: int, margins: Margins, kind: _Kind
+) -> EquivalenceTest:
+    margin = margins.mean_position if kind.slides else margins.mean_angle
+    found = _difference(sides, lambda _, mean: mean[..., below], lambda _, mean: mean[..., above], kind)
+    return _within(found, f"mean {kind.name('angle')} difference", margin, kind)
+
+
+def _difference(sides: Sequence[Sequence[_Run]], below: Statistic, above: Statistic, kind: _Kind) -> Jackknife:
+    """Return what the hardware has more than the simulation: of pairs together, of two sides each by itself."""
+    if len(sides) == 1:
+        return _jackknife(sides[0], lambda spread, mean: above(spread, mean) - below(spread, mean), kind)
+    first, second = (_jackknife(runs, one, kind) for runs, one in zip(sides, (below, above), strict=True))
+    return second.less(first)
+
+
+def _within(found: Jackknife, name: str, margin: Margin, kind: _Kind) -> EquivalenceTest:
+    """Test a statistic in SI units against a margin on both sides."""
+    return _test(found, name, margin.unit, (-margin.value, margin.value), kind, lambda value: margin.per_si * value)
+
+
+def _test(
+    found: Jackknife,
+    name: str,
+    unit: str,
+    ends: tuple[float, float],
+    kind: _Kind,
+    scale: Callable[[float], float],
+    *,
+    ratio: bool = False,
+) -> EquivalenceTest:
+    inside, outside = (found.interval(level, scale) for level in (kind.looks.level, kind.looks.level_of_each(_TESTS)))
+    return equivalence_test(name, unit, inside, *ends, outside=outside, runs=kind.runs, ratio=ratio)
+
+
+def _log_spread(column: int) -> Statistic:
+    return lambda spread, _: 0.5 * np.log(np.maximum(spread[..., column, column], 1e-300))
+
+
+def _spread(column: int) -> Statistic:
+    return lambda spread, _: np.sqrt(np.maximum(spread[..., column, column], 0.0))
+
+
+def _spread_tests(
+    sides: Sequence[Sequence[_Run]], simulation: int, hardware: int, margins: Margins, kind: _Kind
+) -> list[EquivalenceTest]:
+    """Test the spreads; angle, velocity and torque of the two sides begin at the columns given."""
+    tests = []
+    for index, what in enumerate(_QUANTITIES):
+        if what == "torque" and not kind.driven:
+            continue
+        margin: Margin = getattr(margins, f"spread_{what}")
+        size = _log_spread if margin.is_share else _spread
+        found = _difference(sides, size(simulation + index), size(hardware + index), kind)
         if margin.is_share:
-            return np.asarray(100.0 * size / np.sqrt(_variance(means, own)))
-        return np.asarray(margin.per_si * size)
+            top = 1.0 + margin.si
+            name = f"spread of {kind.name(what)} (ratio)"
+            tests.append(_test(found, name, "-", (1.0 / top, top), kind, math.exp, ratio=True))
+        else:
+            tests.append(_within(found, f"spread of {kind.name(what)} difference", margin, kind))
+    return tests
 
-    interval = bootstrap_interval(resampled, distance, level=kind.looks.level)
-    name = f"distance of {'velocities' if what == 'velocity' else kind.name('angles')}"
-    if index > 2:
-        name += " less the delay"
-    return equivalence_test(name, margin.unit, interval, -math.inf, margin.value, runs=kind.runs)
+
+def _path_test(
+    runs: Sequence[_Run], columns: tuple[int, int], what: str, margin: Margin, kind: _Kind
+) -> EquivalenceTest:
+    """Test the distance of two motions, the simulation's and the hardware's."""
+    a, b = columns
+
+    def distance(spread: Array, mean: Array) -> Array:
+        square = spread[..., a, a] + spread[..., b, b] - 2.0 * spread[..., a, b] + (mean[..., b] - mean[..., a]) ** 2
+        per = np.maximum(spread[..., b, b], 1e-300) if margin.is_share else 1.0
+        return np.asarray(np.sqrt(np.maximum(square, 0.0) / per))
+
+    quantity, _, note = what.partition(" ")
+    name = f"distance of {'velocities' if quantity == 'velocity' else kind.name('angles')} {note}".rstrip()
+    factor = 100.0 if margin.is_share else margin.per_si
+    found = _jackknife(runs, distance, kind)
+    return _test(found, name, margin.unit, (-math.inf, margin.value), kind, lambda value: factor * max(value, 0.0))

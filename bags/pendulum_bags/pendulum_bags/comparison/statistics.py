@@ -1,12 +1,12 @@
-"""Statistics of correlated samples: description, effective sample size, block bootstrap, Kolmogorov-Smirnov.
+"""Statistics of correlated samples: description, block jackknife, Kolmogorov-Smirnov.
 
-Neighbouring samples of a motion say nearly the same thing. Every interval here therefore counts blocks, not samples.
+Neighbouring samples of a motion are nearly equal. Every interval here therefore counts blocks, not samples.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,34 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.distributions import kolmogorov_tail, normal_quantile, student_quantile
-from pendulum_bags.runs.correlation import autocorrelation, effective_size
+from pendulum_bags.distributions import kolmogorov_tail, student_quantile
+from pendulum_bags.runs.correlation import effective_size
 from pendulum_msgs_py.errors import DataError
 
-__all__ = [
-    "Interval",
-    "KolmogorovSmirnov",
-    "Resampled",
-    "block_length",
-    "bootstrap_interval",
-    "describe",
-    "kolmogorov_smirnov",
-    "quantile_pairs",
-    "resample",
-    "rms",
-]
-
-RESAMPLES = 2000
-"""Bootstrap resamples: the Monte Carlo error of a 5 % quantile is then below half a percent of probability."""
-
-FAR_TAIL = 0.05
-"""Probability beyond an end of an interval down to which it is counted from the resamples."""
-LONGER = 2.0
-"""Factor on the block length of the rule; with it, 90 % intervals from some seven effective samples cover 84 %."""
-_AT_ONCE = 2_000_000
-"""Numbers that a resampling holds at once."""
-LEAST_BLOCKS = 5
-"""Blocks that a run must at least hold, however correlated it is."""
+__all__ = ["Interval", "Jackknife", "KolmogorovSmirnov", "describe", "kolmogorov_smirnov", "quantile_pairs", "rms"]
 
 
 def describe(values: ArrayLike) -> dict[str, float]:
@@ -71,83 +48,6 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def block_length(values: ArrayLike) -> int:
-    """Return the block length that the circular block bootstrap needs for the mean of these samples.
-
-    Source: Politis and White, Econometric Reviews 23, 2004, with the correction of Patton, Politis and White,
-    Econometric Reviews 28, 2009: b = (2 G^2 / D)^(1/3) n^(1/3), flat-top lag window, at most n / 3.
-    """
-    samples = np.asarray(values, dtype=float)
-    size = samples.size
-    longest = max(1, math.ceil(min(3.0 * math.sqrt(size), size / 3.0)))
-    variance = float(samples.var())
-    if size < 8 or variance <= 0.0:
-        return 1
-    rho = autocorrelation(samples)
-    reach = max(5, math.ceil(math.sqrt(math.log10(size))))
-    bound = 2.0 * math.sqrt(math.log10(size) / size)
-    limit = min(math.ceil(math.sqrt(size)) + reach, size - reach - 1)
-    quiet = np.abs(rho[1:]) < bound
-    last = next((lag for lag in range(limit + 1) if quiet[lag : lag + reach].all()), limit)
-    window = min(2 * max(last, 1), size - 1)
-    lags = np.arange(-window, window + 1)
-    taper = np.clip(2.0 * (1.0 - np.abs(lags) / window), 0.0, 1.0)
-    covariance = variance * rho[np.abs(lags)]
-    spread = float((taper * np.abs(lags) * covariance).sum())
-    density = float((taper * covariance).sum())
-    if density <= 0.0:
-        return longest
-    best = (2.0 * spread**2 / (4.0 / 3.0 * density**2)) ** (1.0 / 3.0) * size ** (1.0 / 3.0)
-    return int(np.clip(math.ceil(best), 1, longest))
-
-
-def _bootstrap_means(
-    runs: Sequence[Array], lengths: Sequence[int], *, resamples: int, seed: int, runs_differ: bool
-) -> tuple[Array, Array]:
-    """Resample runs, and blocks within each run, and return the mean of every column.
-
-    Several runs are drawn with replacement first, so that what differs from run to run counts; the blocks inside
-    them, whose lengths are in samples, are circular. With one run only the blocks are drawn.
-
-    Returns:
-        Means of the columns over all samples of each resample, shape (B, m); and the same with each run drawn once,
-        which vary only by what varies within a run.
-    """
-    rng = np.random.default_rng(seed)
-    columns = runs[0].shape[1]
-    sums = np.empty((len(runs), resamples, columns))
-    for k, (samples, length) in enumerate(zip(runs, lengths, strict=True)):
-        sums[k] = _circular_block_sums(samples, length, resamples, rng)
-    sizes = np.array([len(samples) for samples in runs], dtype=float)
-    within = np.asarray(sums.sum(axis=0) / sizes.sum())
-    if len(runs) == 1 or not runs_differ:
-        return within, within
-    chosen = rng.integers(len(runs), size=(len(runs), resamples))
-    # A run that is drawn twice is resampled twice: take its blocks from another resample.
-    turn = (np.arange(resamples) + rng.integers(resamples, size=(len(runs), 1))) % resamples
-    total = sums[chosen, turn].sum(axis=0)
-    return np.asarray(total / sizes[chosen].sum(axis=0)[:, None]), within
-
-
-def _circular_block_sums(samples: Array, length: int, resamples: int, rng: np.random.Generator) -> Array:
-    size = len(samples)
-    length = min(length, size)
-    wrapped = np.concatenate((samples, samples[: length - 1])) if length > 1 else samples
-    edges = np.concatenate((np.zeros((1, samples.shape[1])), np.cumsum(wrapped, axis=0)))
-    whole, rest = divmod(size, length)
-    starts = rng.integers(size, size=(resamples, whole))
-    sums = np.empty((resamples, samples.shape[1]))
-    # Long runs have many blocks: a part of the resamples at a time keeps memory small.
-    step = max(1, _AT_ONCE // (whole * samples.shape[1]))
-    for first in range(0, resamples, step):
-        chosen = starts[first : first + step]
-        sums[first : first + step] = (edges[chosen + length] - edges[chosen]).sum(axis=1)
-    if rest:
-        last = rng.integers(size, size=resamples)
-        sums += edges[last + rest] - edges[last]
-    return np.asarray(sums)
-
-
 class Interval(NamedTuple):
     """An estimate with its interval.
 
@@ -156,7 +56,7 @@ class Interval(NamedTuple):
         low: Lower end.
         high: Upper end.
         level: Probability that the interval is meant to have.
-        error: Standard error by the bootstrap.
+        error: Standard error.
         blocks: Independent pieces that the interval rests on.
     """
 
@@ -178,104 +78,60 @@ class Interval(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Resampled:
-    """What a bootstrap of several columns left behind.
+class Jackknife:
+    """An estimate with its standard error, from estimates that each lack one part of the data.
 
-    Args:
-        means: Of the columns, over all samples, shape (m,).
-        draws: The same of each resample, shape (B, m).
-        within: The same of each resample with every run drawn once, shape (B, m).
-        blocks: Independent pieces.
-        runs: Recordings that may differ from one another by more than chance; 1 where they differ by their seeds alone.
+    Attributes:
+        estimate: From all data.
+        error: Standard error.
+        freedom: Degrees of freedom of the error.
+        blocks: Parts.
     """
 
-    means: Array
-    draws: Array
-    within: Array
+    estimate: float
+    error: float
+    freedom: float
     blocks: int
-    runs: int = 1
 
+    @classmethod
+    def of(cls, estimate: float, without: Array, runs: Array | None = None) -> Jackknife:
+        """Return the delete-one-block jackknife (Quenouille, Biometrika 43, 1956; Tukey, Ann. Math. Stat. 29, 1958).
 
-def resample(
-    runs: Sequence[Array], *, resamples: int = RESAMPLES, seed: int = 0, runs_differ: bool = True
-) -> Resampled:
-    """Return the means of all columns over all runs, and the same of every resample.
+        Runs that differ by more than chance add the variance between them, with the degrees of freedom of a sum of two
+        variances (Satterthwaite, Biometrics Bulletin 2, 1946).
 
-    The block is ``LONGER`` times the longest that any column of a run asks for: the rule balances bias and variance
-    of the interval's width, but an interval that is too narrow deceives, and one that varies does not.
+        Args:
+            estimate: From all data.
+            without: Estimates that each lack one block, shape (g,), g >= 2.
+            runs: Estimates from each run alone, where runs may differ by more than chance; None where they do not.
+        """
+        blocks = len(without)
+        variance, freedom = float((blocks - 1) * np.var(without)), blocks - 1.0
+        if runs is not None and len(runs) > 1:
+            total = float(np.var(runs, ddof=1)) / len(runs)
+            between = max(total - variance, 0.0)
+            if between > 0.0:
+                freedom = total**2 / (between**2 / (len(runs) - 1) + variance**2 / freedom)
+                variance = total
+        return cls(estimate, math.sqrt(variance), freedom, blocks)
 
-    Args:
-        runs: Samples of each run, shape (n_i, m).
-        resamples: Number of resamples, B.
-        seed: Seed of the resampling; the same data give the same interval.
-        runs_differ: Whether runs may differ by more than their seeds, as those of a real machine do; lockstep repeats
-            of an emulator do not, and their blocks are all alike.
-    """
-    lengths = [
-        min(
-            math.ceil(LONGER * max(block_length(column) for column in samples.T)),
-            max(1, len(samples) // LEAST_BLOCKS),
-        )
-        for samples in runs
-    ]
-    blocks = sum(max(1, len(samples) // length) for samples, length in zip(runs, lengths, strict=True))
-    pooled = np.concatenate(runs).mean(axis=0)
-    # Sums of large equal numbers would lose what differs between resamples.
-    centred = [samples - pooled for samples in runs]
-    draws, within = _bootstrap_means(centred, lengths, resamples=resamples, seed=seed, runs_differ=runs_differ)
-    return Resampled(pooled, pooled + draws, pooled + within, blocks, len(runs) if runs_differ else 1)
+    def less(self, other: Jackknife) -> Jackknife:
+        """Return the difference to an independent one."""
+        ones, others = self.error**2, other.error**2
+        total = max(ones + others, 1e-300)
+        freedom = total**2 / max(ones**2 / self.freedom + others**2 / other.freedom, 1e-300)
+        return Jackknife(self.estimate - other.estimate, math.sqrt(total), freedom, min(self.blocks, other.blocks))
 
+    def interval(self, level: float, scale: Callable[[float], float] = float) -> Interval:
+        """Return the interval by Student's t.
 
-def bootstrap_interval(resampled: Resampled, statistic: Callable[[Array], Array], *, level: float = 0.9) -> Interval:
-    """Return a statistic of column means with its percentile interval.
-
-    Few blocks make bootstrap intervals too short, for two reasons known from means of few values: the spread is
-    estimated around the blocks' own mean, and it is itself uncertain. The same holds for few runs that differ from one
-    another. So the ends are moved out by the ratio of the unbiased standard error to that of the resamples, and by the
-    ratio of Student's t to the normal quantile, with the degrees of freedom of a sum of two variances, that
-    between runs and that within them (Satterthwaite, Biometrics Bulletin 2, 1946).
-
-    Args:
-        resampled: From :func:`resample`.
-        statistic: Maps means, shape (..., m), to values, shape (...).
-        level: Probability of the interval, in (0, 1). Ends far out are those of 90 % moved by Student's t, since the
-            resamples hold too few values there.
-    """
-    estimate = float(statistic(resampled.means))
-    draws = np.asarray(statistic(resampled.draws), dtype=float)
-    tail = 0.5 * (1.0 - level)
-    seen = max(tail, FAR_TAIL)
-    low, high = np.quantile(draws, (seen, 1.0 - seen))
-    variance, freedom = _variance_of(resampled, statistic, float(draws.var(ddof=1)))
-    spread = max(float(draws.std(ddof=1)), 1e-300)
-    stretch = float(student_quantile(1.0 - tail, freedom)) / normal_quantile(1.0 - seen) * math.sqrt(variance) / spread
-    error = math.sqrt(variance)
-    return Interval(
-        estimate,
-        estimate + stretch * min(float(low) - estimate, 0.0),
-        estimate + stretch * max(float(high) - estimate, 0.0),
-        level,
-        error,
-        resampled.blocks,
-    )
-
-
-def _variance_of(resampled: Resampled, statistic: Callable[[Array], Array], total: float) -> tuple[float, float]:
-    """Return the unbiased variance of a statistic and its degrees of freedom.
-
-    Drawing R runs, and blocks in them, gives the variance V (R - 1) / R + W, where V is that of the statistic and W the
-    part of V that comes from within runs, which drawing the blocks alone gives.
-    """
-    runs = resampled.runs
-    blocks = max(resampled.blocks, runs + 2)
-    if runs == 1:
-        return total * blocks / (blocks - 1), blocks - 1
-    within = float(np.var(np.asarray(statistic(resampled.within), dtype=float), ddof=1)) * blocks / (blocks - runs)
-    between = max((total - within) * runs / (runs - 1) - within, 0.0)
-    variance = between + within
-    if variance <= 0.0:
-        return total, runs - 1
-    return variance, variance**2 / (between**2 / (runs - 1) + within**2 / (blocks - runs))
+        Args:
+            level: Probability.
+            scale: Maps the estimate and the ends to the quantity reported, such as ``math.exp`` for a logarithm.
+        """
+        reach = float(student_quantile(0.5 + 0.5 * level, self.freedom)) * self.error
+        estimate, low, high = (scale(self.estimate + side * reach) for side in (0.0, -1.0, 1.0))
+        return Interval(estimate, low, high, level, self.error, self.blocks)
 
 
 class KolmogorovSmirnov(NamedTuple):

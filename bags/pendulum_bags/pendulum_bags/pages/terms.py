@@ -57,16 +57,24 @@ TERMS: Mapping[str, Term] = {
         r"9\d % interval|intervals?(?! at the recorder)|95 % from",
         "Procedures that make such intervals cover the true value in 90 (or 95) of 100 repetitions.",
     ),
-    "bootstrap": Term(
-        "block bootstrap",
-        r"block bootstrap|independent blocks",
-        "The run is cut into blocks that are nearly independent. They are drawn again and again, with replacement, and "
-        "the spread of what the draws give makes the interval. Few blocks make a rough interval.",
+    "jackknife": Term(
+        "block jackknife",
+        r"block jackknife|independent blocks",
+        "The run is cut into blocks that are nearly independent. The estimate is computed again without each of them; "
+        "how far these estimates scatter gives the interval. Few blocks make a wide interval.",
+    ),
+    "long-run": Term(
+        "long-run spread",
+        r"[Ll]ong-run",
+        "The spread of a run without end under the same noise. The response to the recorded noise is separated from "
+        "the rest, so that what this noise did by chance in a few seconds does not count.",
     ),
     "tost": Term(
         "two one-sided tests",
         r"[Tt]wo one-sided tests",
-        "Equivalence is shown when the whole interval lies within the margin; a difference when none of it does.",
+        "Equivalence is shown when the whole interval lies within the margin. One test of nine suffices for a "
+        "difference, "
+        "so it needs a wider interval, each test at a ninth of the error, that lies outside.",
     ),
     "equivalent": Term(
         "equivalent, not equivalent, undecided",

@@ -104,7 +104,8 @@ def tests_table(comparison: Comparison) -> Table:
     )
     verdict = comparison.verdict
     sentence = (
-        "Two one-sided tests each, intervals by block bootstrap. Ratios are hardware per simulation; "
+        "Two one-sided tests each, of long-run values, intervals by block jackknife. A difference needs an interval "
+        "at a ninth of the error, since one test suffices for it. Ratios are hardware per simulation; "
         "distances are root mean "
         f"squares, per standard deviation of the hardware's motion where they are in %. Compared with "
         f"{verdict.margins.whose}."

@@ -34,7 +34,7 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
     verdict = comparison.verdict
     tests = verdict.tests
     mark = _MARKS[verdict.outcome]
-    runs = "this run" if len(comparison.pairs) == 1 else f"these {len(comparison.pairs)} runs"
+    runs = "this run" if len(comparison.tested) == 1 else f"these {len(comparison.tested)} runs"
     whose = verdict.margins.whose
     if mark is Mark.YES:
         reason = f"in {runs} simulation and the hardware move alike within {whose}, in all {len(tests)} tests"

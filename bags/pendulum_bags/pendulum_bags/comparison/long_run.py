@@ -1,0 +1,219 @@
+"""Long-run variances from a short window: the response to the known disturbance is separated from the rest.
+
+The variance of a few seconds of motion misses the long-run one twice: it is taken about the window's own mean, and
+the disturbance of these seconds was larger or smaller than usual at the frequencies that the loop amplifies. Neither
+shows in a resampling of the window. Where the disturbance was recorded and is white, both are known:
+
+    y(t) = c + b' z(t) + e(t),    var y = b' G b + var e
+
+with z the responses of simple modes to the disturbance, G their long-run covariance, which follows from the modes
+alone, and e what they do not explain. The decomposition is exact for any modes and any plant, linear or not, since e
+is orthogonal to z; better modes only leave less to e (a control variate: Owen, Monte Carlo theory, 2013, chapter 8).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy
+
+from pendulum_bags.arrays import Array
+from pendulum_bags.comparison.band import SlowClock
+from pendulum_bags.distributions import chi_square_tail
+from pendulum_bags.runs.correlation import autocorrelation, effective_size
+from pendulum_bags.runs.series import Signal
+
+__all__ = ["Disturbance", "Moments", "covariance", "moments"]
+
+_LEAST_CHANGES = 50
+_CHANCE = 1e-3
+"""Probability of taking white noise for coloured."""
+_LAGS = 20
+_SLOWEST = 0.35
+"""Time constant of the slowest mode, as a share of the run."""
+_SAMPLES_PER_BAND = 4.0
+_ORDER = 4
+"""Order of the model whose oscillating modes are taken."""
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """White noise that is held.
+
+    Args:
+        t: Times at which it takes a new value, shape (n,) [s].
+        value: Shape (n,).
+        hold: Time for which each value is held [s].
+    """
+
+    t: Array
+    value: Array
+    hold: float
+
+    @classmethod
+    def of(cls, signal: Signal | None, hold: float | None) -> Disturbance | None:
+        """Return the disturbance as recorded; None where it was not, or is not white.
+
+        Args:
+            signal: As recorded; the same value may be repeated.
+            hold: Time for which each value is held [s]; None if unknown.
+        """
+        if signal is None or not hold:
+            return None
+        changes = np.concatenate(([0], 1 + np.flatnonzero(np.diff(signal.value))))
+        t, value = signal.t[changes], signal.value[changes]
+        if value.size < _LEAST_CHANGES:
+            return None
+        # Portmanteau test of Ljung and Box, Biometrika 65, 1978; the mean of the noise is known to be 0.
+        size = value.size
+        rho = autocorrelation(value, 0.0)[1 : 1 + _LAGS]
+        statistic = size * (size + 2.0) * float((rho**2 / (size - np.arange(1, 1 + rho.size))).sum())
+        return None if chi_square_tail(statistic, rho.size) < _CHANCE else cls(t, value, hold)
+
+    @property
+    def variance(self) -> float:
+        """Mean square of the values."""
+        return float(np.mean(self.value**2))
+
+    def mean_over(self, edges: Array) -> Array:
+        """Return the mean over each interval between neighbouring edges, shape (len(edges) - 1,)."""
+        t = np.append(self.t, max(self.t[-1] + self.hold, edges[-1]))
+        area = np.concatenate(([0.0], np.cumsum(self.value * np.diff(t))))
+        return np.asarray(np.diff(np.interp(edges, t, area)) / np.diff(edges))
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Sums of products over blocks of time: all that the statistics need.
+
+    Args:
+        products: Of the constant, the modes and the motions, shape (blocks, q, q).
+        sizes: Samples of each block, shape (blocks,).
+        gram: Long-run covariance of constant and modes, shape (p, p).
+        known: Whether the disturbance explains the motion; else p is 1.
+        samples: Independent samples that the motions have, for the bias of a mean; shape (q - p,).
+    """
+
+    products: Array
+    sizes: Array
+    gram: Array
+    known: bool
+    samples: Array
+
+
+def moments(clock: SlowClock, motions: Array, disturbance: Disturbance | None, blocks: int) -> Moments:
+    """Return the sums of products of one run.
+
+    Args:
+        clock: Its times.
+        motions: Band-limited, at the even times of the clock, shape (n, m).
+        disturbance: Its noise, on the same time axis; None where none is known.
+        blocks: Into how many blocks of equal length it is divided.
+    """
+    size = len(motions)
+    modes, gram = np.empty((size, 0)), np.empty((0, 0))
+    if disturbance is not None:
+        modes, gram = _responses(clock, motions, disturbance)
+    columns = np.concatenate((np.ones((size, 1)), modes, motions), axis=1)
+    edges = np.linspace(0, size, blocks + 1).astype(int)
+    parts = [columns[first:last] for first, last in pairwise(edges)]
+    whole = np.zeros((1 + len(gram),) * 2)
+    whole[1:, 1:] = gram
+    return Moments(
+        np.stack([part.T @ part for part in parts]),
+        np.diff(edges).astype(float),
+        whole,
+        disturbance is not None,
+        np.array([effective_size(column) for column in motions.T]),
+    )
+
+
+def _responses(clock: SlowClock, motions: Array, disturbance: Disturbance) -> tuple[Array, Array]:
+    """Return the responses of the modes at the even times, shape (n, p), and their long-run covariance."""
+    times = clock.even_times
+    period = clock.period
+    before = max(0, math.floor((times[0] - disturbance.t[0]) / period))
+    edges = np.concatenate((times[0] - period * np.arange(before + 1, 0, -1), times))
+    inputs = disturbance.mean_over(edges)
+    span = period * len(times)
+    poles = _poles(clock, motions, inputs[before:], _SLOWEST * span)
+    responses = clock.filtered_even(_modal(inputs, poles)[before:])
+    # One value of the noise alone: the energy of its response is what every value adds to the variance.
+    count = math.ceil((8.0 * _SLOWEST * span + 1.0) / period)
+    ratio = disturbance.hold / period
+    phases = 1 if abs(ratio - round(ratio)) < 1e-3 else 8
+    grid = period * np.arange(count + 1)
+    gram = np.zeros((responses.shape[1],) * 2)
+    # Where in a period the noise changes; far enough from the start for the filter to settle.
+    phase = float(np.median((disturbance.t - times[0] + 0.5 * period) % period)) - 0.5 * period
+    start = phase + period * math.ceil(0.5 / period)
+    for k in range(phases):
+        first = start + k * disturbance.hold
+        pulse = np.clip(grid[1:] - first, 0.0, disturbance.hold) - np.clip(grid[:-1] - first, 0.0, disturbance.hold)
+        one = clock.filtered_even(_modal(pulse / period, poles))
+        gram += one.T @ one
+    return responses, gram * disturbance.variance / (ratio * phases)
+
+
+def _modal(inputs: Array, poles: Array) -> Array:
+    """Return the input, the input one sample late, and the responses of modes with these poles, shape (n, p)."""
+    columns = [inputs, np.concatenate(([0.0], inputs[:-1]))]
+    for pole in poles:
+        response = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], inputs.astype(complex))
+        columns += [response.real] if pole.imag == 0.0 else [response.real, response.imag]
+    return np.stack(columns, axis=1)
+
+
+def _poles(clock: SlowClock, motions: Array, inputs: Array, slowest: float) -> Array:
+    """Return real poles, an octave apart, and the oscillating ones that the motions show.
+
+    Real poles alone explain an oscillation badly; which frequencies there are, a model of low order tells.
+    """
+    period = clock.period
+    octaves = np.arange(1 + math.floor(math.log2(max(2.0, 2.0 * slowest / period))))
+    real = np.exp(-2.0 * 0.5**octaves)
+    skip = max(1, round(1.0 / (period * _SAMPLES_PER_BAND * clock.band)))
+    u = clock.filtered_even(inputs[:, None])[::skip, 0]
+    found: list[complex] = []
+    for column in motions[::skip].T:
+        power = float(np.std(column))
+        if power <= 0.0 or column.size < 10 * _ORDER:
+            continue
+        y = (column - column.mean()) / power
+        past = [y[_ORDER - k : -k] for k in range(1, _ORDER + 1)]
+        past += [u[_ORDER - k : u.size - k] for k in range(_ORDER + 1)]
+        weights = np.linalg.lstsq(np.stack(past, axis=1), y[_ORDER:], rcond=None)[0]
+        roots = np.roots(np.concatenate(([1.0], -weights[:_ORDER])))
+        found += [root for root in roots if root.imag > 1e-3 and 0.3 < abs(root) < 1.0]
+    distinct: list[complex] = []
+    for root in sorted(found, key=abs, reverse=True):
+        # Modes that nearly coincide explain the same.
+        if all(abs(root - other) > 0.2 * (1.0 - abs(other)) + 0.02 for other in distinct) and len(distinct) < 3:
+            distinct.append(root)
+    return np.concatenate((real.astype(complex), np.array(distinct, dtype=complex) ** (1.0 / skip)))
+
+
+def covariance(products: Array, sizes: Array, moment: Moments) -> tuple[Array, Array]:
+    """Return the long-run covariance of the motions, shape (..., m, m), and their means, shape (..., m).
+
+    Args:
+        products: Sums of products over samples, shape (..., q, q).
+        sizes: Number of samples, shape (...).
+        moment: Of the run, for what does not depend on the samples.
+    """
+    p = len(moment.gram)
+    means = products / sizes[..., None, None]
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("...ii->...i", means[..., :p, :p]), 1e-300))
+    scaled = means[..., :p, :p] * scale[..., :, None] * scale[..., None, :]
+    inverse = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True) * scale[..., :, None] * scale[..., None, :]
+    weights = inverse @ means[..., :p, p:]
+    transposed = np.swapaxes(weights, -1, -2)
+    rest = means[..., p:, p:] - transposed @ means[..., :p, p:]
+    if not moment.known:
+        # About the window's own mean, which is known from so many samples only.
+        short = np.sqrt(1.0 / np.maximum(1.0 - 1.0 / np.maximum(moment.samples, 2.0), 0.5))
+        rest = rest * short[:, None] * short[None, :]
+    return transposed @ moment.gram @ weights + rest, weights[..., 0, :]
