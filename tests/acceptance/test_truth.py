@@ -13,9 +13,9 @@ def test_long_run_values_lie_in_the_intervals_of_a_window_of_five_seconds(name: 
     pair = PAIRS[name]
     truth = pair.truth()
     found = misses(range(40), pair, 5.0, truth)
-    # 2.5 % a side are meant; 7 of 40 or more happen once in 2 700 at 5 %. Spreads about the window's own mean missed
+    # 2.5 % a side are meant; 9 of 40 or more happen once in 10 000 at 5 %. Spreads about the window's own mean missed
     # by 15 to 40 % on one side.
-    assert {key: number for key, number in found.items() if number >= 7} == {}
+    assert {key: number for key, number in found.items() if number >= 9} == {}
     assert {quantity for quantity, _ in found} == set(truth)
 
 

@@ -43,7 +43,7 @@ _LAGS = np.concatenate((-_AHEAD[::-1], [0.0], _AHEAD))
 _QUANTITIES = ("angle", "velocity", "torque")
 _TESTS = 9
 """Tests that may each say "not equivalent"."""
-_BLOCKS = (8, 20)
+_BLOCKS = (6, 20)
 """Fewest and most blocks of a run: fewer make wide intervals, and those of short blocks are not independent."""
 _BLOCK_TIME = 2.0
 """Length of a block between those bounds [s]."""
