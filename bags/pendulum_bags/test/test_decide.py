@@ -59,7 +59,7 @@ class Recorder:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    write_pair(tmp_path / "run", 1, 2.0)
+    write_pair(tmp_path / "run", 1, 5.0)
     return tmp_path / "run"
 
 
@@ -72,7 +72,7 @@ def test_a_run_that_decides_is_not_repeated(folder: Path) -> None:
     assert found.verdict.tests[0].interval.level == pytest.approx(0.95)
 
 
-def near(folder: Path, share: float = 0.7) -> Margins:
+def near(folder: Path, share: float = 0.55) -> Margins:
     """Return margins that the first run cannot decide, but more can: a share of its interval beyond its estimate."""
     test = compare_folders([folder]).verdict.tests[1]
     away = abs(test.interval.estimate - 1.0) + share * (test.interval.high - test.interval.low)

@@ -319,11 +319,16 @@ def test_a_report_judges_by_the_margins_that_the_run_was_judged_by_and_says_that
     run = tmp_path / "run"
     run.mkdir()
     (run / "sim").symlink_to(bags["sim"])
-    write(run / "hw", recordings["alike"], stand_in="simulation")
-    assert main([str(run), "--margin", "delay=0.001ms", "-o", str(run)]) == 0
+    write(run / "hw", recordings["other"], stand_in="simulation")
+    shares = [
+        f"{kind}=900%" for kind in ("spread_angle", "spread_velocity", "spread_torque", "path_angle", "path_velocity")
+    ]
+    wide = [*shares, "delay=90ms", "mean_angle=20deg", "mean_position=1m"]
+    assert main([str(run), *(word for margin in wide for word in ("--margin", margin)), "-o", str(run)]) == 0
     capsys.readouterr()
     assert report_main([str(run), "--png-only"]) == 0
-    assert capsys.readouterr().out.startswith("No: ")
+    # By the default margins it is a no; too little is alike for a delay.
+    assert capsys.readouterr().out.startswith("Undecided: ")
     text = (run / "report.html").read_text(encoding="utf-8")
     assert "no machine was measured: a second simulation took the place of the hardware" in text
 

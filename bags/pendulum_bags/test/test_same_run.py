@@ -134,7 +134,7 @@ def test_no_delay_is_told_as_none_in_every_place_and_lies_within_no_margin() -> 
     assert math.isnan(found.delay)
     assert json.loads(json.dumps(found.to_json(), allow_nan=False))["verdict"]["tests"]
     figures = {figure.name: figure for figure in comparison_figures(found)}
-    assert "there is no peak, and no delay that could be told" in figures["alignment"].sentence
+    assert "cannot be determined: there is no peak" in figures["alignment"].sentence
     assert "nan" not in " ".join(figure.sentence for figure in figures.values())
     # A comparison that differs is told as such all the same.
     assert same_run_layer(found).mark is Mark.NO

@@ -173,6 +173,7 @@ class Comparison:
             "emulated": self.is_emulated,
             "looks": self.looks.number,
             "left_out": list(self.left_out),
+            "notes": list(self.notes),
             "stalls": [dict(stall) for stall in self.stalls],
             "plants": self.plants,
             "paired": self.paired,

@@ -394,7 +394,6 @@ def _summary(settings: RegulationSettings, comparison: Comparison, answer: Answe
         "hardware": settings.hardware,
         "seed": settings.noise.seed,
         "strategy": settings.strategy,
-        "notes": comparison.notes,
         "versions": versions(),
         "answer": answer.to_json(),
     }
