@@ -122,10 +122,10 @@ def verdict(spoiled, path):
     return named, refused, said
 
 
-@pytest.mark.parametrize("name", SPOILS)
-def test_what_is_spoiled_is_named_and_nothing_else(name, tmp_path):
+@pytest.mark.parametrize(("name", "seed"), [*((name, 1) for name in SPOILS), ("gap", 2)])
+def test_what_is_spoiled_is_named_and_nothing_else(name, seed, tmp_path):
     cause = SPOILS[name][0]
-    named, refused, said = verdict(spoil(name, 1), tmp_path / "run.csv")
+    named, refused, said = verdict(spoil(name, seed), tmp_path / "run.csv")
     assert named == ({cause} if cause else set()), said[0]
     assert refused == (cause not in {None, "sign", "wrap", "gap"}), said[0]
 

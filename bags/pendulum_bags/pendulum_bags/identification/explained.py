@@ -14,7 +14,7 @@ import numpy as np
 
 from pendulum_bags.identification.model import to_plant
 from pendulum_bags.identification.output_error import OutputErrorFit
-from pendulum_bags.identification.problem import Piece
+from pendulum_bags.identification.problem import sensor_noise
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE, errors_by_window
 from pendulum_bags.identification.residual_tests import INCOMPLETE
 from pendulum_bags.identification.selection import at_bounds
@@ -65,7 +65,7 @@ def explained(fit: OutputErrorFit, outliers: Sequence[tuple[str, float, float, f
         keep[np.argsort(errors)[-len(outliers) :]] = False
     rms, straight = (float(np.sqrt(np.mean(values[keep] ** 2))) for values in (errors, lines))
     share = rms / straight if straight > 0.0 else 1.0
-    noise = _noise(fit.pieces)
+    noise = float(np.sqrt(np.mean([sensor_noise(piece.recording.position) ** 2 for piece in fit.pieces])))
     refusal = None
     if fit.reading is not None:
         refusal = f"{REFUSED}: {fit.reading}"
@@ -120,9 +120,3 @@ def undetermined_fit(fit: OutputErrorFit, uncertainty: Uncertainty) -> str | Non
     listing = ", ".join(f"{name} {model[name]:.4g} {model.units[name]} ({why})" for name, why in lost.items())
     more = "a swing from a larger angle" if free else "a torque that moves it to and fro through larger angles"
     return f"{REFUSED}: the recording does not determine {listing}; no plant can be made of it. Record {more}."
-
-
-def _noise(pieces: Sequence[Piece]) -> float:
-    """Return the sensor's noise by third differences, in which a smooth motion all but vanishes [rad]."""
-    thirds = np.concatenate([np.diff(piece.recording.position, 3) for piece in pieces])
-    return float(np.std(thirds) / math.sqrt(20.0))

@@ -10,9 +10,9 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED
-from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_fit import MechanismFit, Windows, fit, line_errors, rms_by_joint
 from pendulum_bags.identification.mechanism_model import MechanismModel, tellable
+from pendulum_bags.identification.problem import sensor_noise
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -151,7 +151,7 @@ def refusal(
         better = better_reading(plant, data, found)
         if better is not None:
             return f"{REFUSED}: {better}"
-    noise = 6.0 * np.max([_noise(part.recording) for part in data], axis=0)
+    noise = 6.0 * np.max([sensor_noise(part.recording.position) for part in data], axis=0)
     # What the fit misses in its own data is no fault of a recording in which a joint hardly moves.
     usual = np.sqrt(np.mean([score.rms**2 for score in training.values()], axis=0))
     for name, score, least in (
@@ -169,11 +169,6 @@ def refusal(
                 "something that was not recorded moves the machine, or it is another one"
             )
     return far
-
-
-def _noise(recording: JointRecording) -> Array:
-    """Return the sensor's noise of each joint by third differences, in which a smooth motion all but vanishes."""
-    return np.asarray(np.std(np.diff(recording.position, 3, axis=0), axis=0) / math.sqrt(20.0))
 
 
 def _far_off(plant: MechanismParameters, found: MechanismFit) -> str | None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_model import MechanismModel, step_functions
-from pendulum_bags.identification.problem import cut_windows
+from pendulum_bags.identification.problem import cut_windows, off_line
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [
@@ -435,10 +435,7 @@ def line_errors(data: Windows) -> Array:
     """Return the rms errors of the best straight lines through each joint of each window, shape (n,)."""
     errors = np.zeros_like(data.position)
     for i, inside in enumerate(data.inside):
-        t = data.time[i, inside] - data.time[i, 0]
-        base = np.column_stack((np.ones_like(t), t))
-        y = data.position[i, inside]
-        errors[i, inside] = y - base @ np.linalg.lstsq(base, y, rcond=None)[0]
+        errors[i, inside] = off_line(data.time[i, inside], data.position[i, inside])
     return rms_by_joint(errors, data)
 
 

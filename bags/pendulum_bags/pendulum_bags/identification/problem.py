@@ -20,9 +20,12 @@ __all__ = [
     "Simulation",
     "cut_windows",
     "longest_step",
+    "off_line",
     "prepare",
     "projected_sensitivities",
+    "sensor_noise",
     "simulate",
+    "stretches_between_gaps",
 ]
 _NOTHING = np.zeros((0, 0))
 
@@ -98,22 +101,30 @@ def cut_windows(time: Array, window: float | None) -> NDArray[np.int64]:
     return windows[keep].astype(np.int64)
 
 
-def _between_gaps(recording: Recording, window: float | None) -> NDArray[np.int64]:
-    """Return windows that no gap of the recording lies in, shape (w, 2)."""
+def stretches_between_gaps(recording: Recording) -> list[tuple[int, int]]:
+    """Return first and one past last sample of each stretch that no gap lies in."""
     found = gaps(recording)
-    if not found:
-        return cut_windows(recording.time, window)
     since = recording.time - recording.time[0]
     begins = [0, *(int(np.searchsorted(since, stop - 1e-9)) for _, stop in found)]
     ends = [*(int(np.searchsorted(since, start + 1e-9)) for start, _ in found), since.size]
+    return list(zip(begins, ends, strict=True))
+
+
+def _between_gaps(recording: Recording, window: float | None) -> NDArray[np.int64]:
+    """Return windows that no gap of the recording lies in, shape (w, 2)."""
+    stretches = stretches_between_gaps(recording)
+    if len(stretches) == 1:
+        return cut_windows(recording.time, window)
     parts = [
         first + cut_windows(recording.time[first:stop], window)
-        for first, stop in zip(begins, ends, strict=True)
+        for first, stop in stretches
         # A stretch too short for a window's two states and something to compare is left out.
         if stop - first >= 8
     ]
     if not parts:
-        raise DataError(f"{recording.name} has {len(found)} gaps and no 8 samples between any two; expected fewer gaps")
+        raise DataError(
+            f"{recording.name} has {len(stretches) - 1} gaps and no 8 samples between any two; expected fewer gaps"
+        )
     return np.concatenate(parts)
 
 
@@ -143,6 +154,19 @@ def _first_state(recording: Recording, first: int) -> tuple[float, float]:
     scale = max(float(np.max(np.abs(t))), 1e-9)
     fit = np.polynomial.polynomial.polyfit(t / scale, recording.position[low:high], degree)
     return float(fit[0]), float(fit[1] / scale)
+
+
+def off_line(time: Array, values: Array) -> Array:
+    """Return what the best straight lines through values leave over, shape of the values: (n,) or (n, k)."""
+    since = time - np.mean(time)
+    off = values - np.mean(values, axis=0)
+    slope = since @ off / max(float(since @ since), 1e-300)
+    return np.asarray(off - (np.multiply.outer(since, slope)))
+
+
+def sensor_noise(position: Array) -> Array:
+    """Return the noise of samples by third differences, in which a smooth motion all but vanishes, along axis 0."""
+    return np.asarray(np.std(np.diff(position, 3, axis=0), axis=0) / math.sqrt(20.0))
 
 
 def longest_step(model: FitModel, recording: Recording) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import BOUNDS, FitModel
 from pendulum_bags.identification.options import default_window
-from pendulum_bags.identification.problem import Piece, prepare
+from pendulum_bags.identification.problem import Piece, off_line, prepare
 from pendulum_bags.identification.solver import Solution, residuals, solve
 from pendulum_bags.identification.starts import equation_residual, first_models, rank
 from pendulum_bags.runs.datasets import Recording
@@ -49,10 +49,7 @@ def errors_by_window(parts: Sequence[Array], pieces: Sequence[Piece]) -> tuple[A
         time, angle = piece.recording.time, piece.recording.position
         for first, stop in piece.windows:
             errors.append(float(np.sqrt(np.mean(part[first:stop] ** 2))))
-            t = time[first:stop] - np.mean(time[first:stop])
-            y = angle[first:stop] - np.mean(angle[first:stop])
-            slope = float(t @ y) / max(float(t @ t), 1e-300)
-            lines.append(float(np.sqrt(np.mean((y - slope * t) ** 2))))
+            lines.append(float(np.sqrt(np.mean(off_line(time[first:stop], angle[first:stop]) ** 2))))
     return np.array(errors), np.array(lines)
 
 

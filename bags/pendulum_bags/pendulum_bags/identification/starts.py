@@ -14,7 +14,7 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import FitModel
-from pendulum_bags.identification.problem import Piece
+from pendulum_bags.identification.problem import Piece, stretches_between_gaps
 from pendulum_bags.identification.solver import Solution, solve
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
@@ -63,7 +63,11 @@ def equation_residual(recording: Recording, *, window: float = 0.2) -> tuple[flo
 
 
 def _filtered_equation(recording: Recording, window: float) -> tuple[Array, Array]:
-    """Return the regressors of J, b, c, G, the offset and the cosine, shape (n, 6), and the input, filtered."""
+    """Return the regressors of J, b, c, G, the offset and the cosine, shape (n, 6), and the input, filtered.
+
+    Of the longest stretch without a gap: a filter that reaches across one knows nothing of the time in it.
+    """
+    recording = recording.rows(*max(stretches_between_gaps(recording), key=lambda pair: pair[1] - pair[0]))
     time, theta = recording.time, recording.position
     stamps = recording.input_stamps
     drive = recording.input if stamps is time else np.interp(time, stamps, recording.input)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.model import FitModel, from_plant
-from pendulum_bags.identification.problem import Piece, prepare, simulate
+from pendulum_bags.identification.problem import Piece, off_line, prepare, simulate
 from pendulum_bags.identification.solver import solve
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -46,10 +46,7 @@ class WindowScore:
     @property
     def lines(self) -> float:
         """Root mean square error of the best straight line through each window [rad]."""
-        left = self.measured.copy()
-        for first, stop in self.windows:
-            base = np.column_stack((np.ones(stop - first), self.time[first:stop] - self.time[first]))
-            left[first:stop] -= base @ np.linalg.lstsq(base, left[first:stop], rcond=None)[0]
+        left = np.concatenate([off_line(self.time[a:b], self.measured[a:b]) for a, b in self.windows])
         return float(np.sqrt(np.mean(left**2)))
 
 
