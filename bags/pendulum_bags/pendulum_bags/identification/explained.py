@@ -111,6 +111,10 @@ def undetermined_fit(fit: OutputErrorFit, uncertainty: Uncertainty) -> str | Non
     gain = uncertainty.intervals.get("input_gain")
     if gain is not None and gain.low <= 0.0 <= gain.high:
         lost["input_gain"] = gain.text
+    offset = uncertainty.intervals.get("torque_offset")
+    largest = max(float(np.max(np.abs(piece.recording.input))) for piece in fit.pieces) * abs(model["input_gain"])
+    if offset is not None and not free and offset.high - offset.low > 2.0 * largest:
+        lost["torque_offset"] = f"{offset.text}, more than all of the recorded torque"
     for name in at_bounds(fit.chosen):
         # A strength of 0 is an answer; the end of a range that was never meant to be reached is none.
         if name in {"inertia", "gravity", "torque_offset", "angle_offset", "input_gain"} and model[name] != 0.0:

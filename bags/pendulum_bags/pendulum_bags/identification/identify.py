@@ -14,6 +14,7 @@ from pendulum_bags.identification.geometry import check_geometry
 from pendulum_bags.identification.options import DEFAULTS, Options
 from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
 from pendulum_bags.identification.problem import prepare
+from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_bags.identification.residual_tests import residual_tests
 from pendulum_bags.identification.result import IdentificationResult, fingerprint
 from pendulum_bags.identification.solver import solve
@@ -51,7 +52,8 @@ def identify(
     fit = fit_output_error(recordings, options)
     tests = residual_tests(fit)
     account = explained(fit, tests.outliers)
-    uncertainty = assess(fit, tests, profiles=0 if account.refusal is not None else profiles)
+    explains = account.share <= DOUBTFUL_SHARE
+    uncertainty = assess(fit, tests, profiles=0 if account.refusal is not None else profiles, explains=explains)
     if account.refusal is None and (lost := undetermined_fit(fit, uncertainty)) is not None:
         account = replace(account, refusal=lost)
     geometry = check_geometry(fit.model, uncertainty, options.geometry)

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
-from pendulum_bags.identification.explained import REFUSED
+from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_choice import choose
 from pendulum_bags.identification.mechanism_doubt import Score, better_reading, refusal
@@ -46,6 +46,12 @@ two numbers per joint: parameters from long windows predict short ones better th
 
 _SHORTEST = 0.2
 """Shortest window by default, however fast neighbouring motions part [s]."""
+
+_POOR = 0.25
+"""Share of what straight lines miss from which on a fit is tried again by way of shorter windows."""
+
+_CLEARS = 0.2
+"""Share of the error that is left at most where a few windows, in which something pushed, made it."""
 
 _PUSHED = 0.25
 """Share of the windows that may be left out as pushed."""
@@ -286,8 +292,9 @@ class _Search:
         data = self._windows(length)
         tried: list[tuple[float, MechanismFit, str, dict[str, float], list[Windows], float]] = []
         error = self._attempt(start, data, length, tried)
+        shortest = None
         for shorter in (length / 3.0, length / 9.0):
-            if (tried and min(one[0] for one in tried) <= DOUBTFUL_SHARE) or shorter < _SHORTEST:
+            if (tried and min(one[0] for one in tried) <= _POOR) or shorter < _SHORTEST:
                 break
             # Short windows have fewer minima: what they find is another start.
             near: list[tuple[float, MechanismFit, str, dict[str, float], list[Windows], float]] = []
@@ -295,12 +302,15 @@ class _Search:
             if not near or near[0][0] > DOUBTFUL_SHARE:
                 continue
             self._attempt(near[0][1].model, data, length, tried)
-            if not fixed:
-                tried.extend(near)
-        if not tried:
+            shortest = None if fixed else near[0]
+        best = min(tried, key=lambda one: one[0]) if tried else None
+        # What long windows show, if poorly, predicts better than what short ones do.
+        if shortest is not None and (best is None or best[0] > LARGEST_SHARE):
+            best = shortest
+        if best is None:
             better = better_reading(self.plant, data)
             raise DataError(better or str(error))
-        return min(tried, key=lambda one: (one[0] > DOUBTFUL_SHARE, -one[5], one[0]))[1:]
+        return best[1:]
 
     def _windows(self, length: float) -> list[Windows]:
         data = [prepare_windows(recording, length, stride=self.stride) for recording in self.recordings]
@@ -344,7 +354,8 @@ def _without_pushes(
     Left out is what makes the difference: without a few windows the fit has to explain the rest.
     """
     total = sum(len(part.time) for part in data)
-    if _worst(found, data) <= DOUBTFUL_SHARE or total < 8:
+    share = _worst(found, data)
+    if share <= DOUBTFUL_SHARE or total < 8:
         return found, data, []
     lines = np.sqrt(np.mean([line_errors(part) ** 2 for part in data], axis=0))
     now, kept, out = found, data, []
@@ -362,7 +373,7 @@ def _without_pushes(
         kept = [p.subset(rest) if i == piece else p for i, p in enumerate(kept)]
         states = [np.delete(x, window, axis=0) if i == piece else x for i, x in enumerate(now.states)]
         now = fit(now.model, kept, now.free, 1.0 / np.maximum(lines, 1e-9), states=states, most=10, tolerance=1e-3)
-        if _worst(now, kept) <= DOUBTFUL_SHARE:
+        if _worst(now, kept) <= min(DOUBTFUL_SHARE, _CLEARS * share):
             return now, kept, sorted(out)
     return found, data, []
 

@@ -56,7 +56,7 @@ class Uncertainty:
     sentences: tuple[str, ...]
 
 
-def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2) -> Uncertainty:
+def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2, explains: bool = True) -> Uncertainty:
     """Return intervals and what limits them.
 
     With white residuals the intervals are those of least squares (the window states profiled out), corrected for
@@ -70,6 +70,7 @@ def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2) -> U
         fit: The fit.
         tests: Its residual tests.
         profiles: For how many of the weakest parameters to compute profile intervals.
+        explains: Whether the fit explains the motion; else its cost excludes nothing that the folds leave open.
 
     Source:
         Ljung, System Identification, ch. 9; Newey and West, Econometrica 55, 1987; Liang and Zeger, Biometrika
@@ -106,7 +107,7 @@ def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2) -> U
         raised = deviation[name] / max(own.white_deviation[name], 1e-150)
         found[name] = low, high = profile_interval(fit, name, inflation=raised)
         held = intervals[name]
-        if held.relative <= 1.0:
+        if held.relative <= 1.0 or not explains:
             # One interval for everything: what either way of looking at a weak parameter leaves open.
             low, high = min(held.low, low), max(held.high, high)
         # Else the estimate's neighbourhood, all that a covariance knows, says nothing about ends that far.
