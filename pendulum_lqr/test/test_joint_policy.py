@@ -103,7 +103,7 @@ def test_outside_of_the_box_of_any_joint_it_gives_up_for_good_and_names_it(tmp_p
     assert learned.command(0.0, *STILL) != (0.0,)
 
 
-def test_a_fallback_that_does_not_settle_is_refused_as_soon_as_the_period_is_known(tmp_path):
+def test_a_fallback_or_a_catch_that_does_not_settle_is_refused_as_soon_as_the_period_is_known(tmp_path):
     late = delayed_plant("cart_pole", 0.3)
     refusal = r"lqr asked every 0\.01 s does not settle on plant 'cart_pole'"
     learned = controller(tmp_path, random_policy(late), late, period=None, fallback="lqr")
@@ -111,6 +111,8 @@ def test_a_fallback_that_does_not_settle_is_refused_as_soon_as_the_period_is_kno
         learned.check(0.01)
     with pytest.raises(ParameterError, match=refusal):
         controller(tmp_path, random_policy(late), late, fallback="lqr")
+    with pytest.raises(ParameterError, match=refusal.replace("lqr", "policy")):
+        controller(tmp_path, random_policy(late), late, catch="lqr")
 
 
 def test_a_chosen_fallback_answers_after_it_gave_up_and_begins_softly(tmp_path):

@@ -340,6 +340,9 @@ def test_a_swing_up_that_its_lqr_would_not_hold_at_this_period_is_refused() -> N
     tardy = make_joint_controller("nmpc", delayed_plant("cart_pole", 0.05), {}, 0.05)
     with pytest.raises(ParameterError, match=r"nmpc asked every 0\.059 s does not settle on plant 'cart_pole'"):
         tardy.check(0.059)
+    # The same where it is made for whole states.
+    with pytest.raises(ParameterError, match=r"tvlqr asked every 0\.002 s does not settle on plant 'acrobot_frict"):
+        make_mechanism_controller("tvlqr", delayed_plant("acrobot_frictionless", 0.3), DT)
 
 
 @pytest.mark.timeout(400)

@@ -1,15 +1,19 @@
 """The rate of the states: measured, heeded, and refused where a controller does not bear it."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.controller_interface.controller import CONTROLLERS, make_controller
+from pendulum_lqr.controller_interface.controller import CONTROLLERS, BaseController, make_controller
 from pendulum_lqr.controller_interface.loop_check import settles
 from pendulum_lqr.controller_interface.sampling import PeriodWatch, differs, rate_problem, uses_period
+from pendulum_lqr.linear.analysis import delayed_spectral_radius
+from pendulum_lqr.linear.design import output_lqr
+from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 MS = 1_000_000
@@ -128,3 +132,24 @@ def test_a_balancing_controller_settles_at_a_set_point_too():
     controller = make_controller("lqr", DFKI, 0.01, {"set_point": 0.3})
     assert settles(controller, DFKI, 0.01, 0.3)
     assert not settles(make_controller("pid", DFKI, 0.01, {"set_point": 0.3}), DFKI, 0.002, 0.3)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.02])
+def test_a_law_that_is_no_known_gain_is_refused_within_a_ten_thousandth_of_the_spectral_radius_at_which_its_gain_is(
+    lag: float,
+) -> None:
+    class Followed(BaseController):
+        def command(self, t: float, x: Sequence[float]) -> float:
+            return -K[0] * x[0] - K[1] * x[1]
+
+    K = tuple(map(float, output_lqr(linearise(DFKI.with_values(actuator_time_constant=lag)), (100.0, 0.01), 0.1).K))
+    for radius_above in (True, False):
+        low, high = 0.0, 0.1
+        while True:
+            middle = 0.5 * (low + high)
+            plant = DFKI.with_values(actuator_time_constant=lag, transport_delay=middle)
+            radius = delayed_spectral_radius(linearise(plant), K, 0.01)
+            if 2e-5 < (radius - 1.0 if radius_above else 1.0 - radius) < 1e-4:
+                break
+            low, high = (low, middle) if radius > (1.00006 if radius_above else 0.99994) else (middle, high)
+        assert settles(Followed(1.5), plant, 0.01) != radius_above
