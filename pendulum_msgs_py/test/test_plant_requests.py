@@ -38,6 +38,12 @@ class Plant:
         self.interface = PlantInterface(self.node, self.supervisor, lambda: NOW, polled=True)
         self.node.poll_services(timer=False)
         self.interface.sample = JointSample.of_one(NOW, 0.0, 0.0)
+        self.said: list[str] = []
+        self.interface.publish_diagnostics = lambda: self.said.append("diagnostics")  # type: ignore[method-assign]
+        self.interface.publish_event = lambda name, **details: self.said.append(f"{name}: {details}")  # type: ignore[method-assign]
+        logger = self.node.get_logger()
+        for level in ("info", "error"):
+            setattr(logger, level, lambda text, level=level, **_: self.said.append(f"{level}: {text}"))
 
     def arm(self, wanted: bool = True) -> str:
         answer = self.interface._on_arm(SetBool.Request(data=wanted), SetBool.Response())
@@ -81,6 +87,54 @@ def test_a_trajectory_that_came_before_the_plant_was_armed_was_not_meant_for_an_
     assert plant.follow(arrived_ns=time.time_ns())
 
 
+@pytest.mark.parametrize(
+    ("waited", "followed"), [(0, True), (1, False), (10 * NANOSECONDS - 1, False), (10 * NANOSECONDS, True)]
+)
+def test_a_trajectory_waited_if_it_came_before_arming_and_no_clock_was_set_back(
+    plant: Plant, waited: int, followed: bool
+) -> None:
+    assert plant.arm() == ""
+    assert plant.follow(arrived_ns=plant.interface._armed_ns - waited) is followed
+    told = "info: following a trajectory" if followed else "error: joint_trajectory refused: it came before the plant"
+    assert plant.said[1].startswith(told)
+    assert followed or plant.said[2].startswith("trajectory_refused: {'reason': 'it came before the plant was armed")
+
+
+@pytest.mark.parametrize("stamped_after", [-TRAJECTORY_AGE_LIMIT, TRAJECTORY_AGE_LIMIT, -NOW / NANOSECONDS])
+def test_a_trajectory_as_old_as_the_limit_and_one_without_a_stamp_are_followed(
+    plant: Plant, stamped_after: float
+) -> None:
+    assert plant.arm() == ""
+    assert plant.follow(stamped_after)
+
+
+def test_a_trajectory_that_the_rules_refuse_is_counted_with_its_reason(plant: Plant) -> None:
+    assert plant.arm() == ""
+    plant.interface.sample = None
+    assert not plant.follow()
+    plant.interface.sample = JointSample.of_one(NOW, 3.0, 0.0)
+    assert not plant.follow()
+    assert plant.interface.refused_trajectories == {"invalid": 2}
+    assert "no measurement yet" in plant.said[1]
+    assert "trajectory starts at" in plant.said[3]
+
+
+def test_each_request_is_answered_with_the_mode_and_shown_in_diagnostics_and_what_waited_is_read(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[object] = []
+    monkeypatch.setattr(plant.interface._trajectories, "take", read.append)
+    for wanted, mode in ((True, "armed_effort"), (True, "armed_effort"), (False, "disarmed")):
+        answer = plant.interface._on_arm(SetBool.Request(data=wanted), SetBool.Response())
+        assert (answer.success, answer.message) == (True, mode)
+    # By the first, which made it ready; each of the others found it so, or ended it.
+    assert read == [plant.interface._on_trajectory]
+    plant.interface.e_stop("pressed")
+    answer = plant.interface._on_e_stop_reset(Trigger.Request(), Trigger.Response())
+    assert (answer.success, answer.message) == (True, "disarmed")
+    assert plant.said == ["diagnostics"] * 4
+
+
 def test_arming_looks_for_two_commanders_itself_and_does_not_wait_for_the_next_look(plant: Plant) -> None:
     twins = [rclpy.create_node("twin", context=plant.context, start_parameter_services=False) for _ in range(2)]
     for twin in twins:
@@ -106,10 +160,12 @@ def test_a_press_ends_what_compiled_code_does_though_it_sees_nothing_but_its_cou
     assert plant.interface._pressed.is_set()
 
 
-@pytest.mark.parametrize("waited", [0, 1, 9 * NANOSECONDS, 11 * NANOSECONDS])
+@pytest.mark.parametrize("waited", [0, 1, 10 * NANOSECONDS - 1, 10 * NANOSECONDS])
 def test_a_request_counts_for_nothing_that_waited_while_the_e_stop_was_pressed(plant: Plant, waited: int) -> None:
     outdated = 0 < waited < 10 * NANOSECONDS
+    before_ns = time.time_ns()
     plant.interface.e_stop("pressed")
+    assert before_ns <= plant.interface._pressed_ns <= time.time_ns()
     plant.node.request_ns = plant.interface._pressed_ns - waited
     answer = plant.interface._on_e_stop_reset(Trigger.Request(), Trigger.Response())
     assert answer.success is not outdated
@@ -125,7 +181,9 @@ def test_a_request_counts_for_nothing_that_waited_while_the_e_stop_was_pressed(p
 def test_a_press_that_was_counted_is_read_once_and_makes_earlier_requests_outdated(plant: Plant) -> None:
     assert plant.interface._unread_press() is None
     plant.interface._e_stop.arrivals.wake()
+    before_ns = time.time_ns()
     assert plant.interface._unread_press() == (NOW, "e-stop pressed")
+    assert before_ns <= plant.interface._pressed_ns <= time.time_ns()
     assert plant.interface._unread_press() is None
     plant.node.request_ns = plant.interface._pressed_ns - 1
     assert "before the e-stop was pressed" in plant.arm()
