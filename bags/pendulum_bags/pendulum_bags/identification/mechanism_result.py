@@ -358,7 +358,8 @@ def _without_pushes(
     if share <= DOUBTFUL_SHARE or total < 8:
         return found, data, []
     lines = np.sqrt(np.mean([line_errors(part) ** 2 for part in data], axis=0))
-    now, kept, out = found, data, []
+    now, kept = found, data
+    out: list[tuple[str, float, float]] = []
     while len(out) < _PUSHED * total:
         errors = [np.sqrt(np.sum((left / lines) ** 2, axis=(1, 2))) for left in now.residuals]
         piece = int(np.argmax([np.max(each) for each in errors]))
@@ -382,7 +383,7 @@ def _hold_undetermined(
     start: MechanismModel, found: MechanismFit, data: Sequence[Windows], weights: Array
 ) -> tuple[MechanismFit, list[str]]:
     """Return the fit with sizes that the recordings do not determine held at the start's, and their names."""
-    own, held = set(tellable(start.plant)), []
+    own, held = set(tellable(start.plant)), list[str]()
     if _worst(found, data) > DOUBTFUL_SHARE:
         return found, held
     for _ in range(len(own) - 1):

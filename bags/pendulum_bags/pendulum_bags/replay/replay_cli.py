@@ -92,7 +92,7 @@ def replay(
             namespace=prefix or None,
         )
     content = result.as_dict()
-    objection = None if controller else result.objection
+    objection = getattr(result, "objection", None)
     content["objection"] = objection
     if out is not None:
         files = write_figures([result.figure()], out)
