@@ -13,13 +13,14 @@ import pytest
 from pendulum_lqr.controller_interface.interface import JointController
 from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.controllers.joint_lqg import JointLqg
+from pendulum_lqr.linear.analysis import delayed_spectral_radius
 from pendulum_lqr.linear.design import DesignError, kalman_gain
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
-from pendulum_testing.joint_plants import delayed_plant, near_upright
+from pendulum_testing.joint_plants import delayed_plant, lagging_plant, near_upright
 
 PLANTS = ("acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "cart_pole", "furuta")
 PERIOD = 0.01
@@ -138,6 +139,22 @@ def test_an_integral_unwinds_at_the_limit_joint_by_joint_whatever_the_sign_of_it
             change = controller._integral - before
             assert change[count] == pytest.approx(-1e-3 if sign < 0.0 else 0.0, rel=1e-6, abs=1e-12)
             assert np.abs(np.delete(change, count)).max(initial=0.0) < 1e-12
+
+
+def test_the_spectral_radius_of_a_loop_with_integrals_is_that_of_the_law_as_it_answers() -> None:
+    plant = lagging_plant(delayed_plant("double_pendulum", 0.003), 0.01)
+    controller = make_joint_controller("lqi", plant, {"q_integral": 50.0}, PERIOD)
+    controller.effort_limits = (math.inf, math.inf)
+    model = linearise(plant)
+    sampled, goal = discretise(model, PERIOD), np.array(plant.coordinates.goal)
+    columns = []
+    for start in 1e-3 * np.eye(len(sampled.A) + 2):
+        z, controller._integral = start[:-2], start[-2:]
+        u = controller.command(0.0, tuple(map(float, goal + z[:2])), tuple(map(float, z[2:4])))
+        columns.append(1e3 * np.array([*(sampled.A @ z + sampled.B @ u), *controller._integral]))
+    found = float(np.abs(np.linalg.eigvals(np.array(columns).T)).max())
+    K = controller.gain.rows * np.array([1.0] * 4 + [PERIOD] * 2)
+    assert delayed_spectral_radius(model, K, PERIOD, summed=(0, 1)) == pytest.approx(found, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["lqi", "lqg", "discrete_lqr"])
