@@ -153,9 +153,11 @@ def test_under_strategy_3_the_newest_command_tells_which_loop_counts() -> None:
         assert not watched.see(0, position_command=0.5, effort_command=0.75)
 
 
-@pytest.mark.parametrize("late", [0, 12 * MILLISECOND, 25 * MILLISECOND])
+@pytest.mark.parametrize(
+    ("late", "has_clock"), [(0, True), (12 * MILLISECOND, True), (25 * MILLISECOND, True), (0, False)]
+)
 def test_a_record_that_a_busy_host_reads_late_is_compared_with_what_had_been_sent_when_it_was_measured(
-    late: int,
+    late: int, has_clock: bool
 ) -> None:
     """Commands go on while records wait; what the module acts on is the newest that it had."""
     watched, begin, told = Watched(), 1_000_000_000, 0
@@ -168,7 +170,9 @@ def test_a_record_that_a_busy_host_reads_late_is_compared_with_what_had_been_sen
             watched.monitor.told(Command(pwm=0.01 * told), Strategy.DIRECT_PWM, begin + told * STEP + MILLISECOND // 2)
             told += 1
         record = feedback_record(measured, count, effort=1e-9 * count, pwm_command=0.01 * (count - 1) + wrong)
-        fault = watched.monitor.check(record._replace(stamp_ns=measured + waits))
+        # By a clock of the module's own, or by none.
+        own = measured - 500_000_000 if has_clock else 0
+        fault = watched.monitor.check(record._replace(stamp_ns=measured + waits, hardware_ns=own))
         return "" if fault is None else fault.name
 
     assert not any(see(count, 0) for count in range(1, 10))
