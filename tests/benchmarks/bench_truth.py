@@ -103,8 +103,8 @@ def rows() -> Iterator[Row]:
                         at_most=5.0,
                     )
             total: Counter[str] = Counter()
-            for part in pool.map(partial(on_the_margin, pair=pair, stated=margins_on(truth)), blocks):
-                total.update(part)
+            for count in pool.map(partial(on_the_margin, pair=pair, stated=margins_on(truth)), blocks):
+                total.update(count)
             for quantity in _SPREADS:
                 yield counted(
                     f"{name}: \u201cequivalent\u201d within 3 looks although on the margin, spread of {quantity}",

@@ -82,7 +82,7 @@ def test_a_transition_that_fails_releases_the_actuator_and_says_why(
     said: list[str] = []
     monkeypatch.setattr(rig.node, "_quieten", fail)
     monkeypatch.setattr(rig.node.get_logger(), "error", lambda text, **_: said.append(text))
-    assert rig.node.on_deactivate(None) is TransitionCallbackReturn.FAILURE  # type: ignore[arg-type]
+    assert rig.node.on_deactivate(None) is TransitionCallbackReturn.FAILURE
     assert rig.actuator.strategy is Strategy.OFF
     assert rig.node.failure is error
     assert (rig.node._loop, rig.node._bridge) == (None, None)

@@ -298,7 +298,11 @@ def compare_folders(
         DataError: Runs are given that must not be pooled.
     """
     margins = Margins.parse(margin)
-    pairs, own, left_out, stalls, shown = [], [], [], [], []
+    pairs: list[tuple[RunData, RunData]] = []
+    own: list[RunData] = []
+    left_out: list[str] = []
+    stalls: list[dict[str, str]] = []
+    shown: list[int] = []
     for folder in map(Path, folders):
         if broken := read_stalls(folder):
             stalls += [{"run": folder.resolve().name, **stall} for stall in broken]

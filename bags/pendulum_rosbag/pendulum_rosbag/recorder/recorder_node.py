@@ -106,7 +106,7 @@ class Recorder(PollingNode):
 
     # -- sessions ----------------------------------------------------------------------------------------------
 
-    def _begin(self) -> None:
+    def _begin(self) -> RecordingSession:
         number = len(self.reports)
         base = self._options.output
         path = base if not number else base.with_name(f"{base.name}_{number + 1}")
@@ -120,10 +120,11 @@ class Recorder(PollingNode):
             max_duration=options.max_duration,
         )
         with self._lock:
-            self._session = RecordingSession(writer, on_failure=self._on_failure)
-            self._session.add_topic(self._events, message_type("std_msgs/msg/String"), [QosProfile()])
+            session = self._session = RecordingSession(writer, on_failure=self._on_failure)
+            session.add_topic(self._events, message_type("std_msgs/msg/String"), [QosProfile()])
         self._started = time.monotonic()
         print(f"recording to {writer.path}", flush=True)
+        return session
 
     def _end(self) -> SessionReport | None:
         with self._lock:
@@ -234,10 +235,9 @@ class Recorder(PollingNode):
         if box is None or self._session is not None or not box.is_due(time.time_ns()):
             return
         with self._lock:
-            self._begin()
-            assert self._session is not None
+            session = self._begin()
             for tap, time_ns, data in box.empty():
-                self._offer(tap, self._session, [(time_ns, data)])
+                self._offer(tap, session, [(time_ns, data)])
             self.note("black_box", reason=box.reason)
             self._end()
         self._publish_black_box()
