@@ -20,11 +20,11 @@ from pendulum_testing.bag_readers import JOINT_STATE, state
 COUNT = 200
 
 
-def write(bag: Path, storage: str = "mcap", first: int = 0) -> Path:
+def write(bag: Path, storage: str = "mcap", first: int = 0, shift: int = 0) -> Path:
     with BagWriter(bag, storage) as writer:
         writer.add_topic("/a", JOINT_STATE)
         for index in range(first, first + COUNT):
-            writer.write("/a", index, state(index))
+            writer.write("/a", index, state(index + shift))
     (file,) = [*bag.glob("*.mcap"), *bag.glob("*.db3")]
     return file
 
@@ -117,6 +117,17 @@ def test_a_copy_in_a_folder_without_metadata_is_read_once(tmp_path: Path) -> Non
     with read_bag(bag) as opened:
         assert opened.topics["/a"].count == COUNT
         assert any("left out: all its messages are in" in note for note in opened.notes)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_another_run_at_the_same_simulated_times_is_no_copy(tmp_path: Path, storage: str) -> None:
+    bag = tmp_path / "bag"
+    file = write(bag, storage)
+    shutil.move(write(tmp_path / "more", storage, shift=1), bag / f"tuesday{file.suffix}")
+    (bag / "metadata.yaml").unlink()
+    with read_bag(bag) as opened:
+        assert opened.topics["/a"].count == 2 * COUNT
+    assert rewrite([bag], tmp_path / "converted").messages == {"/a": 2 * COUNT}
 
 
 def test_a_torn_file_is_replaced_by_its_sound_twin(tmp_path: Path) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
-import numpy as np
 import yaml
 
 from pendulum_msgs_py.errors import BagError
@@ -308,21 +308,21 @@ def _leave_out_copies(folder: BagFolder, sources: list[Source]) -> None:
     for source in [one for one in sources if one.path in folder.unlisted and one.stop_ns]:
         for other in sources:
             inside = other.start_ns <= source.start_ns and source.stop_ns <= other.stop_ns
-            if other is not source and inside and _log_times(source).items() <= _log_times(other).items():
+            # Runs of a simulation begin at the same time, so that times alone make no copy.
+            if other is not source and inside and _messages(source) <= _messages(other):
                 folder.notes.append(f"{source.path.name} is left out: all its messages are in {other.path.name}")
                 sources.remove(source)
                 source.close()
                 break
 
 
-def _log_times(source: Source) -> dict[tuple[str, int], int]:
-    """Return how many messages a file has by topic and log time [ns]."""
+def _messages(source: Source) -> Counter[tuple[str, int, int]]:
+    """Return how often a file has each message: topic, log time [ns] and hash of its bytes."""
     topics = {stream.channel: stream.topic for stream in source.streams}
-    counts: dict[tuple[str, int], int] = {}
+    counts: Counter[tuple[str, int, int]] = Counter()
     for batch in source.batches(set(topics), None, None):
         topic = topics[batch.channel]
-        for time, count in zip(*np.unique(batch.times, return_counts=True), strict=True):
-            counts[topic, int(time)] = counts.get((topic, int(time)), 0) + int(count)
+        counts.update((topic, time, hash(data)) for time, data in batch.payloads())
     return counts
 
 
