@@ -72,6 +72,28 @@ def test_a_log_with_a_row_for_each_topic_takes_each_from_its_own_rows(tmp_path, 
     assert "each is taken from its own rows" in " ".join(data_notes(recording))
 
 
+def test_topics_that_meet_in_some_rows_are_still_taken_from_their_own(tmp_path):
+    text = "time,position,velocity,torque\n"
+    for k, (t, q, v, u) in enumerate(zip(TIME, ANGLE, SPEED, TORQUE, strict=True)):
+        state, command = f"{t:.6f},{q:.6f},{v:.6f},", f"{u:.6f}\n"
+        text += state + command if k % 50 == 0 else f"{state}\n{t + 0.004:.6f},,,{command}"
+    recording = read_csv(save(tmp_path / "sparse.csv", text))
+    np.testing.assert_allclose(recording.time, TIME)
+    np.testing.assert_allclose(recording.input, TORQUE)
+
+
+def test_a_comment_with_units_below_the_header_names_no_columns(tmp_path):
+    text = "# time,position,velocity,torque\n# s,rad,rad/s,N m\n" + rows(TIME, ANGLE, SPEED, TORQUE)
+    assert read_recording(save(tmp_path / "run.csv", text)).time.size == TIME.size
+
+
+def test_columns_between_spaces_are_told_with_the_mapping_that_reads_them(tmp_path):
+    path = save(tmp_path / "run.csv", "time position velocity torque\n" + rows(TIME, ANGLE, SPEED, TORQUE, mark=" "))
+    with pytest.raises(DataError, match="`delimiter: ' '` reads it otherwise"):
+        read_csv(path)
+    assert read_csv(path, {**MAPPINGS["pendulum"], "delimiter": " "}).time.size == TIME.size
+
+
 @pytest.mark.parametrize(
     "before",
     ["# logger 3\n#\n# made on Monday, by hand\n", "# a, b: 5\n\n", "", "# 1, 2, 3\n"],
@@ -88,6 +110,12 @@ def test_comments_before_the_header_need_no_skip(tmp_path, before, head):
 def test_semicolons_tabs_and_decimal_commas_are_read(tmp_path, mark, decimal):
     text = rows(TIME, ANGLE, SPEED, TORQUE, mark=mark).replace(".", decimal)
     path = save(tmp_path / "run.csv", mark.join(["time", "position", "velocity", "torque"]) + "\n" + text)
+    np.testing.assert_allclose(read_recording(path).position, ANGLE, atol=1e-6)
+
+
+def test_a_column_of_dates_hides_no_decimal_commas(tmp_path):
+    text = rows(TIME, ANGLE, SPEED, TORQUE, mark=";").replace(".", ",").replace("\n", ";27.11.2026\n")
+    path = save(tmp_path / "run.csv", "time;position;velocity;torque;date\n" + text)
     np.testing.assert_allclose(read_recording(path).position, ANGLE, atol=1e-6)
 
 

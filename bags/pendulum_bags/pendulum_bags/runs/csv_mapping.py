@@ -24,7 +24,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +77,8 @@ MAPPINGS: Mapping[str, Mapping[str, Any]] = {
 ``free_swing`` (no input)."""
 
 _DELIMITERS = (",", ";", "\t")
-_DECIMAL_COMMA, _DECIMAL_POINT = re.compile(r"\d,\d"), re.compile(r"\d\.\d")
+_DECIMAL_COMMA, _DECIMAL_POINT = re.compile(r"\d,\d"), re.compile(r"(?<![\d.])\d+\.\d+(?![\d.])")
+"""A date such as 27.11.2026 has no decimal point."""
 
 _SECTION_KEYS = {
     "time": {"column", "unit", "period", "start"},
@@ -174,7 +175,8 @@ def _rows_by_topic(rules: Mapping[str, Any], names: list[str], table: Array) -> 
     has = {key: _finite(rules[key], names, table) for key in ("time", "position", "velocity", "input") if key in rules}
     states = has["time"] & has["position"]
     inputs = has["time"] & has["input"]
-    if (states & inputs).any() or not (states.any() and inputs.any()):
+    # Topics that a logger writes apart may meet in some rows; holes leave most of them whole.
+    if 2 * np.sum(states & inputs) >= min(np.sum(states), np.sum(inputs)):
         return None
     if "velocity" in has and (states & has["velocity"]).any():
         states &= has["velocity"]
@@ -245,7 +247,7 @@ def _read_table(source: Path, delimiter: str, skip: int, wanted: set[str]) -> tu
     lines = text.split("\n", skip)
     if len(lines) <= skip:
         raise DataError(f"{source} has {len(lines)} lines; expected a header after the {skip} lines to skip")
-    head, body, line = _head_and_body(lines[skip])
+    head, body, line = _head_and_body(lines[skip], wanted)
     delimiter = delimiter or max(_DELIMITERS, key=head.count)
     try:
         cells = next(csv.reader([head.lstrip("# ").strip()], delimiter=delimiter), [])
@@ -253,6 +255,7 @@ def _read_table(source: Path, delimiter: str, skip: int, wanted: set[str]) -> tu
         raise DataError(f"{source} begins with a line that is no CSV: {error}") from error
     names = [name.strip() for name in cells]
     others = [mark for mark in _DELIMITERS if mark != delimiter and mark in head]
+    others += [" "] * (" " in head.strip("# ") and len(body.lstrip().split("\n", 1)[0].split()) > 1)
     if len(names) == 1 and others:
         raise DataError(
             f"{source} has one column, {names[0][:60]!r}, between {delimiter!r}; expected several: a mapping file with "
@@ -289,16 +292,18 @@ def _read_table(source: Path, delimiter: str, skip: int, wanted: set[str]) -> tu
     return names, table
 
 
-def _head_and_body(text: str) -> tuple[str, str, int]:
+def _head_and_body(text: str, wanted: Collection[str]) -> tuple[str, str, int]:
     """Return the line that names the columns, what is below it, and the number of lines before it.
 
-    Lines that begin with ``#`` are comments; the last of them names the columns where numbers follow.
+    Lines that begin with ``#`` are comments; where numbers follow, the last of them that names a wanted column is the
+    header, else the last: one of units may stand below.
     """
     lines = text.split("\n")
     first = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
     comments = [i for i in range(first) if lines[i].strip()]
     if comments and (first == len(lines) or _is_number(re.split(r"[,;\t ]", lines[first].strip())[0] or "0")):
-        first = comments[-1]
+        named = [i for i in comments if {c.strip("# \r").casefold() for c in re.split(r"[,;\t]", lines[i])} & {*wanted}]
+        first = named[-1] if named else comments[-1]
     head = min(first, len(lines) - 1)
     return lines[head], "\n".join(lines[head + 1 :]), head
 
