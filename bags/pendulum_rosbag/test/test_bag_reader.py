@@ -175,6 +175,17 @@ def test_states_of_several_joints_come_as_objects(tmp_path: Path) -> None:
         read_bag(path).array("/a")
 
 
+@pytest.mark.parametrize("names", [["p", "q"], ["p"] * 9000 + ["q"]], ids=["from the first", "in a later block"])
+def test_joints_that_take_turns_are_not_taken_for_one(tmp_path: Path, names: list[str]) -> None:
+    path = tmp_path / "bag"
+    with BagWriter(path) as writer:
+        writer.add_topic("/a", JOINT_STATE)
+        for time, name in enumerate(names):
+            writer.write("/a", time, joint_state(time, "", [name], [1.0], [2.0], [3.0]))
+    with pytest.raises(DataError, match="holds sensor_msgs/msg/JointState of 2 joints that take turns: p, q; "):
+        read_bag(path).array("/a")
+
+
 def test_bytes_behind_the_message_are_passed_over(tmp_path: Path) -> None:
     path = tmp_path / "bag"
     with BagWriter(path) as writer:

@@ -467,6 +467,7 @@ def _held(kind: str, stored: Sequence[StoredMessage]) -> str:
     """Return what a topic holds, in words: of joint states, what makes them unfit."""
     if kind != _JOINT_STATE:
         return kind
+    turns = dict.fromkeys(str(name) for item in stored for name in item.message.name)
     for item in stored:
         joints = [str(name) for name in item.message.name]
         sizes = [len(getattr(item.message, column)) for column in ("position", "velocity", "effort")]
@@ -476,4 +477,6 @@ def _held(kind: str, stored: Sequence[StoredMessage]) -> str:
             return f"{kind} of {len(joints)} joints ({', '.join(joints)})"
         if max(sizes) > 1:
             return f"{kind} of the joint {joints[0]} with {max(sizes)} values"
+    if len(turns) > 1:
+        return f"{kind} of {len(turns)} joints that take turns: {', '.join(turns)}"
     return f"{kind} in more layouts than can be read (big-endian CDR, or damaged)"

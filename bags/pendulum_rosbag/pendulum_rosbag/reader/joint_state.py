@@ -44,12 +44,14 @@ class Layout:
 
     Args:
         size: Bytes up to the last field (a serialiser may append some that mean nothing).
+        joint: Its name, with the terminating zero.
         frame: Start and length of the frame id without its terminating zero.
         values: Offset of position, velocity and effort; -1 when absent.
         constants: (offset, bytes) that every message of this layout has.
     """
 
     size: int
+    joint: bytes
     frame: tuple[int, int]
     values: tuple[int, int, int]
     constants: tuple[tuple[int, bytes], ...]
@@ -70,6 +72,7 @@ def layout_of(data: bytes) -> Layout | None:
             return None
         constants.append((at, data[at : at + 8 + name_size]))
         at += 8 + name_size
+        joint = data[at - name_size : at]
         values = []
         for _ in range(3):
             at = _align(at, 4)
@@ -91,7 +94,7 @@ def layout_of(data: bytes) -> Layout | None:
     # The zero that ends the frame id is as constant as its length.
     constants.append((15 + frame_size, b"\x00"))
     position, velocity, effort = values
-    return Layout(at, (16, frame_size - 1), (position, velocity, effort), tuple(constants))
+    return Layout(at, joint, (16, frame_size - 1), (position, velocity, effort), tuple(constants))
 
 
 def _align(at: int, size: int) -> int:
@@ -198,6 +201,7 @@ class _Columns:
 
     array: npt.NDArray[Any]
     at: int = 0
+    joint: bytes | None = None
     frames: list[tuple[Any, int, Any]] = field(default_factory=list)
 
 
@@ -213,7 +217,7 @@ class JointStateParser:
         self._fixed = True
 
     def add(self, batch: Batch) -> None:
-        """Parse more messages; once one is no one-joint JointState, the rest is passed over."""
+        """Parse more messages; once one is no JointState of one joint and the same, the rest is passed over."""
         if not self._fixed:
             return
         columns = self._columns
@@ -228,7 +232,7 @@ class JointStateParser:
 
         Returns:
             Structured array with the columns :data:`FIELDS`, and ``frame_id`` when any message has one; ``None``
-            when a message is no one-joint JointState in little-endian CDR.
+            when a message is no one-joint JointState in little-endian CDR, or joints take turns.
         """
         return _with_frames(self._columns) if self._fixed else None
 
@@ -261,6 +265,9 @@ def _parse_block(
             layout = layout_of(_message(batch, int(offsets[first]), None if sizes is None else int(sizes[first])))
             if layout is None or layout in layouts or tried >= _LAYOUTS:
                 return False
+            if columns.joint not in {None, layout.joint}:
+                return False
+            columns.joint = layout.joint
             layouts.append(layout)
         layout = layouts[tried]
         tried += 1
