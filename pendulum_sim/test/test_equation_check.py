@@ -185,6 +185,8 @@ class Odd(gymnasium.Env[Any, Any]):
 
     def _observe(self) -> Any:
         theta, speed = self.x + self.odd.get("noise", 0.0) * self.np_random.normal(size=2)
+        theta = theta + self.odd.get("shown", 0.0)
+        theta = 1.0 - theta if "mirrored" in self.odd else theta
         if wrap := self.odd.get("wrap"):
             theta = (theta + 0.5 * wrap) % wrap - 0.5 * wrap
         return np.array([theta, speed * self.odd.get("speed_unit", 1.0)])
@@ -229,6 +231,12 @@ gymnasium.register("Odd-v0", entry_point=Odd)
         ({"wrap": math.pi}, "an angle that jumps by"),
         ({"no_angle": 1}, "a reset that is ignored"),
         ({"no_speed": 1}, "a reset that ignores the velocity"),
+        (
+            {"shown": 0.5},
+            "another zero of the angle that is read than of the start (put at -3.14 rad, it is read as -2.64 rad)",
+        ),
+        ({"mirrored": 1}, "another sign, or swapped sine and cosine, of the angle that is read than of the start"),
+        ({"speed_unit": 0.1}, "or a unit of velocity: its angle moves 10 times as far"),
         ({"delay": 3}, "a delay (an effort acts 30 ms later)"),
         ({"lag": 0.05}, "a lag of the effort"),
         ({"clip": 1.0}, "an action that is clipped (beyond about 1 N m more does nothing; the limit is 5 N m)"),

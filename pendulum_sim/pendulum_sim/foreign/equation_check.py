@@ -57,6 +57,8 @@ _CLOSE = 0.05
 """What a response may leave over of another that is taken for the same."""
 _LOST = 0.3
 """Share of a start's velocity that is left a period later where it was not taken."""
+_SAME_TURN = 0.99
+"""Mean of unit vectors from which angles differ by one angle."""
 _LEAST_JUMP = 0.5
 """Least jump [rad or m]."""
 _OTHER_PERIOD = 0.2
@@ -434,6 +436,12 @@ def _reset(case: _Case) -> str:
     unit = case.plant.coordinates.joints[j].unit
     far = np.abs(came - there)
     if len(swings) > _FEW and np.median(far) > 0.2 * np.std(asked):
+        for sign, what in ((1.0, "another zero"), (-1.0, "another sign, or swapped sine and cosine,")):
+            if abs(np.mean(np.exp(1j * (came - sign * there)))) > _SAME_TURN:
+                return (
+                    f"{what} of the angle that is read than of the start (put at {asked[0]:.2f} {unit}, it is read as "
+                    f"{wrap(float(came[0])):.2f} {unit})"
+                )
         i = int(np.argmax(far))
         at = wrap(float(came[i])) if case.plant.coordinates.joints[j].turns else float(came[i])
         return f"a reset that is ignored (put at {asked[i]:.2f} {unit}, it is at {at:.2f} {unit} a period later)"
@@ -443,7 +451,9 @@ def _reset(case: _Case) -> str:
     if power > 0.0:
         kept = float(np.dot([theirs.velocity[1, j] for _, theirs, _ in moving], asked)) / power
         ours = float(np.dot([mine.velocity[1, j] for _, _, mine in moving], asked)) / power
-        if kept < _LOST and ours > 1.0 - _LOST:
+        # Of another unit of velocity the angle moves on.
+        went = float(np.dot([np.diff(theirs.position[:2, j])[0] for _, theirs, _ in moving], asked)) / power
+        if max(kept, went / case.plant.dt) < _LOST and ours > 1.0 - _LOST:
             return "a reset that ignores the velocity (it starts at rest)"
     return ""
 
@@ -466,11 +476,13 @@ def _wrap(case: _Case) -> str:
 def _period(case: _Case) -> str:
     """Name a period or a unit by which angle and velocity do not belong together."""
     dt, j = case.plant.dt, case.joint
-    firsts = [
-        (np.diff(t.position[1:3, j])[0], 0.5 * dt * float(np.sum(t.velocity[1:3, j])))
-        for _, t, _ in case.whole(_MOVING)
-    ]
-    ratios = [moved / told for moved, told in firsts if told]
+    ratios = []
+    for _, theirs, _ in case.whole(_MOVING):
+        moved, speeds = float(np.diff(theirs.position[1:3, j])[0]), theirs.velocity[1:3, j]
+        # By the integrator, a step goes at any velocity between its first and its last.
+        told = moved if speeds.min() <= moved / dt <= speeds.max() else dt * float(speeds.mean())
+        if told:
+            ratios.append(moved / told)
     if len(ratios) <= _FEW:
         return ""
     low, ratio, high = (float(value) for value in np.quantile(ratios, (0.25, 0.5, 0.75)))
