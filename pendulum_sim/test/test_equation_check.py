@@ -195,7 +195,7 @@ class Odd(gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         self.x = np.array((options or {}).get("state", [0.0, 0.0]), dtype=float)
         self.x *= [1.0 - self.odd.get("no_angle", 0.0), 1.0 - self.odd.get("no_speed", 0.0)]
-        self.waiting, self.torque = [0.0] * int(self.odd.get("delay", 0)), 0.0
+        self.waiting, self.torque = [0.0] * int(self.odd.get("delay", 0)), self.torque if "kept" in self.odd else 0.0
         return self._observe(), {}
 
     def step(self, action: Any) -> Any:
@@ -237,6 +237,7 @@ gymnasium.register("Odd-v0", entry_point=Odd)
         ),
         ({"mirrored": 1}, "another sign, or swapped sine and cosine, of the angle that is read than of the start"),
         ({"speed_unit": 0.1}, "or a unit of velocity: its angle moves 10 times as far"),
+        ({"lag": 0.05, "kept": 1}, "a reset that leaves something behind (with the same seed a run differs by"),
         ({"delay": 3}, "a delay (an effort acts 30 ms later)"),
         ({"lag": 0.05}, "a lag of the effort"),
         ({"clip": 1.0}, "an action that is clipped (beyond about 1 N m more does nothing; the limit is 5 N m)"),
