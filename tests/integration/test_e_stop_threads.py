@@ -208,14 +208,17 @@ def test_an_error_of_the_button_is_a_press_and_silence_is_noticed_after_it(desk:
 def test_silence_of_the_button_is_measured_by_a_clock_that_nobody_sets(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clocks = []
+    clocks, periods_ns = [], []
     create_timer = Node.create_timer
 
     def watched(node: Node, *arguments: object, **named: object) -> object:
         timer = create_timer(node, *arguments, **named)
         clocks.append(timer.clock.clock_type)
+        periods_ns.append(timer.timer_period_ns)
         return timer
 
     monkeypatch.setattr(Node, "create_timer", watched)
     desk.servers.append(EStopInputServer(desk.owner, 1.0, desk.press, lambda: False))
+    # Silence is noticed a quarter of its limit late at most.
+    assert periods_ns == [250_000_000]
     assert clocks == [ClockType.STEADY_TIME]
