@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_rosbag.convert.rewrite import rewrite
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.repair.repair import repair_bag
@@ -128,6 +128,24 @@ def test_another_run_at_the_same_simulated_times_is_no_copy(tmp_path: Path, stor
     with read_bag(bag) as opened:
         assert opened.topics["/a"].count == 2 * COUNT
     assert rewrite([bag], tmp_path / "converted").messages == {"/a": 2 * COUNT}
+
+
+@pytest.mark.parametrize("compression", [None, "zstd"])
+def test_a_damaged_copy_does_not_keep_the_bag_from_being_opened(tmp_path: Path, compression: str | None) -> None:
+    bag = tmp_path / "bag"
+    with BagWriter(bag, compression=compression) as writer:
+        for topic in ("/a", "/b"):
+            writer.add_topic(topic, JOINT_STATE)
+            for index in range(COUNT):
+                writer.write(topic, index, state(index))
+    (file,) = bag.glob("*.mcap")
+    content = bytearray(file.read_bytes())
+    content[len(content) // 3] ^= 0xFF
+    file.with_name("copy.mcap").write_bytes(content)
+    with read_bag(bag) as opened:
+        assert set(opened.topics) == {"/a", "/b"}
+    with pytest.raises(BagError, match=r"copy\.mcap"), read_bag(bag) as opened:
+        list(opened.raw("/a"))
 
 
 def test_a_torn_file_is_replaced_by_its_sound_twin(tmp_path: Path) -> None:

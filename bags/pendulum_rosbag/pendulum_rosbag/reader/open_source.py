@@ -307,13 +307,21 @@ def _leave_out_copies(folder: BagFolder, sources: list[Source]) -> None:
     """Close files that nobody lists and whose messages all stand in another file: copies, or what a repair left."""
     for source in [one for one in sources if one.path in folder.unlisted and one.stop_ns]:
         for other in sources:
-            inside = other.start_ns <= source.start_ns and source.stop_ns <= other.stop_ns
-            # Runs of a simulation begin at the same time, so that times alone make no copy.
-            if other is not source and inside and _messages(source) <= _messages(other):
+            if _is_copy(source, other):
                 folder.notes.append(f"{source.path.name} is left out: all its messages are in {other.path.name}")
                 sources.remove(source)
                 source.close()
                 break
+
+
+def _is_copy(source: Source, other: Source) -> bool:
+    """Tell whether all messages of a file are in another; of files that cannot be read whole nothing is known."""
+    inside = other is not source and other.start_ns <= source.start_ns and source.stop_ns <= other.stop_ns
+    try:
+        # Runs of a simulation begin at the same time, so that times alone make no copy.
+        return inside and _messages(source) <= _messages(other)
+    except BagError:
+        return False
 
 
 def _messages(source: Source) -> Counter[tuple[str, int, int]]:
