@@ -81,6 +81,37 @@ def test_a_position_that_is_held_fades_too() -> None:
     assert plant.period() == (DriveKind.EFFORT, pytest.approx(3.6))
 
 
+@pytest.mark.parametrize("stop", _STOPS)
+def test_a_stop_where_no_torque_acts_is_off_at_once_while_an_effort_of_zero_woke_the_torque_loop(stop: str) -> None:
+    never_commanded = Plant(0.5)
+    assert never_commanded.period(command=None) == (DriveKind.EFFORT, 0.0)
+    just_armed = Plant(0.5)
+    at_zero = Plant(0.5)
+    at_zero.drive()
+    assert at_zero.period(command=-1.0) == (DriveKind.EFFORT, 0.0)
+    silent = Plant(0.5)
+    silent.drive()
+    assert [silent.period(command=None) for _ in range(6)][-1] == (DriveKind.EFFORT, 0.0)
+    # The effort that a module reports for no duty where it compensates its speed, or a report that comes late.
+    silent.supervisor.report_applied((3.0,))
+    for plant in (never_commanded, just_armed, at_zero, silent):
+        _STOPS[stop](plant.supervisor, plant.now_ns)
+        assert plant.period() == (DriveKind.OFF, 0.0)
+
+
+def test_a_position_that_is_held_after_a_gap_in_commands_fades_too() -> None:
+    plant = Plant(0.1)
+    plant.drive()
+    for _ in range(6):
+        plant.period(command=None)
+    hold = from_points([0.0, 10.0], [0.0, 0.0], [0.0, 0.0])
+    assert plant.supervisor.accept_trajectory(hold, plant.now_ns, plant.sample) == ""
+    plant.period(command=None)
+    plant.supervisor.report_applied((4.0,))
+    plant.supervisor.e_stop(plant.now_ns)
+    assert plant.period() == (DriveKind.EFFORT, pytest.approx(3.6))
+
+
 def test_a_fault_cuts_the_torque_of_a_plant_that_drives_and_of_one_that_fades() -> None:
     for stops_first in (False, True):
         plant = Plant(0.5)

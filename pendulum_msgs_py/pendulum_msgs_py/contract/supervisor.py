@@ -347,7 +347,11 @@ class PlantSupervisor:
 
     def _stop_drive(self, mode: Mode, reason: str, now_ns: int) -> None:
         """Release the drive, or with stop category 1 let the torque that acts fade to zero first; one fade alone."""
-        stop = Handover(now_ns, self._applied) if self.mode.armed else self._stop
+        stop = self._stop
+        if self.mode.armed:
+            # Where no torque acts there is none to fade, and a torque of zero would wake the torque loop of a module.
+            starved = self.mode is Mode.EFFORT and self._gap_from is not None
+            stop = Handover(now_ns, self._applied) if any(self._applied) and not starved else None
         self._release(mode, reason, now_ns)
         self._stop = stop
 
