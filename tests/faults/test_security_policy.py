@@ -102,6 +102,8 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(
             here |= {"/hw/recorder", "/conductor", "/console", "/hw/bridge_e_stop", "/sim/simulator_e_stop"}
             # Services of nodes that are not there, and of a trial that is not begun here.
             absent = {"/sim/recorder/status", "/hw/procedure/start", "/sim/joint_commands"}
+            # Heard where a hold-to-run switch is wanted.
+            absent |= {"/hw/enable_input", "/sim/enable_input"}
             found: dict[str, tuple[Any, Any]] = {}
 
             def as_allowed() -> bool:
@@ -114,7 +116,9 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(
                         found[full] = "is not there yet", {}
                         continue
                     # What the recorder hears is what has been said so far: topics without a publisher are not there.
-                    silent = {"/hw/markers", "/hw/recorder/transition_event"} if full == "/hw/recorder" else set()
+                    # Its diagnostics are those of a black box.
+                    own = {"/hw/markers", "/hw/recorder/transition_event", "/diagnostics"}
+                    silent = own if full == "/hw/recorder" else set()
                     problems = missing(allowed[full], now, absent | silent), extra(allowed[full], now)
                     if any(problems):
                         found[full] = problems
