@@ -111,6 +111,7 @@ def _run(folder: Path, *, compiled: bool, **parameters: Any) -> tuple[list[bytes
                 "/sim",
                 clock="lockstep",
                 initial_theta=3.0,
+                start_effort_limit=0.0,
                 lockstep_inputs=["effort_command", "disturbance"],
                 lockstep_subscribers=2,
                 compiled=compiled,
@@ -159,7 +160,7 @@ def test_a_run_is_the_same_compiled_and_interpreted(tmp_path: Path, parameters: 
 def test_in_real_time_it_runs_compiled_and_answers_whoever_calls(
     processes: ProcessGroup, domain_id: int, tmp_path: Path
 ) -> None:
-    plant = graph.simulator("/sim", rate_hz=250.0, initial_theta=3.0)
+    plant = graph.simulator("/sim", rate_hz=250.0, initial_theta=3.0, start_effort_limit=0.0)
     with closing(PlantPeer("/sim", torque=0.5)) as peer:
         program = processes.start(plant.package, plant.executable, *plant.ros_arguments())
         peer.until(lambda: int(peer.diagnostics.get("periods_compiled", 0)) > 200, "compiled periods", 120.0)
@@ -205,7 +206,7 @@ def test_in_real_time_it_runs_compiled_and_answers_whoever_calls(
 def test_in_lockstep_it_waits_at_rest_while_somebody_asks_and_stops_at_once(
     processes: ProcessGroup, domain_id: int
 ) -> None:
-    plant = graph.simulator("/sim", clock="lockstep", initial_theta=3.0)
+    plant = graph.simulator("/sim", clock="lockstep", initial_theta=3.0, start_effort_limit=0.0)
     with closing(PlantPeer("/sim", torque=0.5)) as peer:
         program = processes.start(plant.package, plant.executable, *plant.ros_arguments())
         peer.until(lambda: int(peer.diagnostics.get("periods_compiled", 0)) > 100, "compiled steps", 120.0)

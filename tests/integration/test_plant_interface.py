@@ -132,7 +132,15 @@ def _start(processes: ProcessGroup, *arguments: str) -> RunningProgram:
     return processes.start_command([sys.executable, str(_PLANT), *arguments], name="tiny_plant")
 
 
-_AS_TINY_PLANT = ("--ros-args", "-r", "__node:=tiny_plant", "-p", "armed_at_start:=false")
+_AS_TINY_PLANT = (
+    "--ros-args",
+    "-r",
+    "__node:=tiny_plant",
+    "-p",
+    "armed_at_start:=false",
+    "-p",
+    "start_effort_limit:=0.0",
+)
 
 
 def _start_mujoco(processes: ProcessGroup, folder: Path) -> RunningProgram:

@@ -59,7 +59,9 @@ def test_our_controller_brings_our_plant_upright_through_an_effort_controllers_t
     processes: ProcessGroup, watcher: Watcher
 ) -> None:
     # Without torque it falls away from upright, so that an upright pendulum proves the loop.
-    plant = processes.start("pendulum_sim", "simulator", *IN_SIM, *PATIENT, "-p", "initial_theta:=3.3")
+    plant = processes.start(
+        "pendulum_sim", "simulator", *IN_SIM, *PATIENT, "-p", "initial_theta:=3.3", "-p", "start_effort_limit:=0.0"
+    )
     adapter = processes.start("pendulum_lqr", "effort_adapter", *IN_SIM, *PATIENT)
     adapter.wait_for_output("ready", 40.0)
     processes.start(

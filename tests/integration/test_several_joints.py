@@ -72,6 +72,7 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
         "lockstep_duration:=2.0",
         "lockstep_subscribers:=4",
         "initial_position:=[3.19, -0.05]",
+        "start_effort_limit:=0.0",
     )
     peer.until(lambda: any(event["name"] == names.Event.LOCKSTEP_FINISHED for event in peer.events), "the end", 90.0)
     controller.wait_for_output(r"lqr for plant acrobot_frictionless: K = \[.*limit 6 N m", 10)
@@ -164,6 +165,7 @@ def test_mpc_takes_the_period_of_the_states_and_stops_a_cart_before_the_end_of_i
         4.0,
         "rate_hz:=50.0",
         "initial_position:=[1.5, 3.1415927]",
+        "start_effort_limit:=0.0",
         "initial_velocity:=[0.5, 0.0]",
     )
     peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 5, "the last state, after 4 s", 90.0)
@@ -193,7 +195,9 @@ def test_a_policy_holds_a_cart_pole_in_lockstep_and_gives_up_where_it_was_never_
     )
     # This node could answer too, and counts as one.
     peer.until(lambda: answers.get_publisher_count() == 2, "the controller as publisher")
-    simulator = _start_lockstep(processes, "cart_pole", 4.0, "initial_position:=[0.05, 3.19]")
+    simulator = _start_lockstep(
+        processes, "cart_pole", 4.0, "initial_position:=[0.05, 3.19]", "start_effort_limit:=0.0"
+    )
     peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 5, "the last state, after 4 s", 90.0)
     assert np.abs(np.array(peer.states[-1].position) - [0.0, math.pi]).max() < 0.02
     peer.until(lambda: len(efforts) > 1000, "the answers")
@@ -206,7 +210,7 @@ def test_a_policy_holds_a_cart_pole_in_lockstep_and_gives_up_where_it_was_never_
     assert [len(grid) == len(dict(grid)) for grid in held].count(True) == 1
     simulator.send_signal(signal.SIGINT)
     assert simulator.wait(20.0) == 0
-    _start_lockstep(processes, "cart_pole", 1.0, "initial_position:=[0.55, 3.19]")
+    _start_lockstep(processes, "cart_pole", 1.0, "initial_position:=[0.55, 3.19]", "start_effort_limit:=0.0")
     controller.wait_for_output(r"gave up after 0\.000 s: position of cart 0\.55 m", 60)
 
 
