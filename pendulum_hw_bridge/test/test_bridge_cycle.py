@@ -108,6 +108,25 @@ def test_a_drive_is_prepared_with_settings_of_the_measured_supply_and_zero_torqu
     assert rig.port.gains == rig.module.mapping.limited_gains(32.0)
 
 
+@pytest.mark.parametrize("fault", ["host_stalled", ""])
+def test_a_drive_that_is_prepared_during_a_stop_of_category_1_waits_while_it_went_on_to_fade(fault: str) -> None:
+    rig = Rig().armed()
+    rig.supervisor.limits = replace(rig.supervisor.limits, stop_time=1.0)
+    rig.supervisor.report_applied((1.0,))
+    rig.supervisor.disarm(rig.port.time_ns)
+    rig.see()
+    assert rig.bridge.act().effort[0] > 0.9
+    if fault:
+        rig.bridge.fail(fault, "did not run")
+    rig.see()
+    assert rig.bridge.prepare() == ""
+    rig.see()
+    assert rig.bridge.act().drive.kind is DriveKind.OFF
+    assert rig.port.commands[-1].pwm == 0.0
+    assert rig.supervisor.arm(rig.port.time_ns, rig.bridge.sample) == ""
+    assert rig.bridge.act().fault == ""
+
+
 def test_a_drive_is_not_prepared_with_a_present_fault() -> None:
     rig = Rig()
     rig.bridge.connect()

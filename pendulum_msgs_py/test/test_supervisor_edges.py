@@ -594,6 +594,8 @@ def test_no_reset_takes_back_a_press_that_nobody_has_carried_out_yet() -> None:
     [
         lambda plant: plant.offer(Input.EFFORT_COMMAND, JointCommand.of_one(0, 0.0, "/c"), 0),
         lambda plant: plant.set_commander_conflict(""),
+        lambda plant: plant.hear_enable(0, held=False),
+        lambda plant: plant.end_stop(),
         lambda plant: plant.accept_trajectory(_hold(), 0, JointSample.of_one(0, 0.0, 0.0)),
         lambda plant: plant.arm(0, JointSample.of_one(0, 0.0, 0.0)),
         lambda plant: plant.disarm(0),
@@ -617,6 +619,16 @@ def test_each_step_waits_for_the_lock(step: Callable[[SharedSupervisor], object]
         thread.join(0.02)
         assert thread.is_alive()
     thread.join()
+
+
+def test_a_shared_plant_that_is_prepared_fades_no_more() -> None:
+    supervisor, sample = SharedSupervisor(PlantLimits(effort=(5.0,), stop_time=1.0)), JointSample.of_one(0, 0.0, 0.0)
+    assert supervisor.arm(0, sample) == ""
+    supervisor.report_applied((4.0,))
+    supervisor.disarm(0)
+    assert supervisor.decide(0, sample).effort == (4.0,)
+    supervisor.end_stop()
+    assert supervisor.decide(0, sample).kind is DriveKind.OFF
 
 
 def test_a_trajectory_waits_for_the_lock_and_takes_no_e_stop_of_meanwhile_back() -> None:

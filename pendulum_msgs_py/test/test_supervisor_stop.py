@@ -166,6 +166,15 @@ def test_arming_ends_what_is_left_of_a_stop() -> None:
     assert plant.period() == (DriveKind.OFF, 0.0) or plant.period()[1] == 0.0
 
 
+def test_a_drive_that_is_prepared_fades_no_more() -> None:
+    plant = Plant(1.0)
+    plant.drive()
+    plant.supervisor.disarm(plant.now_ns)
+    assert plant.period()[1] > 8.0
+    plant.supervisor.end_stop()
+    assert plant.period() == (DriveKind.OFF, 0.0)
+
+
 def test_a_clock_that_steps_lengthens_no_stop() -> None:
     plant = Plant(0.1)
     plant.drive()

@@ -96,6 +96,7 @@ class Bridge:
         # A drive that was disarmed in this very cycle is in force still: it ends before anything is written.
         if self._driving or self.stop_pending:
             self.release()
+        self.supervisor.end_stop()
         if self.stop_pending:
             return "the module has not confirmed that it is off"
         refusal = self._present_fault()

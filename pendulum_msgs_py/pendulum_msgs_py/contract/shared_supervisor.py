@@ -178,6 +178,11 @@ class SharedSupervisor(PlantSupervisor):
         with self._in_turn():
             super().fault(reason, now_ns)
 
+    def end_stop(self) -> None:
+        """Let nothing fade any more."""
+        with self._in_turn():
+            super().end_stop()
+
     def decide(self, now_ns: int, sample: JointSample | None) -> Drive:
         """Return what the plant has to do now."""
         with self._lock:

@@ -197,6 +197,10 @@ class PlantSupervisor:
         if self.mode not in {Mode.E_STOP, Mode.FAULT}:
             self._release(Mode.FAULT, reason, now_ns)
 
+    def end_stop(self) -> None:
+        """Let nothing fade any more: a drive that is prepared for arming must not go on with it."""
+        self._stop = None
+
     # --- decision ------------------------------------------------------------------------------------------
 
     def decide(self, now_ns: int, sample: JointSample | None) -> Drive:
