@@ -86,6 +86,8 @@ def test_the_torque_that_setpoints_stand_for_is_the_way_back() -> None:
         assert mapping(kind).effort_of(no_torque(mapping(kind).strategy), motor, 0.7) == 0.0
     # Under position control the duty in force tells.
     assert mapping().effort_of(Command(position=1.0), motor, 0.5) == 1.0
+    # The effort that brings this duty back: its own, with no speed compensated twice at a hand-over or a stop.
+    assert mapping(COMPENSATED).effort_of(Command(position=1.0), motor, 0.75) == 1.0
     assert mapping().effort_of(Command(position=1.0), motor, NAN) == 0.0
     assert mapping().effort_of(Command(velocity=1.0), motor, 0.5) == 0.0
 

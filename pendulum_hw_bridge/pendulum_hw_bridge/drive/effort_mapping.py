@@ -132,7 +132,7 @@ class EffortMapping:
             return (command.pwm - compensated) / self.pwm_per_torque(motor.voltage)
         if not (math.isfinite(command.position) and math.isfinite(pwm_in_force)):
             return 0.0
-        return pwm_in_force / self.pwm_per_torque(motor.voltage)
+        return (pwm_in_force - self._compensated_pwm(motor)) / self.pwm_per_torque(motor.voltage)
 
     def _compensated_pwm(self, motor: MotorState) -> float:
         if self.kind is not EffortStrategy.DIRECT_PWM_COMPENSATED:
