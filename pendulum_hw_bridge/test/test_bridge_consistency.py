@@ -46,6 +46,15 @@ def test_the_defaults_fit_together(backend: str) -> None:
     check(backend=backend)
 
 
+@pytest.mark.parametrize("backend", ["emulator", "hebi"])
+def test_a_stop_may_not_fade_through_the_torque_loop_which_drove_five_times_harder_than_before(backend: str) -> None:
+    check(backend=backend, effort_strategy="effort_loop")
+    for strategy in ("direct_pwm", "direct_pwm_compensated"):
+        check({"stop_time": 0.3}, backend=backend, effort_strategy=strategy)
+    with pytest.raises(ParameterError, match=r"stop_time is 0.3 s; expected 0 with effort_strategy 'effort_loop'"):
+        check({"stop_time": 0.3}, backend=backend, effort_strategy="effort_loop")
+
+
 def test_no_backend_that_can_hurt_is_taken_for_an_emulator() -> None:
     assert BACKENDS.keys() >= EMULATED_BACKENDS
     assert not [name for name in EMULATED_BACKENDS if BACKENDS[name].is_machine]

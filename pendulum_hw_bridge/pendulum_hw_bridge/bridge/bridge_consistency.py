@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pendulum_hw_bridge.backends import BACKENDS
+from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.port.actuator import PEAK_EFFORT, MStopAction
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
@@ -63,6 +64,11 @@ def check_consistency(values: Mapping[str, Any], limits: PlantLimits) -> None:
     if not period <= limits.command_timeout <= slowest:
         raise ParameterError(
             f"command_timeout is {limits.command_timeout:g} s; expected {period:g} to {slowest:g} s {where}"
+        )
+    if limits.stop_time and values["effort_strategy"] == EffortStrategy.EFFORT_LOOP.value:
+        raise ParameterError(
+            f"stop_time is {limits.stop_time:g} s; expected 0 with effort_strategy {values['effort_strategy']!r}: "
+            "its torque loop, woken by a stop, makes more torque than acted"
         )
     if hardware:
         _check_hardware(values, limits)
