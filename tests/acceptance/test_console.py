@@ -43,8 +43,9 @@ IN_SHORT = (
 """Ways to lose a stop, each tried once here; all of them, 20 times: ``python -m tests.tools.faults.console_stops``."""
 STOP_LIMIT_MS = 100.0
 COVERED_BY_NOTICES = """() => {
-    const notices = [...document.querySelectorAll(".notices > *, .q-notification")]
-        .map((it) => it.getBoundingClientRect());
+    // A long notice scrolls: what its place does not show covers nothing.
+    const notices = [...document.querySelectorAll(".notices, .q-notification")]
+        .filter((it) => it.childElementCount).map((it) => it.getBoundingClientRect());
     return [...document.querySelectorAll("button, input, select, a")].map((it) => [it, it.getBoundingClientRect()])
         .filter(([it, box]) => box.width && notices.some((other) => box.left < other.right && other.left < box.right
             && box.top < other.bottom && other.top < box.bottom)).map(([it]) => it.outerHTML);
@@ -244,6 +245,8 @@ def test_two_clients_see_stop_tune_and_meet_a_new_simulator(browser: Any, bench:
     on_the_phone.press("Tab")
     phone.locator(".notices .bad", has_text="refuses r").wait_for(timeout=10_000)
     for page in (desk, phone):
+        # The bar stays on top, so whatever is scrolled lies under it.
+        page.evaluate("window.scrollTo(0, 0)")
         assert page.evaluate(COVERED_BY_NOTICES) == []
 
     # So it does after a field was emptied, or holds more than a parameter can.
