@@ -25,7 +25,8 @@ THESIS_GAIN = np.array([33.345265, 0.158993])
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"plant": "x5_9"}, {"plant": "dfki", "start": "random"}])
-def test_gymnasium_checks_pass_for_every_plant(kwargs: dict) -> None:
+def test_gymnasium_checks_pass_for_every_plant(kwargs: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # they draw a window, too
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(gymnasium.make(ENVIRONMENT_ID, **kwargs).unwrapped)
