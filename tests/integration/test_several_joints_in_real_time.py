@@ -37,7 +37,7 @@ def test_commands_for_other_joints_move_nothing_and_are_counted_and_the_e_stop_e
     peer: JointsPeer, processes, node: str
 ) -> None:
     if node == "simulator":
-        package, settings = "pendulum_sim", ["rate_hz:=100.0"]
+        package, settings = "pendulum_sim", ["rate_hz:=100.0", "start_effort_limit:=0.0"]
     else:
         package = "pendulum_hw_bridge"
         settings = ["feedback_rate:=50.0", "feedback_watchdog:=50", "command_lifetime:=2.0"]

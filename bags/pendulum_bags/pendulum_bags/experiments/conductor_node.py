@@ -170,7 +170,8 @@ class PlantClient:
     ) -> None:
         node = conductor.node
         self.conductor = conductor
-        self.namespace = namespace
+        # The root, too, has names that begin with one slash.
+        self.namespace = namespace = namespace.rstrip("/")
         self.sample: JointSample | None = None
         self._foreign_joints: tuple[str, ...] = ()
         self._heard = conductor.listened
@@ -244,7 +245,7 @@ class PlantClient:
             return [(each.node_namespace, each.node_name) for each in node.get_subscriptions_info_by_topic(topic)]
 
         self.conductor.wait_for(
-            f"a recorder on {topic}", lambda: (self.namespace, names.RECORDER) in listeners(), timeout
+            f"a recorder on {topic}", lambda: (self.namespace or "/", names.RECORDER) in listeners(), timeout
         )
         # Some never match: who asks for old moves, or for a deadline. Who does match does so within moments.
         deadline = time.monotonic() + _MATCHING
