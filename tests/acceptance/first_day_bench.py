@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import shlex
 import socket
@@ -152,7 +153,14 @@ class Day:
     def start(self, command: str) -> RunningProgram:
         """Start a command, to type into it."""
         words = [sys.executable, "-m", *shlex.split(command)]
-        environment = {"ROS_DOMAIN_ID": str(self.domain), "NO_COLOR": "1", "RCUTILS_COLORIZED_OUTPUT": "0"}
+        # As in an activated environment: printed commands start with "python".
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+        environment = {
+            "ROS_DOMAIN_ID": str(self.domain),
+            "NO_COLOR": "1",
+            "RCUTILS_COLORIZED_OUTPUT": "0",
+            "PATH": path,
+        }
         return self.processes.start_command(
             words, name=" ".join(words[2:4]), cwd=self.folder, env=environment, typed=True
         )
