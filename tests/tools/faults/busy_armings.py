@@ -116,7 +116,7 @@ def arm_busy_modules(folder: Path, armings: int, *, busy: int, duration: float, 
     return ends
 
 
-@app.command()
+@app.command(epilog="Example: python -m tests.tools.faults.busy_armings --armings 6")
 def busy_armings(
     armings: Annotated[int, typer.Option(help="How often to arm.", min=1)] = 24,
     busy: Annotated[int, typer.Option(help="Busy loops.", min=0)] = 2,

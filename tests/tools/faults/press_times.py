@@ -218,7 +218,7 @@ def press_in_flood(
     return PressTimes(plant.name, flood, *(list(each) for each in zip(*pairs, strict=True)))
 
 
-@app.command()
+@app.command(epilog="Example: python -m tests.tools.faults.press_times --tries 20 --only bridge")
 def press_times(
     tries: Annotated[int, typer.Option(help="Presses for each plant and flood.", min=1)] = 200,
     busy: Annotated[int, typer.Option(help="Busy loops.", min=0)] = 2,

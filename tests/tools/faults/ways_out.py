@@ -20,6 +20,7 @@ from unittest import mock
 import typer
 from rich.progress import track
 
+from pendulum_bags.runs.run_folder import write_json
 from pendulum_hw_bridge.backends import emulator_process, hebi, hebi_group
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
@@ -532,7 +533,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def ways_out(
     backends: Annotated[str, typer.Option(help="Backends, with commas between.")] = ",".join(BENCHES),
     repetitions: Annotated[int, typer.Option(help="Of each way out, strategy and phase.", min=1)] = 20,
-    out: Annotated[Path, typer.Option(help="Where the table goes, in Markdown.")] = Path("build", "ways_out.md"),
+    out: Annotated[Path, typer.Option(help="Where the rows go.")] = Path("build", "ways_out.json"),
 ) -> int:
     """Leave in every way and print what the motors did; exit code 1 where torque exceeds that before the request."""
     rows = [
@@ -544,6 +545,7 @@ def ways_out(
         for phase in PHASES
     ]
     names = (
+        "backend",
         "way out",
         "strategy",
         "phase",
@@ -555,8 +557,8 @@ def ways_out(
         "duty after",
         "s to zero",
     )
-    table = WholeTable("backend", *names)
-    lines = [f"| backend | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
+    table = WholeTable(*names)
+    results = []
     beyond = 0
     fates = list(FATES.values())
     for number, (backend, way, strategy, phase) in enumerate(
@@ -572,10 +574,10 @@ def ways_out(
         figures = (f"{value:.3f}" for value in worst)
         cells = (backend, way, strategy.name, phase, str(len(exits)), str(wrong), *figures)
         table.add_row(*cells)
-        lines.append(f"| {' | '.join(cells)} |")
+        results.append(dict(zip(names, cells, strict=True)))
     make_console().print(table)
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_json(out, results)
     return int(beyond > 0)
 
 
