@@ -53,12 +53,12 @@ _WAITS = (
     "tests/faults/test_live_machine.py",
     "tests/faults/test_ways_out.py",
     "tests/faults/test_press_times.py",
+    "tests/faults/test_security_policy.py",
     "tests/integration",
 )
 """Other tests with processes that keep a plant's time, longest first: they wait for most of it, two at a time."""
 _SIMULATED_TIME = (
     "tests/integration/test_experiments.py",
-    "tests/faults/test_security_policy.py",
     "tests/integration/test_course.py",
     "tests/integration/test_several_joints.py",
 )

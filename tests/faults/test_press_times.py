@@ -13,7 +13,7 @@ _LATEST = 1000.0
 """Far above the 100 ms of the long form: the plant may have no priority here [ms]."""
 
 
-@pytest.mark.parametrize(("plant", "flood"), zip(PLANTS, reversed(FLOODS), strict=True), ids=str)
+@pytest.mark.parametrize(("plant", "flood"), list(zip(PLANTS, reversed(FLOODS), strict=True)), ids=str)
 def test_an_e_stop_ends_torque_in_a_flood_beside_busy_loops(tmp_path: Path, plant: Plant, flood: str) -> None:
     times = press_in_flood(tmp_path, plant, flood, 2, busy=2)
     assert len(times.driven) == 2
