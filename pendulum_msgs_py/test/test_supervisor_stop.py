@@ -71,6 +71,22 @@ def test_category_1_fades_from_what_acted_in_the_stated_time_whatever_is_command
     assert plant.fade(20) == [0.0] * 20
 
 
+@pytest.mark.parametrize("stop", _STOPS)
+def test_a_stop_between_decision_and_report_fades_from_the_torque_that_is_under_way(stop: str) -> None:
+    for before, under_way in ((None, 5.0), (2.0, 8.0), (8.0, -4.0)):
+        plant = Plant(0.1)
+        plant.period(command=before)
+        plant.period(command=before)
+        plant.now_ns += _PERIOD_NS
+        plant.sample = JointSample.of_one(plant.now_ns, 0.0, 0.0, 0.0)
+        command = JointCommand.of_one(plant.now_ns, under_way, "lqr")
+        plant.supervisor.offer(Input.EFFORT_COMMAND, command, plant.now_ns)
+        decided = plant.supervisor.decide(plant.now_ns, plant.sample)
+        _STOPS[stop](plant.supervisor, plant.now_ns)
+        plant.supervisor.report_applied(decided.effort)
+        assert plant.fade(3) == pytest.approx([decided.effort[0] * left for left in (0.9, 0.8, 0.7)])
+
+
 def test_a_position_that_is_held_fades_too() -> None:
     plant = Plant(0.1)
     hold = from_points([0.0, 10.0], [0.0, 0.0], [0.0, 0.0])
@@ -186,6 +202,17 @@ def test_a_clock_that_steps_lengthens_no_stop() -> None:
     plant.supervisor.e_stop(plant.now_ns)
     plant.now_ns -= 10 * NANOSECONDS
     assert plant.fade(12)[-1] == 0.0
+
+
+@pytest.mark.parametrize("step", [-_PERIOD_NS // 2, -3 * _PERIOD_NS, -10 * NANOSECONDS])
+def test_a_clock_that_steps_back_gives_no_stop_its_torque_back(step: int) -> None:
+    plant = Plant(0.1)
+    plant.drive()
+    plant.supervisor.e_stop(plant.now_ns)
+    assert plant.fade(5)[-1] == pytest.approx(4.5)
+    plant.now_ns += step - _PERIOD_NS
+    # The period in which it stepped counts for nothing, none before it is lost.
+    assert plant.fade(6) == pytest.approx([4.5, 3.6, 2.7, 1.8, 0.9, 0.0])
 
 
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])

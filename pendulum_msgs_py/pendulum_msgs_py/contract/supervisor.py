@@ -283,6 +283,9 @@ class PlantSupervisor:
             self._trajectory_start_ns += lost
             if self._handover is not None:
                 self._handover.start_ns += lost
+            if self._stop is not None:
+                # A stop waits for nothing, but a clock that steps back must not give it its torque back.
+                self._stop.start_ns += min(0, lost)
 
     def _decide_position(self, now_ns: int, sample: JointSample, push: Vector) -> Drive | None:
         trajectory = self._trajectory
@@ -351,23 +354,25 @@ class PlantSupervisor:
 
     def _stop_drive(self, mode: Mode, reason: str, now_ns: int) -> None:
         """Release the drive, or with stop category 1 let the torque that acts fade to zero first; one fade alone."""
-        stop = self._stop
+        stop, applied = self._stop, self._applied
         if self.mode.armed:
             # Where no torque acts there is none to fade, and a torque of zero would wake the torque loop of a module.
             starved = self.mode is Mode.EFFORT and self._gap_from is not None
-            stop = Handover(now_ns, self._applied) if any(self._applied) and not starved else None
+            stop = None if starved else Handover(now_ns, ())
         self._release(mode, reason, now_ns)
-        self._stop = stop
+        self._stop, self._applied = stop, applied
 
     def _decide_stop(self, now_ns: int, sample: JointSample | None, push: Vector) -> Drive:
         """Return what a plant does that is not armed: nothing, or what is left of a stop of category 1."""
         stop = self._stop
         if stop is None:
             return self._off(push)
-        # A plant that catches up decides as of before the request; a clock that steps back must not lengthen the stop.
+        # Taken here: a request may come while a torque that was decided before it is not reported as applied yet.
+        stop.effort = stop.effort or self._applied
+        # A plant that catches up decides as of before the request.
         stop.start_ns = min(stop.start_ns, now_ns)
         remaining = stop.remaining(now_ns, self.limits.stop_time)
-        if remaining == 0.0 or self._measurement_fault(now_ns, sample):
+        if remaining == 0.0 or not any(stop.effort) or self._measurement_fault(now_ns, sample):
             self._stop = None
             return self._off(push)
         effort = tuple(remaining * held for held in stop.effort)
