@@ -238,7 +238,7 @@ def test_words_and_holes_in_columns_that_no_mapping_wants_are_no_matter(tmp_path
     path.write_text("time,label,position,torque\n0.0,a,1.0,0.0\n0.1,b,oops,0.0\n", encoding="utf-8")
     with refused("line 3, column 'position' holds 'oops'; expected a number"):
         read_csv(path)
-    path.write_text("time,label,position,torque\n0.0,a,1.0,0.0\n0.1,b,1.0\n", encoding="utf-8")
+    path.write_text("time,label,position,torque\n0.0,a,1.0,0.0\n0.1,b,1.0\n0.2,c,1.0,0.0\n", encoding="utf-8")
     with refused("line 3 has 3 cells; expected 4"):
         read_csv(path)
 

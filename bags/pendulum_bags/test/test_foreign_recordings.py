@@ -195,3 +195,64 @@ def test_a_wrong_unit_is_still_found_in_a_recording_with_a_pause(tmp_path):
     path = save(tmp_path / "run.csv", "time,position,velocity,torque\n" + table)
     with pytest.raises(DataError, match="deg/s instead of rad/s"):
         check_consistency(read_csv(path))
+
+
+@pytest.mark.parametrize("drop", [False, True])
+@pytest.mark.parametrize("driven", [False, True])
+def test_position_and_velocity_in_rows_of_their_own_are_both_read(tmp_path, drop, driven):
+    text = "time,position,velocity,torque\n"
+    for t, q, v, u in zip(TIME, ANGLE, SPEED, TORQUE, strict=True):
+        text += f"{t:.6f},{q:.6f},,\n{t + 0.002:.6f},,{v:.6f},\n" + f"{t + 0.004:.6f},,,{u:.6f}\n" * driven
+    mapping = MAPPINGS["pendulum" if driven else "free_swing"]
+    recording = read_recording(save(tmp_path / "sparse.csv", text), {**mapping, "drop_nan": drop})
+    np.testing.assert_allclose(recording.time, TIME)
+    np.testing.assert_allclose(recording.position, ANGLE, atol=1e-6)
+    expected = np.interp(TIME, TIME + 0.002, SPEED)
+    np.testing.assert_allclose(recording.velocity, expected, atol=1e-6)
+    if driven:
+        np.testing.assert_allclose(recording.input_stamps, TIME + 0.004)
+        np.testing.assert_allclose(recording.input, TORQUE)
+
+
+def test_a_velocity_apart_from_rows_with_angle_and_torque_costs_no_torque(tmp_path):
+    text = "time,position,velocity,torque\n"
+    for t, q, v, u in zip(TIME, ANGLE, SPEED, TORQUE, strict=True):
+        text += f"{t:.6f},{q:.6f},,{u:.6f}\n{t + 0.002:.6f},,{v:.6f},\n"
+    recording = read_recording(save(tmp_path / "sparse.csv", text))
+    np.testing.assert_allclose(recording.position, ANGLE, atol=1e-6)
+    np.testing.assert_allclose(recording.input, TORQUE)
+    assert recording.velocity is not None
+
+
+def test_an_empty_optional_column_is_none(tmp_path):
+    table = rows(TIME, ANGLE, np.full(TIME.size, np.nan), TORQUE)
+    path = save(tmp_path / "run.csv", "time,position,velocity,torque\n" + table)
+    for drop in (False, True):
+        recording = read_recording(path, {**MAPPINGS["pendulum"], "drop_nan": drop})
+        assert recording.velocity is None
+        assert recording.time.size == TIME.size
+
+
+def test_a_row_of_units_below_the_header_is_no_data_and_is_compared(tmp_path):
+    table = rows(TIME, ANGLE, SPEED, TORQUE)
+    head = "time,position,velocity,torque\n"
+    recording = read_recording(save(tmp_path / "units.csv", f"{head}[s],[rad],[rad/s],[N m]\n{table}"))
+    np.testing.assert_allclose(recording.position, ANGLE, atol=1e-6)
+    with pytest.raises(DataError, match="column 'position' is in deg by the row below the header"):
+        read_recording(save(tmp_path / "deg.csv", f"{head}s,deg,rad/s,N m\n{table}"))
+
+
+@pytest.mark.parametrize("torn", ["4.000000,0.1", "4.000000,0.1,0.2,0.3e", "4.000000,"])
+def test_a_last_line_that_was_not_written_whole_is_left_out(tmp_path, torn):
+    table = rows(TIME, ANGLE, SPEED, TORQUE)
+    recording = read_recording(save(tmp_path / "torn.csv", f"time,position,velocity,torque\n{table}{torn}"))
+    assert recording.time.size == TIME.size
+    assert f"the last line, {torn!r}, is not whole" in " ".join(data_notes(recording))
+
+
+def test_a_short_line_in_the_middle_is_still_an_error(tmp_path):
+    lines = rows(TIME, ANGLE, SPEED, TORQUE).splitlines()
+    lines[100] = "1.0,0.1"
+    path = save(tmp_path / "short.csv", "time,position,velocity,torque\n" + "\n".join(lines) + "\n")
+    with pytest.raises(DataError, match="line 102 has 2 cells; expected 4"):
+        read_recording(path)

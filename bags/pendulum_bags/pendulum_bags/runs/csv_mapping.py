@@ -14,8 +14,9 @@ The unit of ``input`` says what drives the joint: a torque, a voltage, or an ang
 command), ``linear`` goes straight to the next (a measurement; the default for a torque). ``detrend: constant`` or
 ``linear`` takes a mean or a drift from the input of a bad torque sensor. ``skip`` lines before the header, if any,
 are left out, as are lines that begin with ``#``; ``drop_nan: true`` leaves out rows with a NaN or an empty cell. Where
-each row has the columns of one topic, states are taken from their rows and the input from its own. An angle that jumps
-by whole turns is unwrapped; where the time steps back, the recording is cut.
+each row has the columns of one topic, each quantity is taken from its own rows, a velocity by interpolation. A row of
+units below the header is compared with the mapping. An angle that jumps by whole turns is unwrapped; where the time
+steps back, the recording is cut.
 """
 
 from __future__ import annotations
@@ -116,42 +117,59 @@ def read_csv(
     if type(skip) is not int or skip < 0:
         raise DataError(f"{origin}: skip is {skip!r}; expected a number of lines before the header, >= 0")
     wanted = set().union(*(_wanted_columns(one) for one in (rules, *also)))
-    names, table = _read_table(source, delimiter, skip, wanted)
+    names, table, units, torn = _read_table(source, delimiter, skip, wanted)
+    for section in (rules[key] for key in _SECTION_KEYS if key in rules):
+        stated = units.get(_found_column(section, names) or "", section.get("unit"))
+        if stated != section.get("unit") and any(stated in known for known in UNITS.values()):
+            raise DataError(
+                f"{source}: column {_found_column(section, names)!r} is in {stated} by the row below the header; "
+                f"{origin} says {section.get('unit')!r}: write `unit: {stated}` in a mapping file"
+            )
     first, last = _row_range(rules, len(table), origin)
     table = table[first:last]
     given = rules.get("meta") or {}
     if not isinstance(given, Mapping):
         raise DataError(f"{origin}: meta is {given!r}; expected names and values")
     meta = {"source": str(source), "mapping": origin, **given}
+    if torn:
+        meta["clock_notes"] = [f"the last line, {torn!r}, is not whole and is left out"]
     if first or last < len(table) + first:
         meta["rows"] = [first, last]
-    by_topic = None if also else _rows_by_topic(rules, names, table)
-    input_table = table
-    if by_topic is not None:
-        table, input_table = by_topic
+    by_topic = {} if also else _rows_by_topic(rules, names, table)
+    if by_topic:
+        table = by_topic.pop("position")
         meta["rows_by_topic"] = True
     elif rules.get("drop_nan") is True:
-        whole = np.isfinite(table[:, [name.casefold() in wanted for name in names]]).all(axis=1)
+        known = np.isfinite(table[:, [name.casefold() in wanted for name in names]])
+        whole = known[:, known.any(axis=0)].all(axis=1)
         meta["nan_rows"] = int(np.sum(~whole))
-        table = input_table = table[whole]
+        table = table[whole]
     time, steps = continued(_time(rules["time"], names, table, source, origin, first))
     if steps:
-        meta["clock_notes"] = steps
+        meta["clock_notes"] = [*meta.get("clock_notes", ()), *steps]
+
+    def own_rows(key: str, quantity: str) -> tuple[Array | None, Array | None]:
+        """Return a quantity and its stamps, if it has rows of its own."""
+        rows = by_topic.get(key, table)
+        column = _column(key, rules[key], quantity, names, rows, source, origin, first)
+        if key not in by_topic or column is None:
+            return column, None
+        stamps, _ = continued(_time(rules["time"], names, rows, source, origin, first))
+        kept = first_of_each_stamp(stamps)
+        return column[kept], stamps[kept]
+
     position = _column("position", rules["position"], "angle", names, table, source, origin, first)
     assert position is not None
     velocity = None
     if "velocity" in rules:
-        velocity = _column("velocity", rules["velocity"], "velocity", names, table, source, origin, first)
+        velocity, stamps = own_rows("velocity", "velocity")
+        velocity = velocity if velocity is None or stamps is None else np.interp(time, stamps, velocity)
     drive, kind, between, stamps = np.zeros_like(time), "none", "linear", None
     if "input" in rules:
         section = rules["input"]
         quantity = _quantity_of(section.get("unit"), origin)
-        column = _column("input", section, quantity, names, input_table, source, origin, first)
+        column, stamps = own_rows("input", quantity)
         assert column is not None
-        if by_topic is not None:
-            stamps, _ = continued(_time(rules["time"], names, input_table, source, origin, first))
-            kept = first_of_each_stamp(stamps)
-            stamps, column = stamps[kept], column[kept]
         drive = _detrended(column, section.get("detrend"), origin)
         kind = {"effort": "effort", "voltage": "voltage", "angle": "position_goal"}[quantity]
         between = hold or str(section.get("hold", "linear" if kind == "effort" and stamps is None else "zero"))
@@ -168,19 +186,18 @@ def read_csv(
     return Recording(time, position, velocity, drive, input_kind=kind, hold=between, input_time=stamps, meta=meta)
 
 
-def _rows_by_topic(rules: Mapping[str, Any], names: list[str], table: Array) -> tuple[Array, Array] | None:
-    """Return the rows with a state and those with an input, of a log that has no row with both; else ``None``."""
-    if "input" not in rules:
-        return None
+def _rows_by_topic(rules: Mapping[str, Any], names: list[str], table: Array) -> dict[str, Array]:
+    """Return the rows of position, and of velocity and input where these are in other rows; nothing where none is."""
     has = {key: _finite(rules[key], names, table) for key in ("time", "position", "velocity", "input") if key in rules}
     states = has["time"] & has["position"]
-    inputs = has["time"] & has["input"]
+    own = {key: has["time"] & has[key] for key in ("velocity", "input") if key in has}
     # Topics that a logger writes apart may meet in some rows; holes leave most of them whole.
-    if 2 * np.sum(states & inputs) >= min(np.sum(states), np.sum(inputs)):
-        return None
-    if "velocity" in has and (states & has["velocity"]).any():
-        states &= has["velocity"]
-    return table[states], table[inputs]
+    apart = {key for key, rows in own.items() if 2 * np.sum(states & rows) < min(np.sum(states), np.sum(rows))}
+    if not apart:
+        return {}
+    for key in own.keys() - apart:
+        states &= own[key] if (states & own[key]).any() else True
+    return {"position": table[states], **{key: table[own[key]] for key in apart}}
 
 
 def _finite(section: Mapping[str, Any], names: list[str], table: Array) -> NDArray[np.bool_]:
@@ -238,8 +255,13 @@ def _wanted_columns(rules: Mapping[str, Any]) -> set[str]:
     return {column.casefold() for column in columns if isinstance(column, str)}
 
 
-def _read_table(source: Path, delimiter: str, skip: int, wanted: set[str]) -> tuple[list[str], Array]:
-    """Return the names of all columns and their numbers, NaN for words in columns that nobody wants."""
+def _read_table(
+    source: Path, delimiter: str, skip: int, wanted: set[str]
+) -> tuple[list[str], Array, dict[str, str], str]:
+    """Return names and numbers of all columns, their units by a row of units, and a last line that was torn off.
+
+    Words in columns that are not wanted are NaN.
+    """
     try:
         text = source.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -270,10 +292,21 @@ def _read_table(source: Path, delimiter: str, skip: int, wanted: set[str]) -> tu
         raise DataError(f"{source} has no rows below its header")
     if delimiter != "," and _DECIMAL_COMMA.search(body) and not _DECIMAL_POINT.search(body):
         body = body.replace(",", ".")
+    used = [index for index, name in enumerate(names) if name.casefold() in wanted]
+    units: dict[str, str] = {}
+    row, _, rest = body.partition("\n")
+    cells = next(csv.reader([row], delimiter=delimiter), [])
+    if rest.strip() and len(cells) == len(names) and not any(_is_number(cell or "0") for cell in cells):
+        units = {name: cell.strip(" []()") for name, cell in zip(names, cells, strict=True)}
+        body, line = rest, line + 1
+    start = body.rstrip().rfind("\n") + 1
+    torn = body[start:].strip()
+    cells = next(csv.reader([torn], delimiter=delimiter), [])
+    whole = len(cells) >= len(names) and (body.endswith("\n") or _is_number(cells[-1].strip() or "0"))
+    body, torn = (body, "") if whole or not start or torn.startswith("#") else (body[:start], torn)
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=delimiter, ndmin=2)
     except ValueError as error:
-        used = [index for index, name in enumerate(names) if name.casefold() in wanted]
         if bad := _first_bad_cell(body, names, delimiter, skip + line, used):
             raise DataError(f"{source}: {bad}") from error
         if not used:
@@ -289,7 +322,7 @@ def _read_table(source: Path, delimiter: str, skip: int, wanted: set[str]) -> tu
         raise DataError(
             f"{source} has {table.shape[1]} columns of numbers but {len(names)} names in its header{hint * halves}"
         )
-    return names, table
+    return names, table, units, torn
 
 
 def _head_and_body(text: str, wanted: Collection[str]) -> tuple[str, str, int]:
@@ -387,6 +420,8 @@ def _column(
     if sign not in (1, -1):
         raise DataError(f"{origin}: sign of {name} is {sign!r}; expected 1 or -1")
     raw = table[:, names.index(found)]
+    if section.get("optional") and raw.size and np.isnan(raw).all():
+        return None
     bad = np.flatnonzero(~np.isfinite(raw))
     if bad.size:
         raise DataError(
