@@ -20,7 +20,7 @@ from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.residual_tests import _stretches, _told
 from pendulum_bags.pages.terms import Terms
 from pendulum_bags.runs.datasets import Recording
-from pendulum_bags.runs.next_test import next_test_of, question_of
+from pendulum_bags.runs.next_test import measurement_of, next_test_of, question_of
 from pendulum_bags.verdict.same_run import same_run_layer
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_testing.plant_pairs import SIMULATED, pair
@@ -60,6 +60,48 @@ QUICK = Options(friction="viscous", folds=2, multi_start=False)
 )
 def test_a_plant_file_is_tested_by_the_recorded_experiment_under_other_noise(command: str, expected: str) -> None:
     assert next_test_of([{"command": command}], "my.yaml") == expected
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        (THESIS, ""),
+        (
+            f"{THESIS} --plant=my.yaml --seed 7 --strategy effort_loop -o /tmp/a",
+            "--plant my.yaml --strategy effort_loop",
+        ),
+        (f"{THESIS} --simulation 'my robot.xml' --mapping m.yaml", "--simulation 'my robot.xml' --mapping m.yaml"),
+        (f"{THESIS} --hardware emulator --q 1 1", ""),
+    ],
+)
+@pytest.mark.parametrize("experiment", ["frequency_response", "ranking"])
+def test_other_layers_are_measured_of_the_plants_that_were_compared(
+    command: str, options: str, experiment: str
+) -> None:
+    told = measurement_of([{}, {"command": command}], experiment)
+    assert told == f"python -m pendulum_bags experiment {experiment} {options}".rstrip()
+    known = typer.main.get_command(experiment_app).commands[experiment]  # type: ignore[attr-defined]
+    names = {name for parameter in known.params for name in parameter.opts}
+    assert {word for word in shlex.split(told) if word.startswith("--")} <= names
+
+
+@pytest.mark.parametrize(
+    "command", [f"{THESIS} --hardware hebi", f"{THESIS} --simulation ros:/lab --plant x", "by hand"]
+)
+def test_no_experiment_on_the_emulator_is_told_to_measure_another_machine(command: str) -> None:
+    assert measurement_of([{"command": command}], "ranking") == ""
+
+
+def test_the_emulated_machine_of_several_joints_is_kept_for_the_next_test(tmp_path: Path) -> None:
+    joints = "python -m pendulum_bags experiment joints"
+    bag, machine = str(tmp_path / "hw"), tmp_path / "machine.yaml"
+    assert next_test_of([{"command": joints}], "my.yaml", [bag]) == f"{joints} --plant my.yaml --seed 2"
+    machine.touch()
+    kept = f"{joints} --plant my.yaml --seed 2 --machine {machine}"
+    assert next_test_of([{"command": joints}], "my.yaml", [bag]) == kept
+    assert next_test_of([{"command": THESIS}], "my.yaml", [bag]) == f"{THESIS} --plant my.yaml --seed 2"
+    given = next_test_of([{"command": f"{joints} --machine other.yaml"}], "my.yaml", [bag])
+    assert given == f"{joints} --machine other.yaml --plant my.yaml --seed 2"
 
 
 def test_a_record_without_a_command_tells_no_experiment() -> None:
@@ -151,7 +193,7 @@ def test_a_file_that_was_fitted_is_left_alone_by_the_next_fit_and_no_third_is_pr
     assert again.startswith(f"The simulation had {simulated} already. Identify once more")
     assert f"identify /lab/run/hw --out {following})" in again
     assert f"({THESIS} --plant {following} --seed 3)" in again
-    assert "experiment frequency_response)" in otherwise
+    assert f"experiment frequency_response --plant {shlex.quote(simulated)})" in otherwise
     assert slack_steps(["/lab/run/hw"], f"{THESIS} --plant={shlex.quote(simulated)}")[0] == again.replace(
         "seed 3", "seed 2"
     )

@@ -314,7 +314,7 @@ def recorded(tmp_path: Path) -> Path:
 
 
 def test_a_damaged_recording_is_named_and_not_left_out(recorded, capsys):
-    fallen = {one.name: one.hw_failed for one in collect_contenders([recorded])}
+    fallen = {one.name: one.hw_failed for one in collect_contenders([recorded])[0]}
     assert fallen == {"lqr": 1, "pid": 0, "lqi": 0}
     (file,) = (recorded / "lqr_hw_2").glob("*.mcap")
     chunk = McapSource(file).chunks[0]
@@ -382,7 +382,7 @@ def test_runs_of_a_study_and_a_folder_are_collected(tmp_path, capsys):
                 (place / "spec.json").write_text(json.dumps(spec.to_json()))
                 record = {"status": "done", "labels": {"controller": name}, "metrics": scaled}
                 (place / "run.json").write_text(json.dumps(record))
-    contenders = collect_contenders([tmp_path])
+    contenders, _ = collect_contenders([tmp_path])
     assert [one.name for one in contenders] == ["lqr", "lqi", "pid"] or len(contenders) == 3
     first = next(one for one in contenders if one.name == "lqr")
     np.testing.assert_allclose(first.parts("sim"), cost_parts(metrics, 5.0))
@@ -416,6 +416,6 @@ def test_two_policies_of_one_file_name_are_two_and_named_by_their_files(tmp_path
             columns = regulate(rate=100, seed=1, duration=0.5, hardware=side == "hw")
             bag = tmp_path / f"{side}_{number}"
             write_bag(bag, columns, f"/{side}", metadata=spec.metadata(), ramps=False)
-    names = {one.name for one in collect_contenders([tmp_path])}
+    names = {one.name for one in collect_contenders([tmp_path])[0]}
     assert len(names) == 3
     assert all(name.startswith("policy trained (file=") and str(tmp_path) not in name for name in names)

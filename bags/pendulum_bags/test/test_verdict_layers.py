@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from pendulum_bags.runs.case import IDENTITY, Case
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, read_layers, sum_up, write_layer
 from pendulum_msgs_py.errors import DataError
 
@@ -68,3 +70,31 @@ def test_layers_kept_in_a_run_folder_are_read_back(tmp_path: Path) -> None:
     (tmp_path / "layers" / "same_run.json").write_text("{}")
     with pytest.raises(DataError, match=r"same_run.json holds no result of a layer"):
         read_layers(tmp_path)
+
+
+def test_a_layer_of_other_plants_does_not_join_an_answer_and_the_sentence_names_both(tmp_path: Path) -> None:
+    ours = Case("thesis (12ab34cd)", "emulator of thesis (12ab34cd), direct_pwm")
+    kept = replace(result(Layer.SAME_CHOICE, Mark.YES), case=ours)
+    write_layer(tmp_path, kept)
+    assert [one.case for one in read_layers(tmp_path, ours)] == [ours]
+    for other, side in (
+        (replace(ours, simulation="x5_9 (0)"), "simulation"),
+        (replace(ours, hardware="hebi (0)"), "hardware"),
+    ):
+        with pytest.raises(DataError) as refused:
+            read_layers(tmp_path, other)
+        theirs, wanted = getattr(ours, side), getattr(other, side)
+        assert str(refused.value) == (
+            f"“same choice” in {tmp_path} is of {side} {theirs}; expected that of the compared recordings, {wanted}"
+        )
+    # Recordings of others, and results of earlier versions, do not say which plants they are of.
+    assert len(read_layers(tmp_path, Case(ours.simulation))) == 1
+    write_layer(tmp_path, replace(kept, case=Case()))
+    assert len(read_layers(tmp_path, ours)) == 1
+
+
+def test_runs_of_two_plants_on_one_side_are_no_case() -> None:
+    one, two = {IDENTITY: "a (1)"}, {IDENTITY: "b (2)"}
+    assert Case.of([one, {}, one], [two]) == Case("a (1)", "b (2)")
+    with pytest.raises(DataError, match=r"hardware is a \(1\) in one run and b \(2\) in another; expected one plant"):
+        Case.of([one], [two, one])

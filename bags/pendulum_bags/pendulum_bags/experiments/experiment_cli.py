@@ -20,6 +20,14 @@ from pendulum_bags.experiments.graph_plant import PREFIX as GRAPH_PREFIX
 from pendulum_bags.experiments.joints_cli import joints
 from pendulum_bags.experiments.new_run import new_run
 from pendulum_bags.experiments.operator import ask_for_running, confirmed
+from pendulum_bags.experiments.plant_options import (
+    AcceptDifferences,
+    MappingFile,
+    SimulatedPlant,
+    Simulation,
+    Strategy,
+    equation_file,
+)
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.experiments.session import refuse_existing
@@ -61,16 +69,6 @@ app = typer.Typer(
     add_completion=False,
 )
 
-ThesisPlant = Annotated[
-    str | None,
-    typer.Option(
-        help="Preset or plant file of the simulated plant, and of the controller's design; default thesis, or with "
-        "--simulation the equation read off it."
-    ),
-]
-Simulation = Annotated[
-    str, typer.Option(help="In the simulator's place: a model file (MJCF or URDF, run by MuJoCo), or gymnasium:ID.")
-]
 AnySimulation = Annotated[
     str,
     typer.Option(
@@ -78,22 +76,11 @@ AnySimulation = Annotated[
         "for a plant that runs already on --domain; that one needs --plant, too."
     ),
 ]
-Mapping = Annotated[
-    Path | None, typer.Option(help="Mapping file of that simulation: joint, actuator, sign, zero, limit.")
-]
 Seed = Annotated[int, typer.Option(help="Seed of the noise; one seed is one signal.", min=0)]
 Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m].")]
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
 Duration = Annotated[float, typer.Option(help="Length of the noise [s].")]
 Controller = Annotated[str, typer.Option(help="Kind of controller, or a policy file (.npz).")]
-AcceptDifferences = Annotated[
-    bool,
-    typer.Option(
-        "--accept-differences",
-        help="Design on the equation of --simulation even if the simulation does not move as it; the report says so.",
-    ),
-]
-Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
 
 
 _OF_SEVERAL_JOINTS = {"duration", "amplitude", "hold_time"}
@@ -112,9 +99,9 @@ def thesis(
         Path | None,
         out_option("Folder of the run; it must be new. Default: bags/runs/<UTC>_thesis."),
     ] = None,
-    plant: ThesisPlant = None,
+    plant: SimulatedPlant = None,
     simulation: AnySimulation = "",
-    mapping: Mapping = None,
+    mapping: MappingFile = None,
     accept_differences: AcceptDifferences = False,
     hardware: Annotated[
         str,
@@ -251,9 +238,9 @@ def thesis(
 def lockstep(
     bag: Annotated[Path, typer.Option(help="Folder of the bag; it must not exist.")],
     side: Annotated[str, typer.Option(help="sim for the simulator, hw for the emulated hardware.")] = "sim",
-    plant: ThesisPlant = None,
+    plant: SimulatedPlant = None,
     simulation: Simulation = "",
-    mapping: Mapping = None,
+    mapping: MappingFile = None,
     accept_differences: AcceptDifferences = False,
     strategy: Strategy = "direct_pwm",
     seed: Seed = 1,
@@ -293,11 +280,9 @@ def lockstep(
         noise=NoiseSettings(seed, amplitude, hold_time or (0.002 if side == "sim" else 0.01), duration),
         storage=storage,
     )
-    if (foreign := settings.foreign) is not None and plant is None:
-        if not accept_differences:
-            foreign.require_equation()
+    if plant is None and (made := equation_file(settings.foreign, bag, accept_differences=accept_differences)):
         refuse_existing(bag)
-        settings = replace(settings, plant=str(foreign.write_equation(bag.parent / "logs" / bag.name)))
+        settings = replace(settings, plant=made)
     started = time.monotonic()
     run_lockstep(bag, settings, side=side, domain=domain, hosts=kept_pool())
     elapsed = time.monotonic() - started

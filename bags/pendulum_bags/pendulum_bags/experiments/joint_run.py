@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import lockstep_parameters
+from pendulum_bags.runs.case import IDENTITY, plant_identity
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_msgs_py.contract.names import JOINT_STATES
@@ -196,6 +197,7 @@ class JointRun:
                 "side": self.side,
                 "plant": self.plant if self.side == "sim" else "another plant file",
                 "design_plant": self.settings.plant,
+                IDENTITY: plant_identity(load_mechanism(self.plant)),
                 "seed": self.settings.seed,
                 "disturbance": self._noise(),
                 "controller": {

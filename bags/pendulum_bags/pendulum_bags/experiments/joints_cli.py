@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -114,6 +115,8 @@ def joints(
     from pendulum_bags.ranking.joint_choice import COST, DURATION, rank_joints, rankable
     from pendulum_bags.ranking.joint_choice import FOLDER as RANKING
     from pendulum_bags.ranking.present import Words, same_choice, write_ranking
+    from pendulum_bags.runs.case import Case, plant_identity
+    from pendulum_bags.runs.next_test import MACHINE_FILE
     from pendulum_bags.verdict import write_layer
     from pendulum_lqr.linear.model import linearise
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
@@ -136,7 +139,7 @@ def joints(
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
     with new_run(out, "joints", console) as folder:
-        made = write_mechanism(folder / "machine.yaml", drawn, provenance={"stands_in_for": f"the machine of {plant}"})
+        made = write_mechanism(folder / MACHINE_FILE, drawn, provenance={"stands_in_for": f"the machine of {plant}"})
         expected = _STARTING + _PACE * duration
         multisine = JointMultisine(settings, periods, signal_period)
         longer = _STARTING + _PACE * multisine.run.duration if measured else 0.0
@@ -183,8 +186,9 @@ def joints(
                     on_wait=progress.refresh,
                 )
                 words = Words("--rank-seeds 10", f"experiment joints --plant {plant} --periods 40", COST)
-                write_ranking(folder / RANKING, found, words=words, emulated=True)
-                write_layer(folder, same_choice(found, words=words))
+                case = Case(*map(plant_identity, (simulated, drawn)))
+                write_ranking(folder / RANKING, found, words=words, emulated=True, case=case)
+                write_layer(folder, replace(same_choice(found, words=words), case=case))
     if analysis is not None and not json_output:
         console.print(designs_table(analysis.designs))
     compare([folder], margin=margin, margins_file=margins_file, out=folder, json_output=json_output)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_bags.experiments.simulation import ForeignSimulation
+from pendulum_bags.runs.case import IDENTITY, plant_identity
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_lqr.controller_interface.controller import controller_parameters
@@ -154,6 +155,13 @@ class RunSpec:
         return ForeignSimulation(self.simulation, self.mapping) if self.simulation else None
 
     @property
+    def identity(self) -> str:
+        """The plant that runs, by name and values."""
+        if (foreign := self.foreign) is not None:
+            return foreign.identity
+        return run_identity(self.plant, self.strategy if self.has_bridge else "")
+
+    @property
     def has_bridge(self) -> bool:
         """Whether the plant is the bridge, which no parameter arms; a simulator starts armed and paused."""
         return self.side == "hw" and not self.simulation
@@ -232,6 +240,7 @@ class RunSpec:
                 "experiment": self.clock,
                 "plant": self.plant if self.side == "sim" else "emulator" if foreign is None else foreign.label,
                 "emulated_plant": self.plant if self.has_bridge else "",
+                IDENTITY: self.identity,
                 **({} if foreign is None else {"simulation": foreign.to_json()}),
                 **({STAND_IN: "simulation"} if self.side == "hw" and foreign is not None else {}),
                 "namespace": self.namespace,
@@ -267,6 +276,16 @@ def lockstep_parameters(
         "lockstep_subscribers": listeners,
         "lockstep_duration": float(duration),
     }
+
+
+def run_identity(plant: str, strategy: str = "") -> str:
+    """Return the identity of a preset or plant file as the simulator runs it, or with a strategy as the emulator does.
+
+    Raises:
+        ParameterError: The plant is unknown.
+    """
+    found = plant_identity(load_plant_to_run(plant)[0])
+    return f"emulator of {found}, {strategy}" if strategy else found
 
 
 def integrator_of(plant: str, method: str) -> str:

@@ -10,8 +10,15 @@ from typing import Any
 
 from pendulum_bags.experiments.graph_plant import PREFIX, running_namespace
 from pendulum_bags.experiments.operator import RealMachine, real_machine
-from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE, THESIS_METHOD, absolute_plant, integrator_of
+from pendulum_bags.experiments.run_spec import (
+    EMULATOR_PATIENCE,
+    THESIS_METHOD,
+    absolute_plant,
+    integrator_of,
+    run_identity,
+)
 from pendulum_bags.experiments.simulation import ForeignSimulation
+from pendulum_bags.runs.case import IDENTITY, identity_of
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_lqr.controller_interface.controller import controller_parameters
@@ -304,6 +311,16 @@ class RegulationSettings:
         """Return the disturbance on one of the plants."""
         return graph.disturbance(namespace, **{"kind": "uniform", **asdict(self.noise), **changes})
 
+    def identity(self, side: str) -> str:
+        """Return the plant of one side, by name and values; of one that runs already by its namespace."""
+        if (foreign := self.foreign_of(side)) is not None:
+            return foreign.identity
+        if side == "hw" and (machine := self.machine) is not None:
+            return f"{identity_of(self.plant_name(side), dict(machine.lab.values))}, {self.strategy}"
+        if (namespace := self.running(side)) is not None:
+            return namespace
+        return run_identity(self.plant) if side == "sim" else run_identity("thesis", self.strategy)
+
     def metadata(self, experiment: str, *, side: str = "sim", **more: Any) -> dict[str, Any]:
         """Return what one side's bag says about its run."""
         foreign = self.foreign_of(side) or self.foreign
@@ -312,6 +329,7 @@ class RegulationSettings:
                 "experiment": experiment,
                 "strategy": self.strategy,
                 "seed": self.noise.seed,
+                IDENTITY: self.identity(side),
                 "disturbance": {"kind": "uniform", **asdict(self.noise)},
                 "controller": {"kind": self.kind, **self.tuning},
                 **policy_record(self.tuning),

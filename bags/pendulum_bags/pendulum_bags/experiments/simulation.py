@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.runs.case import identity_of
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_bags.runs.run_record import DIFFERENCE
 from pendulum_msgs_py.errors import ParameterError
@@ -110,6 +111,11 @@ class ForeignSimulation:
                 "another equation, or --accept-differences to design on this one all the same"
             )
 
+    def absolute(self) -> dict[str, str]:
+        """Return the entries of a study that name it, so that a program started elsewhere finds its files."""
+        given = {"simulation": self.name, "mapping": self.mapping}
+        return {key: str(Path(text).resolve()) if Path(text).is_file() else text for key, text in given.items()}
+
     def open(self) -> Plant:
         """Return the simulation in this process."""
         return open_simulation(self.name, self.mapping).pendulum
@@ -130,6 +136,12 @@ class ForeignSimulation:
             "check": str(facts.check),
         }
         return write_plant(folder / EQUATION_FILE, facts.parameters, provenance=provenance)
+
+    @property
+    def identity(self) -> str:
+        """Name, equation and files."""
+        equation = describe_plants([self.parameters])
+        return identity_of(self.label, equation, *map(Path, filter(None, (self.name, self.mapping))))
 
     def to_json(self) -> dict[str, Any]:
         """Return what a bag says about it."""

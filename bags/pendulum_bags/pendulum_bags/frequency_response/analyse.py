@@ -16,6 +16,7 @@ from pendulum_bags.frequency_response.joint_designs import certify_joint_designs
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, LONGER, same_plant, which_controllers
 from pendulum_bags.frequency_response.record import Record, record_of_joints, record_of_run
 from pendulum_bags.frequency_response.result import Analysis
+from pendulum_bags.runs.case import IDENTITY, Case
 from pendulum_bags.runs.run_record import run_record, stands_in
 from pendulum_bags.verdict import LayerResult, name_in
 from pendulum_lqr.linear.design import output_lqr
@@ -69,8 +70,8 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, 
         plant = _design_plant(path, facts) or plant
         policies |= dict.fromkeys(policies_of(facts))
         measured = estimate(record)
-        emulated = label == "hw" and stands_in(facts)
-        found.append(replace(measured, label=label, facts={**measured.facts, "emulated": emulated}))
+        told = {"emulated": label == "hw" and stands_in(facts), IDENTITY: facts.get(IDENTITY, "")}
+        found.append(replace(measured, label=label, facts={**measured.facts, **told}))
     if len(found) == 2 and found[0].label == found[1].label:
         # Two of one kind: the order in which they were given tells which is held against which.
         found = [replace(one, label=label) for one, label in zip(found, ("sim", "hw"), strict=True)]
@@ -162,6 +163,8 @@ def analyse_responses(
     if certifier is not None:
         results = certify(certifier)
         layers.append(which_controllers(certifier, results, longer=longer))
+    case = Case(*(str(by_label[side].facts.get(IDENTITY, "")) if side in by_label else "" for side in ("sim", "hw")))
+    layers = [replace(layer, case=case) for layer in layers]
     found = Analysis(responses, model, plant, difference, certifier, results, layers, scaling)
     return replace(found, layers=name_in(layers, emulated=found.is_emulated))
 

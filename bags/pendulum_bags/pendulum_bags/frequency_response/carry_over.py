@@ -11,6 +11,7 @@ from pendulum_bags.frequency_response.designs import policies_of
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Layer, LayerResult
+from pendulum_bags.verdict.same_run import same_run_layer
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["carry_over", "layers_of"]
@@ -31,7 +32,7 @@ def carry_over(
         The certificates, None where no response was measured.
 
     Raises:
-        DataError: Designs are given and no response, or it cannot be read.
+        DataError: Designs are given and no response, it cannot be read, or it is of another machine.
         ParameterError: A text is no design.
     """
     place = machine or find_machine(folders)
@@ -44,7 +45,10 @@ def carry_over(
             )
         return None
     facts = run_record(comparison.pairs[0].simulation.metadata)
-    return analyse_machine(place, str(facts.get("plant") or "thesis"), designs, policies_of(facts))
+    found = analyse_machine(place, str(facts.get("plant") or "thesis"), designs, policies_of(facts))
+    for layer in found.layers:
+        same_run_layer(comparison).case.require_same(layer.case, f"the response in {place}")
+    return found
 
 
 def layers_of(analysis: Analysis | None) -> list[LayerResult]:

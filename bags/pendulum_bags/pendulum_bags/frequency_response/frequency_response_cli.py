@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from pendulum_bags.experiments.plant_options import (
+    AcceptDifferences,
+    MappingFile,
+    SimulatedPlant,
+    Simulation,
+    Strategy,
+)
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
@@ -87,8 +95,11 @@ def experiment(
         Path | None,
         out_option("Folder of the run; it must be new. Default: bags/runs/<UTC>_frequency_response."),
     ] = None,
-    plant: Annotated[str, typer.Option(help="Simulated plant, and plant of the designs: preset or file.")] = "thesis",
-    strategy: Annotated[str, typer.Option(help="How the emulated actuator turns torque into PWM.")] = "direct_pwm",
+    plant: SimulatedPlant = None,
+    simulation: Simulation = "",
+    mapping: MappingFile = None,
+    accept_differences: AcceptDifferences = False,
+    strategy: Strategy = "direct_pwm",
     controller: Annotated[
         str, typer.Option(help="Controller that holds both plants meanwhile, or a policy file (.npz).")
     ] = "lqr",
@@ -121,18 +132,20 @@ def experiment(
     from pendulum_bags.experiments.new_run import new_run
     from pendulum_bags.experiments.progress import PhaseProgress
     from pendulum_bags.experiments.run_spec import RunSpec
+    from pendulum_bags.experiments.simulation import ForeignSimulation
     from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
     from pendulum_lqr.policies.policy_file import named_controller
     from pendulum_lqr.responses.controller_response import require_time_invariant
     from pendulum_lqr.responses.gap_metric import Scaling
     from pendulum_msgs_py.plants.plant_parameters import require_one_joint
 
-    require_one_joint(plant, f"python -m pendulum_bags experiment joints --plant {plant}, which measures it, too")
+    if plant is not None:
+        require_one_joint(plant, f"python -m pendulum_bags experiment joints --plant {plant}, which measures it, too")
     scaling = Scaling(angle, velocity, torque)
     kind, parameters = named_controller(controller)
     require_time_invariant(kind)
     check_domain(domain)
-    disturbance = {
+    disturbance: dict[str, Any] = {
         "kind": "multisine",
         "amplitude": amplitude,
         "signal_period": signal_period,
@@ -141,12 +154,20 @@ def experiment(
         "lines": lines,
         "hold_time": 0.01,
     }
+    console = make_console(stderr=json_output, highlight=False)
+    foreign = ForeignSimulation(simulation, str(mapping or "")) if simulation else None
+    if foreign is not None:
+        foreign.check(disturbance["hold_time"])
+        if plant is None and not accept_differences:
+            foreign.require_equation()
     # Both hold each sample for the slower plant's period: the same torque as a function of time.
     specs = [
         RunSpec(
             side=side,
-            plant=plant if side == "sim" else "thesis",
-            design_plant=plant,
+            plant=(plant or "thesis") if side == "sim" else "thesis",
+            design_plant=plant or "thesis",
+            simulation=simulation if side == "sim" else "",
+            mapping=str(mapping or "") if side == "sim" else "",
             strategy=strategy,
             controller=kind,
             controller_parameters=parameters,
@@ -158,7 +179,6 @@ def experiment(
         )
         for side in ("sim", "hw")
     ]
-    console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
     shares = (1.0, 1.0) if realtime else (0.35, 0.15)
     expected = [6.0 + share * spec.duration for spec, share in zip(specs, shares, strict=True)]
@@ -167,6 +187,9 @@ def experiment(
         open_pool() as hosts,
         PhaseProgress(sum(expected) + 12.0, console) as progress,
     ):
+        if foreign is not None and plant is None:
+            equation = str(foreign.write_equation(folder))
+            specs = [replace(spec, design_plant=equation) for spec in specs]
         for spec, length in zip(specs, expected, strict=True):
             progress.phase("simulation" if spec.side == "sim" else "hardware", length)
             record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh, hosts=hosts)

@@ -12,7 +12,9 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.metrics import episode_of, metrics_of
+from pendulum_bags.experiments.run_spec import SIDES, RunSpec
 from pendulum_bags.ranking.contender import Contender, contenders_of
+from pendulum_bags.runs.case import IDENTITY, Case
 from pendulum_bags.runs.find_bags import bags_below
 from pendulum_bags.runs.run_data import is_emulated, read_run
 from pendulum_bags.runs.run_record import run_record
@@ -48,15 +50,16 @@ def cost_parts(metrics: Mapping[str, float | None], duration: float, weights: Se
     return parts
 
 
-def collect_contenders(folders: Sequence[Path], weights: Sequence[float] = WEIGHTS) -> list[Contender]:
-    """Return the controllers that ran on both sides, from all runs below some folders.
+def collect_contenders(folders: Sequence[Path], weights: Sequence[float] = WEIGHTS) -> tuple[list[Contender], Case]:
+    """Return the controllers that ran on both sides, from all runs below some folders, and the plants that ran.
 
     Args:
         folders: Studies, run folders, or folders of bags.
         weights: q11, q22 and r of the cost.
 
     Raises:
-        DataError: There are no runs, or a recording that may be one is damaged: it may be the run that fell.
+        DataError: There are no runs, those of one side are of two plants, or a recording that may be one is damaged:
+            it may be the run that fell.
         ParameterError: A weight is negative or no number.
     """
     if not all(math.isfinite(weight) and weight >= 0.0 for weight in weights):
@@ -80,17 +83,19 @@ def collect_contenders(folders: Sequence[Path], weights: Sequence[float] = WEIGH
     costs: dict[str, dict[str, list[tuple[int, Array | None]]]] = {}
     for run in runs:
         costs.setdefault(run.name, {"sim": [], "hw": []})[run.side].append((run.seed, run.parts))
-    return contenders_of(costs, {run.name for run in runs if not run.emulated})
+    case = Case.of(*([{IDENTITY: run.identity} for run in runs if run.side == side] for side in SIDES))
+    return contenders_of(costs, {run.name for run in runs if not run.emulated}), case
 
 
 class _Run(NamedTuple):
-    """One run: parts of its cost, or None where it failed."""
+    """One run: parts of its cost, or None where it failed, and the identity of its plant."""
 
     name: str
     side: str
     seed: int
     parts: Array | None
     emulated: bool
+    identity: str
 
 
 def _collect(folder: Path, weights: Sequence[float], runs: list[_Run], unread: list[str]) -> None:
@@ -127,7 +132,7 @@ def _studied_run(record: Path, weights: Sequence[float]) -> _Run:
     parts = None
     if told.get("status") == "done" and told.get("metrics", {}).get("success"):
         parts = _parts(told["metrics"], float(spec["duration"]), weights, f"{name} on {side} under seed {seed}")
-    return _Run(name, side, seed, parts, True)
+    return _Run(name, side, seed, parts, True, RunSpec.from_json(spec).identity)
 
 
 def _parts(metrics: Mapping[str, float | None], duration: float, weights: Sequence[float], who: str) -> Array:
@@ -162,7 +167,7 @@ def _recorded_run(bag: Path, weights: Sequence[float]) -> _Run | None:
     if not np.max(np.abs(episode.error)) > _FALLEN:
         who = f"{name} on {side} under seed {seed}"
         parts = _parts(metrics_of(episode), float(episode.t[-1]), weights, who)
-    return _Run(name, side, seed, parts, side == "sim" or is_emulated(run))
+    return _Run(name, side, seed, parts, side == "sim" or is_emulated(run), str(told.get(IDENTITY, "")))
 
 
 def _name(told: Mapping[str, Any]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from pendulum_bags.figures.table import Table
 from pendulum_bags.figures.terminal_table import number_table
 from pendulum_bags.pages.layer_page import write_layer_page
 from pendulum_bags.ranking.ranking import Ranking
+from pendulum_bags.runs.case import UNKNOWN, Case
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, name_in, write_layer
 
@@ -191,6 +192,7 @@ def write_ranking(
     notes: Sequence[str] = (),
     *,
     emulated: bool = False,
+    case: Case = UNKNOWN,
 ) -> Path:
     """Write numbers, layer, figure and page into a folder; return the page.
 
@@ -201,9 +203,10 @@ def write_ranking(
         words: How its runs were made.
         notes: Sentences at the end of the page.
         emulated: Whether an emulator took the place of the hardware; figure and page say so then.
+        case: The plants that ran.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    layer = name_in(same_choice(ranking, words=words), emulated=emulated)
+    layer = name_in(replace(same_choice(ranking, words=words), case=case), emulated=emulated)
     write_json(folder / "ranking.json", ranking.to_json())
     write_layer(folder, layer)
     figures = [name_in(ranking_figure(ranking), emulated=emulated)]

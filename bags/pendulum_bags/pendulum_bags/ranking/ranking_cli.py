@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -46,14 +47,14 @@ def ranking(
     from pendulum_bags.ranking.present import print_ranking, same_choice, write_ranking
     from pendulum_bags.ranking.ranking import rank
 
-    contenders = collect_contenders(folders, weights)
+    contenders, case = collect_contenders(folders, weights)
     found = rank(contenders)
     emulated = all(one.emulated for one in contenders)
     use = not emulated if use_simulation is None else use_simulation
     narrowed = narrow_all(contenders) if use else {}
-    page = write_ranking(out, found, emulated=emulated) if out is not None else None
+    page = write_ranking(out, found, emulated=emulated, case=case) if out is not None else None
     if json_output:
-        content = {**found.to_json(), "layer": same_choice(found).to_json()}
+        content = {**found.to_json(), "layer": replace(same_choice(found), case=case).to_json()}
         if use:
             content["narrowed"] = {name: one.to_json() for name, one in narrowed.items()}
         print(json_text(content))

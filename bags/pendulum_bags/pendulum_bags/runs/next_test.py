@@ -8,29 +8,57 @@ from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
-__all__ = ["next_test_of", "plant_file_of", "question_of"]
+__all__ = ["MACHINE_FILE", "measurement_of", "next_test_of", "plant_file_of", "question_of"]
 
 _EXPERIMENTS = ("thesis", "joints")
+MACHINE_FILE = "machine.yaml"
+"""Plant file of the emulated machine of several joints, within its run folder."""
 _REPLACED = ("--plant", "--seed", "--out", "-o", "--simulation", "--mapping")
 """Options, each with a value, that the test has of its own: noise that a fit has seen is no test of it, and somebody
 else's simulation would stand where the plant is to."""
+_OF_THE_CASE = ("--plant", "--simulation", "--mapping", "--strategy")
+"""Options that say which plants an experiment is of; those that measure other layers take them too."""
 _PLANT_FILES = (".yaml", ".yml")
 _LEFT_OUT = ("--yes",)
 """Nobody is to be spared the question whether a machine may move."""
 
 
-def next_test_of(records: Sequence[Mapping[str, Any]], plant: str) -> str:
+def next_test_of(records: Sequence[Mapping[str, Any]], plant: str, bags: Sequence[str] = ()) -> str:
     """Return the command that runs a recorded experiment again with another plant and other noise.
 
     Args:
         records: What bags say of their runs; the first that was an experiment is run again, under noise of none.
         plant: The plant file.
+        bags: The recordings; beside one of several joints lies its emulated machine, which is kept, not drawn again.
 
     Returns:
         The command; empty where no record tells of an experiment that compares two plants.
     """
     seen = {str(record.get("seed", "")) for record in records}
-    return next(filter(None, (_again(record, plant, seen) for record in records)), "")
+    command = next(filter(None, (_again(record, plant, seen) for record in records)), "")
+    machines = (path for bag in bags if (path := Path(bag).parent / MACHINE_FILE).is_file())
+    if command.split()[4:5] == ["joints"] and not _values_of("--machine", shlex.split(command)):
+        command += "".join(f" --machine {shlex.quote(str(path))}" for path in [*machines][:1])
+    return command
+
+
+def measurement_of(records: Sequence[Mapping[str, Any]], experiment: str) -> str:
+    """Return the command of another experiment with the plants of a recorded one.
+
+    Args:
+        records: What bags say of their runs; the first that was an experiment on the emulator counts.
+        experiment: ``frequency_response`` or ``ranking``.
+
+    Returns:
+        The command; empty where no record tells of such an experiment: these two move no other hardware.
+    """
+    for words in map(_words, records):
+        hardware = set(_values_of("--hardware", words)) - {"emulator"}
+        running = any(value.startswith("ros:") for value in _values_of("--simulation", words))
+        if words[:5] == ["python", "-m", "pendulum_bags", "experiment", "thesis"] and not hardware and not running:
+            options = [(name, value) for name in _OF_THE_CASE for value in _values_of(name, words)[-1:]]
+            return shlex.join([*words[:4], experiment, *(word for pair in options for word in pair)])
+    return ""
 
 
 def plant_file_of(records: Sequence[Mapping[str, Any]]) -> str:

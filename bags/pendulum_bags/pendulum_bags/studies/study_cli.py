@@ -11,6 +11,14 @@ import typer
 from rich.console import Console
 from rich.progress import TextColumn
 
+from pendulum_bags.experiments.plant_options import (
+    AcceptDifferences,
+    MappingFile,
+    SimulatedPlant,
+    Simulation,
+    Strategy,
+    equation_file,
+)
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counting_bar, resumable
@@ -127,11 +135,37 @@ def _shipped(name: str, what: str, example: str) -> Callable[..., None]:
         out: Out = None,
         workers: Workers = 0,
         seeds: Seeds = 0,
+        plant: SimulatedPlant = None,
+        simulation: Simulation = "",
+        mapping: MappingFile = None,
+        accept_differences: AcceptDifferences = False,
+        strategy: Strategy = "direct_pwm",
         retry_failed: Retry = False,
         dry_run: DryRun = False,
         json_output: Json = False,
     ) -> None:
-        _study(name, out, workers, seeds, retry_failed, dry_run, json_output)
+        from pendulum_bags.experiments.run_spec import absolute_plant
+        from pendulum_bags.experiments.simulation import ForeignSimulation
+
+        out = out or Path("bags", "runs", name)
+        foreign = ForeignSimulation(simulation, str(mapping or "")) if simulation else None
+        own = bool(plant or simulation or strategy != "direct_pwm")
+        if foreign is not None and plant is None:
+            plant = equation_file(foreign, out, accept_differences=accept_differences)
+        design = {"design_plant": absolute_plant(plant or "thesis")}
+        sim = {"plant": design["design_plant"], **design}
+        if foreign is not None:
+            sim |= foreign.absolute()
+        _study(
+            name,
+            out,
+            workers,
+            seeds,
+            retry_failed,
+            dry_run,
+            json_output,
+            plants={"sim": sim, "hw": {**design, "strategy": strategy}} if own else None,
+        )
 
     command.__doc__ = f"{what}\n\nExample: python -m pendulum_bags experiment {name} {example}"
     return command
@@ -166,13 +200,14 @@ def _study(
     json_output: bool,
     *,
     yes: bool = False,
+    plants: Mapping[str, Mapping[str, str]] | None = None,
 ) -> None:
     from pendulum_bags.experiments.operator import ask_yes, real_machine
     from pendulum_bags.studies.results import collect, write_table
     from pendulum_bags.studies.runner import StudyProgress, default_workers, open_study_folder, run_study
     from pendulum_bags.studies.study_file import load_study
 
-    found = load_study(source, seeds=range(1, seeds + 1) if seeds else None)
+    found = load_study(source, seeds=range(1, seeds + 1) if seeds else None, plants=plants)
     workers = workers or default_workers(found)
     if found.realtime and workers > 1:
         raise ParameterError(f"workers is {workers}; expected 1: runs in real time must not share the machine")
@@ -260,10 +295,10 @@ def _analyse(
         from pendulum_bags.ranking.present import print_ranking, write_ranking
         from pendulum_bags.ranking.ranking import rank
 
-        contenders = collect_contenders([folder])
+        contenders, case = collect_contenders([folder])
         ranked = rank(contenders)
         notes = [f"Left out: {sentence}." for sentence in found.left_out]
-        write_ranking(folder, ranked, notes=notes, emulated=all(one.emulated for one in contenders))
+        write_ranking(folder, ranked, notes=notes, emulated=all(one.emulated for one in contenders), case=case)
         key, tell = "ranking", lambda console, _: print_ranking(console, ranked)
         result[key] = ranked.to_json()
     write_json(folder / "results.json", result)

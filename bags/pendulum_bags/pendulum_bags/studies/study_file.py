@@ -13,6 +13,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from pendulum_bags.experiments.run_spec import CLOCKS, PERIODS, RunSpec
 from pendulum_bags.experiments.settings import TIME_BESIDE_NOISE
 from pendulum_bags.studies.located import LocatedMapping
@@ -34,7 +36,10 @@ _KEYS = (
     "format", "name", "description", "experiment", "analysis", "clock", "duration", "plants", "controllers",
     "disturbances", "set_points", "starts", "seeds", "repeats", "trials", "optional",
 )  # fmt: skip
-_PLANT_KEYS = ("side", "plant", "design_plant", "strategy", "method", "engine", "parameters", "hardware", "lab")
+_PLANT_KEYS = (
+    "side", "plant", "design_plant", "simulation", "mapping", "strategy", "method", "engine", "parameters", "hardware",
+    "lab",
+)  # fmt: skip
 _MAX_RUNS = 100_000
 _LARGEST = 1e300  # whole numbers in YAML have no end
 
@@ -160,12 +165,15 @@ def shipped_studies() -> dict[str, Path]:
     return {path.stem: path for path in sorted(paths)}
 
 
-def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Study:
+def load_study(
+    source: str | Path, *, seeds: Sequence[int] | None = None, plants: Mapping[str, Mapping[str, str]] | None = None
+) -> Study:
     """Read a study file, or one of the shipped studies by name.
 
     Args:
         source: Path, or name of a shipped study.
         seeds: Seeds to use in place of the file's.
+        plants: By side, entries that its plants get in place of the file's, such as ``{"sim": {"plant": "x5_9"}}``.
 
     Raises:
         ParameterError: The file is refused; the message has file and line.
@@ -180,6 +188,11 @@ def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Stu
     file.reject_unknown(_KEYS)
     if file.get("format", str, None, repr(FORMAT)) != FORMAT:
         file.fail(f"format is {file.values['format']!r}; expected {FORMAT!r}", "format")
+    text = path.read_text(encoding="utf-8")
+    if plants:
+        for entry in file.mapping("plants").values.values():
+            entry.update(plants.get(entry.get("side", "sim"), {}))
+        text = yaml.safe_dump(dict(file.values), sort_keys=False, allow_unicode=True)
     experiment = _choice(file, "experiment", EXPERIMENTS, "run")
     clock = _choice(file, "clock", CLOCKS, "realtime" if experiment == "thesis" else "lockstep")
     if experiment == "thesis" and clock != "realtime":
@@ -201,7 +214,7 @@ def load_study(source: str | Path, *, seeds: Sequence[int] | None = None) -> Stu
         experiment,
         analysis,
         tuple(runs),
-        path.read_text(encoding="utf-8"),
+        text,
         clock,
         tuple(left_out.values()),
     )
@@ -265,6 +278,8 @@ def _plain_runs(
                 side=settings.get("side", "sim"),
                 plant=settings.get("plant", "thesis"),
                 design_plant=settings.get("design_plant", "thesis"),
+                simulation=settings.get("simulation", ""),
+                mapping=settings.get("mapping", ""),
                 strategy=settings.get("strategy", "direct_pwm"),
                 method=settings.get("method", "euler"),
                 plant_parameters=settings.get("parameters", {}),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.verdict.layers import Answer, Layer, LayerResult, Mark, read_layers, sum_up
-from pendulum_bags.verdict.same_run import design_plant, same_run_layer
+from pendulum_bags.verdict.same_run import design_plant, how_to_measure, same_run_layer
 
 __all__ = ["answer_of", "answer_of_joints", "join_joints"]
 
@@ -38,11 +38,12 @@ def answer_of(
         anew: Layers that were judged anew, and stand for those that the folders keep.
 
     Raises:
-        DataError: A kept layer cannot be read, or is kept in two of the folders.
+        DataError: A kept layer cannot be read, is kept in two of the folders, or is of other plants.
     """
+    first = same_run_layer(comparison, more=more)
     known = {Layer.SAME_RUN, *(one.layer for one in anew)}
-    others = [one for folder in folders for one in read_layers(folder) if one.layer not in known]
-    return sum_up([same_run_layer(comparison, more=more), *anew, *others], emulated=comparison.is_emulated)
+    others = [one for folder in folders for one in read_layers(folder, first.case) if one.layer not in known]
+    return sum_up([first, *anew, *others], emulated=comparison.is_emulated, how=how_to_measure(comparison))
 
 
 def join_joints(results: Mapping[str, LayerResult]) -> LayerResult:
@@ -65,6 +66,7 @@ def join_joints(results: Mapping[str, LayerResult]) -> LayerResult:
         ),
         tuple(dict.fromkeys(step for one in because.values() for step in one.next_steps)),
         reason="; ".join(f"{joint}: {one.reason}" for joint, one in because.items()),
+        case=first.case,
     )
 
 
@@ -79,7 +81,7 @@ def answer_of_joints(comparisons: Mapping[str, Comparison], folders: Sequence[Pa
         DataError: As of :func:`answer_of`.
     """
     joined = join_joints({joint: same_run_layer(one) for joint, one in comparisons.items()})
-    kept = [one for folder in folders for one in read_layers(folder) if one.layer is not Layer.SAME_RUN]
+    kept = [one for folder in folders for one in read_layers(folder, joined.case) if one.layer is not Layer.SAME_RUN]
     asked = {one.layer for one in (joined, *kept)}
     plant = shlex.quote(design_plant(next(iter(comparisons.values()))))
     command = f"python -m pendulum_bags experiment joints --plant {plant}"

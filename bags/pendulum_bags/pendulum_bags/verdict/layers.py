@@ -11,8 +11,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import Enum
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+from pendulum_bags.runs.case import UNKNOWN, Case
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict.naming import name_in
 from pendulum_msgs_py.errors import DataError
@@ -129,6 +131,7 @@ class LayerResult:
             "the spread of the velocity is 31 % smaller on the hardware".
         holds: Half a sentence: what may be relied on although another layer says no, such as "designs with a margin
             above 0.21 stabilise the hardware too"; empty for nothing.
+        case: The plants that it is of.
     """
 
     layer: Layer
@@ -138,6 +141,7 @@ class LayerResult:
     next_steps: Sequence[str] = ()
     reason: str = ""
     holds: str = ""
+    case: Case = UNKNOWN
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON values."""
@@ -151,6 +155,7 @@ class LayerResult:
             "next_steps": list(self.next_steps),
             "reason": self.reason,
             "holds": self.holds,
+            "case": asdict(self.case),
         }
 
     @classmethod
@@ -169,6 +174,7 @@ class LayerResult:
                 tuple(map(str, content["next_steps"])),
                 str(content["reason"]),
                 str(content["holds"]),
+                Case(**content.get("case", {})),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"the content is no result of a layer: {error}") from error
@@ -209,7 +215,9 @@ HOW = {
 """The command that measures each layer."""
 
 
-def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
+def sum_up(
+    results: Iterable[LayerResult], *, emulated: bool = False, how: Mapping[Layer, str] = MappingProxyType({})
+) -> Answer:
     """Return one answer from the layers that were measured.
 
     One layer that says no makes it no: each asks something that designing needs. It is yes where at least one layer was
@@ -219,6 +227,7 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
     Args:
         results: At most one for each layer; the others count as not measured.
         emulated: Whether an emulator took the place of the hardware; the text then says so.
+        how: The command that measures a layer of these plants, where it is not that of :data:`HOW`.
 
     Raises:
         DataError: A layer was given twice.
@@ -228,7 +237,7 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
         if result.layer in given:
             raise DataError(f"layer {result.layer.title!r} was given twice; expected each once")
         given[result.layer] = name_in(result, emulated=emulated)
-    layers = tuple(given.get(layer) or _not_measured(layer) for layer in Layer)
+    layers = tuple(given.get(layer) or _not_measured(layer, how.get(layer, HOW[layer])) for layer in Layer)
     by_mark = {mark: [result for result in layers if result.mark is mark] for mark in Mark}
     measured = [result for result in layers if result.mark is not Mark.NOT_MEASURED]
     if by_mark[Mark.NO]:
@@ -249,14 +258,13 @@ def sum_up(results: Iterable[LayerResult], *, emulated: bool = False) -> Answer:
     # What mends a no comes before what decides, and that before what was left out.
     order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES])
     steps = dict.fromkeys(step for result in order for step in result.next_steps)
-    for how in dict.fromkeys(result.reason for result in by_mark[Mark.NOT_MEASURED] if result.reason):
-        titles = [f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED] if result.reason == how]
-        steps[f"Measure {_listed(titles)}: {how}"] = None
+    for command in dict.fromkeys(result.reason for result in by_mark[Mark.NOT_MEASURED] if result.reason):
+        titles = [f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED] if result.reason == command]
+        steps[f"Measure {_listed(titles)}: {command}"] = None
     return Answer(mark, text, layers, tuple(steps))
 
 
-def _not_measured(layer: Layer) -> LayerResult:
-    how = HOW[layer]
+def _not_measured(layer: Layer, how: str) -> LayerResult:
     return LayerResult(layer, Mark.NOT_MEASURED, f"Not measured yet; to measure it: {how}.", reason=how)
 
 
@@ -272,11 +280,15 @@ def write_layer(folder: Path, result: LayerResult) -> Path:
     return path
 
 
-def read_layers(folder: Path) -> list[LayerResult]:
+def read_layers(folder: Path, case: Case = UNKNOWN) -> list[LayerResult]:
     """Return the layers that are kept in a run folder, in order.
 
+    Args:
+        folder: The folder.
+        case: The plants that they have to be of.
+
     Raises:
-        DataError: A file holds no result of a layer.
+        DataError: A file holds no result of a layer, or one of other plants.
     """
     found = []
     for layer in Layer:
@@ -286,6 +298,7 @@ def read_layers(folder: Path) -> list[LayerResult]:
                 found.append(LayerResult.from_json(json.loads(path.read_text(encoding="utf-8"))))
             except (ValueError, DataError) as error:
                 raise DataError(f"{path} holds no result of a layer: {error}") from error
+            case.require_same(found[-1].case, f"“{layer.title}” in {folder}")
     return found
 
 

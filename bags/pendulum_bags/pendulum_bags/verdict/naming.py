@@ -8,6 +8,8 @@ from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from typing import Any, TypeVar, cast
 
+from pendulum_bags.runs.case import Case
+
 __all__ = ["name_hardware", "name_in"]
 
 _T = TypeVar("_T")
@@ -27,7 +29,8 @@ def name_in(value: _T, *, emulated: bool) -> _T:
 
 
 def _named(value: Any) -> Any:
-    if isinstance(value, Enum):
+    # A file may be called hardware.xml.
+    if isinstance(value, (Enum, Case)):
         return value
     if isinstance(value, str):
         return name_hardware(value, emulated=True)

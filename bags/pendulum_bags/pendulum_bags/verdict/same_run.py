@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
-from pendulum_bags.runs.next_test import next_test_of, plant_file_of, question_of
+from pendulum_bags.runs.case import Case
+from pendulum_bags.runs.next_test import measurement_of, next_test_of, plant_file_of, question_of
 from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import run_record
-from pendulum_bags.verdict.layers import HOW, Evidence, Layer, LayerResult, Mark
+from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 
-__all__ = ["design_plant", "in_words", "same_run_layer", "seen_note"]
+__all__ = ["design_plant", "how_to_measure", "in_words", "same_run_layer", "seen_note"]
 
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
@@ -55,7 +56,28 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
             reason = f"{runs} cannot tell yet in {', '.join(test.quantity for test in open_tests)}"
         steps = (_what_it_takes(comparison, more),)
     sentence = f"{reason[0].upper()}{reason[1:]}."
-    return LayerResult(Layer.SAME_RUN, mark, sentence, tuple(map(_evidence, tests)), steps, reason=reason)
+    case = Case.of(
+        [run_record(pair.simulation.metadata) for pair in comparison.pairs],
+        [run_record(pair.hardware.metadata) for pair in comparison.pairs],
+    )
+    return LayerResult(Layer.SAME_RUN, mark, sentence, tuple(map(_evidence, tests)), steps, reason=reason, case=case)
+
+
+def how_to_measure(comparison: Comparison) -> dict[Layer, str]:
+    """Return the commands that measure the other layers of a comparison's own plants."""
+    first = comparison.pairs[0]
+    bags = [one.source or name for one, name in ((first.simulation, "SIM"), (first.hardware, "HW"))]
+    in_frequency = measurement_of(_records(comparison), "frequency_response") or (
+        f"python -m pendulum_bags frequency_response {' '.join(map(shlex.quote, bags))} --out FOLDER"
+    )
+    choice = measurement_of(_records(comparison), "ranking") or (
+        "python -m pendulum_bags ranking FOLDER, with recordings of several controllers on both plants"
+    )
+    return {
+        Layer.SAME_PLANT: in_frequency,
+        Layer.WHICH_CONTROLLERS: in_frequency,
+        Layer.SAME_CHOICE: choice,
+    }
 
 
 def in_words(test: EquivalenceTest) -> str:
@@ -162,7 +184,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
         if fitted:
             steps.append(
                 "If that says no too, no parameters will do: the model lacks what the hardware does. Measure which "
-                f"designs are safe all the same ({HOW[Layer.WHICH_CONTROLLERS]})."
+                f"designs are safe all the same ({how_to_measure(comparison)[Layer.WHICH_CONTROLLERS]})."
             )
     elif late is not None and foreign:
         # No plant file of ours reaches into it.
@@ -204,7 +226,7 @@ def _next_file(fitted: str) -> str:
 
 
 def _test_of_the_plant(comparison: Comparison, plant: str) -> str:
-    command = next_test_of(_records(comparison), plant)
+    command = next_test_of(_records(comparison), plant, [pair.hardware.source for pair in comparison.pairs])
     if not command:
         return f"simulate and design with --plant {shlex.quote(plant)}, and compare again under noise of another seed."
     return (

@@ -1,0 +1,53 @@
+"""Options that say which plants an experiment is of; each command that takes them names them alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from pendulum_bags.experiments.simulation import ForeignSimulation
+
+__all__ = ["AcceptDifferences", "MappingFile", "SimulatedPlant", "Simulation", "Strategy", "equation_file"]
+
+SimulatedPlant = Annotated[
+    str | None,
+    typer.Option(
+        help="Preset or plant file of the simulated plant, and of the controller's design; default thesis, or with "
+        "--simulation the equation read off it."
+    ),
+]
+Simulation = Annotated[
+    str, typer.Option(help="In the simulator's place: a model file (MJCF or URDF, run by MuJoCo), or gymnasium:ID.")
+]
+MappingFile = Annotated[
+    Path | None, typer.Option(help="Mapping file of that simulation: joint, actuator, sign, zero, limit.")
+]
+AcceptDifferences = Annotated[
+    bool,
+    typer.Option(
+        "--accept-differences",
+        help="Design on the equation of --simulation even if the simulation does not move as it; the report says so.",
+    ),
+]
+Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torque into PWM.")]
+
+
+def equation_file(foreign: ForeignSimulation | None, target: Path, *, accept_differences: bool) -> str:
+    """Write the equation of a foreign simulation, on which controllers are designed, and return its plant file.
+
+    Args:
+        foreign: The simulation; None for ours, which has no such file.
+        target: Folder of what is recorded, which may have to be new: the file goes beside it, into ``logs``.
+        accept_differences: Whether the simulation may move otherwise.
+
+    Raises:
+        ParameterError: It does, or is refused.
+    """
+    if foreign is None:
+        return ""
+    if not accept_differences:
+        foreign.require_equation()
+    return str(foreign.write_equation(target.parent / "logs" / target.name))

@@ -1,0 +1,81 @@
+"""Which plants a result is of: results make one answer only where simulation and hardware are the same in all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.plant_differences import AnyPlant, describe_plants
+
+__all__ = ["IDENTITY", "UNKNOWN", "Case", "identity_of", "plant_identity"]
+
+IDENTITY = "identity"
+"""Entry of a run's record: the plant that ran, by name and a hash of all of its values."""
+
+
+def identity_of(name: str, *content: Any) -> str:
+    """Return a name with a short hash of content: JSON values, and paths of files, which count by their bytes."""
+    told = [
+        hashlib.sha256(one.read_bytes()).hexdigest() if isinstance(one, Path) else one
+        for one in content
+        if not isinstance(one, Path) or one.is_file()
+    ]
+    return f"{name} ({hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:8]})"
+
+
+def plant_identity(plant: AnyPlant) -> str:
+    """Return the identity of a plant of ours: two that move alike have one, whatever their files are called."""
+    values = json.loads(describe_plants([plant]))[0]
+    return identity_of(str(values.pop("name")), values)
+
+
+@dataclass(frozen=True)
+class Case:
+    """The plants of a result.
+
+    Attributes:
+        simulation: Identity of the simulation; empty where its recordings do not have one.
+        hardware: Identity of the hardware, the strategy of its drive included; empty likewise.
+    """
+
+    simulation: str = ""
+    hardware: str = ""
+
+    @classmethod
+    def of(cls, simulation: Iterable[Mapping[str, Any]], hardware: Iterable[Mapping[str, Any]]) -> Case:
+        """Return the case of the records of runs on both sides.
+
+        Raises:
+            DataError: The runs of one side are of two plants.
+        """
+        sides = []
+        for side, records in (("simulation", simulation), ("hardware", hardware)):
+            found = sorted({str(record[IDENTITY]) for record in records if record.get(IDENTITY)})
+            if len(found) > 1:
+                raise DataError(f"{side} is {found[0]} in one run and {found[1]} in another; expected one plant")
+            sides.append("".join(found))
+        return cls(*sides)
+
+    def require_same(self, other: Case, where: str) -> None:
+        """Refuse a result of other plants; what is not known of one of them is not compared.
+
+        Args:
+            other: The case of the result.
+            where: Where the result is kept, for the message.
+
+        Raises:
+            DataError: It has another simulation or other hardware.
+        """
+        for side, ours in asdict(self).items():
+            theirs = getattr(other, side)
+            if ours and theirs and ours != theirs:
+                raise DataError(f"{where} is of {side} {theirs}; expected that of the compared recordings, {ours}")
+
+
+UNKNOWN = Case()
+"""The plants of a result that does not name them."""
