@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.lockstep import lockstep_spec
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.studies.study_file import load_study, shipped_studies
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_testing.policies import linear_policy
 
 HEAD = "format: pendulum_study/1\nname: small\n"
@@ -169,3 +172,33 @@ def test_a_policy_file_beside_the_study_is_a_controller_of_it(tmp_path: Path, mo
     (tmp_path / "study" / "mine.npz").unlink()
     with pytest.raises(ParameterError, match=r"study\.yaml:\d+.*mine\.npz does not exist"):
         load_study(tmp_path / "study" / "study.yaml")
+
+
+def test_plants_of_a_shipped_study_are_replaced_and_its_text_says_so(tmp_path: Path) -> None:
+    own = write_plant(tmp_path / "own.yaml", load_plant("thesis").with_values(damping=12.0))
+    plants = {"sim": {"plant": str(own), "design_plant": str(own)}, "hw": {"strategy": "effort_loop"}}
+    study = load_study("pid_vs_lqr", seeds=[1], plants=plants)
+    for run in study.runs:
+        assert run.spec is not None
+        sim = run.spec.side == "sim"
+        assert (run.spec.plant, run.spec.design_plant) == ((str(own), str(own)) if sim else ("thesis", "thesis"))
+        assert run.spec.strategy == ("direct_pwm" if sim else "effort_loop")
+    (tmp_path / "study.yaml").write_text(study.text)
+    assert load_study(tmp_path / "study.yaml", seeds=[1]).runs == study.runs
+
+
+def test_a_run_is_of_a_plant_by_its_values_and_not_by_the_name_of_its_file(tmp_path: Path) -> None:
+    thesis = RunSpec()
+    copied = write_plant(tmp_path / "copied.yaml", load_plant("thesis"))
+    other = write_plant(tmp_path / "other.yaml", load_plant("thesis").with_values(damping=12.0))
+    assert RunSpec(plant=str(copied)).identity == thesis.identity
+    assert RunSpec(plant=str(other)).identity != thesis.identity
+    assert thesis.metadata()["pendulum.run"]["identity"] == thesis.identity
+    machine = RunSpec(side="hw")
+    assert machine.identity == RunSpec(side="hw", design_plant=str(other)).identity
+    assert len({thesis.identity, machine.identity, RunSpec(side="hw", strategy="effort_loop").identity}) == 3
+    # The experiment in real time is of the same plants as its repeats in lockstep.
+    settings = RegulationSettings(plant=str(other))
+    for side in ("sim", "hw"):
+        assert settings.identity(side) == lockstep_spec(settings, side=side).identity
+        assert settings.metadata("thesis", side=side)["pendulum.run"]["identity"] == settings.identity(side)
