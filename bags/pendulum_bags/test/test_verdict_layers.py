@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,7 +13,7 @@ from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, read_layer
 from pendulum_msgs_py.errors import DataError
 
 
-def result(layer: Layer, mark: Mark, **more: str) -> LayerResult:
+def result(layer: Layer, mark: Mark, **more: Any) -> LayerResult:
     row = Evidence("spread of angle", "rad", 1.2, 1.1, float("nan"), "within ±25 %", mark)
     steps = (f"mend {layer.title}",) if mark is not Mark.YES else ()
     return LayerResult(layer, mark, f"{layer.title} says {mark.value}.", (row,), steps, **more)
