@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -231,7 +231,7 @@ def test_identify_tells_the_experiment_that_recorded_its_data() -> None:
     recording = swing()
     result = identify([recording], QUICK, profiles=0)
 
-    def next_step(*records: dict[str, object]) -> tuple[str, str]:
+    def next_step(*records: Mapping[str, object]) -> tuple[str, str]:
         pieces = [
             replace(result.fit.pieces[0], recording=replace(recording, meta={"pendulum.run": one})) for one in records
         ]
