@@ -9,7 +9,7 @@ import threading
 from types import FrameType
 from typing import Any
 
-from pendulum_msgs_py.programs.starter import end_with_starter
+from pendulum_msgs_py.programs.starter import end_with_starter, stops
 
 __all__ = ["keep_interrupts"]
 
@@ -27,12 +27,12 @@ def keep_interrupts() -> None:
     asks it to stop, and a child that is asked to end before it has a handler of its own would run on.
     """
     in_main = threading.current_thread() is threading.main_thread()
-    if in_main and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
     if in_main:
         _interrupted.add(os.getpid())
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is signal.SIG_DFL:
+        stops.clear()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            ignored = signal.SIG_IGN if number is signal.SIGINT else signal.SIG_DFL
+            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler, ignored):
                 signal.signal(number, _interrupt)
         end_with_starter()
     before = sys.unraisablehook
@@ -57,7 +57,8 @@ _interrupted: set[int] = set()
 
 
 def _interrupt(number: int, _frame: FrameType | None) -> None:
-    if os.getpid() in _interrupted:
+    stops.append(number)
+    if number == signal.SIGINT or os.getpid() in _interrupted:
         raise KeyboardInterrupt
     signal.signal(number, signal.SIG_DFL)
     os.kill(os.getpid(), number)

@@ -8,7 +8,10 @@ import signal
 import threading
 from collections.abc import Mapping
 
-__all__ = ["bound_environment", "end_with_starter"]
+__all__ = ["bound_environment", "end_with_starter", "stops"]
+
+stops: list[int] = []
+"""Signals by which this process was asked to end; the end of its starter asks nothing more of one that ends already."""
 
 _STARTER = "PENDULUM_STARTER"
 """Environment variable with the process id of the starter."""
@@ -43,7 +46,9 @@ def _watch(starter: int) -> None:
     else:
         select.select([descriptor], [], [])
         os.close(descriptor)
-    os.kill(os.getpid(), signal.SIGINT)
+    # A second one would be a wish to leave at once, a recorder's last messages or an experiment's plants left behind.
+    if not stops:
+        os.kill(os.getpid(), signal.SIGINT)
     # Nothing arrives here: a pause that needs no clock.
     threading.Event().wait(_PATIENCE)
     os.kill(os.getpid(), signal.SIGKILL)

@@ -40,7 +40,7 @@ from pendulum_msgs_py.programs.executables import (
     split_ros_arguments,
 )
 from pendulum_msgs_py.programs.realtime import run_in_real_time
-from pendulum_msgs_py.programs.starter import end_with_starter
+from pendulum_msgs_py.programs.starter import end_with_starter, stops
 from pendulum_msgs_py.programs.typed_commands import as_typed
 from pendulum_msgs_py.ros.answers import answer_who_listens
 from pendulum_msgs_py.ros.leaving import leaving_graph
@@ -267,6 +267,7 @@ def _watch_signals(signals: socket.socket, stop: Callable[[], None]) -> None:
     first = _next_stop_signal(signals)
     if not first:
         return
+    stops.append(first)
     stop()
     # A launcher passes on the Ctrl-C that the terminal has sent already: only a later one is a second wish.
     patience_ends = time.monotonic() + _ECHO_TIME
