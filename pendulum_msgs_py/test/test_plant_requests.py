@@ -2,39 +2,49 @@
 
 from __future__ import annotations
 
+import math
 import select
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import rclpy
 from rclpy.context import Context
+from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract.names import EFFORT_COMMAND
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
-from pendulum_msgs_py.contract.supervisor import Mode, PlantLimits
+from pendulum_msgs_py.contract.supervisor import DriveKind, Mode, PlantLimits
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_to_message, trajectory_to_message
-from pendulum_msgs_py.ros.plant_interface import TRAJECTORY_AGE_LIMIT, PlantInterface
+from pendulum_msgs_py.ros.plant_interface import TRAJECTORY_AGE_LIMIT, PlantInterface, _came_before
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_testing.trajectories import from_points
 
 NOW = 100 * NANOSECONDS
+_MS = NANOSECONDS // 1000
+
+
+def _system_time(steady_ns: float) -> int:
+    """Return the system time of an instant of the steady clock, right to some microseconds [ns]."""
+    return time.time_ns() - round(time.monotonic_ns() - steady_ns)
 
 
 class Plant:
     """The interface of a plant that rests at its zero."""
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, **limits: Any) -> None:
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain)
         self.node = PollingNode("plant", context=self.context)
-        self.supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
+        self.supervisor = SharedSupervisor(PlantLimits(effort=(5.0,), **limits))
         self.interface = PlantInterface(self.node, self.supervisor, lambda: NOW, polled=True)
         self.node.poll_services(timer=False)
         self.interface.sample = JointSample.of_one(NOW, 0.0, 0.0)
@@ -88,13 +98,13 @@ def test_a_trajectory_that_came_before_the_plant_was_armed_was_not_meant_for_an_
 
 
 @pytest.mark.parametrize(
-    ("waited", "followed"), [(0, True), (1, False), (10 * NANOSECONDS - 1, False), (10 * NANOSECONDS, True)]
+    ("waited", "followed"), [(-_MS, True), (_MS, False), (60 * NANOSECONDS, False), (3600 * NANOSECONDS, False)]
 )
-def test_a_trajectory_waited_if_it_came_before_arming_and_no_clock_was_set_back(
+def test_a_trajectory_waited_if_it_came_before_arming_however_long_the_process_stood_still(
     plant: Plant, waited: int, followed: bool
 ) -> None:
     assert plant.arm() == ""
-    assert plant.follow(arrived_ns=plant.interface._armed_ns - waited) is followed
+    assert plant.follow(arrived_ns=_system_time(plant.interface._armed_at) - waited) is followed
     told = "info: following a trajectory" if followed else "error: joint_trajectory refused: it came before the plant"
     assert plant.said[1].startswith(told)
     assert followed or plant.said[2].startswith("trajectory_refused: {'reason': 'it came before the plant was armed")
@@ -160,13 +170,16 @@ def test_a_press_ends_what_compiled_code_does_though_it_sees_nothing_but_its_cou
     assert plant.interface._pressed.is_set()
 
 
-@pytest.mark.parametrize("waited", [0, 1, 10 * NANOSECONDS - 1, 10 * NANOSECONDS])
-def test_a_request_counts_for_nothing_that_waited_while_the_e_stop_was_pressed(plant: Plant, waited: int) -> None:
-    outdated = 0 < waited < 10 * NANOSECONDS
-    before_ns = time.time_ns()
+@pytest.mark.parametrize("waited", [-_MS, _MS, 60 * NANOSECONDS, 3600 * NANOSECONDS])
+def test_a_request_counts_for_nothing_that_waited_while_the_e_stop_was_pressed_for_however_long(
+    plant: Plant, waited: int
+) -> None:
+    outdated = waited > 0
+    before = time.monotonic_ns()
     plant.interface.e_stop("pressed")
-    assert before_ns <= plant.interface._pressed_ns <= time.time_ns()
-    plant.node.request_ns = plant.interface._pressed_ns - waited
+    assert before <= plant.interface._pressed_at <= time.monotonic_ns()
+    time.sleep(2 * _MS / NANOSECONDS)
+    plant.node.request_ns = _system_time(plant.interface._pressed_at) - waited
     answer = plant.interface._on_e_stop_reset(Trigger.Request(), Trigger.Response())
     assert answer.success is not outdated
     assert ("before the e-stop was pressed" in answer.message) is outdated
@@ -179,11 +192,151 @@ def test_a_request_counts_for_nothing_that_waited_while_the_e_stop_was_pressed(p
 
 
 def test_a_press_that_was_counted_is_read_once_and_makes_earlier_requests_outdated(plant: Plant) -> None:
+    plant.node.request_ns = time.time_ns()
     assert plant.interface._unread_press() is None
+    assert plant.arm() == ""
+    assert plant.arm(wanted=False) == ""
     plant.interface._e_stop.arrivals.wake()
-    before_ns = time.time_ns()
+    before = time.monotonic_ns()
     assert plant.interface._unread_press() == (NOW, "e-stop pressed")
-    assert before_ns <= plant.interface._pressed_ns <= time.time_ns()
+    assert before <= plant.interface._pressed_at <= time.monotonic_ns()
     assert plant.interface._unread_press() is None
-    plant.node.request_ns = plant.interface._pressed_ns - 1
     assert "before the e-stop was pressed" in plant.arm()
+
+
+@pytest.mark.parametrize(("set_by", "waited", "before"), [(0, 5, False), (0, 6, True), (-3600, 4, False), (1, 5, True)])
+def test_what_came_before_is_told_by_how_long_ago_whatever_the_system_clock_was_set_to(
+    monkeypatch: pytest.MonkeyPatch, set_by: int, waited: int, before: bool
+) -> None:
+    # It happened 5 ns ago by the steady clock; of the system clock only what passed since the arrival counts.
+    system_ns = 10**18 + set_by * NANOSECONDS
+    monkeypatch.setattr(time, "time_ns", lambda: system_ns)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 1005)
+    arrived_ns = system_ns - waited if set_by <= 0 else 10**18 - waited
+    assert _came_before(arrived_ns, 1000) is before
+    assert not _came_before(0, 1000)
+    assert not _came_before(arrived_ns, -math.inf)
+
+
+class Switch:
+    """A hold-to-run switch, and the plant that hears it; it speaks every 100 ms."""
+
+    def __init__(self, domain: int) -> None:
+        self.plant = Plant(domain, enable_timeout=0.5)
+        self.ahead_ns = 0
+        self.sent_ns = time.time_ns()
+        self.node = rclpy.create_node("switch", context=self.plant.context, start_parameter_services=False)
+        assert self.plant.interface._enable is not None
+        self.heard = self.plant.interface._enable.subscription
+        self.publisher = self.another(1)
+
+    def another(self, count: int) -> Publisher:
+        """Return a publisher, once the plant has discovered so many."""
+        made = self.node.create_publisher(Bool, "enable_input", 10)
+        deadline = time.monotonic() + 30.0
+        while self.heard.get_publisher_count() != count:
+            assert time.monotonic() < deadline, "the switch was not discovered"
+            time.sleep(0.005)
+        return made
+
+    def close(self) -> None:
+        self.node.destroy_node()
+        self.plant.close()
+
+    def send(self, *, held: bool) -> None:
+        """Send a message; return once it has reached the plant."""
+        self.publisher.publish(Bool(data=held))
+        assert select.select([self.plant.interface._enable.descriptor], [], [], 30.0)[0]  # type: ignore[union-attr]
+
+    def say(self, monkeypatch: pytest.MonkeyPatch, late: int = 0, *, held: bool = True, known: bool = True) -> None:
+        """Let what it sends next be heard so much later than usual [ns]."""
+        self.sent_ns += 100 * _MS
+        monkeypatch.setattr(time, "time_ns", lambda: self.sent_ns + late)
+        stamps = {"source_timestamp": (self.sent_ns + self.ahead_ns) * known, "received_timestamp": self.sent_ns}
+        self.plant.interface._on_enable(serialize_message(Bool(data=held)), stamps)
+        monkeypatch.undo()
+
+
+@pytest.fixture
+def switch(domain_id: int) -> Iterator[Switch]:
+    made = Switch(domain_id)
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("ahead", [0, -3600 * NANOSECONDS, 3600 * NANOSECONDS])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_switch_holds_as_of_when_it_spoke_whatever_its_clock_and_what_waited_is_old(
+    switch: Switch, monkeypatch: pytest.MonkeyPatch, ahead: int, known: bool
+) -> None:
+    plant, switch.ahead_ns = switch.plant, ahead
+    # The process stood still for 10 s; the switch died 4 s before its end.
+    for late in [0, 0, *(range(10_000, 4_000, -100))]:
+        switch.say(monkeypatch, late * _MS, known=known)
+        assert plant.arm().startswith("enable switch is silent") is (late > 0)
+        assert plant.arm(wanted=False) == ""
+    # It speaks again; of 61 messages each was allowed a millisecond.
+    switch.say(monkeypatch, 200 * _MS, known=known)
+    assert plant.arm() == ""
+    assert plant.supervisor._held_ns == NOW - 139 * _MS
+    switch.say(monkeypatch, 200 * _MS, held=False, known=known)
+    assert plant.supervisor.mode is Mode.DISARMED
+
+
+def test_a_switch_whose_clock_drifts_is_heard_for_hours_and_one_whose_clock_is_set_after_a_moment(
+    switch: Switch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant = switch.plant
+    for second in range(1000):
+        switch.say(monkeypatch, second * _MS)
+    assert plant.arm() == ""
+    assert plant.supervisor._held_ns == NOW
+    plant.arm(wanted=False)
+    # Set once, it is late each time.
+    switch.say(monkeypatch, 5000 * _MS)
+    assert plant.arm().startswith("enable switch is silent for 4000 ms")
+    switch.say(monkeypatch, 4999 * _MS)
+    assert plant.arm().startswith("enable switch is silent for 3998 ms")
+    switch.say(monkeypatch, 4999 * _MS)
+    assert plant.arm() == ""
+    # What is late by no more than the timeout is old by as much, and no message makes up for it.
+    for late, old in ((5500, 500), (5501, 500), (5502, 500)):
+        switch.say(monkeypatch, late * _MS)
+        assert plant.supervisor._held_ns == NOW - old * _MS
+
+
+def test_two_switches_hold_nothing(switch: Switch, monkeypatch: pytest.MonkeyPatch) -> None:
+    switch.say(monkeypatch)
+    assert switch.plant.arm() == ""
+    switch.another(2)
+    switch.say(monkeypatch)
+    assert switch.plant.supervisor.mode is Mode.DISARMED
+    assert switch.plant.arm().startswith("enable switch is not held")
+
+
+def test_what_a_switch_said_while_the_plant_was_prepared_is_heard_before_it_is_armed(switch: Switch) -> None:
+    plant, now_ns = switch.plant, NOW
+    plant.interface.clock = lambda: now_ns
+    plant.interface._on_enable(serialize_message(Bool(data=True)), {"source_timestamp": time.time_ns()})
+
+    def prepare() -> str:
+        nonlocal now_ns
+        switch.send(held=True)
+        now_ns += NANOSECONDS
+        plant.interface.sample = JointSample.of_one(now_ns, 0.0, 0.0)
+        return ""
+
+    plant.supervisor._prepare = prepare
+    plant.supervisor._measure = plant.interface.measured
+    assert plant.arm() == ""
+
+
+def test_a_release_is_heard_by_the_very_next_decision(switch: Switch) -> None:
+    plant = switch.plant
+    switch.send(held=True)
+    assert plant.interface.decide().kind is DriveKind.OFF
+    assert plant.arm() == ""
+    assert plant.interface.decide().kind is DriveKind.EFFORT
+    switch.send(held=False)
+    assert plant.interface.decide().kind is DriveKind.OFF
+    assert plant.supervisor.reason.startswith("disarmed: enable switch is not held")

@@ -97,7 +97,7 @@ class BridgeNode(LifecycleNode, PollingNode):
             assembly.limits,
             self._prepare,
             self._withdraw,
-            lambda: (self._interface.clock(), self._interface.sample),
+            lambda: self._interface.measured(),  # noqa: PLW0108  # made below
             coordinates=assembly.coordinates,
         )
         self._lockstep_loop: LockstepLoop | None = None

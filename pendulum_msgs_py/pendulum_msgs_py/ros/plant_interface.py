@@ -47,8 +47,8 @@ __all__ = ["PlantInterface"]
 
 _LEAST_BETWEEN_LINES = 1.0
 """Time between two lines of the log about one mode [s]."""
-_WAITED_NS = 10 * NANOSECONDS
-"""Longest time for which a message or a request may wait [ns]; more is a system clock that was set back."""
+_DRIFT_NS = NANOSECONDS // 1000
+"""Most by which a message of the hold-to-run switch is later than the one before because two clocks differ [ns]."""
 _LOOK = 0.02
 """Time between two looks for a press or a trajectory [s]; of trajectories without pause the newest is read then."""
 TRAJECTORY_AGE_LIMIT = 1.0
@@ -102,8 +102,7 @@ class PlantInterface:
         self.statistics = statistics
         self.sample: JointSample | None = None
         self.published_ns = 0
-        self._armed_ns = 0
-        self._pressed_ns = 0
+        self._armed_at = self._pressed_at = -math.inf
         self.arrived_ns = 0
         self.on_command = on_command
         self.polled = polled
@@ -151,10 +150,11 @@ class PlantInterface:
         self._pressed = threading.Event()
         self._e_stop = EStopServer(node, self.e_stop)
         supervisor.watch_for_presses(self._unread_press)
-        self._enable_topic = ""
+        self._enable: PolledInput | None = None
+        self._enable_lag, self._enable_waited = math.inf, 0.0
         if math.isfinite(supervisor.limits.enable_timeout):
-            self._enable_topic = node.resolve_topic_name(names.ENABLE_INPUT)
-            node.create_subscription(Bool, self._enable_topic, self._on_enable, qos.COMMAND_INPUT)
+            self._enable = node.create_polled_input(Bool, names.ENABLE_INPUT, qos.COMMAND_INPUT)
+            self._enable.watch()
         if math.isinf(supervisor.limits.start_effort):
             node.get_logger().warning("start_effort_limit is 0: a commander may begin with any torque")
 
@@ -207,6 +207,8 @@ class PlantInterface:
 
     def decide(self, now_ns: int | None = None) -> Drive:
         """Return what to do now, by the supervisor's rules; says on the log when the answer changes."""
+        if self._enable is not None and self._enable.came():
+            self._hear_enable()
         drive = self.supervisor.decide(self.clock() if now_ns is None else now_ns, self.sample)
         told = (self.supervisor.mode, drive.starved, self.supervisor.trajectory_finished)
         if told != self._told_mode:
@@ -243,7 +245,7 @@ class PlantInterface:
         """Latch the e-stop; from any thread, waiting for nobody."""
         # Compiled code that waits for an answer has the supervisor, and sees nothing but its counters.
         self.node.wake()
-        self._pressed_ns = time.time_ns()
+        self._pressed_at = time.monotonic_ns()
         self.supervisor.e_stop(self.clock(), reason)
         self._pressed.set()
 
@@ -251,12 +253,17 @@ class PlantInterface:
         """Return a press that has reached this process, though the e-stop's thread has not run since."""
         if not self._e_stop.arrivals.counted():
             return None
-        self._pressed_ns = time.time_ns()
+        self._pressed_at = time.monotonic_ns()
         return self.clock(), PRESSED
 
     def _is_outdated(self) -> bool:
         """Return whether the request being answered came before the e-stop was pressed last, and has waited since."""
-        return bool(self.node.request_ns) and 0 < self._pressed_ns - self.node.request_ns < _WAITED_NS
+        return _came_before(self.node.request_ns, self._pressed_at)
+
+    def measured(self) -> tuple[int, JointSample | None]:
+        """Return the time and the newest state after a preparation, in which the hold-to-run switch was not heard."""
+        self._hear_enable()
+        return self.clock(), self.sample
 
     def safe_stop(self, reason: str) -> None:
         """Disarm, say so in diagnostics; the plant then applies zero torque and publishes that, to be heard too."""
@@ -344,7 +351,7 @@ class PlantInterface:
 
     def _on_trajectory(self, data: bytes, arrived_ns: int) -> None:
         try:
-            if self.supervisor.mode.armed and 0 < self._armed_ns - arrived_ns < _WAITED_NS:
+            if self.supervisor.mode.armed and _came_before(arrived_ns, self._armed_at):
                 raise ParameterError("it came before the plant was armed; expected it after: send it again")
             if self.supervisor.no_trajectories:
                 raise ParameterError(self.supervisor.no_trajectories)
@@ -380,7 +387,7 @@ class PlantInterface:
             refusal = self.supervisor.arm(self.clock(), self.sample)
             if not was_armed:
                 # Arming takes its time; what waited in the meantime was not meant for an armed plant.
-                self._armed_ns = time.time_ns()
+                self._armed_at = time.monotonic_ns()
                 self._trajectories.take(self._on_trajectory)
             response.success, response.message = not refusal, refusal or self.supervisor.mode.value
         else:
@@ -390,10 +397,27 @@ class PlantInterface:
         self.publish_diagnostics()
         return response
 
-    def _on_enable(self, message: Bool) -> None:
+    def _hear_enable(self) -> None:
+        if self._enable is not None:
+            with self.supervisor.alone():
+                for data, info in self._enable.messages():
+                    self._on_enable(data, info)
+
+    def _on_enable(self, data: bytes, info: Mapping[str, int]) -> None:
+        """Hear the hold-to-run switch as of when it spoke: what waited for a process that stood still is old.
+
+        A message has no stamp, and hosts have clocks of their own; but what waited is later than those before it were.
+        """
+        assert self._enable is not None
+        lag = time.time_ns() - (info["source_timestamp"] or info["received_timestamp"])
+        later, self._enable_lag = lag - self._enable_lag, lag
+        # Of messages that waited each is less late than the one before; where none is, a clock was set.
+        was_set = later >= 0 and self._enable_waited > NANOSECONDS * self.supervisor.limits.enable_timeout
+        self._enable_waited = 0.0 if was_set else max(0.0, self._enable_waited + later - _DRIFT_NS)
         # Of two switches one would hide that the other is released or silent.
-        alone = self.node.count_publishers(self._enable_topic) == 1
-        self.supervisor.hear_enable(self.clock(), held=message.data and alone)
+        alone = self._enable.subscription.get_publisher_count() == 1
+        held = data[4:5] == b"\x01"
+        self.supervisor.hear_enable(self.clock() - round(self._enable_waited), held=held and alone)
 
     def _on_e_stop_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         refusal = "asked for before the e-stop was pressed; reset it once more"
@@ -464,3 +488,11 @@ class PlantInterface:
         conflict = bool(self.supervisor.commander_conflict)
         warn = starved or conflict or self._second_commander
         return DiagnosticStatus.WARN if warn else DiagnosticStatus.OK
+
+
+def _came_before(arrived_ns: int, happened_at: float) -> bool:
+    """Return whether what has waited since a system time [ns], 0 if unknown, came before a steady time [ns].
+
+    By how long ago either was: the system clock may have been set since, and a process may stand still for any time.
+    """
+    return arrived_ns > 0 and time.time_ns() - arrived_ns > time.monotonic_ns() - happened_at
