@@ -71,7 +71,7 @@ def how_to_measure(comparison: Comparison) -> dict[Layer, str]:
         f"python -m pendulum_bags frequency_response {' '.join(map(shlex.quote, bags))} --out FOLDER"
     )
     choice = measurement_of(_records(comparison), "ranking") or (
-        "python -m pendulum_bags ranking FOLDER, with recordings of several controllers on both plants"
+        "record several controllers on both plants (python -m pendulum_bags ranking FOLDER)"
     )
     return {
         Layer.SAME_PLANT: in_frequency,
