@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -184,3 +185,20 @@ def test_compare_asks_about_the_policy_that_ran_even_after_its_file_is_gone(
     # Who asks for it by name is told at once.
     assert compare([*arguments, "--design", str(policy)]) == 2
     assert "does not exist" in capsys.readouterr().err
+
+
+def test_a_response_of_another_machine_says_nothing_of_the_designs_of_a_comparison(
+    tmp_path: Path, machine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for side in ("sim", "hw"):
+        metadata = run_metadata(1)
+        metadata["pendulum.run"]["identity"] = f"{side} (1)"
+        columns = regulate(rate=100.0, seed=1, hardware=side == "hw")
+        write_bag(tmp_path / "run" / side, columns, f"/{side}", metadata=metadata, ramps=False)
+    for identity, code in (("hw (1)", 0), ("hw (2)", 2)):
+        measured = read_response(machine / MACHINE)
+        write_response(tmp_path / MACHINE, replace(measured, facts={**measured.facts, "identity": identity}))
+        assert compare([str(tmp_path / "run"), "--machine", str(tmp_path / MACHINE), "--json"]) == code
+    assert (
+        f"{MACHINE} is of hardware hw (2); expected that of the compared recordings, hw (1)" in capsys.readouterr().err
+    )
