@@ -52,6 +52,32 @@ def test_each_rule_refuses_and_counts_under_its_own_name(command: JointCommand, 
 
 
 @pytest.mark.parametrize(
+    ("after_ns", "effort", "ends"), [(1, 0.0, True), (1, -0.0, True), (2, 0.0, False), (1, 1e-9, False)]
+)
+def test_a_zero_right_behind_a_command_ends_it_at_once_and_the_next_one_counts_again(
+    after_ns: int, effort: float, ends: bool
+) -> None:
+    gate = _gate()
+    last = JointCommand.of_one(_NOW - _MS + after_ns, effort, "lqr")
+    # The first of all follows none.
+    assert gate.offer(last._replace(stamp_ns=_NOW - 2 * _MS, effort=(0.0,)), _NOW) is None
+    assert gate.fresh(_NOW) is not None
+    assert gate.offer(_command(age_ms=1.0), _NOW) is None
+    assert gate.offer(last, _NOW) is None
+    assert (gate.fresh(_NOW), gate.newest, gate.accepted) == (None if ends else last, last, 3)
+    assert gate.offer(_command(), _NOW) is None
+    assert gate.fresh(_NOW) == _command()
+
+
+def test_a_zero_of_several_joints_ends_where_each_of_them_is_zero() -> None:
+    for effort, ends in (((0.0, 0.0), True), ((0.0, 1.0), False)):
+        gate = CommandGate(0.05, joints=("a", "b"))
+        for stamp_ns, each in ((_NOW, (1.0, 1.0)), (_NOW + 1, effort)):
+            assert gate.offer(JointCommand(stamp_ns, each, "lqr", ("a", "b")), _NOW) is None
+        assert (gate.fresh(_NOW) is None) is ends
+
+
+@pytest.mark.parametrize(
     ("command", "problem"),
     [
         (_command(age_ms=412.0), "header.stamp is 0.412 s before the plant's time; expected at most 0.05 s"),

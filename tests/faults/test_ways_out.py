@@ -7,12 +7,26 @@ import math
 import pytest
 
 from pendulum_hw_bridge.backends.emulated_machine import DrivePort
+from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation.machine import EmulatedMachine
 from pendulum_hw_bridge.port.actuator import Command, Strategy, no_torque
 from pendulum_hw_bridge.port.clocks import SteppedClock
-from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from tests.tools.faults.ways_out import BENCHES, FATES, PHASES, STRATEGIES, WAYS, Exit, is_possible, take_way_out
+from tests.tools.faults.bridge_rig import Rig
+from tests.tools.faults.motor import driving_torque
+from tests.tools.faults.ways_out import (
+    ANGLE,
+    BENCHES,
+    FATES,
+    PER_DUTY,
+    PHASES,
+    STRATEGIES,
+    WAYS,
+    Exit,
+    is_possible,
+    take_way_out,
+)
 
 UDP = BENCHES[1:]
 WAY = pytest.mark.parametrize("way", list(WAYS))
@@ -63,6 +77,31 @@ def test_the_setpoints_of_a_stop_end_the_torque_while_off_is_missing(backend: st
     left = take_way_out(backend, strategy, "hold", "stop", lost._replace(settings=((),) * 9))
     assert left.torque_before > 1.0
     assert left.lasting < 0.01
+
+
+@pytest.mark.parametrize("kind", EffortStrategy)
+def test_a_controller_that_ends_releases_at_once_while_its_zero_drove_the_torque_loop(kind: EffortStrategy) -> None:
+    rig = Rig(kind=kind, effort_limit=3.0, start=ANGLE)
+    rig.controlling = rig.disturbing = False
+    stamps: list[int] = []
+
+    def hold() -> None:
+        assert rig.bridge.sample is not None
+        stamps.append(rig.bridge.sample.stamp_ns)
+        rig.send(JointCommand.of_one(stamps[-1], 1.31, "controller"))
+
+    rig.break_cycle = hold
+    rig.run(1.0)
+    before = len(rig.duties)
+    rig.break_cycle = lambda: None
+    rig.send(JointCommand.of_one(stamps[-1] + 1, 0.0, "controller"))
+    ended_ns = rig.clock.now_ns()
+    rig.run(0.2)
+    torques = [(time_ns, abs(driving_torque(pwm, torque, PER_DUTY))) for time_ns, pwm, torque in rig.duties]
+    held = max(torque for _, torque in torques[before - 20 : before])
+    assert held > 1.25
+    assert max(torque for _, torque in torques[before:]) < held + 0.05
+    assert max(time_ns for time_ns, torque in torques if torque > 0.01) - ended_ns < 0.015 * NANOSECONDS
 
 
 def test_a_way_out_that_drives_harder_is_found() -> None:

@@ -52,7 +52,17 @@ TARGETS: tuple[Target, ...] = (
     Target("pendulum_msgs_py.contract.commands", ("CommandGate",), _RULES),
     Target(
         "pendulum_msgs_py.contract.rules",
-        ("judge_stamp", "is_ahead", "has_expired", "has_lapsed", "age_of", "is_inside", "within", "rise_within"),
+        (
+            "judge_stamp",
+            "is_ahead",
+            "has_expired",
+            "has_lapsed",
+            "age_of",
+            "is_inside",
+            "is_last",
+            "within",
+            "rise_within",
+        ),
         _RULES,
     ),
     Target(

@@ -397,12 +397,10 @@ class ControllerNode(LifecycleNode, PollingNode):
         if self._multi_array:
             self._command_publisher.publish(Float64MultiArray(data=[0.0] * len(self._driven)))
             return
-        # A second command with the stamp of the last answer would count as a duplicate, so the zero comes after it.
-        newest = self._loop.newest_stamp_ns
-        after = 0 if newest is None else newest + 1
-        stamp = after if self._simulated_time else max(after, self._now())
-        nothing = (0.0,) * len(self._driven)
-        self._command_publisher.publish(encode_joints(stamp, self._full_name, self._driven, (), (), nothing))
+        # Right behind the last answer, with whose stamp it would be a duplicate: so it ends what that one commanded.
+        if (newest := self._loop.newest_stamp_ns) is not None:
+            nothing = (0.0,) * len(self._driven)
+            self._command_publisher.publish(encode_joints(newest + 1, self._full_name, self._driven, (), (), nothing))
 
     def _publish_diagnostics(self) -> None:
         values: dict[str, object] = {"controller": self._settings["controller"], "plant": self._plant.name}

@@ -69,7 +69,6 @@ class EffortAdapterNode(Node):
         self._full_name = self.get_fully_qualified_name()
         self._commanders = 1
         self._reason = ""
-        self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._publisher = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
         self._diagnostics = Diagnostics(self, "effort adapter")
         self.create_subscription(JointState, names.JOINT_STATES, self._on_state, qos.NEWEST_STATE, raw=True)
@@ -86,8 +85,7 @@ class EffortAdapterNode(Node):
         """End with zero torque while the context is still valid."""
         newest = self._adapter.newest_stamp_ns
         if newest is not None and self._adapter.counts["answers"]:
-            stamp = newest + 1 if self._simulated_time else max(newest + 1, self._now())
-            self._publisher.publish(encode_joint_state(stamp, frame_id=self._full_name, effort=0.0))
+            self._publisher.publish(encode_joint_state(newest + 1, frame_id=self._full_name, effort=0.0))
         self._publish_diagnostics()
 
     def _on_state(self, data: bytes) -> None:

@@ -90,9 +90,10 @@ class CommandGate:
         """
         refusal = self._judge(command, now_ns)
         if refusal is None:
+            last = self._newest is not None and rules.is_last(command.stamp_ns, self._newest.stamp_ns)
+            self._expired = last and not any(command.effort)
             self._newest = command if len(command.effort) == len(self.joints) else self._filled(command)
             self._heard_ns = now_ns
-            self._expired = False
             self._holder = command.source
             self.accepted += 1
         else:

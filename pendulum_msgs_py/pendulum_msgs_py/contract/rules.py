@@ -25,6 +25,7 @@ __all__ = [
     "has_lapsed",
     "is_ahead",
     "is_inside",
+    "is_last",
     "judge_stamp",
     "rise_within",
     "within",
@@ -85,6 +86,14 @@ def has_expired(stamp_ns: int, heard_ns: int, now_ns: int, timeout_ns: int) -> b
 def has_lapsed(commanded_ns: int, now_ns: int) -> bool:
     """Tell whether who commands has been silent so long that whoever comes begins."""
     return now_ns - commanded_ns > _HOLD_NS
+
+
+def is_last(stamp_ns: int, newest_ns: int) -> bool:
+    """Return whether an effort of zero ends what its commander commands: it answers no state, but follows the answer.
+
+    Ended at once, a motor is released; an effort of zero would drive its torque loop until it is too old.
+    """
+    return stamp_ns == newest_ns + 1
 
 
 def age_of(stamp_ns: int, now_ns: int) -> float:

@@ -17,6 +17,7 @@ from pendulum_msgs_py.contract.rules import (
     has_lapsed,
     is_ahead,
     is_inside,
+    is_last,
     judge_stamp,
     rise_within,
     within,
@@ -39,10 +40,10 @@ def accept(source: Any, gate: Any, now_ns: int) -> bool:
     verdict = judge_stamp(source.stamp_ns, now_ns, gate.timeout_ns, gate.newest_ns, gate.heard_ns, False)
     if verdict != ACCEPTED:
         return False
+    gate.expired = source.value[0] == 0.0 and is_last(source.stamp_ns, gate.newest_ns)
     gate.newest_ns = source.stamp_ns
     gate.heard_ns = now_ns
     gate.effort = source.value[0]
-    gate.expired = 0
     gate.accepted += 1
     return True
 

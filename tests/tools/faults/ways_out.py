@@ -54,7 +54,7 @@ _PERIOD = 0.01
 _AFTER = 0.1
 _PARAMETERS = load_emulator("thesis")
 _DRIVE = _PARAMETERS.drivetrain
-_PER_DUTY = _DRIVE.supply_voltage * _DRIVE.gear_ratio * _DRIVE.torque_constant / _DRIVE.winding_resistance
+PER_DUTY = _DRIVE.supply_voltage * _DRIVE.gear_ratio * _DRIVE.torque_constant / _DRIVE.winding_resistance
 _ATTEMPT = 0.015
 
 
@@ -381,10 +381,10 @@ def _setpoints(strategy: Strategy, phase: str, cycle: int) -> Command:
     swing = _SWING * math.sin(4.0 * math.pi * _PERIOD * cycle)
     if strategy is Strategy.DIRECT_PWM:
         effort = weight + {"hold": 0.0, "ramp": 3.0, "regulation": swing}[phase]
-        return Command(pwm=effort / _PER_DUTY)
+        return Command(pwm=effort / PER_DUTY)
     if phase == "regulation":
         return Command(effort=weight + swing)
-    stiffness = DEFAULT_GAINS[int(strategy)].position.kp * (_PER_DUTY if strategy is Strategy.PARALLEL_PWM else 1.0)
+    stiffness = DEFAULT_GAINS[int(strategy)].position.kp * (PER_DUTY if strategy is Strategy.PARALLEL_PWM else 1.0)
     target = ANGLE + weight / stiffness
     if phase == "hold":
         return Command(position=target)
@@ -520,7 +520,7 @@ def take_way_out(backend: str, strategy: Strategy, phase: str, way: str, fate: F
 
 def _largest(links: Sequence[LinkState]) -> tuple[float, float]:
     """Return the largest driving torque [N m] and duty [-]."""
-    torques = (driving_torque(link.pwm, link.motor_torque, _PER_DUTY) for link in links)
+    torques = (driving_torque(link.pwm, link.motor_torque, PER_DUTY) for link in links)
     return max(map(abs, torques)), max(abs(link.pwm) for link in links)
 
 
