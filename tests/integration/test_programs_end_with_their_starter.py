@@ -97,6 +97,8 @@ _STARTERS = {
     "launch_file_and_a_thread_that_ends": 1,
 }
 """How many programs each starts, by the functions with which the project's programs start theirs."""
+_CASES = [*(("experiment", how) for how in _ENDS), *((starter, "SIGKILL") for starter in list(_STARTERS)[1:])]
+"""What is started watches a descriptor of its starter: how that one ended is the same for all, tried with one."""
 
 
 @pytest.fixture
@@ -115,8 +117,7 @@ def _ready(folder: Path) -> int:
     return sum("ready" in text or "recording to" in text for text in logs)
 
 
-@pytest.mark.parametrize("how", _ENDS)
-@pytest.mark.parametrize("starter", _STARTERS)
+@pytest.mark.parametrize(("starter", "how"), _CASES)
 def test_what_was_started_ends_with_its_starter_where_it_survived_sigterm_and_a_closed_terminal(
     starter: str, how: str, domain_id: int, processes: ProcessGroup, tmp_path: Path, terminal: tuple[int, str]
 ) -> None:

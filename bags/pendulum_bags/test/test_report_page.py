@@ -689,6 +689,7 @@ def test_page_is_whole_and_usable(visit: Any) -> None:
 
 @in_repository
 @needs_browser
+@pytest.mark.parametrize("visit", ["phone"], indirect=True)  # whose rules of style come on top of the desktop's
 def test_axe_finds_nothing_on_a_report(visit: Any) -> None:
     axe = PROJECT / "tests" / "axe"
     install_packages(axe, "axe-core")
