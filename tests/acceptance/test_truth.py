@@ -8,7 +8,7 @@ from tests.benchmarks.bench_truth import margins_on, misses, on_the_margin
 from tests.truth_plants import PAIRS
 
 
-@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("name", ["gravity 10 for 1.678 N m", "gain 15 % more", "a loop that oscillates"])
 def test_long_run_values_lie_in_the_intervals_of_a_window_of_five_seconds(name: str) -> None:
     pair = PAIRS[name]
     truth = pair.truth()
