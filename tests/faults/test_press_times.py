@@ -14,7 +14,9 @@ _LATEST = 1000.0
 
 
 @pytest.mark.parametrize(("plant", "flood"), list(zip(PLANTS, reversed(FLOODS), strict=True)), ids=str)
-def test_an_e_stop_ends_torque_in_a_flood_beside_a_busy_loop(tmp_path: Path, plant: Plant, flood: str) -> None:
+def test_an_e_stop_ends_torque_in_a_flood_beside_a_busy_loop(
+    tmp_path: Path, domain_id: int, plant: Plant, flood: str
+) -> None:
     times = press_in_flood(tmp_path, plant, flood, 2, busy=1)
     assert len(times.driven) == 2
     assert max(times.driven) < _LATEST

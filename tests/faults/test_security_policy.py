@@ -11,7 +11,6 @@ import pytest
 
 from pendulum_bags.console.console_node import Hub
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
-from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_msgs_py.contract import names
@@ -65,9 +64,7 @@ async def _drive(hub: Hub) -> None:
 
 
 @pytest.mark.timeout(600)
-def test_nodes_do_what_the_policy_allows_and_nothing_else(
-    tmp_path: Path, hosts: HostPool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, hosts: HostPool, domain_id: int) -> None:
     programs = [
         graph.simulator("/sim"),
         graph.bridge("/hw", backend="emulator"),
@@ -81,15 +78,12 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(
     metadata.write_text("{}", encoding="utf-8")
     allowed = granted()
     with (
-        reserve_domain() as domain,
-        ProcessSet(tmp_path, ros_environment(domain, tmp_path), hosts) as processes,
-        Conductor(domain) as conductor,
+        ProcessSet(tmp_path, ros_environment(domain_id, tmp_path), hosts) as processes,
+        Conductor(domain_id) as conductor,
     ):
         for program in programs:
             processes.start_node(program)
         start_recorder(processes, tmp_path / "bag", "/hw", metadata, "mcap")
-        for variable, value in ros_environment(domain, tmp_path).items():
-            monkeypatch.setenv(variable, value)
         hub = Hub()
         try:
             for side, plant in PLANTS.items():
