@@ -55,7 +55,7 @@ class Catch:
         self.active = False
 
     def holds(self, angle: float, velocity: float) -> bool:
-        """Tell whether the LQR is in charge at a state, and remember it."""
+        """Return whether the LQR is in charge at a state, and remember it."""
         angle = wrap(angle - self.set_point)
         cost = self._s00 * angle * angle + 2.0 * self._s01 * angle * velocity + self._s11 * velocity * velocity
         self.active = cost <= (self.release if self.active else self.level)

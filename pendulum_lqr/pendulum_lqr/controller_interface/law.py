@@ -47,7 +47,7 @@ def deviation(angle: float, set_point: float) -> float:
 
 
 def winds_up(push: float, wanted: float, effort: float) -> bool:
-    """Tell whether an integral must stand still: it would push its effort further beyond the limit (N m or N).
+    """Return whether an integral must stand still: it would push its effort further beyond the limit (N m or N).
 
     It may come back while the effort is at its limit (conditional integration); what is not a number is not integrated.
 

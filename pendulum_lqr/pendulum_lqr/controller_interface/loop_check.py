@@ -87,7 +87,7 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
 
 
 def settles(controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> bool:
-    """Tell whether a balancing controller settles on the linear model of its plant; arguments as of :func:`growth`."""
+    """Return whether a balancing controller settles on its plant's linear model; arguments as of :func:`growth`."""
     return growth(controller, plant, period, set_point) < 1.0
 
 

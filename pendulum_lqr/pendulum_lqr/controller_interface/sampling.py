@@ -89,17 +89,17 @@ class PeriodWatch:
 
 
 def goes_on(interval_ns: int) -> bool:
-    """Tell whether a state so long after another goes on from it [ns], and is not that of a plant that began anew."""
+    """Return whether a state so long after another goes on from it [ns], and is not that of a plant that began anew."""
     return 0 < interval_ns < _GAP_NS
 
 
 def differs(measured: float, designed: float) -> bool:
-    """Tell whether states come at another rate than a design counts on; both are periods [s]."""
+    """Return whether states come at another rate than a design counts on; both are periods [s]."""
     return abs(measured / designed - 1.0) > TOLERANCE
 
 
 def uses_period(kind: str, velocity: str = "measured") -> bool:
-    """Tell whether a controller's answers depend on the sampling period that it was designed for.
+    """Return whether a controller's answers depend on the sampling period that it was designed for.
 
     Args:
         kind: Name of the controller; one that is not known here counts as if they did.

@@ -94,7 +94,7 @@ def _s_plane(ax: Axes, values: NDArray[np.complex128], decades: bool) -> None:
 
 
 def _spread(poles: NDArray[np.complex128]) -> bool:
-    """Tell whether poles lie so far apart that only a logarithmic axis shows them all."""
+    """Return whether poles lie so far apart that only a logarithmic axis shows them all."""
     sizes = np.abs(poles)
     return bool(np.max(sizes) > 50.0 * np.min(sizes))
 

@@ -293,7 +293,7 @@ def _on_state(model: LinearModel, K: ArrayLike) -> NDArray[np.float64]:
 
 
 def bears_its_delay(model: LinearModel, K: ArrayLike) -> bool:
-    """Tell whether a loop that is stable without the plant's delay stays so with it.
+    """Return whether a loop that is stable without the plant's delay stays so with it.
 
     Args:
         model: Linear model.

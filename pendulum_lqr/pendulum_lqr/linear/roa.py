@@ -234,7 +234,7 @@ def rigid_rollout(plant: RigidPlant, gain: Gain, effort_limit: float, duration: 
 
 
 def _decreases(loop: _Loop, gain: Gain, directions: Array, reach: float) -> bool:
-    """Tell whether V' < 0 is proven for all 0 <= rho <= reach and all directions."""
+    """Return whether V' < 0 is proven for all 0 <= rho <= reach and all directions."""
     # Upright without offsets, x and -x behave alike, so that half a turn is enough.
     alike = loop.angle == UPRIGHT and loop.low == -loop.high
     rho = np.linspace(0.0, reach, 33)

@@ -39,5 +39,5 @@ def judge_state(stamp_ns: int, now_ns: int, timeout_ns: int, newest_ns: int) -> 
 
 
 def is_saturated(effort: float, limit: float) -> bool:
-    """Tell whether a torque is at its limit [N m]."""
+    """Return whether a torque is at its limit [N m]."""
     return abs(effort) >= limit

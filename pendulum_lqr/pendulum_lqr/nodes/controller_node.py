@@ -316,7 +316,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         return uses_period(self._settings["controller"], self._settings["velocity"])
 
     def _may_answer(self) -> bool:
-        """Tell whether the rate of the states is one that the design is for, as far as it is known."""
+        """Return whether the rate of the states is one that the design is for, as far as it is known."""
         if self._period_known:
             return True
         measured = self._watch.period

@@ -152,7 +152,7 @@ class Certificate:
 
 
 def is_stable(sampled: DiscreteModel, K: ArrayLike) -> bool:
-    """Tell whether a static gain stabilises a sampled model.
+    """Return whether a static gain stabilises a sampled model.
 
     Args:
         sampled: The model; its first states are what is measured: angle and velocity, or those of k joints.
@@ -225,7 +225,7 @@ class Certifier:
 
 
 def _same_winding(first: Complex, second: Complex) -> bool:
-    """Tell whether two loops go round -1 equally often: the ratio of their return differences does not go round 0."""
+    """Return whether two loops go round -1 equally often: the ratio of their return differences does not go round 0."""
     ratio = (1.0 + second) / (1.0 + first)
     steps = np.angle(ratio[1:] / ratio[:-1])
     if np.any(np.abs(steps) > 0.5 * np.pi) or not (ratio[0].real > 0.0 and ratio[-1].real > 0.0):

@@ -108,7 +108,7 @@ def _samples_of_level_1(gain: Gain, n: int) -> Array:
 
 
 def _all_caught(plant: MechanismParameters, gain: Gain, deviations: Array, known: float) -> bool:
-    """Tell whether all deviations, shape (2n, samples), come to rest, or within a level from which others did."""
+    """Return whether all deviations, shape (2n, samples), come to rest, or within a level from which others did."""
     n, driven = len(plant.joints), plant.coordinates.driven
     forward = in_arithmetic(plant.mechanism.forward, np)
     along, p, goal = along_functions(n), plant.packed, np.array(plant.coordinates.goal)
@@ -172,7 +172,7 @@ class MechanismCatch:
         return float(deviation @ self.gain.S @ deviation) / self.region.level
 
     def holds(self, deviation: Array) -> bool:
-        """Tell whether it is in charge of a deviation from upright; it may take over or let go by this."""
+        """Return whether it is in charge of a deviation from upright; it may take over or let go by this."""
         self.active = self.share(deviation) <= (self.leave if self.active else 1.0)
         return self.active
 

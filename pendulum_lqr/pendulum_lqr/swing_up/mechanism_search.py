@@ -74,7 +74,7 @@ class PlanSearch:
         return [self.solve(x, before, guess, self.settings.iterations) for guess in self._guesses(count)]
 
     def arrives(self, plan: IlqrPlan) -> bool:
-        """Tell whether a plan ends where the LQR catches."""
+        """Return whether a plan ends where the LQR catches."""
         coordinates = self.catch.plant.coordinates
         end = tuple(float(value) for value in plan.states[-1, : 2 * len(coordinates.names)])
         return self.catch.share(deviation_of(coordinates, end)) <= 1.0

@@ -102,7 +102,7 @@ def take_back(supervisor: PlantSupervisor, record: Any) -> None:
 
 
 def _may_act(gate: CommandGate) -> bool:
-    """Tell whether a gate has a command that has not grown old for good."""
+    """Return whether a gate has a command that has not grown old for good."""
     return gate._newest is not None and not gate._expired
 
 

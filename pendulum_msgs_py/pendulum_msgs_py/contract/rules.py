@@ -69,12 +69,12 @@ def judge_stamp(stamp_ns: int, now_ns: int, timeout_ns: int, newest_ns: int, hea
 
 
 def is_ahead(stamp_ns: int, now_ns: int) -> bool:
-    """Tell whether a stamp lies further ahead of the plant's clock than clocks may differ."""
+    """Return whether a stamp lies further ahead of the plant's clock than clocks may differ."""
     return stamp_ns - now_ns > FUTURE_TOLERANCE_NS
 
 
 def has_expired(stamp_ns: int, heard_ns: int, now_ns: int, timeout_ns: int) -> bool:
-    """Tell whether a command is too old to act on.
+    """Return whether a command is too old to act on.
 
     Measured from the stamp and from the moment of hearing it: a clock that jumps either way only shortens it. Heard a
     little "later than now" is not only a clock that stepped back: a plant that catches up with periods it missed
@@ -84,7 +84,7 @@ def has_expired(stamp_ns: int, heard_ns: int, now_ns: int, timeout_ns: int) -> b
 
 
 def has_lapsed(commanded_ns: int, now_ns: int) -> bool:
-    """Tell whether who commands has been silent so long that whoever comes begins."""
+    """Return whether who commands has been silent so long that whoever comes begins."""
     return now_ns - commanded_ns > _HOLD_NS
 
 
@@ -102,7 +102,7 @@ def age_of(stamp_ns: int, now_ns: int) -> float:
 
 
 def is_inside(low: float, position: float, high: float, velocity: float, fastest: float) -> bool:
-    """Tell whether a joint is inside its window and not too fast; what is no number is neither."""
+    """Return whether a joint is inside its window and not too fast; what is no number is neither."""
     return low <= position <= high and -fastest <= velocity <= fastest
 
 

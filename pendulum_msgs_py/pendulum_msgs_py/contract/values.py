@@ -35,7 +35,7 @@ class JointSample(NamedTuple):
         return cls(stamp_ns, (position,), (velocity,), (effort,))
 
     def is_finite(self) -> bool:
-        """Tell whether positions and velocities are finite numbers, and efforts too where they are measured."""
+        """Return whether positions and velocities are finite numbers, and efforts too where they are measured."""
         finite = math.isfinite
         for value in self.position + self.velocity:  # twice as fast as all()
             if not finite(value):

@@ -53,7 +53,7 @@ def _somebody_waits(s: Any) -> Any:
 
 @compiled
 def _is_answer(s: Any, stamp_ns: Any) -> Any:
-    """Tell whether a stamp is that of a state of ours: from the newest on, which it nearly always is."""
+    """Return whether a stamp is that of a state of ours: from the newest on, which it nearly always is."""
     for back in range(OWN_STAMPS):  # noqa: SIM110  (compiled code knows no any())
         if s.own_stamp_ns[(s.own_newest - back) % OWN_STAMPS] == stamp_ns:
             return True

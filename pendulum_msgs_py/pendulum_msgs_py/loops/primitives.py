@@ -99,7 +99,7 @@ def sleep_until(time: Any, steady: Any) -> None:
 
 @compiled
 def is_called(time: Any, calls: Any) -> Any:
-    """Tell whether one of two event counters has been added to, without a wait; they stay as they are."""
+    """Return whether one of two event counters has been added to, without a wait; they stay as they are."""
     time.poll[0], time.poll[2] = calls[0], calls[1]
     time.poll[1] = time.poll[3] = _READABLE
     time.until[0] = time.until[1] = 0
@@ -180,5 +180,5 @@ def publish(output: Any, stamp_ns: Any) -> Any:
 
 @compiled
 def has_listeners(output: Any) -> Any:
-    """Tell whether anybody is matched with an output."""
+    """Return whether anybody is matched with an output."""
     return _count(output.publisher, output.matched.ctypes.data) == 0 and output.matched[0] > 0

@@ -139,7 +139,7 @@ def total_damping(plant: RigidPlant) -> float:
 
 
 def is_overdamped(plant: RigidPlant) -> bool:
-    """Tell whether a plant creeps to rest without swinging past it: b^2 > 4 M G, motor included.
+    """Return whether a plant creeps to rest without swinging past it: b^2 > 4 M G, motor included.
 
     Args:
         plant: Plant parameters.

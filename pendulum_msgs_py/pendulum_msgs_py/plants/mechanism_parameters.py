@@ -386,7 +386,7 @@ def _read_document(document: Mapping[str, Any], path: Path) -> tuple[MechanismPa
 
 
 def _positive_definite(rows: Sequence[Sequence[float]]) -> bool:
-    """Tell whether a small symmetric matrix is positive definite, by the pivots of Gauss's elimination."""
+    """Return whether a small symmetric matrix is positive definite, by the pivots of Gauss's elimination."""
     matrix = [list(row) for row in rows]
     for k, pivot_row in enumerate(matrix):
         pivot = pivot_row[k]

@@ -332,7 +332,7 @@ def resolve_plant(preset_or_path: str | Path) -> Path:
 
 
 def is_mechanism(preset_or_path: str | Path) -> bool:
-    """Tell whether a preset or plant file is one of several joints.
+    """Return whether a preset or plant file is one of several joints.
 
     Raises:
         ParameterError: No such preset or file.

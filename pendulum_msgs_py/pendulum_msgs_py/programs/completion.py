@@ -66,7 +66,7 @@ SHELLS = ("bash", "zsh")
 
 
 def asked() -> bool:
-    """Tell whether the shell wants to know what may follow."""
+    """Return whether the shell wants to know what may follow."""
     return bool(os.environ.get(VARIABLE))
 
 

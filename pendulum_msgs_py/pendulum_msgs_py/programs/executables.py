@@ -301,7 +301,7 @@ def report_error(error: BaseException) -> int:
 
 
 def is_exhaustion(error: BaseException) -> bool:
-    """Tell whether an error says, in one library's words or another's, that memory is exhausted."""
+    """Return whether an error says, in one library's words or another's, that memory is exhausted."""
     return isinstance(error, MemoryError) or any(sign in str(error) for sign in _SIGNS_OF_EXHAUSTION)
 
 

@@ -126,7 +126,7 @@ def priority_kept() -> Iterator[None]:
 
 
 def _is_known() -> bool:
-    """Tell whether this system has such priorities, and tells us our threads."""
+    """Return whether this system has such priorities, and tells us our threads."""
     return hasattr(os, "sched_setscheduler") and _TASKS.is_dir()
 
 

@@ -235,7 +235,7 @@ def _is_whole(value: object) -> bool:
 
 
 def _static_follows(plants: Sequence[PlantParameters]) -> bool:
-    """Tell whether static friction is no parameter of its own: where it was left out, it is the Coulomb friction."""
+    """Return whether static friction is no parameter of its own: where it was left out, it is the Coulomb friction."""
     return all(plant.static_friction == plant.coulomb_friction for plant in plants)
 
 

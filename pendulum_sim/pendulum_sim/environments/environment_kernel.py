@@ -31,7 +31,7 @@ ROWS = ("x", "v", "torque", "disturbance", "amplitude", "limit", "q_1", "q_2", "
 
 
 def is_smooth(parameters: PlantParameters) -> bool:
-    """Tell whether a plant is free of dry friction, lag, delay and drivetrain, which the compiled step leaves out."""
+    """Return whether a plant is free of dry friction, lag, delay and drivetrain, which the compiled step leaves out."""
     return (
         parameters.drivetrain is None
         and not is_dry(pack(parameters))

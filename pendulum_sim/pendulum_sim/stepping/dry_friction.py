@@ -91,7 +91,7 @@ def static_friction_balance(theta: float, torque: float, plant: PlantTuple) -> t
 
 
 def is_dry(plant: PlantTuple) -> bool:
-    """Tell whether a plant has dry friction or any friction term: else its equation is smooth."""
+    """Return whether a plant has dry friction or any friction term: else its equation is smooth."""
     dry = False
     for index in DRY:
         dry = dry or plant[index] > 0.0

@@ -175,7 +175,7 @@ class MechanismPlant:
 
 
 def is_smooth_mechanism(parameters: MechanismParameters) -> bool:
-    """Tell whether a plant is free of dry friction, end stops, lag and delay."""
+    """Return whether a plant is free of dry friction, end stops, lag and delay."""
     return not _has_events(parameters) and not any(actuator.transport_delay for actuator in parameters.actuators)
 
 

@@ -259,7 +259,7 @@ class Hub:
         return _accepted(node, await self._call(SetBool, f"{node}/arm", SetBool.Request(data=on)))
 
     def has_node(self, node: str) -> bool:
-        """Tell whether a node is on the graph, by its full name."""
+        """Return whether a node is on the graph, by its full name."""
         found = self._node.get_node_names_and_namespaces()
         return any(names.full_name(space, name) == node for name, space in found)
 

@@ -51,7 +51,7 @@ class Graph(Protocol):
         """Arm or disarm a plant."""
 
     def has_node(self, node: str) -> bool:
-        """Tell whether a node is on the graph, by its full name."""
+        """Return whether a node is on the graph, by its full name."""
 
     def said(self, node: str) -> str:
         """Return what a node said of itself last, in words; empty once it is silent."""

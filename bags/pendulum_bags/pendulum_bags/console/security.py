@@ -23,7 +23,7 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether a host to listen on can be reached from this machine only."""
+    """Return whether a host to listen on can be reached from this machine only."""
     return host in LOOPBACK
 
 

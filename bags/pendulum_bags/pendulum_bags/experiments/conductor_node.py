@@ -309,14 +309,14 @@ class PlantClient:
         self._trajectory.publish(trajectory_to_message(trajectory))
 
     def is_following(self) -> bool:
-        """Tell whether the plant has taken up the move last asked for; raises as :meth:`trajectory_finished`."""
+        """Return whether the plant has taken up the move last asked for; raises as :meth:`trajectory_finished`."""
         return self.trajectory_finished() or any(
             event["name"] == Event.PLANT_MODE and event.get("mode") == "armed_position"
             for event in self.events[self._finished_before :]
         )
 
     def trajectory_finished(self) -> bool:
-        """Tell whether the move last asked for has ended.
+        """Return whether the move last asked for has ended.
 
         Raises:
             PlantStoppedError: The plant faulted, or was stopped or disarmed.
@@ -369,11 +369,11 @@ class PlantClient:
         return "" if event is None else str(event.get("mode"))
 
     def is_armed(self) -> bool:
-        """Tell whether torque may flow."""
+        """Return whether torque may flow."""
         return self.newest_mode() in {Mode.EFFORT.value, Mode.POSITION.value}
 
     def has_controller(self) -> bool:
-        """Tell whether a controller is on the graph."""
+        """Return whether a controller is on the graph."""
         return bool(self._get_state.service_is_ready() and self._change_state.service_is_ready())
 
     def controller_is_active(self) -> bool:

@@ -74,7 +74,7 @@ def check_domain(requested: int | None) -> int | None:
 
 
 def is_unused(domain: int) -> bool:
-    """Tell whether no DDS participant on this machine listens in the domain.
+    """Return whether no DDS participant on this machine listens in the domain.
 
     Source: DDSI-RTPS 2.5, section 9.6.2.3: unicast discovery ports start at 7400 + 250 domain + 10.
     """

@@ -105,7 +105,7 @@ def _write_to(log: Path) -> None:
 
 
 def _left_behind() -> bool:
-    """Tell whether a program has left a thread that must end before the process may, or one of the middleware's.
+    """Return whether a program has left a thread that must end before the process may, or one of the middleware's.
 
     The middleware names its threads; those of Python have the name of the process.
     """

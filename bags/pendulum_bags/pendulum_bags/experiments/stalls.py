@@ -26,7 +26,7 @@ _LOGS = "logs"
 
 
 def is_stall(error: FaultError) -> bool:
-    """Tell whether a plant that is no real machine stopped since this machine stood still."""
+    """Return whether a plant that is no real machine stopped since this machine stood still."""
     if not isinstance(error, PlantStoppedError):
         return False
     name = error.reason.split(":", maxsplit=1)[0]

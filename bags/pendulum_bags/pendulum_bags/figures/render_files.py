@@ -138,7 +138,7 @@ def _draw(figure: Figure, canvas_type: Any) -> Any:
 
 
 def _has_offset(ax: Axes) -> bool:
-    """Tell whether a common factor or sum of the numbers stands above the y axis, where a title gives way to it."""
+    """Return whether a common factor or sum of the numbers stands above the y axis, where a title gives way to it."""
     formatter = ax.yaxis.get_major_formatter()
     formatter.format_ticks(ax.yaxis.get_majorticklocs().tolist())
     return bool(formatter.get_offset())

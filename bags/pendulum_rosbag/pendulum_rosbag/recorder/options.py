@@ -78,7 +78,7 @@ class RecorderOptions:
                 raise ParameterError(f"{name} is {pattern!r}; expected a regular expression ({error})") from None
 
     def wants(self, topic: str) -> bool:
-        """Tell whether a topic is to be recorded."""
+        """Return whether a topic is to be recorded."""
         if self.exclude and re.search(self.exclude, topic):
             return False
         if self.topics or self.regex:

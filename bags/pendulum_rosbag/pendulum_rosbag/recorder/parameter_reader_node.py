@@ -68,7 +68,7 @@ class ParameterReader:
         return self._node.create_client(kind, f"{full}/{service}")
 
     def _offers(self, full: str) -> bool:
-        """Tell whether the graph says that a node offers its parameters: a client made in vain bothers everybody."""
+        """Return whether the graph says that a node offers its parameters: a client made in vain bothers everybody."""
         space, _, name = full.rpartition("/")
         try:
             offered = self._node.get_service_names_and_types_by_node(name, space or "/")

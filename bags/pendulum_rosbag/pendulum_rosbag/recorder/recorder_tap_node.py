@@ -98,7 +98,7 @@ class Tap:
         return time.monotonic() - self._opened < SETTLING
 
     def suits(self, publishers: Sequence[TopicEndpointInfo]) -> bool:
-        """Tell whether the subscription can match all these publishers; take note of how many they are."""
+        """Return whether the subscription can match all these publishers; take note of how many they are."""
         if len(publishers) > self.publishers:
             self._opened = time.monotonic()
         self.publishers = len(publishers)
@@ -119,7 +119,7 @@ class Tap:
             yield info["received_timestamp"], trim(data), see(sequence) if sequence else 0
 
     def repeats(self, session: RecordingSession | None, data: bytes) -> bool:
-        """Tell whether a stamped message is the one before it in a recording once more, and take note of it.
+        """Return whether a stamped message is the one before it in a recording once more, and take note of it.
 
         A plant in lockstep publishes a state again that nobody answers in time, and who has answered it already answers
         the same.
