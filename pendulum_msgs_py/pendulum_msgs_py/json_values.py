@@ -1,4 +1,4 @@
-"""Values as JSON knows them."""
+"""Values that JSON can represent."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def json_text(content: Any) -> str:
 
 
 def without_nan(value: Any) -> Any:
-    """Return a value, or what it holds, with None for numbers that JSON does not know: NaN and infinity."""
+    """Return a value, or what it holds, with None for the numbers that JSON lacks: NaN and infinity."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):

@@ -270,12 +270,12 @@ _MAX_YAML_DEPTH = 40
 
 
 def read_text(path: str | Path, what: str, *, limit: int = _MAX_YAML_BYTES) -> str:
-    """Return the text of a file, or raise a ParameterError that says why it cannot be read.
+    """Return the text of a file, or raise a ParameterError with the reason why it cannot be read.
 
     Args:
         path: The file.
         what: What the file should be, such as ``plant file``.
-        limit: Largest size accepted [bytes]; nobody writes a quarter of a megabyte of parameters by hand.
+        limit: Largest size accepted [bytes]; parameters written by hand stay far below it.
     """
     path = Path(path)
     try:
@@ -326,7 +326,7 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
 
 @lru_cache(maxsize=32)
 def _parse_yaml(text: str) -> Any:
-    """Return what a text says, not to be changed; to parse one takes ten times as long as to read and copy it."""
+    """Return the parsed text, not to be changed; parsing takes ten times as long as reading and copying."""
     loader = _StrictLoader(text)
     try:
         return loader.get_single_data()

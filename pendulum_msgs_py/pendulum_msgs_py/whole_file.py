@@ -15,15 +15,15 @@ from pendulum_msgs_py.errors import PendulumError
 __all__ = ["write_whole", "writing"]
 
 _NOT_REPLACED = {errno.EACCES, errno.EPERM, errno.EBUSY, errno.EROFS, errno.EINVAL}
-"""Errors of who may write to a file, but not replace it: its folder or its owner is beyond them, or it is a mount."""
+"""Errors of replacing a file that may be written: no right to its folder or owner, or it is a mount."""
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file and the folders above it; until all is written, what was there before stays.
+    """Write a file atomically, with the folders above it.
 
-    Nothing is left beside it where the disk is full or Ctrl-C comes in between. Links stay links, and owner and mode of
-    a file what they are. What may not be replaced is written over: devices and pipes, a file of several names or with
-    attributes of its own, one in a folder of somebody else, our own standard output.
+    No temporary file remains if the disk is full or Ctrl-C interrupts. Links stay links; a file keeps its owner and
+    mode. What must not be replaced is overwritten: devices and pipes, a file of several names or with attributes of its
+    own, one in another user's folder, the own standard output.
 
     Args:
         path: Where to write.
@@ -36,13 +36,13 @@ def write_whole(path: Path, content: str | bytes) -> None:
         data = content.encode() if isinstance(content, str) else content
         if b"\0" in os.fsencode(path):
             raise ValueError("embedded null character")
-        # No other path is resolved: somebody may not be allowed to look at the folders above their own.
+        # No other path is resolved: the folders above may not be readable.
         target = path.resolve() if path.is_symlink() else path
     except ValueError as error:
         raise OSError(errno.EINVAL, str(error), str(path)) from error
     except RuntimeError as error:
         raise _circle(path) from error
-    # Newer Pythons resolve links in a circle as far as they get.
+    # Newer Pythons resolve a cycle of links as far as they get.
     if target.is_symlink():
         raise _circle(path)
     status = path.stat() if path.exists() else None
@@ -65,7 +65,7 @@ def _may_be_replaced(target: Path, status: os.stat_result) -> bool:
         with suppress(OSError):
             if os.path.samestat(status, os.fstat(descriptor)):
                 return False
-    # Who may not write to a file must not replace it, although the folder would let them: written over, it is refused.
+    # A file that is not writable must not be replaced, even if its folder allows that: overwriting it raises.
     if not os.access(target, os.W_OK):
         return False
     attributes: list[str] = []
@@ -75,11 +75,11 @@ def _may_be_replaced(target: Path, status: os.stat_result) -> bool:
 
 
 def _replace(target: Path, data: bytes, status: os.stat_result | None) -> None:
-    # Nobody can have laid a link to something else there, and another thread has another name.
+    # A random name cannot be a link that another user prepared, nor the name of another thread.
     beside = target.with_name(f".{secrets.token_hex(8)}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        # What a file keeps from others is in no other file either, be it for a moment.
+        # The temporary file must not be more readable than the one that it replaces.
         mode = 0o666 if status is None else 0o600
         with open(beside, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.write(data)
@@ -98,14 +98,14 @@ def _circle(path: Path) -> OSError:
 
 @contextmanager
 def writing(what: str, failure: type[PendulumError]) -> Iterator[None]:
-    """Say in a sentence why what is written within could not be.
+    """Turn an ``OSError`` of writing within this context into one sentence.
 
     Args:
         what: The thing, with its path.
         failure: Class of the error to raise.
 
     Raises:
-        PendulumError: Of that class, where an ``OSError`` ended the writing; errors of ours stay what they are.
+        PendulumError: Of that class, where an ``OSError`` ended the writing; a PendulumError is passed on.
     """
     try:
         yield

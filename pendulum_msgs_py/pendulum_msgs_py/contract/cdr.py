@@ -1,8 +1,8 @@
 """JointState to and from CDR bytes with one precompiled struct for each kind of message.
 
 rclpy builds, serialises and deserialises a JointState in 4, 4 and 11 us; with a fixed layout the same takes a
-fraction of a microsecond. The layout is checked in full before a byte is believed: whatever differs (no names, more
-values than names, another byte order) is left to real deserialisation.
+fraction of a microsecond. The layout is checked in full before a value is used: a message that differs (no names, more
+values than names, another byte order) is deserialised by rclpy.
 
 Layout (XCDR1, little endian; offsets after the four bytes of encapsulation header)::
 
@@ -62,7 +62,7 @@ class JointStateFields(NamedTuple):
 
 
 class MessageTemplate(NamedTuple):
-    """What all messages of one sender have in common, for who compares bytes.
+    """The constant bytes of one sender's messages.
 
     Attributes:
         data: A message, stamp and numbers zero; padding zero too.
@@ -162,7 +162,7 @@ def template_of(fields: JointStateFields, size: int = 0) -> MessageTemplate:
         marked = pack(words, (*zeros[:index], _MARK, *zeros[index + 1 :]), lambda count: count)
         value_at.append(head + next(at for at, (a, b) in enumerate(zip(marked, data, strict=True)) if a != b))
     trailing = bytes(max(0, size - head - layout.size))
-    # The options of the encapsulation say nothing that is read here.
+    # The options of the encapsulation are not needed.
     kept = _PLAIN_CDR + bytes(head - len(_PLAIN_CDR))
     same_head = b"\xff" * len(_PLAIN_CDR) + bytes(head - len(_PLAIN_CDR))
     return MessageTemplate(kept + data + trailing, same_head + mask + trailing, tuple(value_at))
@@ -190,7 +190,7 @@ def decode_joint_state(data: bytes) -> JointStateFields | None:
     known = _known_layouts.get((size, data[12:16]))
     if known is not None:
         values = known.layout.unpack(data)
-        # All that tells one layout from another: the encapsulation, the names with their lengths, the counts.
+        # What distinguishes two layouts: the encapsulation, the names with their lengths, the counts.
         if values[0] == _PLAIN_CDR and values[3 : known.first] == known.words and values[2] < NANOSECONDS:
             n, first = known.n, known.first
             if known.complete:
@@ -238,7 +238,7 @@ def _decode_unknown(data: bytes) -> JointStateFields | None:
                 offset += (4 - offset) & 7
             quantities.append(struct.unpack_from(f"<{count}d", data, offset))
             offset += 8 * count
-        # rclpy reserves room for the alignment of each sequence, empty ones too, and leaves it at the end.
+        # rclpy reserves space for the alignment of each sequence, empty ones too, and leaves it at the end.
         if size - offset > _MAX_TRAILING or nanosec >= NANOSECONDS:
             return None
         frame_id = data[16 : frame_end - 1].decode()

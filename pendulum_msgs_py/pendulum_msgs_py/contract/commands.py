@@ -1,7 +1,7 @@
-"""Which commands a plant believes: one gate per input, the same on simulator and hardware.
+"""Which commands a plant accepts: one gate per input, the same on simulator and hardware.
 
 A command that is not finite, not of as many joints as the plant has, for other joints or for the same in another
-order, stale, from the future, a second answer to one state, or from a second commander is refused and counted; the
+order, stale, from the future, a second reply to one state, or from a second commander is refused and counted; the
 plant acts on the newest one that passed.
 """
 
@@ -22,7 +22,7 @@ __all__ = ["CommandGate", "Refusal"]
 class Refusal(str, Enum):
     """Why a command was not applied; the value is the key in diagnostics.
 
-    ``not_one_joint`` is a message that has not one value for each joint that it may speak to, ``other_joint`` one that
+    ``not_one_joint`` is a message without one value for each joint of the input, ``other_joint`` one that
     names other joints, or the same in another order.
     """
 
@@ -49,7 +49,7 @@ class CommandGate:
     """Checks the commands of one input and keeps the newest that passed.
 
     Args:
-        timeout: Age beyond which a command counts for nothing [s], > 0.
+        timeout: Age beyond which a command is ignored [s], > 0.
         joints: The joints that commands must be for, in this order; an empty list of names means the only one.
         partial: Whether a command may be for some of the joints, in their order; the others get nothing.
         unit: Unit of the efforts, for messages.
@@ -124,7 +124,7 @@ class CommandGate:
 
     @property
     def commander(self) -> str:
-        """Who sent the newest accepted command."""
+        """Source of the newest accepted command."""
         return self._holder
 
     def reset(self) -> None:

@@ -26,7 +26,7 @@ class Mode(str, Enum):
     @property
     def armed(self) -> bool:
         """Whether torque may flow."""
-        # Asked several times a period: a set would hash the members, which enum does in Python.
+        # Runs several times a period; a set would hash the members, which enum does in Python.
         return self is Mode.EFFORT or self is Mode.POSITION
 
 
@@ -58,7 +58,7 @@ class Drive(NamedTuple):
         disturbance: The disturbance's share.
         push: n efforts on the joints themselves; applied whatever the kind, as a hand would.
         saturated: A sum was clamped.
-        starved: Armed for effort, but without a fresh command of somebody who may command: zero torque.
+        starved: Armed for effort, but without a fresh command of the commander: zero torque.
         handover: Under position control, the share of the hand-over from effort that is still to go, 1 to 0 [-].
     """
 
@@ -76,11 +76,11 @@ class Drive(NamedTuple):
 
 @dataclass(frozen=True)
 class PlantLimits:
-    """Limits that a plant keeps; those that are one number hold for each joint, in its own unit.
+    """Limits that a plant enforces; those that are one number hold for each joint, in its own unit.
 
     Attributes:
         effort: Largest effort of each driven joint, after the sum of controller and disturbance [N m or N].
-        command_timeout: Age at which a command counts for nothing [s].
+        command_timeout: Age at which a command is ignored [s].
         feedback_timeout: Age of the measurement at which an armed plant faults [s].
         velocity: Speed at which an armed plant faults, and largest of a trajectory [rad/s].
         position_min: Lower end of each joint's position window; ``(-inf,)`` for no window at any [rad or m].

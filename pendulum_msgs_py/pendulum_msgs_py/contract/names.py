@@ -42,9 +42,9 @@ SIGNALS = (JOINT_STATES, EFFORT_COMMAND, DISTURBANCE, APPLIED_EFFORT)
 """What goes round the loop, in order: without one of them a recording of a run is of no use."""
 EVENTS = "events"
 E_STOP_INPUT = "e_stop_input"
-"""``std_msgs/Bool``: true is pressed, false says "not pressed" and has to come all the time."""
+"""``std_msgs/Bool``: true is pressed, false is released; has to be published continuously."""
 ENABLE_INPUT = "enable_input"
-"""``std_msgs/Bool``: true is held and has to come all the time, false is released."""
+"""``std_msgs/Bool``: true is held, false is released; has to be published continuously."""
 
 # Absolute names, by ROS convention.
 DIAGNOSTICS = "/diagnostics"
@@ -62,7 +62,7 @@ def full_name(namespace: str, node: str) -> str:
 
 
 class Event:
-    """Names of what is told on ``events``; their details stand in the README."""
+    """Names of the events on ``events``; the README has their details."""
 
     PLANT_MODE = "plant_mode"
     TRAJECTORY_REFUSED = "trajectory_refused"

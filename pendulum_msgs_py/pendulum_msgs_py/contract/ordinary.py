@@ -1,7 +1,7 @@
-"""The supervisor's state in ordinary periods as numbers, for a loop that runs compiled.
+"""The supervisor's state in nominal periods as numbers, for the compiled loop.
 
-Ordinary is: one driven joint is armed for effort and commanded by who commanded it before; no trajectory, no hand-over,
-no push, no conflict. The numbers are lent to the loop and taken back after it; all else, and all words, stay here.
+A period is nominal if one driven joint is armed for effort and the commander has not changed, without trajectory,
+hand-over, push or conflict. The loop borrows the numbers and returns them; all else, texts included, stays here.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ ORDINARY = np.dtype(
 
 
 def lend(supervisor: PlantSupervisor, record: Any) -> bool:
-    """Write the state of a supervisor into a record; return whether its next period may be an ordinary one.
+    """Write the state of a supervisor into a record; return whether its next period may be a nominal one.
 
     Args:
-        supervisor: Nobody else uses it until it is taken back.
+        supervisor: Not to be used until :func:`take_back`.
         record: Of :data:`ORDINARY`, its fields by attribute.
     """
     commands, disturbances = supervisor.gates[Input.EFFORT_COMMAND], supervisor.gates[Input.DISTURBANCE]
@@ -65,7 +65,7 @@ def lend(supervisor: PlantSupervisor, record: Any) -> bool:
         and len(supervisor.coordinates.joints) == len(supervisor.limits.effort) == 1
         and supervisor._handover is None
         and not supervisor.commander_conflict
-        # Its silence is looked for at each decision.
+        # The switch's timeout is checked at each decision, which compiled code does not do.
         and math.isinf(supervisor.limits.enable_timeout)
         and commands._newest is not None
         and supervisor._commanding == commands._newest.source
@@ -102,7 +102,7 @@ def take_back(supervisor: PlantSupervisor, record: Any) -> None:
 
 
 def _may_act(gate: CommandGate) -> bool:
-    """Return whether a gate has a command that has not grown old for good."""
+    """Return whether a gate has a command that has not expired."""
     return gate._newest is not None and not gate._expired
 
 

@@ -1,4 +1,4 @@
-"""Parameters that every plant has, whatever it is: the limits that it keeps, and how its loop runs."""
+"""Parameters that every plant has, whatever it is: the limits that it enforces, and how its loop runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ REALTIME_PRIORITY = ParameterSpec(
     maximum=99,
     read_only=True,
 )
-"""Of all who keep a plant's time, or answer in it."""
+"""Of all programs that run, or reply, at a plant's rate."""
 
 COMPILED = ParameterSpec(
     "compiled",

@@ -1,7 +1,7 @@
 """The rules of a plant as functions of numbers, for one command or one joint at a time.
 
-Gates and supervisor call them as they stand here; the loops that run compiled compile these very functions. What they
-decide is named, counted and told by who calls them.
+Gates and supervisor call them; compiled loops compile these very functions. The caller names, counts and reports what
+they decide.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NEVER = -(2**63)
 """In the place of a stamp that there is none of."""
 
 ACCEPTED, TOO_OLD, FROM_FUTURE, SECOND_COMMANDER, DUPLICATE, OUT_OF_ORDER = range(6)
-"""What :func:`judge_stamp` answers."""
+"""Results of :func:`judge_stamp`."""
 _HOLD_NS = round(COMMANDER_HOLD * NANOSECONDS)
 
 
@@ -49,10 +49,10 @@ def judge_stamp(stamp_ns: int, now_ns: int, timeout_ns: int, newest_ns: int, hea
     Args:
         stamp_ns: Stamp of the command [ns].
         now_ns: The plant's clock [ns].
-        timeout_ns: Age at which a command counts for nothing [ns].
+        timeout_ns: Age at which a command is ignored [ns].
         newest_ns: Stamp of the newest command that passed [ns], or ``NEVER``.
         heard_ns: When that one passed, on the plant's clock [ns].
-        other: Whether it comes from somebody else than that one.
+        other: Whether it comes from another sender.
     """
     if now_ns - stamp_ns > timeout_ns:
         return TOO_OLD
@@ -76,15 +76,15 @@ def is_ahead(stamp_ns: int, now_ns: int) -> bool:
 def has_expired(stamp_ns: int, heard_ns: int, now_ns: int, timeout_ns: int) -> bool:
     """Return whether a command is too old to act on.
 
-    Measured from the stamp and from the moment of hearing it: a clock that jumps either way only shortens it. Heard a
-    little "later than now" is not only a clock that stepped back: a plant that catches up with periods it missed
-    decides as of each of them.
+    Measured from the stamp and from the arrival, so that a clock that jumps either way only shortens it. An arrival
+    slightly "later than now" does not imply such a jump: a plant that catches up on missed periods decides as of each
+    of them.
     """
     return now_ns - stamp_ns > timeout_ns or abs(now_ns - heard_ns) > timeout_ns
 
 
 def has_lapsed(commanded_ns: int, now_ns: int) -> bool:
-    """Return whether who commands has been silent so long that whoever comes begins."""
+    """Return whether the commander has timed out, so that the next command starts a new one."""
     return now_ns - commanded_ns > _HOLD_NS
 
 
@@ -102,7 +102,7 @@ def age_of(stamp_ns: int, now_ns: int) -> float:
 
 
 def is_inside(low: float, position: float, high: float, velocity: float, fastest: float) -> bool:
-    """Return whether a joint is inside its window and not too fast; what is no number is neither."""
+    """Return whether a joint is inside its window and below the speed limit; False for NaN."""
     return low <= position <= high and -fastest <= velocity <= fastest
 
 
@@ -118,6 +118,6 @@ def within(value: float, limit: float) -> float:
 def rise_within(last: float, wanted: float, step: float) -> float:
     """Return an effort that rises from the last one by a step at most.
 
-    Away from zero alone: torque that nobody asks for any more must not stay because it may only fall slowly.
+    Away from zero only: torque that is no longer commanded must drop at once.
     """
     return min(max(last, 0.0) + step, max(min(last, 0.0) - step, wanted))

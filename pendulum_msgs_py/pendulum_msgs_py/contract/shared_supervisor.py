@@ -17,7 +17,7 @@ from pendulum_msgs_py.contract.values import JointCommand, JointSample, Vector
 __all__ = ["SharedSupervisor"]
 
 _LONGEST_COURTESY = 0.005
-"""Longest time that whoever had the supervisor alone leaves to those who have waited [s]."""
+"""Longest time that :meth:`alone` yields to waiting threads [s]."""
 
 
 class SharedSupervisor(PlantSupervisor):
@@ -58,11 +58,11 @@ class SharedSupervisor(PlantSupervisor):
 
     @property
     def waiting_at(self) -> int:
-        """Address of an ``int64`` that counts who waits for :meth:`alone` to end, for compiled code to look at."""
+        """Address of an ``int64`` that counts threads that wait for :meth:`alone` to end; polled by compiled code."""
         return ctypes.addressof(self._waiting)
 
     def watch_for_presses(self, look: Callable[[], tuple[int, str] | None]) -> None:
-        """Look for an e-stop before each decision and each request.
+        """Poll for an e-stop before each decision and each request.
 
         Args:
             look: Returns time [ns] and reason of a press that :meth:`e_stop` has not been called for, or None.
@@ -89,20 +89,20 @@ class SharedSupervisor(PlantSupervisor):
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
-        """Keep everybody else from the supervisor; who comes in the meantime is counted, waits, and is next."""
+        """Hold the supervisor exclusively; other threads are counted, wait, and run next."""
         with self._lock:
             self._look_then_carry_out()
             yield
-        # A lock is whose who asks first, and we are awake: without this who disarms waits for one more decision.
+        # Python locks are unfair: without this yield a waiting disarm loses a period.
         if self._waiting.value:
             with self._counting:
                 self._counting.wait_for(lambda: not self._waiting.value, _LONGEST_COURTESY)
 
     @contextlib.contextmanager
     def _in_turn(self) -> Iterator[bool]:
-        """Take the lock, and let compiled code that has it know that somebody wants it.
+        """Take the lock, and signal to compiled code that holds it that a thread is waiting.
 
-        Yields whether e-stops had been pressed that nobody had carried out yet.
+        Yields whether there were e-stop requests that had not been carried out yet.
         """
         with self._counting:
             self._waiting.value += 1
@@ -132,7 +132,7 @@ class SharedSupervisor(PlantSupervisor):
 
     def accept_trajectory(self, trajectory: Trajectory, now_ns: int, sample: JointSample) -> str:
         """Start to follow a trajectory."""
-        # Points are made here, where nobody waits: under the lock they would keep the actuator and the e-stop.
+        # Points are computed before the lock is taken: under it they would delay actuator and e-stop.
         trajectory = trajectory.from_position(sample.position[0])
         with self._in_turn():
             return super().accept_trajectory(trajectory, now_ns, sample)
@@ -159,14 +159,14 @@ class SharedSupervisor(PlantSupervisor):
             super().disarm(now_ns, reason)
 
     def e_stop(self, now_ns: int, reason: str = "e-stop pressed") -> None:
-        """Latch the e-stop: whatever is decided from now on knows of it, even before this thread has the lock."""
+        """Latch the e-stop: each decision from now on respects it, even before this thread has the lock."""
         self._newest_press = press = (now_ns, reason)
         self._presses.append(press)
         with self._in_turn():
-            pass  # it is carried out on the way in, unless somebody has been faster
+            pass  # it is carried out on the way in, unless another thread did so first
 
     def e_stop_reset(self, now_ns: int) -> str:
-        """Leave the e-stop for disarmed, unless one was pressed since that who asks for this cannot have known of."""
+        """Leave the e-stop for disarmed, unless a press arrived after the reset was requested."""
         known = self._newest_press
         with self._in_turn() as pressed:
             if pressed or self._newest_press is not known:
@@ -190,7 +190,7 @@ class SharedSupervisor(PlantSupervisor):
             return super().decide(now_ns, sample)
 
     def report_applied(self, effort: Vector) -> None:
-        """Tell what efforts were really applied."""
+        """Record the efforts that were really applied."""
         with self._lock:
             self._carry_out_presses()
             super().report_applied(effort)

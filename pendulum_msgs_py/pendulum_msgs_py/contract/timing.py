@@ -33,10 +33,10 @@ class SteadyWallClock:
 
 
 class RingOfTimes:
-    """The last N durations, kept without allocation; percentiles are computed when somebody asks."""
+    """The last N durations, kept without allocation; percentiles are computed on request."""
 
     def __init__(self, size: int = 4096) -> None:
-        # Not numpy's: an item is set several times a period, and looked at twice a second.
+        # Not numpy's: an item is written several times a period, and read twice a second.
         self._values = array("q", bytes(8 * size))
         self._size = size
         self._count = 0
@@ -61,7 +61,7 @@ class RingOfTimes:
         return self._count
 
     def percentiles_us(self, *percents: float) -> list[float]:
-        """Return percentiles of the durations kept, each the nearest in rank [us]; NaN before the first."""
+        """Return percentiles of the stored durations, each the nearest in rank [us]; NaN before the first."""
         kept = np.frombuffer(self._values, dtype=np.int64)[: min(self._count, self._size)]
         if kept.size == 0:
             return [float("nan")] * len(percents)
@@ -98,7 +98,7 @@ class Throttle:
         return left_out
 
     def flush(self, now: float) -> int:
-        """Return how many lines were left out once their time is over, so that the last state can be told; else 0."""
+        """Return how many lines were left out once their time is over, so that the last state can be logged; else 0."""
         return 0 if not self._left_out or now - self._last < self._interval else self.ask(now) or 0
 
 
@@ -139,11 +139,11 @@ class LoopStatistics:
         self._window_cycles += len(late_ns)
 
     def round_trip(self, duration_ns: int) -> None:
-        """Record the time from the publication of a state until the command that answers it is there [ns]."""
+        """Record the time from the publication of a state until the command in reply to it arrives [ns]."""
         self.latency.add(duration_ns)
 
     def act_on_age(self, age_ns: int) -> None:
-        """Record how old a measurement is when the command that answers it is taken: what a loop's delay is [ns]."""
+        """Record how old a measurement is when the command in reply to it is taken: the loop's delay [ns]."""
         self.answered_age.add(age_ns)
 
     def summary(self, now_ns: int) -> Mapping[str, float]:

@@ -54,7 +54,7 @@ class Trajectory:
         points: The points.
         lowest: Smallest position [rad].
         highest: Largest position [rad].
-        max_speed: Largest speed asked for, as commanded or as positions imply [rad/s].
+        max_speed: Largest speed, as commanded or as the positions imply [rad/s].
     """
 
     points: tuple[TrajectoryPoint, ...]
@@ -63,7 +63,7 @@ class Trajectory:
     max_speed: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Refuse what no position controller should be asked to follow; note what a plant will ask at once."""
+        """Refuse what no position controller should follow; precompute what a plant needs at once."""
         if not self.points:
             raise ParameterError("trajectory has 0 points; expected at least one")
         previous = -math.inf
@@ -106,8 +106,8 @@ class Trajectory:
 
         That is how ``joint_trajectory_controller`` of ros2_control reads a goal of one point. A single point at rest
         is reached on half a cosine, so that velocity neither jumps at its start nor at its end; the first of several
-        points, linearly. Who starts at time 0 has said all there is to say; whoever does not has asked for all of the
-        time, however near the first point is.
+        points, linearly. A trajectory that starts at time 0 is complete; one that starts later uses all of that time,
+        however near the first point is.
 
         Args:
             position: Where the joint is [rad].

@@ -47,12 +47,12 @@ class JointSample(NamedTuple):
 
 
 class JointCommand(NamedTuple):
-    """Efforts asked for, in answer to one state.
+    """Commanded efforts, in reply to one state.
 
     Attributes:
-        stamp_ns: Stamp of the state that this command answers [ns].
+        stamp_ns: Stamp of the state that this command replies to [ns].
         effort: One effort for each joint that it names [N m or N].
-        source: Who commands (``header.frame_id``).
+        source: The commander (``header.frame_id``).
         joints: Joint names that the message carried; empty means "the only joint".
     """
 

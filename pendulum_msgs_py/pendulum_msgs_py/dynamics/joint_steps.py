@@ -79,7 +79,7 @@ def joint_functions(count: int) -> tuple[Callable[..., Any], ...]:
     """Return (along, put, lag) for a number of joints: what loops over tuples would do, written out to be compiled.
 
     Raises:
-        ParameterError: Nobody has written them for so many.
+        ParameterError: There are none for so many joints.
     """
     if count not in _PUT:
         raise ParameterError(f"a mechanism of {count} joints is not stepped yet; expected 1 or 2")
@@ -110,7 +110,7 @@ def _constrained(
     if count == len(a):
         return along(a, -1.0, a)
     if count == 1:
-        # The acceleration is a straight line of the effort: one more point of it tells which effort holds.
+        # The acceleration is affine in the effort: one more point of it gives the effort that holds.
         more = forward(q, v, put(tau, last, tau[last] + 1.0), p)
         column = along(more, -1.0, a)
         a = put(along(a, -a[last] / column[last], column), last, 0.0)
@@ -154,7 +154,7 @@ def _modes(forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any, p: A
         elif table[STATIC][i] > 0.0 or q[i] <= table[LOWER][i] or q[i] >= table[UPPER][i]:
             held = put(held, i, 1.0)
             rest += 1
-    # Let go of whatever cannot be held, one joint at a time, the one that is pulled hardest beyond its friction first.
+    # Release the joints that cannot be held, one at a time, the one pulled hardest beyond its friction first.
     for _ in range(n):
         if rest == 0:
             break

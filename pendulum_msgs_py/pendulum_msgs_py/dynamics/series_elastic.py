@@ -73,10 +73,10 @@ def feedforward_pwm(
     efficiency: float,
     nominal_resistance: float,
 ) -> float:
-    """Return the duty that answers a torque command without an effort loop, u = tau R / (N V K_t eta) [-].
+    """Return the duty for a torque command without an effort loop, u = tau R / (N V K_t eta) [-].
 
-    It takes the motor for stalled, its winding for one at 20 degrees Celsius, and asks for 1 / eta more than the
-    output needs.
+    It assumes a stalled motor with its winding at 20 degrees Celsius, and commands 1 / eta more than the output
+    needs.
 
     Args:
         torque: Commanded torque tau at the output [N m].

@@ -32,7 +32,7 @@ def narrowed(
         high: Time after it [s].
         g_high: The function there.
         side: Which end moved last, -1 or 1; 0 for none.
-        root: Time at which the function was looked at [s].
+        root: Time at which the function was evaluated [s].
         g: The function there.
         before: Whether that is before the root.
 

@@ -1,4 +1,4 @@
-"""The compiled loop that answers each message of an input, for the compiler's process alone."""
+"""The compiled loop that replies to each message of an input, for the compiler's process alone."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def answer_loop(own: np.dtype[Any], answer: Any) -> Any:
     """Return the loop, compiled.
 
     Args:
-        own: Layout of what answers depend on and change.
-        answer: Compiled function ``answer(s, arrived_ns)`` that answers the message which was taken and counts the
-            answer, or returns False before it has changed anything: the message is Python's then. The time is that of
+        own: Layout of what replies depend on and change.
+        answer: Compiled function ``answer(s, arrived_ns)`` that replies to the message which was taken and counts the
+            reply, or returns False before it has changed anything: Python then handles the message. The time is that of
             the monotonic clock [ns].
     """
 
@@ -58,7 +58,7 @@ def answer_loop(own: np.dtype[Any], answer: Any) -> Any:
 
 @compiled
 def count_answer(s: Any, stamp_ns: Any, age_ns: Any, compute_ns: Any) -> None:
-    """Count an answer that went out, with its times [ns]."""
+    """Count a reply that was published, with its times [ns]."""
     s.stamp_ns[s.answers] = stamp_ns
     s.age_ns[s.answers] = age_ns
     s.compute_ns[s.answers] = compute_ns

@@ -1,4 +1,4 @@
-"""The record of a loop that answers each message of an input by one of an output."""
+"""The record of a loop that replies to each message of an input by one of an output."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from pendulum_msgs_py.loops.records import INPUT, OUTPUT, TIME
 __all__ = ["ENDED", "FAILED", "LEFT", "MOST_ANSWERS", "Answerer", "LoopKind", "answer_record"]
 
 MOST_ANSWERS = 1024
-"""Answers of one slice, whose times are kept one by one."""
+"""Largest number of replies in one slice; each of their times is stored."""
 ENDED, LEFT, FAILED = range(3)
-"""Why a slice ended: its time is over or somebody calls, a message is left to Python, or rcl could not take one."""
+"""Why a slice ended: its time is over or a call is pending, a message is left to Python, or rcl failed to take one."""
 
 
 @dataclass(frozen=True)
 class LoopKind:
-    """Which loop answers.
+    """The loop that replies.
 
     Attributes:
-        own: Layout of what its answers depend on and change.
+        own: Layout of what its replies depend on and change.
         builder: Builds it, ``module:function``.
         choice: Which variant of it.
     """
@@ -33,28 +33,28 @@ class LoopKind:
 
 
 class Answerer(Protocol):
-    """Who answers, and lends a loop what it needs for it.
+    """A node's logic that replies, and lends a loop the numbers for it.
 
     Attributes:
         kind: The loop; None where there is none.
-        refusal: Why it cannot answer as things are; empty where it can.
+        refusal: Why it cannot reply at present; empty where it can.
     """
 
     kind: LoopKind | None
     refusal: str
 
     def lend(self, own: Any) -> bool:
-        """Write what answers depend on into a record; return False where the next message is Python's anyway."""
+        """Write what replies depend on into a record; return False where Python has to handle the next message."""
 
     def take_back(self, record: Any) -> None:
-        """Take over what one answer or more have changed; the record is the loop's whole one."""
+        """Take over the changes by one or more replies; the record is the loop's whole one."""
 
 
 def answer_record(own: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the layout of a loop that answers.
+    """Return the layout of a loop that replies.
 
     Args:
-        own: Layout of what its answers depend on and change.
+        own: Layout of what its replies depend on and change.
     """
     return np.dtype(
         [

@@ -1,6 +1,6 @@
 """The compiler's process: ``python -m pendulum_msgs_py.loops.compile_loop FILE MODULE:BUILDER [CHOICE ...]``.
 
-Without arguments it keeps the loops that experiments run, so that no program has to wait for them.
+Without arguments it caches the loops that experiments run, so that no program has to wait for them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def _keep_common() -> None:
     def keep(loop: tuple[str, ...]) -> None:
         try:
             keep_loop(*loop)
-        # Programs say so themselves, and run interpreted.
+        # Programs report this themselves, and run interpreted.
         except NoMachineCodeError as error:
             print(f"note: {' '.join(loop)} is not compiled: {error}", file=sys.stderr)
 

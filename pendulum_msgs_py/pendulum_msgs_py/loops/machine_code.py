@@ -1,8 +1,8 @@
-"""Machine code of loops: compiled once by numba in a process of its own, kept on disk, loaded without numba.
+"""Machine code of loops: compiled once by numba in a process of its own, cached on disk, loaded without numba.
 
-To import numba takes a program half a second of the processor and 60 MB; to load what it has compiled takes neither.
-A loop is one function of one record of numbers (:mod:`numpy.dtype`), which all that it
-reads and writes is in, and of symbols that its caller names.
+Importing numba costs a program half a second of processor time and 60 MB; loading what it has compiled costs neither.
+A loop is one function of one record of numbers (:mod:`numpy.dtype`), which holds all that it reads and writes, and of
+symbols that its caller names.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ _LIBRARIES = {
     "libm.so.6": ("sin", "cos", "sincos", "tan", "exp", "expm1", "log", "sqrt", "tanh", "pow", "fmod", "floor"),
     "libc.so.6": ("memcpy", "memmove", "memset", "clock_gettime", "clock_nanosleep", "ppoll", "read"),
 }
-"""What every loop may call beside what its caller names."""
+"""What every loop may call in addition to what its caller names."""
 _PATIENCE = 120.0
 """Longest time that a compiler may take on a busy machine [s]."""
 _COMPILER = "pendulum_msgs_py.loops.compile_loop"
 
 
 class NoMachineCodeError(PendulumError):
-    """A loop cannot be had compiled; the message says why, and its caller runs interpreted."""
+    """A loop cannot be compiled; the message has the reason, and the caller runs interpreted."""
 
 
 def load_loop(builder: str, *choice: str, symbols: Mapping[str, int]) -> Loop:
@@ -74,12 +74,12 @@ def _load(builder: str, choice: tuple[str, ...], symbols: tuple[tuple[str, int],
 
 
 def keep_loop(builder: str, *choice: str) -> tuple[dict[str, Any], bytes]:
-    """Return what is kept of a loop, and its code; where none is kept, or of other source, it is compiled first.
+    """Return the cached head and code of a loop; it is compiled first if not cached, or if its source has changed.
 
     Args: as in :func:`load_loop`.
 
     Raises:
-        NoMachineCodeError: It cannot be had here.
+        NoMachineCodeError: It cannot be compiled here.
     """
     path = _path(builder, choice)
     kept = _read(path)
@@ -141,7 +141,7 @@ def _addresses() -> dict[str, int]:
 
 
 def _path(builder: str, choice: tuple[str, ...]) -> Path:
-    """Return where the code of a loop is kept: a file for each choice, compiler and kind of processor."""
+    """Return the cache file of a loop's code: one for each choice, compiler and kind of processor."""
     module, _, function = builder.partition(":")
     try:
         versions = [importlib.metadata.version(each) for each in ("numba", "llvmlite", "numpy")]
@@ -153,7 +153,7 @@ def _path(builder: str, choice: tuple[str, ...]) -> Path:
     if not os.access(home if home.exists() else home.parent, os.W_OK):
         try:
             home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pendulum"
-        except RuntimeError as error:  # a user whom nobody knows, as in a container
+        except RuntimeError as error:  # a user without a name, as in a container
             raise NoMachineCodeError(f"no folder for machine code: {error}") from error
     name = "-".join((function, *choice, digest)).replace(":", ".")
     return home / f"{name}.loop"
@@ -161,7 +161,7 @@ def _path(builder: str, choice: tuple[str, ...]) -> Path:
 
 @cache
 def _processor() -> str:
-    """Return what the kernel tells of the first processor that matters to a compiler: its model, and what it can do."""
+    """Return the model and the instruction sets of the first processor, on which machine code depends."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").partition("\n\n")[0].splitlines()
         return "\n".join(line for line in lines if line.startswith(("model name", "flags")))
@@ -169,8 +169,8 @@ def _processor() -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes] | None:
-    """Return what is known of the code and the code itself; None where it is damaged, of other source, or not there."""
-    # Whatever somebody else has written there, it is not ours.
+    """Return the head of the code and the code itself; None where it is damaged, of other source, or missing."""
+    # A file of another program is ignored, whatever it holds.
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
         line, _, code = path.read_bytes().partition(b"\n")
         head = json.loads(line)
@@ -198,11 +198,11 @@ def _folder(package: str) -> Path:
 
 
 def _compile_apart(path: Path, builder: str, choice: tuple[str, ...]) -> None:
-    """Have a loop compiled by a process of its own; of several who want it one compiles, the others wait."""
+    """Compile a loop in a process of its own; of several programs that need it one compiles, the others wait."""
     with _alone(path):
         if _read(path) is not None:
             return
-        # Whoever starts a program for the first time should not take it for one that hangs.
+        # The message shows that the first start, which takes seconds, does not hang.
         print(f"compiling {builder} {' '.join(choice)}: ten seconds or so, this once", file=sys.stderr, flush=True)
         command = [sys.executable, "-m", _COMPILER, str(path), builder, *choice]
         try:

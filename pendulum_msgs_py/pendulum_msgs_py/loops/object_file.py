@@ -65,7 +65,7 @@ class LinkedCode:
 
 
 def undefined_symbols(code: bytes) -> set[str]:
-    """Return the names that an object file leaves to be found by who loads it.
+    """Return the names that an object file leaves to its loader.
 
     Raises:
         ValueError: It is no such file.

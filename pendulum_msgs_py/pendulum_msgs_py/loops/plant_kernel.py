@@ -1,7 +1,7 @@
-"""Ordinary periods of a plant of one joint, for compiled code: take torques, decide, step, publish.
+"""Nominal periods of a plant of one joint, for compiled code: take torques, decide, step, publish.
 
-Everything is looked at before anything is changed: where a period or a message is not an ordinary one, the loop ends
-with it untouched, and Python does it by the same rules.
+Every check comes before the first change: a period or a message that is not nominal ends the loop untouched, and
+Python handles it by the same rules.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ def _somebody_waits(s: Any) -> Any:
 
 @compiled
 def _is_answer(s: Any, stamp_ns: Any) -> Any:
-    """Return whether a stamp is that of a state of ours: from the newest on, which it nearly always is."""
-    for back in range(OWN_STAMPS):  # noqa: SIM110  (compiled code knows no any())
+    """Return whether a stamp is that of an own state, newest first since it nearly always is that one."""
+    for back in range(OWN_STAMPS):  # noqa: SIM110  (compiled code has no any())
         if s.own_stamp_ns[(s.own_newest - back) % OWN_STAMPS] == stamp_ns:
             return True
     return False
@@ -106,7 +106,7 @@ def plant_loop(layout: Any, step: Any) -> Any:
     def advance(s: Any) -> Any:
         """Do one period from a decision to its publication; return whether it was done, and its state is out."""
         until_ns = s.now_ns + s.period_ns
-        # In lockstep a decision is as of the state that was answered, in real time as of the deadline.
+        # In lockstep a decision is as of the state that was replied to, in real time as of the deadline.
         if not _decide(s, s.now_ns if s.lockstep else until_ns):
             return False
         before_ns = s.sample_ns
@@ -115,7 +115,7 @@ def plant_loop(layout: Any, step: Any) -> Any:
         s.now_ns = s.sample_ns = until_ns
         s.position, s.velocity, s.effort = s.plant.theta, s.plant.theta_dot, s.plant.torque
         s.answered = 0
-        # The state first: somebody waits to answer it.
+        # The state first: the controller waits for it.
         out = s.states
         out.value[0], out.value[1], out.value[2] = s.position, s.velocity, s.effort
         s.published_ns = wall_ns(s.time)
@@ -158,7 +158,7 @@ def plant_loop(layout: Any, step: Any) -> Any:
             if waits != _IS_READ:
                 return MESSAGE_WAITS + waits
             if s.answered & s.expected == s.expected:
-                # The last step tells that it was.
+                # Python does the last step, which publishes that it was.
                 if s.now_ns + s.period_ns >= s.last_ns or not advance(s):
                     return UNUSUAL
                 continue

@@ -22,14 +22,14 @@ __all__ = [
 ]  # fmt: skip
 
 MOST_PERIODS = 256
-"""Periods of one slice in real time, whose figures are kept one by one."""
+"""Largest number of periods in one slice in real time; each of their figures is stored."""
 OWN_STAMPS = 128
-"""Stamps of own states that an answer is looked up among."""
+"""Number of own stamps among which a command's stamp is searched."""
 EFFORT, DISTURBANCE, PUSH = range(3)
 """Where each input stands."""
 INPUTS = 3
 ENDED, UNUSUAL, MESSAGE_WAITS = range(3)
-"""Why a slice ended: its time is over, the next period is not an ordinary one, or a message is Python's to read.
+"""Why a slice ended: its time is over, the next period is not nominal, or a message is Python's to read.
 
 With the last, the number of the input is added.
 """
@@ -44,7 +44,7 @@ def plant_record(plant: np.dtype[Any]) -> np.dtype[Any]:
     return np.dtype(
         [
             ("time", TIME),
-            # Where it is counted who else wants the supervisor, an i8: the loop ends before its next period.
+            # Address of the i8 that counts threads waiting for the supervisor, for which the loop ends.
             ("waiting_at", "u8"),
             ("waiting", "i8", (1,)),
             ("counter", "i4"),

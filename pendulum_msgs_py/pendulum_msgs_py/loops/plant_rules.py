@@ -1,7 +1,7 @@
-"""Ordinary decisions of a plant of one joint on the numbers of a record: the supervisor's rules, one after the other.
+"""Nominal decisions of a plant of one joint on the numbers of a record: the supervisor's rules, one after the other.
 
-Plain functions, which loops compile and tests run as they stand. Each looks at everything before it changes anything:
-where what it is asked about is not ordinary it says so, and Python decides by the same rules.
+Plain functions, which loops compile and tests run unchanged. Each checks everything before it changes anything: where
+a case is not nominal it returns so, and Python decides by the same rules.
 """
 
 from __future__ import annotations

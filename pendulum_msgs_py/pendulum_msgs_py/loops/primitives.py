@@ -1,6 +1,6 @@
 """What compiled loops are made of: time, waiting, messages. Imported by the compiler's process alone.
 
-The functions of rcl are called as ``pendulum_rcl_...``: who loads a loop says where they are, so that they are those of
+The functions of rcl are called as ``pendulum_rcl_...``: the loader passes their addresses, so that they are those of
 the library that rclpy has loaded (:mod:`pendulum_msgs_py.ros.direct`).
 """
 
@@ -31,7 +31,7 @@ __all__ = [
     "wall_ns",
 ]
 
-# Whoever compiles has them: simulator and control. This package needs neither, and a recorder has none.
+# Simulator and control, which compile, install them; this package and the recorder run without.
 numba = importlib.import_module("numba")
 llvm = importlib.import_module("llvmlite.binding")
 types = numba.types
@@ -45,7 +45,7 @@ _get_time = types.ExternalFunction("clock_gettime", _int(_int, _address))
 _sleep = types.ExternalFunction("clock_nanosleep", _int(_int, _int, _address, _address))
 _poll = types.ExternalFunction("ppoll", _int(_address, types.uint64, _address, _address))
 _read = types.ExternalFunction("read", types.int64(_int, _address, _address))
-# Compiled here, called elsewhere: the linker in between only wants them to have an address.
+# Compiled here, called elsewhere: the linker in between only needs them to have an address.
 for _symbol in ("pendulum_rcl_take", "pendulum_rcl_publish", "pendulum_rcl_count"):
     llvm.add_symbol(_symbol, 1)
 
@@ -53,7 +53,7 @@ _WALL, _STEADY, _ABSOLUTE, _READABLE = 0, 1, 1, 1
 """``CLOCK_REALTIME``, ``CLOCK_MONOTONIC``, ``TIMER_ABSTIME``, ``POLLIN``."""
 _STAMP_AT, _HEADER = 4, 4
 NOTHING, ORDINARY, OTHER, FAILED = range(4)
-"""What :func:`take_one` found: no message, one as expected, one that Python has to look at, or an error of rcl."""
+"""What :func:`take_one` found: no message, one as expected, one that Python has to handle, or an error of rcl."""
 _TAKE_FAILED = 401
 """``RCL_RET_SUBSCRIPTION_TAKE_FAILED``: there is none."""
 
@@ -99,7 +99,7 @@ def sleep_until(time: Any, steady: Any) -> None:
 
 @compiled
 def is_called(time: Any, calls: Any) -> Any:
-    """Return whether one of two event counters has been added to, without a wait; they stay as they are."""
+    """Return whether one of two event counters has been incremented; it neither waits nor resets them."""
     time.poll[0], time.poll[2] = calls[0], calls[1]
     time.poll[1] = time.poll[3] = _READABLE
     time.until[0] = time.until[1] = 0
@@ -180,5 +180,5 @@ def publish(output: Any, stamp_ns: Any) -> Any:
 
 @compiled
 def has_listeners(output: Any) -> Any:
-    """Return whether anybody is matched with an output."""
+    """Return whether a subscriber is matched with an output."""
     return _count(output.publisher, output.matched.ctypes.data) == 0 and output.matched[0] > 0

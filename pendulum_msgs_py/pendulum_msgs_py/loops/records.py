@@ -35,12 +35,12 @@ MOST_VALUES = 3
 HAND_OVER_NS = 250_000
 """Time that the receiver of the newest message has before Python is next [ns].
 
-Linux wakes a receiver on the core of the sender, and does not interrupt a sender who goes on computing there: what
-Python does between two slices, done at once, kept the receiver from answering for half a millisecond.
+Linux wakes a receiver on the sender's core and does not preempt the sender: the work that Python does between two
+slices, done at once, delayed the reply by half a millisecond.
 """
 
 TIME = np.dtype([("now", "i8", (2,)), ("until", "i8", (2,)), ("poll", "i4", (6,))], align=True)
-"""Where the C library puts the time, and is told one, in seconds and nanoseconds; three times ``struct pollfd``."""
+"""Times that the C library writes and reads, in seconds and nanoseconds; three times ``struct pollfd``."""
 
 MESSAGE = np.dtype(
     [("buffer", "u8"), ("length", "u8"), ("capacity", "u8"), ("allocator", "u8", (5,))],
@@ -52,7 +52,7 @@ INPUT = np.dtype(
     [
         ("subscription", "u8"),
         ("message", "u8", (MESSAGE.itemsize // 8,)),
-        # rmw_message_info_t: when it was sent and when it came [ns], and more that nobody asks for.
+        # rmw_message_info_t: when it was sent and when it arrived [ns], and more that is not used.
         ("info", "i8", (16,)),
         ("size", "i8"),
         ("template", "u1", (MOST_BYTES,)),
@@ -66,9 +66,9 @@ INPUT = np.dtype(
     ],
     align=True,
 )
-"""A subscription, the message that is expected there, and what the newest one said.
+"""A subscription, the message that is expected there, and the newest one's content.
 
-``size`` is 0 where none is expected: whatever comes is Python's. ``most`` bounds the messages of one look.
+``size`` is 0 where none is expected: Python handles every message. ``most`` bounds the messages of one poll.
 """
 
 OUTPUT = np.dtype(
@@ -121,14 +121,14 @@ def structure_of(layout: np.dtype[Any]) -> type[ctypes.Structure]:
 
 
 def expect_template(source: NDArray[Any], template: MessageTemplate | None) -> None:
-    """Say which message is expected of an input.
+    """Set the message that is expected of an input.
 
     Args:
         source: Record of :data:`INPUT`.
-        template: None where whatever comes is Python's.
+        template: None where Python handles every message.
     """
     source["size"] = 0
-    # What a message does not tell reads as zero, whatever the one before told.
+    # What a message lacks reads as zero, not as the value of the message before.
     source["value_at"], source["value"] = 0, 0.0
     if template is None or len(template.data) > MOST_BYTES or len(template.value_at) > MOST_VALUES:
         return
@@ -140,7 +140,7 @@ def expect_template(source: NDArray[Any], template: MessageTemplate | None) -> N
 
 
 def set_template(output: NDArray[Any], template: MessageTemplate) -> None:
-    """Say which message goes out.
+    """Set the message that is published.
 
     Args:
         output: Record of :data:`OUTPUT`; its own message points at the bytes in it.

@@ -16,9 +16,9 @@ from pendulum_msgs_py.programs.kept_kernels import name_symbols_apart
 
 __all__ = ["WITHIN", "compile_to_tell", "compile_tree", "tuple_loader"]
 
-# Whoever compiles has it: simulator and control. This package needs it nowhere else.
+# Simulator and control, which compile, install it; this package needs it nowhere else.
 numba = importlib.import_module("numba")
-# What is compiled here becomes part of kernels that are kept.
+# What is compiled here becomes part of cached kernels.
 name_symbols_apart()
 
 WITHIN = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -41,7 +41,7 @@ def compile_tree(
     Args:
         function: A plain function of this project that uses scalars, tuples and ``math``.
         exact: Give the very bits that Python gives; else a fused multiply-add may change the last one.
-        inline: Write each function into its caller: machine code that is told no functions can be kept on disk.
+        inline: Inline each function: machine code without function arguments can be cached on disk.
         substitutes: Modules that are found in the place of those that the functions name.
         within: Compiled functions alone call it, as they do what it calls.
     """
@@ -59,7 +59,7 @@ def compile_tree(
         # Of fastmath nothing but contraction is allowed. C code calls none of these: a wrapper for it would only cost
         # time to compile.
         allowed = False if exact else {"contract"}
-        # Arrays are lent to what loops run: nobody there counts who holds them, as numba would in a law with a loop.
+        # Loops borrow their arrays; without the option numba would count references in a law with a loop.
         wrappers = WITHIN if within else {"no_cfunc_wrapper": True}
         options = {"fastmath": allowed, "error_model": "numpy", "forceinline": inline, "_nrt": not exact}
         _cache[key] = numba.njit(copy, **wrappers, **options)
@@ -67,11 +67,10 @@ def compile_tree(
 
 
 def compile_to_tell(function: Callable[..., Any]) -> Any:
-    """Return a function, compiled by :func:`compile_tree`, for compiled functions to call or to be told.
+    """Return a function, compiled by :func:`compile_tree`, for compiled functions to call or to take as an argument.
 
-    Numba tells a compiled function by its address in this process, and machine code with addresses is not kept on
-    disk, unless each function that is told it is written into its caller: much to compile. What this returns is told by
-    its type alone.
+    Numba passes a compiled function by its address in this process, and machine code with addresses cannot be cached on
+    disk unless each function that takes one is inlined: much to compile. What this returns is passed by its type alone.
     """
     compiled = compile_tree(function)
 
@@ -88,7 +87,7 @@ def tuple_loader(length: int, stride: int) -> Any:
     """Return a compiled function (array, start) -> (array[start], array[start + stride], ...).
 
     Args:
-        length: Values to load, >= 1; compiled code needs to know it.
+        length: Values to load, >= 1; a constant of the compiled code.
         stride: Distance between two of them.
     """
     if length == 1:

@@ -22,7 +22,7 @@ from pendulum_msgs_py.parameters import ParameterSpec
 __all__ = ["FURUTA"]
 
 _SLENDER = 1e-9
-"""Share of a slender rod's inertia that file formats want about its own axis."""
+"""Share of a slender rod's inertia that file formats require about its own axis."""
 
 
 def forward(q: Any, v: Any, torque: Any, p: Any) -> Any:

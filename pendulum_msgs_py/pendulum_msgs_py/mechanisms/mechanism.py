@@ -15,7 +15,7 @@ STANDARD_GRAVITY = 9.81
 """Acceleration of gravity where a plant file gives none [m/s^2]."""
 
 Point = tuple[float, float, float]
-"""x to the right, y away from who looks, z up [m]."""
+"""x to the right, y away from the viewer, z up [m]."""
 
 
 def positive(name: str, default: float, unit: str, description: str) -> ParameterSpec:

@@ -38,7 +38,7 @@ def potential(q: Any, p: Any) -> Any:
 
 
 def _shape(p: Any) -> tuple[float, float]:
-    """Return mass and length of a bob with nine tenths of the inertia: the file says M and G, not what they are of."""
+    """Return mass and length of a bob with nine tenths of the inertia: the file has M and G only."""
     at_bob = _BOB_SHARE * p[0]
     length = at_bob * STANDARD_GRAVITY / p[1] if p[1] > 0.0 else _FLAT_LENGTH
     return at_bob / length**2, length

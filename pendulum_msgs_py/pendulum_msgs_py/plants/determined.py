@@ -1,4 +1,4 @@
-"""Does a plant file know its plant? Intervals over orders of magnitude, or from nothing up, determine no design."""
+"""Whether a plant file determines its plant: intervals from zero up, or over orders of magnitude, allow no design."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPAN = 10.0
 """Upper end over estimate, or over lower end of a size, from which on an interval determines no more than an order."""
 
 _LONGEST = 1.0
-"""Width of the interval of a time from which on it says nothing about a drive [s]."""
+"""Width of the interval of a time from which on it does not determine a drive [s]."""
 
 _OVERDAMPED = 2.0
 """Damping ratio beyond which the inertia of a pendulum is a fast lag behind its damping, which decides instead."""
@@ -71,7 +71,7 @@ def undetermined(
 
 
 def require_determined(preset_or_path: str | Path) -> None:
-    """Refuse a plant file whose own intervals say that it does not know the plant.
+    """Refuse a plant file whose own intervals do not determine the plant.
 
     Raises:
         ParameterError: An interval holds 0 or spans orders of magnitude where that matters; or as ``load_plant``.

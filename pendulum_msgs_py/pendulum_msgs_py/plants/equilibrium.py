@@ -40,7 +40,7 @@ __all__ = [
 
 
 class RigidPlant(Protocol):
-    """What is asked of a plant at least; ``PlantParameters`` has it, and where it has more, that counts too."""
+    """The least that a plant has to have; what ``PlantParameters`` adds to it is used where present."""
 
     @property
     def inertia(self) -> float:
@@ -89,7 +89,7 @@ def resistance_of(drive: SeriesElasticParameters) -> float:
 
 
 def command_pwm(torque: Any, drive: SeriesElasticParameters) -> Any:
-    """Return the duty that answers a torque command [N m], a number, also a complex one, or an array [-]."""
+    """Return the duty for a torque command [N m], a number, also a complex one, or an array [-]."""
     return feedforward_pwm(
         torque,
         drive.supply_voltage,
@@ -103,7 +103,7 @@ def command_pwm(torque: Any, drive: SeriesElasticParameters) -> Any:
 def torque_gain(plant: RigidPlant) -> float:
     """Return the torque at the link per commanded torque, at rest [-]; 1 for a rigid plant.
 
-    A series-elastic actuator without an effort loop answers with R(20 degC) / (R(T) eta) times what is asked for: the
+    A series-elastic actuator without an effort loop applies R(20 degC) / (R(T) eta) times the commanded torque: the
     command is divided by the efficiency, and the simulated gears lose their share as friction and not by it.
 
     Args:
@@ -156,7 +156,7 @@ def held_torque(plant: RigidPlant, theta: float) -> float:
         plant: Plant parameters.
         theta: Measured angle, 0 hanging down [rad].
     """
-    # sin(math.pi) is 1.2e-16, not 0: upright must not ask for a torque.
+    # sin(math.pi) is 1.2e-16, not 0: upright must not need a torque.
     angle = theta - offset_of(plant, "angle_offset")
     weight = 0.0 if angle == UPRIGHT else gravity_torque(angle, plant.gravity)
     return weight - offset_of(plant, "torque_offset")

@@ -5,8 +5,8 @@
     F(v) = (tau_C + a) + (tau_S - tau_C) exp(-(v / v_s)^2),   a = sum of the magnitudes of the terms at |v|
     F    = tau_S + a(0)                                       at rest
 
-A line of ``FRICTION_TERMS`` gives a plant its parameters, with unit and default, in plant files, tables and help. The
-simulators, single and in batches, the emulated actuator, the designs' friction and ``identify`` all ask
+A line of ``FRICTION_TERMS`` defines a plant's parameters, with unit and default, in plant files, tables and help. The
+simulators, single and in batches, the emulated actuator, the designs' friction and ``identify`` all call
 :func:`added_friction` for the sum of them.
 """
 
@@ -126,5 +126,5 @@ def without_terms() -> dict[str, float]:
 
 
 def modules() -> list[ModuleType]:
-    """Return the modules that the terms come from: who keeps machine code of them looks at their age."""
+    """Return the modules of the terms; caches of machine code compare their age."""
     return [sys.modules[name] for name in {__name__, *(term.magnitude.__module__ for term in FRICTION_TERMS.values())}]

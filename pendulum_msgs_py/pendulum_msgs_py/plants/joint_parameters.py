@@ -56,13 +56,13 @@ class JointParameters:
 
 @cache
 def joint_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
-    """Return the table of what a plant file may say of a joint, in its units."""
+    """Return the table of a joint's entries in a plant file, in its units."""
     return _in_units_of(joint, JointParameters)
 
 
 @cache
 def actuator_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
-    """Return the table of what a plant file may say of a joint's actuator, in its units."""
+    """Return the table of an actuator's entries in a plant file, in its joint's units."""
     return _in_units_of(joint, Actuator)
 
 
@@ -71,11 +71,11 @@ def _in_units_of(joint: Joint, kind: type) -> tuple[ParameterSpec, ...]:
 
 
 def read_joint(joint: Joint, entry: object, where: str) -> tuple[JointParameters, dict[str, list[float]]]:
-    """Return what a plant file says of a joint, and the intervals in it by name.
+    """Return a joint's entries in a plant file, and the intervals in them by name.
 
     Args:
-        joint: Which one.
-        entry: What stands there.
+        joint: The joint.
+        entry: The entry as parsed.
         where: Prefix of messages.
 
     Raises:

@@ -1,7 +1,7 @@
-"""The lab file: which actuator stands in a lab and how it is mounted, limited, driven and fed, said once.
+"""The lab file: which actuator stands in a lab and how it is mounted, limited, driven and fed, stated once.
 
 Bridge, checklist, scan, guided procedures, launch files and experiments read the same file. Each value stands with its
-unit, and an entry that nobody knows is refused::
+unit, and an unknown entry is refused::
 
     format: pendulum_lab/1
     module: {backend: hebi, family: Lab, name: Pendulum, serial: X5-9-00123, type: X5-9}
@@ -12,9 +12,9 @@ unit, and an entry that nobody knows is refused::
       effort: {value: 5.0, unit: N m}
     proofs: {...}          # written by the guided procedures
 
-An entry is a parameter of the bridge under a name that a person would give it; what values are allowed says the
-bridge's own table. To the bridge, 0 (or a window with equal ends) often stands for no limit or a default. Who writes
-it means the opposite, so that a lab file leaves such an entry out. Text that is a path is taken from the file's folder.
+An entry is a parameter of the bridge under a descriptive name; the bridge's own table has the allowed values. To the
+bridge, 0 (or a window with equal ends) often stands for no limit or a default, which is not what such an entry
+suggests: a lab file leaves it out. Text that is a path is relative to the file's folder.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ __all__ = [
 
 FORMAT = "pendulum_lab/1"
 EMULATED_BACKENDS = frozenset({"emulator", "emulator_process"})
-"""Backends of the bridge behind which a pendulum is emulated: it may be pushed, and started again with nobody asked.
+"""Backends of the bridge behind which a pendulum is emulated: it may be pushed, and restarted without a prompt.
 Any other name is a machine, since what is taken for an emulator by mistake moves by itself."""
 EMULATED_NETWORK = "emulator:"
 """What ``interface`` begins with where backend ``hebi`` finds emulators in place of modules: ``emulator:HOST:PORT``."""
@@ -61,8 +61,8 @@ class LabEntry:
         parameter: Parameter of the bridge that it sets.
         unit: SI unit; with one, the entry is written ``{value: ..., unit: ...}``.
         kind: Type of the value: ``float``, ``int``, ``str``, or ``list`` of numbers.
-        path: Whether the text may be a path, which counts from the lab file's folder.
-        left_out: What is without the entry, where the bridge's parameter says so with 0; 0 and less are then refused.
+        path: Whether the text may be a path, relative to the lab file's folder.
+        left_out: Meaning of a missing entry, which the bridge's parameter codes as 0; 0 and less are then refused.
     """
 
     parameter: str
@@ -118,7 +118,7 @@ LAB_ENTRIES: Mapping[str, Mapping[str, LabEntry]] = {
         "voltage_window": LabEntry("voltage_window", "V", list),
     },
 }
-"""What a lab file may say, by section and entry."""
+"""The entries of a lab file, by section."""
 
 _TOP = ("format", "name", "notes", *LAB_ENTRIES, "proofs")
 _KINDS = {float: "a number", int: "an integer", str: "text", list: "a list of numbers"}

@@ -345,7 +345,7 @@ def _read_document(document: Mapping[str, Any], path: Path) -> tuple[MechanismPa
     where = str(path)
     reject_unknown(document, ("format", "name", "model", "parameters", "joints", "provenance"), where=where)
     model = document.get("model")
-    # Lists and mappings are no names, and no keys to look up either.
+    # Lists and mappings are neither names nor hashable.
     if not isinstance(model, str) or model not in MECHANISMS:
         given = "missing" if model is None else repr(model)
         raise ParameterError(f"{where}: model is {given}; {suggestion(model, MECHANISMS)}")

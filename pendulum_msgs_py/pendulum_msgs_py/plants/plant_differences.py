@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 PLANT_PARAMETERS = "plant_parameters"
-"""Key in a plant's diagnostics under which it says what it is."""
+"""Key of a plant's description in its diagnostics."""
 _SAME = 1e-3
 """Relative difference of a value up to which it is the same, written with fewer digits."""
 
@@ -107,12 +107,12 @@ def _joint_differences(designed: AnyPlant, running: AnyPlant) -> tuple[PlantDiff
 
 
 def plant_mismatch(designed: AnyPlant, running: Sequence[AnyPlant]) -> str:
-    """Return in words how the plant that runs is not the one designed for, or nothing where it is.
+    """Return as text how the running plant differs from the one designed for; empty where it does not.
 
     Args:
         designed: The plant designed for.
         running: Descriptions of the one plant that runs, such as a machine with its drivetrain and the rigid plant
-            that experiments on it give; one that fits is enough, and the closest is told of. Empty: nothing is known.
+            that experiments on it give; one match is enough, else the closest is reported. Empty: nothing is known.
     """
     if not running:
         return ""
@@ -127,7 +127,7 @@ def plant_mismatch(designed: AnyPlant, running: Sequence[AnyPlant]) -> str:
 
 
 def describe_plants(plants: Sequence[AnyPlant]) -> str:
-    """Return what a plant says that it is, one description or several, as text for its diagnostics."""
+    """Return a plant's descriptions, one or several, as text for its diagnostics."""
     return json.dumps([_as_mapping(plant) for plant in plants], separators=(",", ":"))
 
 

@@ -191,7 +191,7 @@ class PlantParameters(_FrictionTerms):
     def with_values(self, **changes: Any) -> PlantParameters:
         """Return a copy with some values changed, checked again.
 
-        A static friction that is the Coulomb friction follows it: nobody asked for a plant that sticks harder.
+        A static friction equal to the Coulomb friction follows it: otherwise a change would add stiction.
         """
         if "coulomb_friction" in changes and self.static_friction == self.coulomb_friction:
             changes = {"static_friction": None, **changes}

@@ -137,7 +137,7 @@ def write_quantities(
 
 
 def build_plant(kind: type[Any], parts: Mapping[str, Any], where: str) -> Any:
-    """Return what a file describes, or say in which file it is refused."""
+    """Return what a file describes; an error names the file."""
     try:
         return kind(**parts)
     except ParameterError as error:

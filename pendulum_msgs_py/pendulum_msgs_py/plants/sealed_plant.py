@@ -1,6 +1,6 @@
-"""A plant file for an exercise: simulators run it, and nobody reads its parameters at a glance.
+"""A plant file for an exercise: simulators run it, and its parameters are not readable at a glance.
 
-The seal is packing, not encryption. It keeps an honest student from seeing the answer by accident.
+The seal is packing, not encryption. It prevents a student from seeing the solution by accident.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def seal_plant(parameters: PlantParameters) -> str:
 
 
 def load_plant_to_run(preset_or_path: str | Path) -> tuple[PlantParameters, bool]:
-    """Return the parameters for a simulator, and whether they are sealed, which means that nobody may be told.
+    """Return the parameters for a simulator, and whether they are sealed, so that they must not be shown.
 
     Args:
         preset_or_path: A preset, a plant file or a sealed plant file.

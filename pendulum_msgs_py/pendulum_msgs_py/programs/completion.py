@@ -1,8 +1,8 @@
 """Completion of command lines in bash and zsh: ``source <(python -m pendulum_bags --completion bash)``.
 
 Programs are started as ``python -m PACKAGE EXECUTABLE``, which no library for command lines completes: the shell sees a
-program named python. So the script that is printed here sends what was typed to the program itself, marked by an
-environment variable, and the program answers with what may follow instead of running.
+program named python. The printed script therefore passes the typed words to the program itself, marked by an
+environment variable, and the program prints what may follow instead of running.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ SHELLS = ("bash", "zsh")
 
 
 def asked() -> bool:
-    """Return whether the shell wants to know what may follow."""
+    """Return whether the shell requests completions."""
     return bool(os.environ.get(VARIABLE))
 
 
@@ -81,7 +81,7 @@ def script(shell: str) -> str:
     """
     if shell not in SHELLS:
         raise ParameterError(f"shell is {shell!r}; expected one of {', '.join(SHELLS)}")
-    # Imported late: every program asks this module whether a shell wants an answer, and few print a script.
+    # Imported late: every program imports this module, and few print a script.
     from importlib.metadata import distributions
 
     names = {str(found.metadata["Name"]).replace("-", "_") for found in distributions()}
@@ -126,7 +126,7 @@ def of_command(command: Any, words: Sequence[str]) -> list[str]:
     if below and not incomplete.startswith("-"):
         return _beginning(sorted(below), incomplete)
     if not incomplete.startswith("-"):
-        return []  # an argument: files, which the shell knows
+        return []  # an argument: files, which the shell completes
     named = [name for option in options for name in (*option.opts, *option.secondary_opts)]
     return _beginning(sorted({*named, "--help"}), incomplete)
 

@@ -48,7 +48,7 @@ def counting_bar(console: Console, *columns: ProgressColumn) -> Progress:
 def results_at_once(
     console: Console, unit: str, jobs: Sequence[Callable[[], _Result]], workers: int = 0
 ) -> list[_Result]:
-    """Return what each job returns, run in processes of their own beside a counting bar.
+    """Return what each job returns, run in processes of their own, with a progress bar.
 
     Args:
         console: Where to draw.

@@ -46,15 +46,15 @@ __all__ = [
 ]
 
 EXIT_USAGE = 2
-"""Exit code of a program that was asked for something it cannot do."""
+"""Exit code of a program whose arguments or request are invalid."""
 
 
 class _Told(int):
-    """An exit code of a program that has said itself why it ends."""
+    """An exit code of a program that has printed the reason itself."""
 
 
 EXIT_INTERRUPTED = _Told(130)
-"""Exit code after Ctrl-C, by the shell's convention of 128 + SIGINT; who returns it has said that and what is left."""
+"""Exit code after Ctrl-C, by the shell's convention of 128 + SIGINT; printed already, with what is left."""
 
 
 def run_package(package: str, argv: Sequence[str] | None = None) -> int:
@@ -79,13 +79,13 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
 def answer_of_dispatcher(
     arguments: Sequence[str], names: Collection[str], *, usage: Callable[[], str], unknown: Callable[[str], str]
 ) -> int | None:
-    """Answer what a command that only starts others answers itself: completion, help, a name that is not known.
+    """Handle what a dispatching command does itself: completion, help, an unknown name.
 
     Args:
         arguments: All of the command's.
         names: Programs that it starts.
         usage: Returns its help.
-        unknown: Returns what to say of a name that is none of these.
+        unknown: Returns the message for a name that is none of these.
 
     Returns:
         The exit code; None where the first argument is the name of a program to start.
@@ -128,7 +128,7 @@ def run_program(target: str, arguments: Sequence[str], *, called_as: str = "") -
         main = getattr(importlib.import_module(module_name), function_name)
         return int(main(list(arguments)) or 0)
     except KeyboardInterrupt:
-        # Ctrl-C while the modules are still loading: nothing runs yet that could say so itself.
+        # Ctrl-C while the modules are still loading: no command runs yet that could report it.
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except Exception as error:
@@ -142,7 +142,7 @@ _called_as: list[str] = []
 
 
 def print_completion(arguments: Sequence[str]) -> int:
-    """Print what a shell is to source, as ``--completion [SHELL]`` asks; return the exit code."""
+    """Print the script of ``--completion [SHELL]`` for a shell to source; return the exit code."""
     try:
         print_text(completion.script(arguments[0] if arguments else "bash"))
     except PendulumError as error:
@@ -167,7 +167,7 @@ def cli_main(
         name: Program name for the help text, such as ``python -m pendulum_lqr design``.
         takes_ros_arguments: Arguments from ``--ros-args`` on belong to ROS; the command finds them in ``context.obj``.
     """
-    # Once more: a console script calls us, and nothing else of this module.
+    # Once more: a console script calls this function only.
     keep_interrupts()
     # Imported late: a node that has no command line should not pay for typer and rich.
     import typer.main
@@ -186,7 +186,7 @@ def cli_main(
     try:
         prog_name = (_called_as and _called_as[-1]) or (name and as_typed(name))
         result = command.main(args=own, prog_name=prog_name, standalone_mode=False, obj=ros)
-        # What is still buffered would else meet a broken pipe at exit, where nobody can catch it.
+        # Otherwise a broken pipe would raise at exit, where it cannot be caught.
         sys.stdout.flush()
     except PendulumError as error:
         return report_error(error)
@@ -206,18 +206,18 @@ def cli_main(
         _discard_output()
         return 0
     except SystemExit as stop:
-        # click turns a broken pipe into exit code 1, also where it should leave exits to us.
+        # click turns a broken pipe into exit code 1, also in standalone_mode=False.
         if isinstance(stop.__context__, BrokenPipeError):
             _discard_output()
             return 0
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     except OSError as error:
-        # A path that was asked for; any other is a defect, which its traceback tells.
+        # Only errors of a path are the user's; any other is a defect and needs its traceback.
         if error.errno not in _OF_A_PATH:
             raise
         where = f"{os.fsdecode(error.filename)} cannot be read or written: " if error.filename else ""
         return report_error(ParameterError(f"{where}{error.strerror}"))
-    # typer makes a bare 130 of Ctrl-C, of which nobody has told yet.
+    # typer turns Ctrl-C into a bare 130, which has not been reported yet.
     if result == EXIT_INTERRUPTED and not isinstance(result, _Told):
         print("interrupted", file=sys.stderr)
     return int(result) if isinstance(result, int) else 0
@@ -226,7 +226,7 @@ def cli_main(
 def _refuse_repeats(command: Any) -> None:
     """Let a command and its subcommands refuse an option that is given twice but counts once.
 
-    Click takes the last without a word: whoever overlooked the first would get another result than they asked for.
+    Click silently takes the last one, so that an overlooked first one would have no effect.
     """
     for one in getattr(command, "commands", {}).values():
         _refuse_repeats(one)
@@ -238,7 +238,7 @@ def _refuse_repeats(command: Any) -> None:
 
         def parse_once(args: list[str]) -> Any:
             values, left, order = parse(args)
-            # Whoever asks for help gets it, and a flag that cannot be taken back says the same once more.
+            # Help may be repeated, and so may a flag without a negative form.
             counted_once = [] if any(option.name == "help" for option in order) else order
             for option in counted_once:
                 count = order.count(option)
@@ -261,7 +261,7 @@ def _complete_help(command: Any) -> None:
 
 
 def _one_name(name: str) -> str:
-    """Return the name that we have for an option: ``--output`` of ROS 2's own tools is ``--out`` here, not in helps."""
+    """Return the option's name here: ``--output``, as in ROS 2's own tools, is ``--out``; helps omit the alias."""
     return "out" if name == "output" else name
 
 
@@ -274,7 +274,7 @@ def print_text(text: str) -> None:
 
 
 def _discard_output() -> None:
-    """Send what is still buffered nowhere: the reader of our output has gone, nothing is left to say."""
+    """Send what is still buffered nowhere: the reader of the output has gone."""
     with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
@@ -301,14 +301,14 @@ def report_error(error: BaseException) -> int:
 
 
 def is_exhaustion(error: BaseException) -> bool:
-    """Return whether an error says, in one library's words or another's, that memory is exhausted."""
+    """Return whether an error of any library means that memory is exhausted."""
     return isinstance(error, MemoryError) or any(sign in str(error) for sign in _SIGNS_OF_EXHAUSTION)
 
 
 def report_exhaustion(error: BaseException) -> int:
-    """Say in one sentence that a limit of the process's memory was met, and return exit code 1; 0 for other errors.
+    """Print that a limit of the process's memory was met, and return exit code 1; 0 for other errors.
 
-    Under a limit it is chance who meets it: Python, the loader of a library, or a library that starts a thread.
+    Under a limit the error comes from Python, the loader of a library, or a library that starts a thread.
     """
     if not is_exhaustion(error):
         return 0
@@ -319,7 +319,7 @@ def report_exhaustion(error: BaseException) -> int:
 
 
 def report_missing(error: BaseException) -> int:
-    """Say in one sentence which library is missing and how to get it; return the exit code, 0 for other errors."""
+    """Print which library is missing and how to install it; return the exit code, 0 for other errors."""
     text = how_to_install(error) if isinstance(error, ImportError) else ""
     return report_error(ParameterError(text)) if text else 0
 
@@ -339,7 +339,7 @@ _OF_A_PATH = frozenset(
         errno.ELOOP,
     }
 )
-"""What the file system answers to a path that it cannot serve."""
+"""Error numbers of the file system for a path that it cannot serve."""
 _SIGNS_OF_EXHAUSTION = (
     "failed to map segment",
     "annot allocate memory",
@@ -355,14 +355,14 @@ _DOCSTRING = re.compile(r'(?:\s*#.*\n)*\s*"""(.*?)(?:"""|\n)')
 
 
 def summary(name: str, target: str) -> str:
-    """Return what a program is for: the first line of its module's docstring, read without importing the module.
+    """Return a program's summary: the first line of its module's docstring, read without importing the module.
 
     Args:
-        name: The program; where the line speaks of several (```one``: this; ``other``: that``), its part is returned.
+        name: The program; where the line covers several (```one``: this; ``other``: that``), its part is returned.
         target: Its entry point, ``module:function``.
     """
     top, *rest = target.partition(":")[0].split(".")
-    # By its file: to ask for the module would import the packages that it is in.
+    # By its file: finding the module would import its packages.
     spec = importlib.util.find_spec(top)
     folders = [] if spec is None else list(spec.submodule_search_locations or [])
     files = [path for folder in folders if (path := Path(folder, *rest).with_suffix(".py")).is_file()]

@@ -47,17 +47,17 @@ def extra_of(module: str) -> str:
 
 
 def how_to_install(error: ImportError) -> str:
-    """Return a sentence that says which library is missing and how to get it, or where a module of ours is now.
+    """Return a sentence with the missing library and how to install it, or the new place of an own module.
 
     Args:
         error: What an import of it raised.
 
     Returns:
-        Empty where the library is none that a package of ours names.
+        Empty where no package of this project names the library.
     """
     module = error.name if isinstance(error, ModuleNotFoundError) else None
     if module and (package := module.partition(".")[0]) in _PACKAGES and (place := _place_of(package)) is not None:
-        # It is there; a module of it is not, which whoever imports it knows by the name of an earlier version.
+        # The package is installed; the import uses a module's name of an earlier version.
         now = sorted(
             f"{package}.{path.parent.name}.{path.stem}" for path in place.glob(f"*/{module.split('.')[-1]}.py")
         )

@@ -21,9 +21,9 @@ _under_way = 0
 
 @contextmanager
 def hang_guard() -> Iterator[None]:
-    """End the process with exit code 1, and say where it stood, if this context is not left within 5 s.
+    """End the process with exit code 1 and print its stacks if this context is not left within 5 s.
 
-    No signal does that while a library keeps Python's lock. Whatever is to be made safe, or written, comes before.
+    No signal does that while a library holds the GIL. Make the plant safe and write files before.
     """
     global _under_way  # noqa: PLW0603  # the watchdog is one for the process
     _watch()

@@ -1,4 +1,4 @@
-"""Whatever asks a program to end interrupts it as Ctrl-C does, and no such request is lost."""
+"""Every request to end a program interrupts it as Ctrl-C does, and none is lost."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def keep_interrupts() -> None:
     A program that dies of a closed terminal leaves plants armed and bags open; one that ``nohup`` started ignores it.
 
     Without job control, as in a script, a shell starts what it puts into the background with SIGINT ignored. Python
-    leaves that as it is, and hands it on to all that it starts. An experiment would then go on, plants armed, whoever
-    asks it to stop, and a child that is asked to end before it has a handler of its own would run on.
+    leaves that as it is, and passes it on to its children. An experiment would then run on, plants armed, whatever
+    requests its end, and so would a child that is interrupted before it has a handler of its own.
     """
     in_main = threading.current_thread() is threading.main_thread()
     if in_main:

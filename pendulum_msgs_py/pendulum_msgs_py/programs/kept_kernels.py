@@ -1,7 +1,7 @@
-"""Keeps what numba compiles on disk, so that a program that starts again need not compile for seconds.
+"""A cache on disk of what numba compiles, so that a restarted program need not compile for seconds.
 
-Numba's own ``cache=True`` knows a function by its file alone. Kernels here are made of functions from several files,
-for a method or a mechanism: they are known by that choice and by all source of the packages that they come from.
+Numba's own ``cache=True`` identifies a function by its file alone. Kernels here are made of functions from several
+files, for a method or a mechanism: their key is that choice and all source of the packages that they come from.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ _COUNTED = re.compile(rb"B\dv\d{1,8}B")
 def name_symbols_apart() -> None:
     """Number what numba compiles at random from here on.
 
-    Numba counts, from 1 in each process, to tell functions of one name apart: functions made anew for each method or
-    mechanism. Of two processes each may keep another function under one symbol; who loads both is linked to the first
-    for all, and gets wrong numbers or writes where it must not (numba, issue 10486). A child by ``fork`` would go on
-    with its parent's count.
+    Numba numbers functions of one name from 1 in each process: those made again for each method or mechanism. Two
+    processes may cache different functions under one symbol; a process that loads both is linked to the first for all,
+    and gets wrong numbers or invalid writes (numba, issue 10486). A child by ``fork`` would continue its parent's
+    numbers.
     """
     identity = sys.modules["numba.core.bytecode"].FunctionIdentity
     identity._unique_ids = iter(partial(secrets.randbits, 64), None)
 
 
 def keep_kernel(dispatcher: Any, name: str, *choice: object) -> Any:
-    """Return a compiled function that looks on disk for its machine code first, and leaves it there.
+    """Return a compiled function that loads its machine code from disk, or stores it there.
 
     Args:
         dispatcher: What ``numba.njit`` returned. Of the project's functions it may call those of its own package and of
             ``pendulum_msgs_py``.
-        name: What the kernel is called; no other one of its package is called so.
+        name: The kernel's name, unique in its package.
         choice: All that the function was made for: functions that it calls, by their code, the rest by ``repr``.
     """
     with contextlib.suppress(RuntimeError):  # there is no folder to write to: it compiles each time
@@ -66,7 +66,7 @@ class KernelStore:
     """
 
     def __init__(self, function: Any, name: str, choice: tuple[object, ...]) -> None:
-        # Who has something compiled has numba; this package needs none otherwise.
+        # A program that compiles has numba installed; this package needs none otherwise.
         self._numba = sys.modules["numba.core"]
         name_symbols_apart()
         self._folder = Path(self._numba.caching.CompileResultCacheImpl(function).locator.get_cache_path())
@@ -83,14 +83,14 @@ class KernelStore:
         return str(self._folder)
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """Return the kernel for these types of arguments; None where none was kept, or what was is damaged."""
+        """Return the kernel for these types of arguments; None where none is cached, or it is damaged."""
         target.refresh()
         # Whatever a damaged file holds, compiling again mends it.
         with contextlib.suppress(OSError, ValueError, EOFError, pickle.UnpicklingError):
             head, _, content = self._path(signature, target.codegen()).read_bytes().partition(b"\n")
             # Of other source it is not even read: what it names may be gone.
             if head == self._head(content):
-                payload = pickle.loads(content)  # noqa: S301  (our own, as the compiled modules beside it)
+                payload = pickle.loads(content)  # noqa: S301  (our own, as the compiled modules next to it)
                 return self._numba.compiler.CompileResult._rebuild(target, *payload)
         return None
 
@@ -150,13 +150,13 @@ def _source_of(package: str) -> str:
 
 
 def drop_stale_code(kernel: Any, modules: Iterable[ModuleType]) -> None:
-    """Delete what numba's own ``cache=True`` keeps of a kernel where it is older than what the kernel calls.
+    """Delete numba's own cache of a kernel where it is older than what the kernel calls.
 
-    Numba looks at the kernel's own file only; without this an edited equation would be ignored in silence.
+    Numba checks the kernel's own file only; an edited equation would be ignored silently.
 
     Args:
         kernel: The compiled function.
-        modules: Those whose functions and tables it was compiled from, beside its own.
+        modules: Those whose functions and tables it was compiled from, besides its own.
     """
     folder = getattr(getattr(kernel, "_cache", None), "cache_path", None)
     if folder is None or not Path(folder).is_dir():

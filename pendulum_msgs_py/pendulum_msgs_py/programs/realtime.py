@@ -32,20 +32,19 @@ NO_REALTIME = "PENDULUM_NO_REALTIME"
 
 
 def run_in_real_time(priority: int) -> None:
-    """Run this process before every ordinary one: all its threads, and those that they will start (``SCHED_FIFO``).
+    """Give all threads of this process, and those that they will start, real-time priority (``SCHED_FIFO``).
 
-    The thread that calls goes one behind the others: among equals nobody interrupts whoever runs, and on a single core
-    an e-stop's thread would wait until a loop that is busy is no longer.
+    The calling thread gets one less than the others: equals do not preempt each other, and on a single core an e-stop's
+    thread would wait for a busy loop to end.
 
-    The middleware's threads too, since a torque that waits for them is as late as one that waits for Python. Processes
-    that they start would have it as well: start those :func:`as_ordinary`. (``SCHED_RESET_ON_FORK`` takes it from new
-    threads too.)
+    The middleware's threads too, since a torque that waits for them is late too. Start child
+    processes :func:`as_ordinary`, else they inherit it. (``SCHED_RESET_ON_FORK`` would take it from new threads too.)
 
     Args:
-        priority: 1 to 99, a higher one goes first; 0 leaves everything as it is; -1 is 50 where this user may have it.
+        priority: 1 to 99, a higher one goes first; 0 changes nothing; -1 is 50 where this user may have it.
 
     Raises:
-        ParameterError: This user may not have it, or this system knows no such priority.
+        ParameterError: This user may not have it, or this system has no such priority.
     """
     if priority < 0:
         priority = 0 if os.environ.get(NO_REALTIME) or not may_run_in_real_time(_AHEAD) else _AHEAD
@@ -63,7 +62,7 @@ def run_in_real_time(priority: int) -> None:
 
 
 def thread_numbers() -> set[int]:
-    """Return the kernel's numbers of this process's threads; none where it does not tell."""
+    """Return the kernel's numbers of this process's threads; empty where it has no list of them."""
     return {int(task.name) for task in _TASKS.iterdir()} if _is_known() else set()
 
 
@@ -98,10 +97,10 @@ def may_run_in_real_time(priority: int) -> bool:
 
 @contextlib.contextmanager
 def as_ordinary() -> Iterator[None]:
-    """Let this thread, and the processes that it starts, be ordinary ones meanwhile: for work that takes its time.
+    """Run this thread, and the processes that it starts, at normal priority meanwhile: for lengthy work.
 
-    Who computes in real time for a second keeps all ordinary programs off a core until the kernel gives them 50 ms of
-    it, and these it takes from a plant on that core as well.
+    A thread that computes in real time for a second blocks all normal programs of its core until the kernel gives them
+    50 ms, which a plant on that core then misses.
     """
     with priority_kept():
         if _is_known() and os.sched_getparam(0).sched_priority:
@@ -111,7 +110,7 @@ def as_ordinary() -> Iterator[None]:
 
 @contextlib.contextmanager
 def priority_kept() -> Iterator[None]:
-    """Give this thread back at the end what it has now: what runs in it then has not asked for real time."""
+    """Restore this thread's scheduling on exit: the code that follows has not requested real time."""
     if not _is_known():
         yield
         return
@@ -120,13 +119,13 @@ def priority_kept() -> Iterator[None]:
         yield
     finally:
         if (os.sched_getscheduler(0), os.sched_getparam(0)) != before:
-            # Who has lost the right meanwhile goes on without.
+            # A process that has lost the right meanwhile continues without.
             with contextlib.suppress(OSError):
                 os.sched_setscheduler(0, *before)
 
 
 def _is_known() -> bool:
-    """Return whether this system has such priorities, and tells us our threads."""
+    """Return whether this system has such priorities, and lists a process's threads."""
     return hasattr(os, "sched_setscheduler") and _TASKS.is_dir()
 
 

@@ -4,7 +4,7 @@
 (https://design.ros2.org/articles/ros2_access_control_policies.html). What a node needs is stated here once, from the
 names that the nodes themselves use; a test compares it with what the nodes do on a running graph.
 
-The player of recordings has no permissions: it says again whatever a bag holds, and belongs on a domain without plants.
+The player of recordings has no permissions: it republishes all of a bag, and belongs on a domain without plants.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ _WATCHED = (names.APPLIED_EFFORT, names.EFFORT_COMMAND, names.DISTURBANCE, names
 
 @dataclass(frozen=True)
 class Permissions:
-    """What one node may do.
+    """The topics and services that one node may use.
 
     In :data:`NODES` names are as the node writes them: relative, private (``~/``) or absolute, and with placeholders
-    where a node has to do with several others; :func:`granted` writes them out.
+    where a node connects to several others; :func:`granted` writes them out.
 
     Attributes:
-        publish: Topics that it may speak on.
-        subscribe: Topics that it may hear.
+        publish: Topics that it may publish.
+        subscribe: Topics that it may subscribe to.
         reply: Services that it may offer.
         request: Services that it may call.
     """
@@ -254,7 +254,7 @@ def granted(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[s
             for rule in fields(full)
         }
         me = _resolve(node, "", here)
-        # A node does not ask itself for its parameters.
+        # A node does not call its own parameter services.
         entries["request"] = {name for name in entries["request"] if name.rpartition("/")[0] != me}
         answer[me] = Permissions(**{rule: tuple(sorted(found)) for rule, found in entries.items()})
     return answer

@@ -1,7 +1,7 @@
 """Tables whose figures are never cut, on a terminal of any width and in a file.
 
-Rich shortens a cell that finds no room to an ellipsis, and takes a pipe for a terminal of 80 columns. ``11.7…`` is no
-figure, so every program of ours prints through :func:`make_console` and :class:`WholeTable`.
+Rich shortens a cell that does not fit to an ellipsis, and takes a pipe for a terminal of 80 columns. ``11.7…`` is no
+figure, so every program prints through :func:`make_console` and :class:`WholeTable`.
 """
 
 from __future__ import annotations
