@@ -34,6 +34,7 @@ __all__ = [
     "require_mapping",
     "suggestion",
     "validate",
+    "xacro_hint",
 ]
 
 ParameterValue: TypeAlias = bool | int | float | str | list[float] | list[str]
@@ -311,6 +312,9 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
         ParameterError: The file is missing, not text, not YAML (with line and column), or holds no mapping.
     """
     text = read_text(path, what)
+    if text.lstrip().startswith("<"):
+        way = xacro_hint(path, text) or "`pendulum experiment --simulation FILE` takes a URDF or MJCF model"
+        raise ParameterError(f"{what} {path} is XML; expected YAML ({way})")
     try:
         return require_mapping(copy.deepcopy(_parse_yaml(text)), f"{what} {path}")
     except yaml.MarkedYAMLError as error:
@@ -322,6 +326,15 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
             raise
         sentence = " ".join(str(error).split())
         raise ParameterError(f"{what} {path} is not YAML: {sentence}") from error
+
+
+def xacro_hint(path: str | Path, text: str) -> str:
+    """Return how a source for xacro becomes a model that ``--simulation`` takes; nothing for another text."""
+    name = Path(path).name
+    if "xmlns:xacro" not in text and not name.endswith(".xacro"):
+        return ""
+    made = f"xacro {name} > {name.split('.')[0]}.urdf (without ROS: pip install xacro)"
+    return f"it is a source for xacro; --simulation takes the URDF that it makes: {made}"
 
 
 @lru_cache(maxsize=32)

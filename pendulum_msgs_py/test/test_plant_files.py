@@ -177,3 +177,17 @@ def test_static_friction_follows_the_coulomb_friction_unless_it_is_its_own():
     assert sticks.with_values(coulomb_friction=0.04).static_friction == 0.09
     with pytest.raises(ParameterError, match=r"static_friction is 0.09 N m; expected >= coulomb_friction"):
         sticks.with_values(coulomb_friction=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "root", "way"),
+    [
+        ("arm.urdf", "<robot/>", r"experiment --simulation FILE"),
+        ("arm.urdf.xacro", '<robot xmlns:xacro="x"/>', r"xacro arm\.urdf\.xacro > arm\.urdf"),
+    ],
+)
+def test_a_model_in_place_of_a_plant_file_says_what_takes_it(tmp_path, name, root, way):
+    path = tmp_path / name
+    path.write_text(f'<?xml version="1.0"?>\n{root}\n')
+    with pytest.raises(ParameterError, match=rf"is XML; expected YAML \(.*{way}"):
+        load_plant(path)

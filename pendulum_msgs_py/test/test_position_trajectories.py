@@ -87,8 +87,8 @@ def test_the_largest_speed_is_at_least_that_of_every_interval(start: float, goal
     [
         ([], [], [], "0 points"),
         ([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], "later than 0.0 s"),
-        ([0.0, -1.0], [0.0, 0.0], [0.0, 0.0], "expected >= 0 s"),
-        ([-1.0], [0.0], [0.0], "expected >= 0 s"),
+        ([0.0, -1.0], [0.0, 0.0], [0.0, 0.0], "later than 0.0 s"),
+        ([-1.0], [0.0], [0.0], "trajectory point 0 is at -1.0 s; expected >= 0 s"),
         ([math.nan], [0.0], [0.0], "expected finite numbers"),
         ([0.0], [math.inf], [0.0], "expected finite numbers"),
         ([0.0], [0.0], [math.nan], "expected finite numbers"),
@@ -101,6 +101,11 @@ def test_bad_points_are_refused(
     with pytest.raises(ParameterError) as caught:
         from_points(times, positions, velocities)
     assert message in str(caught.value)
+
+
+def test_a_first_point_is_compared_with_0_alone() -> None:
+    with pytest.raises(ParameterError, match=r"is at -1.0 s; expected >= 0 s$"):
+        from_points([-1.0], [0.0], [0.0])
 
 
 @pytest.mark.parametrize(

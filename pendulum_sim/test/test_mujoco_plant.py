@@ -189,7 +189,7 @@ def test_meshes_of_a_ros_package_are_found_or_left_out_with_a_word(tmp_path: Pat
 def test_a_source_for_xacro_says_how_it_becomes_a_model(tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf.xacro"
     path.write_text('<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="arm"/>', encoding="utf-8")
-    with pytest.raises(ParameterError, match=r"expected the URDF that it makes: xacro arm\.urdf\.xacro > arm\.urdf"):
+    with pytest.raises(ParameterError, match=r"takes the URDF that it makes: xacro arm\.urdf\.xacro > arm\.urdf"):
         load_mujoco_plant(path)
 
 

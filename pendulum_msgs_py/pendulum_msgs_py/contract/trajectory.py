@@ -75,9 +75,8 @@ class Trajectory:
                     f"trajectory point {index} is at {point.position} rad; expected at most {MAX_POSITION:g} rad"
                 )
             if point.time < 0.0 or point.time <= previous:
-                raise ParameterError(
-                    f"trajectory point {index} is at {point.time} s; expected >= 0 s and later than {previous} s"
-                )
+                least = f"later than {previous} s" if index else ">= 0 s"
+                raise ParameterError(f"trajectory point {index} is at {point.time} s; expected {least}")
             previous = point.time
         positions = [point.position for point in self.points]
         speed = max(abs(point.velocity) for point in self.points)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import xacro_hint
 
 __all__ = ["read_model"]
 
@@ -19,11 +20,8 @@ def read_model(mujoco: Any, path: Path) -> tuple[Any, list[str]]:
         ParameterError: MuJoCo refuses it, or it is a source of a model.
     """
     text = path.read_text(encoding="utf-8", errors="replace")
-    if "xmlns:xacro" in text or path.suffix == ".xacro":
-        raise ParameterError(
-            f"model {path} is a source for xacro; expected the URDF that it makes: xacro {path.name} > "
-            f"{path.name.split('.')[0]}.urdf (without ROS: pip install xacro)"
-        )
+    if hint := xacro_hint(path, text):
+        raise ParameterError(f"model {path} is no model yet: {hint}")
     remarks: list[str] = []
     try:
         if "<robot" not in text or "<mesh" not in text:
