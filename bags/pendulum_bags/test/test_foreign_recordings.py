@@ -256,3 +256,13 @@ def test_a_short_line_in_the_middle_is_still_an_error(tmp_path):
     path = save(tmp_path / "short.csv", "time,position,velocity,torque\n" + "\n".join(lines) + "\n")
     with pytest.raises(DataError, match="line 102 has 2 cells; expected 4"):
         read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("before", "way"), [("", "it has none: write one above"), ("log of run\n", "`skip: N` leaves")]
+)
+def test_a_table_without_names_is_not_told_to_skip_lines(tmp_path, before, way):
+    table = rows(TIME, ANGLE, SPEED, TORQUE)
+    names = "time,position,velocity,torque\n" * bool(before)
+    with pytest.raises(DataError, match=way):
+        read_recording(save(tmp_path / "run.csv", f"1.0,2.0\n{before}{names}{table}"))

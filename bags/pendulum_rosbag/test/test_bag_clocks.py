@@ -51,7 +51,17 @@ def write(
 @pytest.mark.parametrize(("storage", "packing"), KINDS)
 @pytest.mark.parametrize(
     ("period_ms", "log_back_ms", "stamp_back_ms"),
-    [(10, 5300, 5300), (2, 53, 53), (20, 53, 53), (2, 53, 0), (10, 0, 5300), (10, 60_000, 60_000), (2, 5300.4, 5299.9)],
+    [
+        (10, 5300, 5300),
+        (2, 53, 53),
+        (20, 53, 53),
+        (2, 53, 0),
+        (2, 20, 20),
+        (2, 12, 0),
+        (10, 0, 5300),
+        (10, 60_000, 60_000),
+        (2, 5300.4, 5299.9),
+    ],
 )
 def test_two_passes_of_a_clock_that_stepped_back_are_never_mixed(
     tmp_path: Path, period_ms: int, log_back_ms: float, stamp_back_ms: float, storage: str, packing: str | None
@@ -88,6 +98,17 @@ def test_a_late_message_and_a_file_in_no_order_are_no_steps() -> None:
     assert steps_back(late) == []
     assert steps_back(np.random.default_rng(1).permutation(times)) == []
     assert steps_back(np.concatenate([times, times - 200_000_000 + 10**9])) == [100]
+
+
+def test_a_small_step_back_is_told_from_late_and_early_messages() -> None:
+    times = np.arange(1000) * 2_000_000
+    stepped = np.concatenate([times[:500], times[500:] - 20_000_000])
+    assert steps_back(stepped) == [500]
+    late, early, jittered = times.copy(), times.copy(), stepped.copy()
+    late[500:505] -= 20_000_000  # five messages that were held up
+    early[500] += 20_000_000
+    jittered += np.random.default_rng(1).integers(-15_000_000, 15_000_000, 1000)  # no steady messages: nothing shows
+    assert steps_back(late) == steps_back(early) == steps_back(jittered) == []
 
 
 @pytest.mark.parametrize("stamp", [0, 1, BEGIN])

@@ -11,8 +11,11 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.convert.convert_cli import convert_main
+from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.info_cli import main as info_main
+from pendulum_rosbag.reader.joint_state import two_motions
 from pendulum_rosbag.reader.statistics import time_statistics
 from pendulum_rosbag.storage import BagWriter
 from pendulum_testing.bag_readers import JOINT_STATE, STRING, text_message
@@ -102,3 +105,33 @@ def test_a_ros_1_bag_gets_the_command_that_reads_it_killed_or_not(
         told = " ".join(capsys.readouterr().err.split())
         assert f"rosbag reindex {killed}" in told
         assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize("share", [2, 5])
+def test_two_machines_on_one_topic_are_refused_and_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], share: int
+) -> None:
+    bag = tmp_path / "bag"
+    with BagWriter(bag) as writer:
+        writer.add_topic("/joint_states", JOINT_STATE)
+        for index, time in enumerate(REGULAR):
+            now = BEGIN + time
+            angle = 0.3 * np.sin(2e-9 * time) + 0.4 * (index % share == 0)
+            writer.write("/joint_states", now, encode_joint_state(now, position=angle, velocity=0.0))
+    assert info_main([str(bag)]) == 0
+    assert "/joint_states: holds two motions" in " ".join(capsys.readouterr().out.split())
+    with read_bag(bag) as opened, pytest.raises(DataError, match=r"two motions \(\d+ of 400 messages jump by 0.4 rad"):
+        opened.array("/joint_states")
+    with read_bag(bag) as opened, pytest.raises(DataError, match="two motions"):
+        opened.joints("/joint_states")
+
+
+def test_noise_ticks_wraps_and_spikes_are_one_motion() -> None:
+    random = np.random.default_rng(2)
+    time = np.arange(0.0, 10.0, 0.01)
+    swing = 2.5 * np.sin(3.0 * time)
+    spikes = swing + 0.5 * (np.arange(time.size) % 50 == 7)
+    wrapped = np.angle(np.exp(1j * (np.pi + 0.02 * random.standard_normal(time.size))))
+    ticks = 0.006 * random.integers(0, 2, time.size)
+    for angle in (swing, spikes, wrapped, ticks, random.normal(0.0, 0.3, time.size), np.full(time.size, np.nan)):
+        assert two_motions(angle) == ""

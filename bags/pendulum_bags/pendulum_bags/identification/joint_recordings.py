@@ -114,8 +114,8 @@ def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path 
 
     Raises:
         BagError: The bag cannot be read.
-        DataError: A column, a unit or a joint is not as the mapping says, joints are missing, foreign or in another
-            order, or the input is not an effort.
+        DataError: A column, a unit or a joint is not as the mapping says, joints are missing or foreign, or the
+            input is not an effort.
     """
     source = Path(path)
     if not source.exists():
@@ -179,17 +179,17 @@ def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
         applied = bag.joints(applied_topic) if applied_topic in bag.topics else None
         if push_topic in bag.topics and np.any(bag.joints(push_topic).effort):
             raise DataError(f"topic {push_topic} of bag {source} pushes links from outside; expected none of that")
-    if states.names != coordinates.names:
+    if sorted(states.names) != sorted(coordinates.names):
         raise DataError(
-            f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(coordinates.names)}, in "
-            "this order"
+            f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(coordinates.names)}"
         )
+    columns = [states.names.index(name) for name in coordinates.names]
     # A plant in lockstep sends a state again when its answer was missed: the same stamp is the same state.
     stamps, first = np.unique(states.stamp_ns, return_index=True)
-    position, effort = states.position[first], np.zeros((stamps.size, len(states.names)))
+    position, effort = states.position[first][:, columns], np.zeros((stamps.size, len(columns)))
     driven = list(coordinates.driven)
     if applied is None:
-        effort[:, driven] = states.effort[first][:, driven]
+        effort[:, driven] = states.effort[first][:, columns][:, driven]
     else:
         if not set(coordinates.driven_names) <= set(applied.names) <= set(coordinates.names):
             raise DataError(

@@ -37,6 +37,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.runs.datasets import Recording, continued, first_of_each_stamp
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.parameters import load_yaml, suggestion
+from pendulum_rosbag.reader.joint_state import two_motions
 
 __all__ = ["MAPPINGS", "UNITS", "read_csv"]
 
@@ -176,6 +177,8 @@ def read_csv(
         # Nobody said so of this file: a built-in mapping and a default are guesses.
         if hold is None and ("hold" not in section or origin.startswith("built-in")):
             meta["hold_assumed"] = True
+    if jumps := two_motions(position):
+        raise DataError(f"{source} holds two motions ({jumps}); expected those of one plant")
     _check_magnitudes(source, time, position)
     kept = first_of_each_stamp(time)
     if not kept.all():
@@ -284,9 +287,10 @@ def _read_table(
             f"`delimiter: {others[0]!r}` reads it otherwise"
         )
     if not names or all(_is_number(name) for name in names):
+        later = any(re.search("[A-Za-z]{2}", row) for row in body.splitlines())
+        way = "a mapping file with `skip: N` leaves out N lines before it" if later else "it has none: write one above"
         raise DataError(
-            f"{source} begins with {head[:60]!r}; expected a first line with the names of the columns (a mapping file "
-            "with `skip: N` leaves out N lines before it)"
+            f"{source} begins with {head[:60]!r}; expected a first line with the names of the columns ({way})"
         )
     if not body.strip():
         raise DataError(f"{source} has no rows below its header")

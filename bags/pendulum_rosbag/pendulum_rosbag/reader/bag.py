@@ -17,7 +17,7 @@ from pendulum_msgs_py.contract.cdr import decode_joint_state
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader.batches import Batch, Int64, Source, Stream
 from pendulum_rosbag.reader.clock import CLOCK_JUMP, ClockStep, find_steps, go_on, pass_order, set_stamps, steps_back
-from pendulum_rosbag.reader.joint_state import JointStateParser
+from pendulum_rosbag.reader.joint_state import JointStateParser, two_motions
 from pendulum_rosbag.reader.joint_table import JointTable, joint_table
 from pendulum_rosbag.reader.open_source import BagFolder, damage_of, open_folder, open_sources, parsed
 from pendulum_rosbag.reader.topic_info import StoredMessage, TopicInfo, ros_topic, ros_type
@@ -141,6 +141,7 @@ class Bag(Mapping[str, Any]):
                 f"expected sensor_msgs/msg/JointState of one joint{way_out}"
             )
         recorded = values["log_time_ns"], values["stamp_ns"]
+        self._check_one_motion(topic, values["position"])
         log_times, stamps = self._timed(topic, *recorded)
         if log_times is recorded[0] and stamps is recorded[1]:
             return values
@@ -158,6 +159,7 @@ class Bag(Mapping[str, Any]):
         """
         if topic not in self._tables:
             table = joint_table(self.raw(topic), f"topic {topic} of bag {self.path}")
+            self._check_one_motion(topic, *table.position.T)
             log_times, stamps = self._timed(topic, table.log_time_ns, table.stamp_ns)
             self._tables[topic] = replace(table, log_time_ns=log_times, stamp_ns=stamps)
         return self._tables[topic]
@@ -284,6 +286,13 @@ class Bag(Mapping[str, Any]):
             return np.argsort(times, kind="stable")
         name = self._entry(topic).info.name
         return pass_order(times, [step.rows.get(name, 0) for step in self.clock_steps()])
+
+    def _check_one_motion(self, topic: str, *positions: npt.NDArray[Any]) -> None:
+        if jumps := next(filter(None, map(two_motions, positions)), ""):
+            raise DataError(
+                f"topic {topic} of bag {self.path} holds two motions ({jumps}); expected those of one plant: record "
+                "each sender under a topic of its own"
+            )
 
     def _timed(self, topic: str, log_times: Int64, stamps: Int64) -> tuple[Int64, Int64]:
         """Return log times and stamps of a topic that go on where a clock stepped back, all stamps set."""

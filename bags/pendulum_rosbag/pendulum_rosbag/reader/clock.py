@@ -20,6 +20,8 @@ CLOCK_JUMP = 0.05
 """A lasting step of a clock counts as a jump from this size [s]."""
 _MOST = 20
 """Steps of a topic, and one of 50 messages, from which they count as stored in no order."""
+_AROUND = 20
+"""Messages on either side of a small step that have to confirm it."""
 _NEXT_BUFFER = 1 << 40
 
 
@@ -48,16 +50,31 @@ def steps_back(times: Int64) -> list[int]:
     if not len(intervals) or int(intervals.min()) >= 0:
         return []
     period = _period(times)
-    back = np.flatnonzero((intervals < 0) & (intervals - period < -CLOCK_JUMP * 1e9))
-    if len(back) > min(_MOST, 1 + len(times) // 50):
-        return []
+    sizes = period - intervals
+    large = sizes > CLOCK_JUMP * 1e9
+    # Of steady messages a smaller step shows, too, as long as it is none of the usual irregularities.
+    small = ~large & (sizes > max(2 * period, 10 * float(np.quantile(np.abs(sizes), 0.9))))
+    limit = min(_MOST, 1 + len(times) // 50)
+    back = np.zeros(len(sizes), bool)
+    for kind in (large, small):
+        backward = kind & (intervals < 0)
+        back |= backward if np.sum(backward) <= limit else False
     found = []
-    for place in back.tolist():
+    for place in np.flatnonzero(back).tolist():
+        if small[place] and not _lasts(times, place + 1, period, int(sizes[place])):
+            continue
         # What follows a late message makes up for the step.
         following = int(intervals[place + 1]) if place + 1 < len(intervals) else -1
         if 0 <= following < max(-int(intervals[place]) / 2, 1.5 * period):
             found.append(place + 1)
     return found
+
+
+def _lasts(times: Int64, step: int, period: int, size: int) -> bool:
+    """Return whether most messages around a step, and not one or a few alone, stand apart by its size."""
+    regular = times - period * np.arange(len(times))
+    before, after = regular[max(step - _AROUND, 0) : step], regular[step : step + _AROUND]
+    return bool(np.median(before) - np.median(after) > size / 2)
 
 
 def _period(times: Int64) -> int:

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from pendulum_rosbag.reader.batches import MCAP_HEAD, Batch, Int64, items_at
 from pendulum_rosbag.storage.mcap_records import MESSAGE
 
-__all__ = ["FIELDS", "JointStateParser", "Layout", "Trimmer", "canonical", "layout_of"]
+__all__ = ["FIELDS", "JointStateParser", "Layout", "Trimmer", "canonical", "layout_of", "two_motions"]
 
 FIELDS = np.dtype(
     [("log_time_ns", "<i8"), ("stamp_ns", "<i8"), ("position", "<f8"), ("velocity", "<f8"), ("effort", "<f8")]
@@ -137,6 +137,26 @@ class Trimmer:
             return data
         self._layouts = [*self._layouts[-_LAYOUTS:], layout_found]
         return data[: layout_found.size]
+
+
+_APART, _BACK, _SHARE = 0.05, 0.2, 0.12
+"""Two motions on one topic: jumps of at least this angle [rad], back but for that share, in that share of messages."""
+
+
+def two_motions(position: npt.NDArray[Any]) -> str:
+    """Return how an angle jumps to and fro, in words, where two senders share a topic; nothing where it does not.
+
+    Args:
+        position: Of one joint, in the order of the messages, shape (n,) [rad].
+    """
+    known = position[np.isfinite(position)]
+    steps = np.diff(np.unwrap(known))
+    least = np.minimum(np.abs(steps[1:]), np.abs(steps[:-1]))
+    there_and_back = (least > _APART) & (np.abs(steps[1:] + steps[:-1]) < _BACK * least)
+    count = int(np.sum(there_and_back))
+    if count < max(10, _SHARE * known.size):
+        return ""
+    return f"{count} of {known.size} messages jump by {float(np.median(least[there_and_back])):.2g} rad and back"
 
 
 # -- arrays ------------------------------------------------------------------------------------------------------

@@ -55,15 +55,14 @@ class JointTable:
 
 
 def joint_table(messages: Iterable[tuple[int, bytes]], where: str) -> JointTable:
-    """Return messages of JointState as a table.
+    """Return messages of JointState as a table; joints may stand in another order in each message.
 
     Args:
         messages: Log time [ns] and bytes of each.
         where: Topic and bag, for messages.
 
     Raises:
-        DataError: There is none, one is no JointState with a value for each of its names, or one names other joints or
-            the same in another order.
+        DataError: There is none, one is no JointState with a value for each of its names, or one names other joints.
     """
     times: list[int] = []
     stamps: list[int] = []
@@ -74,13 +73,17 @@ def joint_table(messages: Iterable[tuple[int, bytes]], where: str) -> JointTable
         if fields is None:
             raise DataError(f"{where}: message {len(times)} is no JointState with one value for each of its names")
         expected = fields.joints if expected is None else expected
+        columns = tuple(fields[3:])
         if fields.joints != expected:
-            raise DataError(
-                f"{where}: message {len(times)} is of {', '.join(fields.joints)}; expected {', '.join(expected)}"
-            )
+            if sorted(fields.joints) != sorted(expected):
+                raise DataError(
+                    f"{where}: message {len(times)} is of {', '.join(fields.joints)}; expected {', '.join(expected)}"
+                )
+            order = [fields.joints.index(joint) for joint in expected]
+            columns = tuple(tuple(values[place] for place in order) if values else () for values in columns)
         times.append(log_time_ns)
         stamps.append(fields.stamp_ns)
-        for column, values in zip(rows, fields[3:], strict=True):
+        for column, values in zip(rows, columns, strict=True):
             column.append(values or (np.nan,) * len(expected))
     if expected is None:
         raise DataError(f"{where}: no messages; expected at least one")

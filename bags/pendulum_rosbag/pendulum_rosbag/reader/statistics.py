@@ -13,6 +13,7 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.batches import Int64
 from pendulum_rosbag.reader.clock import CLOCK_JUMP, set_stamps
+from pendulum_rosbag.reader.joint_state import two_motions
 from pendulum_rosbag.reader.topic_info import TopicInfo
 from pendulum_rosbag.storage.stamps import stamp_reader
 
@@ -254,6 +255,8 @@ def bag_statistics(bag: Bag) -> BagStatistics:
             # A topic that is no JointState though it says so costs no other; ``array`` finds out about clocks.
             with contextlib.suppress(DataError):
                 values = bag[name]
+                if isinstance(values, np.ndarray) and (jumps := two_motions(values["position"])):
+                    result.problems.append(f"{name}: holds two motions ({jumps})")
                 bag.array(name)
         stamps: Int64 | None
         if isinstance(values, np.ndarray):
@@ -267,7 +270,7 @@ def bag_statistics(bag: Bag) -> BagStatistics:
             echoes[name] = log_times, stamps
     result.latencies = _latencies(echoes)
     result.events = bag.events()
-    result.problems = [*result.damage, *bag.clock_notes]
+    result.problems = [*result.damage, *bag.clock_notes, *result.problems]
     for name, topic in result.topics.items():
         result.problems += [f"{name}: {sentence}" for sentence in _problems(topic)]
     if not total:

@@ -65,8 +65,9 @@ def _joint_columns(values: Sequence[StoredMessage]) -> dict[str, Any]:
     """Return the columns of states of several joints; none where messages are not all of the same joints."""
     messages = [stored.message for stored in values]
     joints = [str(name) for name in messages[0].name]
-    if len(joints) < 2 or len(set(joints)) < len(joints) or any(list(one.name) != joints for one in messages):
+    if len(joints) < 2 or len(set(joints)) < len(joints) or any({*one.name} != {*joints} for one in messages):
         return {}
+    orders = [[[*one.name].index(joint) for joint in joints] for one in messages]
     stamps = [int(one.header.stamp.sec) * NANOSECONDS + int(one.header.stamp.nanosec) for one in messages]
     columns: dict[str, Any] = {"log_time_ns": [stored.log_time_ns for stored in values], "stamp_ns": stamps}
     absent = (math.nan,) * len(joints)
@@ -74,7 +75,10 @@ def _joint_columns(values: Sequence[StoredMessage]) -> dict[str, Any]:
         rows = [tuple(getattr(one, quantity)) or absent for one in messages]
         if any(len(row) != len(joints) for row in rows):
             return {}
-        columns |= {f"{name}.{quantity}": [row[index] for row in rows] for index, name in enumerate(joints)}
+        columns |= {
+            f"{name}.{quantity}": [row[order[index]] for row, order in zip(rows, orders, strict=True)]
+            for index, name in enumerate(joints)
+        }
     return {**columns, "frame_id": [one.header.frame_id for one in messages]}
 
 
