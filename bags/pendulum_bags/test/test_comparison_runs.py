@@ -230,7 +230,8 @@ def test_a_run_that_lost_many_states_is_told_apart_from_a_sound_one(folder: Path
     plants = compare_folders([folder]).plants
     assert timing_warning(plants) == ""
     disturbed = {**plants, "sim": {**plants["sim"], "samples": 2384, "missed_deadlines": 116}}
-    assert "sim missed 116 of 2500 states (4.6 %); end other programs" in timing_warning(disturbed)
+    assert "sim missed 116 of 2500 states (4.6 %); look for pauses, end other programs" in timing_warning(disturbed)
+    assert "busy" not in timing_warning(disturbed)
 
 
 def test_without_events_the_window_is_that_of_the_disturbance(tmp_path: Path) -> None:

@@ -124,7 +124,7 @@ def test_a_run_that_a_busy_machine_disturbed_is_measured_again_and_left_out(tmp_
     recorder(folder, SETTINGS, 1)
     found = decide(folder, SETTINGS, Margins.parse(), Budget(60.0, recorder.clock), record=lambda *_, **__: None)
     assert [pair.hardware.source for pair in found.pairs] == [str(repeat_folder(folder, 1) / "hw")]
-    assert "the computer was too busy (simulation missed 250 states)" in found.left_out[0]
+    assert "because states are missing (simulation missed 250 states)" in found.left_out[0]
     # The seed that was asked for makes the run again, not that of the repeat.
     told = _summary(SETTINGS, found, answer_of(found))
     assert found.to_json()["seed"] != SETTINGS.noise.seed

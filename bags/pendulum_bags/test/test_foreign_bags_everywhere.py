@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pendulum_bags.analyse.analyse_cli import main as analyse_main
@@ -15,6 +16,8 @@ from pendulum_bags.comparison import compare_runs
 from pendulum_bags.comparison.compare_cli import main as compare_main
 from pendulum_bags.identification.identify_cli import main as identify_main
 from pendulum_bags.replay.replay_cli import main as replay_main
+from pendulum_bags.report.report_cli import main as report_main
+from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.convert.convert_cli import convert_main, cut_main, filter_main, merge_main
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.export_cli import main as export_main
@@ -128,3 +131,37 @@ def test_every_command_takes_what_info_shows(tmp_path: Path, capsys: pytest.Capt
         assert list(converted) == list(original)
         for topic in ("/hw/joint_states", "/hw/effort_command"):
             assert converted.raw(topic) == original.raw(topic)
+
+
+def bare(path: Path, later: float, *, velocity: bool = True) -> Path:
+    """Write a swing as a foreign recorder does: joint states alone, no events, no disturbance."""
+    random = np.random.default_rng(round(1e3 * later))
+    with BagWriter(path) as writer:
+        writer.add_topic("joint_states", message_type("sensor_msgs/msg/JointState"))
+        for index in range(2000):
+            t = 0.005 * index
+            angle = 0.4 * np.sin(4.0 * (t - later)) + 0.3 * np.sin(2.3 * (t - later)) + random.normal(0.0, 1e-3)
+            speed = 1.6 * np.cos(4.0 * (t - later)) + 0.69 * np.cos(2.3 * (t - later)) if velocity else None
+            stamp = _LATER + index * 5_000_000
+            writer.write("joint_states", stamp, encode_joint_state(stamp, position=angle, velocity=speed))
+    return path
+
+
+@pytest.mark.parametrize("velocity", [True, False])
+def test_two_bags_without_noise_are_compared_as_a_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], velocity: bool
+) -> None:
+    one, other = (bare(tmp_path / name, later, velocity=velocity) for name, later in (("a", 0.0), ("b", 0.02)))
+    result = compare_runs(one, other)
+    assert result.pairs[0].simulation.window.t.size == 2000
+    assert not result.is_paired
+    assert compare_main([str(one), str(other)]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "The hardware has neither a disturbance nor events: all of its recording is compared." in shown
+
+
+def test_a_report_of_one_bag_says_what_it_is_and_what_shows_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert report_main([str(EXAMPLES / "regulation_hw")]) == 2
+    assert "regulation_hw is one bag; expected run folders, or two bags" in " ".join(capsys.readouterr().err.split())

@@ -18,7 +18,14 @@ from pendulum_bags.comparison.margins import MarginArgument, Margins
 from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
 from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
-from pendulum_bags.runs.run_data import OpenBag, RunData, is_emulated, noise_hold_time, plant_summary, read_run
+from pendulum_bags.runs.run_data import (
+    OpenBag,
+    RunData,
+    is_emulated,
+    noise_hold_time,
+    plant_summary,
+    read_run,
+)
 from pendulum_bags.runs.run_folder import pair_folders, read_looks, read_stalls
 from pendulum_bags.runs.run_record import DIFFERENCE, STAND_IN, run_record
 from pendulum_msgs_py.errors import BagError, DataError
@@ -67,6 +74,8 @@ class Comparison:
             simulation = record.get("simulation") if run.label == "simulation" or STAND_IN in record else None
             if isinstance(simulation, Mapping) and (difference := simulation.get(DIFFERENCE)):
                 notes.append(f"The {run.label}, {simulation.get('name')}, {difference}.")
+            if run.is_whole:
+                notes.append(f"The {run.label} has neither a disturbance nor events: all of its recording is compared.")
         return [*dict.fromkeys(notes), *self.unproved, *self.left_out]
 
     @property
@@ -267,8 +276,8 @@ def compare_runs(
         ParameterError: A margin is out of domain.
     """
     margins = Margins.parse(margin)
-    simulation = read_run(sim_bag, prefix=sim_prefix, label="simulation", joint=joint, open_bag=open_bag)
-    hardware = read_run(hw_bag, prefix=hw_prefix, label="hardware", joint=joint, open_bag=open_bag)
+    simulation = read_run(sim_bag, prefix=sim_prefix, label="simulation", joint=joint, or_all=True, open_bag=open_bag)
+    hardware = read_run(hw_bag, prefix=hw_prefix, label="hardware", joint=joint, or_all=True, open_bag=open_bag)
     own = [] if own_protocol is None else [_read_own(own_protocol, joint, open_bag)]
     return compare([(simulation, hardware)], own=own, margin=margins)
 
@@ -317,7 +326,7 @@ def compare_folders(
             ]
             if place == folder and busy and len(places) > 1:
                 left_out.append(
-                    f"The run in real time does not count, because the computer was too busy ({', '.join(busy)}). "
+                    f"The run in real time does not count, because states are missing ({', '.join(busy)}). "
                     "It was repeated in lockstep, which does not depend on the computer's speed."
                 )
             else:

@@ -14,6 +14,7 @@ from pendulum_bags.comparison.compare_cli import DesignOption, LayersOption, Mac
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option
+from pendulum_rosbag.reader.open_source import is_bag_folder, is_storage_file
 
 __all__ = ["main"]
 
@@ -74,6 +75,11 @@ def report(
         bad = next(folder for folder in folders if not ((folder / "sim").exists() and (folder / "hw").exists()))
         if not bad.exists():
             raise BagError(f"run folder {bad} does not exist")
+        if is_storage_file(bad) or (bad.is_dir() and is_bag_folder(bad)):
+            raise BagError(
+                f"{bad} is one bag; expected run folders, or two bags to compare (`pendulum info {bad}` shows what is "
+                "in it)"
+            )
         raise BagError(f"run folder {bad} has no bags sim and hw; expected run folders, or two bags")
     alone = folders[0] if pooled and len(folders) == 1 else None
     target = out or alone or folders[0].resolve().parent / "report"

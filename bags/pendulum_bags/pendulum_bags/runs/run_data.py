@@ -98,6 +98,11 @@ class RunData:
         return missed_share(self.missed_deadlines, self.window.t.size) > TOLERATED
 
     @property
+    def is_whole(self) -> bool:
+        """Whether the recording has neither a disturbance nor events, so that all of it is the window."""
+        return self.disturbance is None and self.event_time(START_EVENT) is None
+
+    @property
     def tracking_error(self) -> NDArray[np.float64] | None:
         """Angle less its moving reference during the noise [rad]; None where none is known."""
         return None if self.reference is None else self.window.position - UPRIGHT - self.reference
@@ -146,7 +151,7 @@ def _space(bag: Bag, prefix: str | None) -> str:
 
 
 def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a sentence where a plant left out so many states that the run tells more of the machine than of the plant.
+    """Return a sentence where too many states are missing; the stamps alone do not show why.
 
     Args:
         plants: Figures of :func:`plant_summary`, by the plant's name.
@@ -159,7 +164,7 @@ def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
     ]
     if not words:
         return ""
-    return f"The computer was too busy for these plants: {', '.join(words)}; end other programs and repeat the run."
+    return f"States are missing: {', '.join(words)}; look for pauses, end other programs, and repeat the run."
 
 
 def missed_share(missed: int, samples: int) -> float:
@@ -186,6 +191,7 @@ def read_run(
     joint: str | None = None,
     start_ns: int | None = None,
     stop_ns: int | None = None,
+    or_all: bool = False,
     open_bag: OpenBag = read_bag,
 ) -> RunData:
     """Read one plant's part of a bag.
@@ -199,6 +205,7 @@ def read_run(
         start_ns: Start of the window by the plant's stamps [ns]; by default the event ``noise_start``, or without
             one the first sample of the disturbance.
         stop_ns: End of the window [ns]; by default ``noise_end``, or the last sample of the disturbance.
+        or_all: Whether the window is the whole recording where it has neither events nor a disturbance.
         open_bag: How the bag is opened.
 
     Raises:
@@ -209,6 +216,7 @@ def read_run(
         space = _space(bag, prefix)
         topic = f"{space}/{names.JOINT_STATES}"
         states = _increasing(bag.array(topic) if joint is None else bag.joints(topic).of(joint))
+        states = states[np.isfinite(states["position"])]
         if len(states) < 4:
             raise DataError(f"bag {path} has {len(states)} states; expected at least 4")
         commands = _optional(bag, f"{space}/{names.EFFORT_COMMAND}", joint)
@@ -216,15 +224,17 @@ def read_run(
         applied = _optional(bag, f"{space}/{names.APPLIED_EFFORT}", joint)
         events = [event for event in bag.events() if event["topic"].startswith(f"{space}/")]
         metadata, damage = dict(bag.metadata), [*bag.damage, *bag.clock_notes]
-    start, stop = _window(events, disturbance, str(path), start_ns, stop_ns)
+    start, stop = _window(events, disturbance, str(path), start_ns, stop_ns, states["stamp_ns"] if or_all else None)
     name = label or Path(path).stem
     stamps = states["stamp_ns"]
     times = (stamps - start) / NANOSECONDS
     slides = joint in _SLIDING
+    position = states["position"] if slides else unwrap_near_upright(states["position"])
+    measured = np.isfinite(states["velocity"]).all()
     whole = Series(
         times,
-        states["position"] if slides else unwrap_near_upright(states["position"]),
-        states["velocity"],
+        position,
+        states["velocity"] if measured else np.gradient(position, times),
         _answers(stamps, commands, states["effort"]),
         name,
         "m" if slides else "rad",
@@ -366,6 +376,7 @@ def _window(
     path: str,
     start_ns: int | None,
     stop_ns: int | None,
+    stamps: NDArray[np.int64] | None,
 ) -> tuple[int, int]:
     found = {
         name: [int(event["stamp_ns"]) for event in events if event["name"] == name] for name in (START_EVENT, END_EVENT)
@@ -376,6 +387,8 @@ def _window(
         live = disturbance["stamp_ns"][disturbance["effort"] != 0.0]
         if len(live):
             active = int(live[0]), int(live[-1])
+    if stamps is not None and active is None and not starts:
+        return int(stamps[0]), int(stamps[-1]) + 1
     start = start_ns if start_ns is not None else (starts[-1] if starts else active[0] if active else None)
     if start is None:
         raise DataError(f"bag {path} has neither an event {START_EVENT!r} nor a disturbance; expected one of them")

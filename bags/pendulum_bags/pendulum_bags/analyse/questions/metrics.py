@@ -9,9 +9,7 @@ from pendulum_bags.comparison import read_run
 from pendulum_bags.comparison.metrics import episode_of, metrics_of
 from pendulum_bags.runs.run_data import plant_summary
 from pendulum_bags.runs.run_record import run_record
-from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
-from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader import read_bag
 
 __all__ = ["answer"]
@@ -20,15 +18,9 @@ __all__ = ["answer"]
 def answer(path: Path, plant: str) -> dict[str, Any]:
     """Return spread, damage and metrics of a plant in a bag, by name."""
     with read_bag(path) as bag:
-        states = bag.array(f"{plant}/{names.JOINT_STATES}")
         set_point = run_record(bag.metadata).get("set_point", 0.0)
-    try:
-        run = read_run(path, prefix=plant)
-    except DataError:
-        if len(states) < 4:
-            raise
-        # A recording without noise has no window: all of it is what the controller did.
-        run = read_run(path, prefix=plant, start_ns=int(states["stamp_ns"][0]), stop_ns=int(states["stamp_ns"][-1]))
+    # A recording without noise has no window: all of it is what the controller did.
+    run = read_run(path, prefix=plant, or_all=True)
     goal = UPRIGHT + (float(set_point) if isinstance(set_point, (int, float)) else 0.0)
     found = plant_summary(run)
     found["damage"] = "; ".join(found["damage"])
