@@ -6,7 +6,7 @@ Each pendulum has its own parameters, gain, start, seed and noise amplitude::
 
 Equations, integrators and noise are those of :class:`pendulum_sim.stepping.plant.RigidPlant` and of
 ``pendulum_msgs_py.contract.noise``, compiled, so that one pendulum of a batch moves like one on the graph.
-Memory does not depend on the number of steps, unless the trajectories are asked for.
+Memory does not depend on the number of steps, unless trajectories are requested.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BatchResult:
-    """What came of a batch of B pendulums.
+    """Results of a batch of B pendulums.
 
     Attributes:
         theta: Final angles, shape (B,), not wrapped [rad].
@@ -46,7 +46,7 @@ class BatchResult:
         mean_theta_dot: Mean of the velocity, shape (B,) [rad/s].
         std_theta_dot: Its standard deviation, shape (B,) [rad/s].
         trajectories: theta [rad], theta_dot [rad/s] and applied effort [N m] at the start of each step, shape
-            (steps, 3, B); None unless asked for.
+            (steps, 3, B); None unless requested.
     """
 
     theta: Array
@@ -160,7 +160,7 @@ def simulate_batch(
     growth = growth_rate(integrator, packed[:, 1] / packed[:, 0], packed[:, 2] / packed[:, 0], h, list(coefficients.T))
     if (worst := int(np.argmax(growth))) >= 0 and growth[worst] > MOST_GROWTH:
         values = {name: float(packed[worst, PACKED.index(name)]) for name in ("inertia", "damping", "gravity")}
-        # The plant at fault, rebuilt, so that its own check says what is wrong and what would do.
+        # The plant at fault, rebuilt, so that its own check reports the cause and a value that works.
         check_stability(integrator, plants[min(worst, len(plants) - 1)].with_values(**values), dt, substeps, h)
     delays = np.array([plant.transport_delay for plant in plants])
     smooth = not (delays.any() or packed[:, DRY].any() or packed[:, LAG].any())

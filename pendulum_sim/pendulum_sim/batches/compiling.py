@@ -27,10 +27,8 @@ def compile_tree(function: Callable[..., Any], *, vector: bool = False, inline: 
 
     Args:
         function: A plain function of this project that uses scalars, tuples and ``math``.
-        vector: Take ``pendulum_sim.batches.vector_math`` in the place of ``math``, and write each function into its
-            caller.
-        inline: Write each function into its caller, a compiled one: machine code that is told no functions can be kept
-            on disk.
+        vector: Take ``pendulum_sim.batches.vector_math`` in place of ``math``, and inline each function.
+        inline: Inline each function, a compiled one: machine code without function arguments can be cached on disk.
     """
     substitutes = {math: _vector_module} if vector else {}
     return _compile_tree(function, inline=inline or vector, substitutes=substitutes, within=inline)

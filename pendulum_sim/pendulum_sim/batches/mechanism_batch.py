@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MechanismBatch:
-    """What came of a batch of B plants of n joints, m of them driven.
+    """Results of a batch of B plants of n joints, m of them driven.
 
     Attributes:
         position: Final positions, shape (B, n), not wrapped [rad or m].
@@ -39,7 +39,7 @@ class MechanismBatch:
         mean_deviation: Mean of q - goal over the steps, shape (B, n).
         std_deviation: Its standard deviation, shape (B, n).
         trajectories: Positions, velocities and applied efforts of all joints at the start of each step, shape
-            (steps, 3 n, B); None unless asked for.
+            (steps, 3 n, B); None unless requested.
     """
 
     position: Array

@@ -60,7 +60,7 @@ def check_weights(q: object, r: float, count: int, expected: str) -> None:
 
 
 def check_reset_options(options: Mapping[str, Any], known: Sequence[str] = ("state", "start")) -> None:
-    """Refuse an option that nobody would heed."""
+    """Refuse unknown options."""
     unknown = set(options) - set(known)
     if unknown:
         expected = f"{', '.join(known[:-1])} or {known[-1]}"
@@ -87,7 +87,7 @@ class PlantVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         single: The environment of one plant, which can be drawn.
 
     Raises:
-        ParameterError: There is no plant or no step, or a picture is asked for.
+        ParameterError: There is no plant or no step, or a picture is requested.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}

@@ -1,6 +1,6 @@
 """URDF and MJCF of a plant of several joints, written from the same bodies as it is drawn with.
 
-x points to the right, y away from who looks, z up; hanging down is position 0 of every hinge.
+x points to the right, y away from the viewer, z up; hanging down is position 0 of every hinge.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """``export_model``: write a plant as URDF or MJCF.
 
-The parameters say M_c and G_c, not mass and length: any link with m l^2 <= M_c and m g l = G_c moves the same. The
+The parameters are M_c and G_c, not mass and length: any link with m l^2 <= M_c and m g l = G_c moves the same. The
 one drawn has nine tenths of its inertia in the bob. Angle 0 hangs down along -z; positive turns the bob towards +x,
-counter-clockwise for who looks along +y.
+counter-clockwise seen along +y.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ _CASING, _ROD, _BOB = "0.25 0.25 0.28 1", "0.6 0.62 0.66 1", "0.85 0.3 0.2 1"
 
 @dataclass(frozen=True)
 class LinkShape:
-    """A link that moves as the parameters say.
+    """A link with the dynamics of the parameters.
 
     Attributes:
         mass: m [kg].
         length: Distance of the centre of mass from the joint, l [m].
         inertia: Inertia about the centre of mass, parallel to the joint [kg m^2].
-        bob_radius: Radius of a steel ball of that mass, for the eye [m].
+        bob_radius: Radius of a steel ball of that mass, for drawing [m].
     """
 
     mass: float
@@ -74,9 +74,9 @@ def link_shape(parameters: PlantParameters) -> LinkShape:
 def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: str = "/sim") -> str:
     """Return the URDF of the link, for RViz, robot_state_publisher and Gazebo; the joint bears the contract's name.
 
-    URDF knows no motor behind a spring. Of a series-elastic plant the joint has the damping and dry friction of link
+    URDF has no motor behind a spring. Of a series-elastic plant the joint has the damping and dry friction of link
     and motor together, as in slow motion; the rotor's inertia joins that of the link.
-    An effort is then that of the motor: ``torque_gain`` times what our plants are commanded.
+    An effort is then that of the motor: ``torque_gain`` times the command of this project's plants.
 
     Args:
         parameters: The plant.

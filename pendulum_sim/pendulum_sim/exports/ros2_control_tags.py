@@ -1,4 +1,4 @@
-"""What ros2_control wants in a URDF: the joint's interfaces, and the hardware behind them."""
+"""What ros2_control requires in a URDF: the joint's interfaces, and the hardware behind them."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def add_ros2_control(robot: ElementTree.Element, hardware: str, namespace: str, 
         parameters = {
             "joint_states_topic": f"{space}/{JOINT_STATES}",
             "joint_commands_topic": f"{space}/joint_commands",
-            # It says a command only where positions and commanded positions differ by more than this, and we command
-            # none: a pendulum that hangs would hear nothing.
+            # It publishes a command only where positions and commanded positions differ by more than this; there are
+            # no commanded positions here: a hanging pendulum would get no commands.
             "trigger_joint_command_threshold": "-1",
         }
         for name, value in parameters.items():

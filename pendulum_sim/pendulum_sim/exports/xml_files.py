@@ -26,7 +26,7 @@ def lateness(lag: float, delay: float, timestep: float) -> dict[str, str]:
 
     Args:
         lag: Time constant; 0 for none [s].
-        delay: Transport delay, which MuJoCo 4 and later know; 0 for none [s].
+        delay: Transport delay, which needs MuJoCo 4 or later; 0 for none [s].
         timestep: Of the model [s].
     """
     attributes = {"dyntype": "filterexact", "dynprm": number(lag)} if lag > 0.0 else {}

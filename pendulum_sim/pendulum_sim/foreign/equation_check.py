@@ -1,8 +1,8 @@
-"""Does a plant move as its equation says? Both are run from the same starts under the same efforts, joint by joint.
+"""Whether a plant moves as its equation predicts: both run from equal starts under equal efforts, joint by joint.
 
-Nothing is read off the plant but its states, so that the check shares no assumption with whatever found the equation.
-A cause is named only if it was tested: by running a copy of the plant in which it is switched off, or by the shape of
-what the equation leaves over.
+Only the plant's states are read, so that the check shares no assumption with the source of the equation. A cause is
+named only if it was tested: by running a copy of the plant in which it is switched off, or by the shape of the
+residual.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ changes within the margins of the verdict."""
 _WINDOW, _LEAST_PERIODS, _MOST_PERIODS = 0.2, 5, 200
 """Length of a run [s], and its bounds in periods."""
 _ANGLES = 25
-"""Starts around the circle, both ends included."""
+"""Number of start angles over a full turn, both ends included."""
 _RANDOM_STARTS = 24
 _SLIDE = 0.1
 """Distance from the middle at which a joint that slides starts [m]."""
@@ -116,7 +116,7 @@ class EquationCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether every joint moves as the equation says, within :data:`TOLERANCE`."""
+        """Whether every joint moves as the equation predicts, within :data:`TOLERANCE`."""
         return max(self.errors) <= TOLERANCE
 
     def __str__(self) -> str:
@@ -174,13 +174,13 @@ def check_equation(
     switches: Switches | None = None,
     reseeded: JointPlant | None = None,
 ) -> EquationCheck:
-    """Return how far a plant moves otherwise than an equation, and why.
+    """Return how far a plant deviates from an equation, and why.
 
     Args:
-        plant: The plant; it is left anywhere, so reset it afterwards.
+        plant: The plant; it is left in any state, so reset it afterwards.
         equation: What a controller would be designed on, with the same period and joints.
-        coarse: The equation by an integrator of first order with that period, whose error counts for nothing.
-        switches: What can be switched off; asked only where the two differ.
+        coarse: The equation by an integrator of first order with that period, whose error is tolerated.
+        switches: What can be switched off; called only where the two differ.
         reseeded: The plant with other random numbers, where it has any.
     """
     count = max(_LEAST_PERIODS, min(_MOST_PERIODS, math.ceil(_WINDOW / plant.dt)))
@@ -238,7 +238,7 @@ def check_recording(position: Array, velocity: Array, effort: Array, equation: J
 
 
 def _plan(equation: JointPlant, coarse: JointPlant | None, count: int) -> _Runs:
-    """Return the runs, and what the equation says of them: at rest first, then as fast as these came."""
+    """Return the runs and the equation's results: from rest first, then at the speeds that these reached."""
     runs = _Runs()
     limits, joints = equation.effort_limits, len(equation.coordinates.joints)
     still, none = (0.0,) * joints, (0.0,) * len(limits)
@@ -341,8 +341,8 @@ class _Case:
     Attributes:
         plant: The plant.
         equation: The equation.
-        runs: Runs, and what the equation says of them.
-        traces: What the plant did.
+        runs: Runs, and the equation's results.
+        traces: The plant's results.
         errors: Largest error of each run [-].
         joint: The joint with the largest error.
         count: Periods of a run.
@@ -538,7 +538,7 @@ def _clipped(case: _Case) -> str:
 
 
 def _late(case: _Case) -> str:
-    """Name an effort that comes late, if the equation answers to such a one as the plant does."""
+    """Name a delayed effort, if the equation with that delay responds as the plant does."""
     dt = case.plant.dt
     for i, limit in enumerate(case.plant.effort_limits):
         theirs, mine = (_response(case, plant, i, _SMALL * limit) for plant in (case.plant, case.equation))
@@ -568,7 +568,7 @@ def _unlike(theirs: Array, mine: Array) -> float:
 
 
 def _stop(case: _Case) -> str:
-    """Name a part of the circle in which something else acts, where free swings elsewhere are right."""
+    """Name a range of angles with another torque, such as a stop, if free swings elsewhere match."""
     j = case.joint
     swings = [(p.position[j], e) for p, e in zip(case.runs.probes, case.errors, strict=True) if p.kind == _FREE]
     swings.sort()

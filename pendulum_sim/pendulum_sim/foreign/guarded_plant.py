@@ -1,4 +1,4 @@
-"""What may go wrong with a simulation that somebody else wrote, each named in one sentence."""
+"""What may go wrong with a third-party simulation, each named in one sentence."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["GuardedPlant", "PaceWatch", "StallWatch", "in_one_sentence"]
 _LATEST = 0.5
 """Distance behind the wall's time at which a simulation that is too slow is given up [s]."""
 _LARGEST_STEP = 10.0
-"""Periods that one step counts for at most: one pause of the machine says nothing about the simulation."""
+"""Cap on one step's duration, in periods: one pause of the machine is not the simulation's."""
 _MEMORY = 0.02
 """Weight of the newest step in the mean."""
 
@@ -37,10 +37,10 @@ class GuardedPlant:
         return self._plant.state
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Start anew.
+        """Restart.
 
         Raises:
-            FaultError: The simulation cannot, or starts with values that are not finite.
+            FaultError: The simulation fails to, or starts with values that are not finite.
         """
         return self._try("reset", self._plant.reset, theta, theta_dot)
 
@@ -64,7 +64,7 @@ class GuardedPlant:
 
 
 class PaceWatch:
-    """Tells a simulation that is too slow for the wall's time from a machine that paused once.
+    """Distinguishes a simulation too slow for real time from a single pause of the machine.
 
     Args:
         period: Time that a step simulates [s].
@@ -136,7 +136,7 @@ def in_one_sentence(name: str, what: str, kind: type[PendulumError]) -> Iterator
         kind: Exception that is raised in its place.
 
     Raises:
-        PendulumError: Of that kind; one of ours keeps its sentence.
+        PendulumError: Of that kind; another PendulumError is passed on.
     """
     try:
         yield

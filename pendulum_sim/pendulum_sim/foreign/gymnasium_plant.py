@@ -1,4 +1,4 @@
-"""An environment of Gymnasium as a plant: Pendulum-v1, our own, and any whose adapter file says what is what.
+"""An environment of Gymnasium as a plant: Pendulum-v1, this package's, and any with an adapter file.
 
 An adapter file::
 
@@ -78,7 +78,7 @@ _STEPS = 3
 
 
 def load_adapter(path: str | Path) -> Adapter:
-    """Return what an adapter file says.
+    """Return the contents of an adapter file.
 
     Raises:
         ParameterError: The file is refused; the message names file and entry.
@@ -106,14 +106,14 @@ def load_gymnasium_plant(
 
     Args:
         env_id: Identifier for ``gymnasium.make``; ``module:ID`` imports the module that registers it first.
-        adapter: What the environment does not say.
+        adapter: What the environment does not define.
         seed: Seed of every reset.
-        effort_limit: Largest torque where nothing else says one; 0 for none [N m].
+        effort_limit: Largest torque where nothing else sets one; 0 for none [N m].
 
     Raises:
         ParameterError: Gymnasium is missing, or environment and adapter do not fit.
     """
-    # Late: who runs no environment needs no Gymnasium.
+    # Imported late: only environments need Gymnasium.
     try:
         import gymnasium
     except ImportError as error:
@@ -177,14 +177,14 @@ class GymnasiumPlant:
 
     @property
     def state(self) -> PlantState:
-        """The present state; the effort is what was asked for, as an environment measures none."""
+        """The present state; the effort is the commanded one, as an environment measures none."""
         return PlantState(self._steps * self.dt, self._theta, self._theta_dot, self._applied)
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Start anew with the seed, at an angle [rad] and a velocity [rad/s].
+        """Restart with the seed, at an angle [rad] and a velocity [rad/s].
 
         Raises:
-            ParameterError: Nothing says how the environment is put there.
+            ParameterError: The environment has no way to be set to that state.
         """
         check_start(theta, theta_dot)
         start = self._adapter.get("start")
@@ -209,11 +209,11 @@ class GymnasiumPlant:
             setattr(self._env.unwrapped, str(start), held)
         self._steps, self._applied = 0, 0.0
         if isinstance(start, str) and self._adapter.get("read") is None:
-            # The observation is older than the start; it is set anew by the first step.
+            # The observation is older than the start; the first step renews it.
             self._theta, self._theta_dot = float(theta), float(theta_dot)
         else:
             self._read(observation, fresh=True)
-            # Whole turns are nobody's business but ours.
+            # The environment does not count whole turns; the plant does.
             self._theta += 2.0 * math.pi * round((theta - self._theta) / (2.0 * math.pi))
         return self.state
 
@@ -237,7 +237,7 @@ class GymnasiumPlant:
         other._seed = self._seed + 1
         return other
 
-    # --- what the adapter says -----------------------------------------------------------------------------
+    # --- entries of the adapter -----------------------------------------------------------------------------
 
     def _error(self, text: str) -> ParameterError:
         return ParameterError(f"environment {self._id}: {text}")
@@ -333,8 +333,8 @@ class GymnasiumPlant:
         if "equation" in self._adapter:
             found = load_plant(self._adapter["equation"])
             return found.with_values(effort_limit=self._limit, name=self._id)
-        # A step here and there: v' = a v + c u - d sin(theta), of which a and c tell inertia and damping. The first
-        # ones are not counted, so that neither what a reset does nor a short delay of the effort is taken for either.
+        # A step here and there: v' = a v + c u - d sin(theta), of which a and c give inertia and damping. The first
+        # steps are skipped, so that neither a reset nor a short delay of the effort biases the fit.
         generator = np.random.default_rng(0)
         rows, after = np.empty((_PROBES, 3)), np.empty(_PROBES)
         for i in range(_PROBES):

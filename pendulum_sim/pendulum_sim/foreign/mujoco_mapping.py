@@ -1,4 +1,4 @@
-"""The mapping file of a MuJoCo model: what the model file does not say in our terms.
+"""The mapping file of a MuJoCo model: what the model file does not define in the contract's terms.
 
 Every entry but the format may be left out::
 
@@ -36,13 +36,13 @@ _TEXTS = ("joint", "actuator")
 
 @dataclass(frozen=True)
 class MujocoMapping:
-    """What a model file does not say; None and empty text stand for what is chosen by itself.
+    """What a model file does not define; None and empty text stand for an automatic choice.
 
     Attributes:
         joint: Name of the hinge.
         actuator: Name of the actuator; ``none`` for torque on the joint itself.
-        sign: Sign of the file's angle in ours, 1 or -1.
-        zero: The file's angle that is 0 in ours [rad].
+        sign: Sign of the file's angle in the contract's, 1 or -1.
+        zero: The file's angle that is 0 in the contract [rad].
         effort_limit: Largest torque [N m].
         timestep: In place of the file's own [s].
         control_per_torque: Control for a command of 1 N m [1/(N m)].

@@ -32,7 +32,7 @@ def read_model(mujoco: Any, path: Path) -> tuple[Any, list[str]]:
             if found is not None and (problem := _problem(mujoco, found)) == "":
                 mesh.file = str(found)
                 continue
-            # A mesh says nothing of the dynamics where a link has its inertia; where not, MuJoCo says so.
+            # A mesh has no effect on the dynamics where a link has its inertia; where not, MuJoCo reports it.
             for geom in [geom for geom in spec.geoms if geom.meshname == mesh.name]:
                 spec.delete(geom)
             why = "no such file" if found is None else problem

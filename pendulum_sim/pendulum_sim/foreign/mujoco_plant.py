@@ -1,6 +1,6 @@
 """A model of MuJoCo as a plant: any MJCF or URDF with one hinge to drive.
 
-Actuators, friction, integrator and timestep are those of the file; a mapping file says what the file does not. A file
+Actuators, friction, integrator and timestep are those of the file; a mapping file adds what is missing. A file
 of ``export_model`` needs none: a joint with the contract's name has its zero and its sign, and an actuator ``effort``
 on it takes the contract's command as it is.
 """
@@ -42,7 +42,7 @@ def load_mujoco_plant(
 
     Args:
         path: MJCF or URDF.
-        mapping: What the file does not say.
+        mapping: What the file does not define.
         rate_hz: Rate of states; 0 for 500 Hz, or one of the file's timestep where that is longer [Hz].
         effort_limit: Largest torque where neither file nor mapping has one; 0 for none [N m].
 
@@ -60,12 +60,12 @@ def load_mujoco_plant(
 
 
 def _import_mujoco() -> Any:
-    # Late: nobody who has no such model should need 60 MB of it.
+    # Imported late: it takes 60 MB, which only such a model needs.
     try:
         import mujoco
     except ImportError as error:
         raise ParameterError(how_to_install(error) or f"MuJoCo cannot be imported: {error}") from error
-    # It would write its warnings to a file of its own in the working folder; what they say is raised here.
+    # It would write its warnings to a file of its own in the working folder; they are raised here as errors.
     mujoco.set_mju_user_warning(lambda _text: None)
     return mujoco
 
@@ -149,7 +149,7 @@ class MujocoPlant:
         return PlantState(self._steps * self.dt, theta, self._sign * float(data.qvel[self._dof]), self._sign * effort)
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Start anew as the file does, but for the joint's angle [rad] and velocity [rad/s]; a motor moves with it."""
+        """Restart as the file does, except for the joint's angle [rad] and velocity [rad/s]; a motor moves with it."""
         check_start(theta, theta_dot)
         model, data = self._model, self._data
         self._mujoco.mj_resetData(model, data)
@@ -210,7 +210,7 @@ class MujocoPlant:
         other.reset()
         return other
 
-    # --- what the file says --------------------------------------------------------------------------------
+    # --- contents of the file -------------------------------------------------------------------------------
 
     def _name(self, kind: str, index: int) -> str:
         return str(getattr(self._model, kind)(index).name) or f"number {index}"
@@ -402,7 +402,7 @@ class MujocoPlant:
             if model.actuator_dyntype[self._actuator] != int(mujoco.mjtDyn.mjDYN_NONE):
                 lag = float(model.actuator_dynprm[self._actuator, 0])
             delay = float(model.actuator_delay[self._actuator])
-            # The motor's own, which MuJoCo keeps apart from the joint's.
+            # The motor's own, which MuJoCo stores apart from the joint's.
             damping += float(model.actuator_damping[self._actuator]) * self._gear**2
         gain = abs(gain)
         return PlantParameters(

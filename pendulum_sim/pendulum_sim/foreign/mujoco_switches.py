@@ -11,7 +11,7 @@ __all__ = ["CAUSES", "switch_off"]
 
 _FINER = 8
 _LOCKED = 1e6
-"""Inertia that keeps a joint where it is, as a multiple of the largest of the model."""
+"""Inertia that locks a joint, as a multiple of the largest of the model."""
 _DISABLED = {"contact": "mjDSBL_CONTACT", "an equality constraint": "mjDSBL_EQUALITY"}
 _CLEARED = {
     "the range of a joint": ("jnt_limited",),

@@ -120,7 +120,7 @@ class Picture:
             length: Size of the plant in the picture [px].
         """
         share = max(-1.0, min(1.0, share))
-        # A square root shows the small torques of regulation beside the full one.
+        # A square root shows the small torques of regulation next to the full one.
         sweep = math.copysign(math.sqrt(abs(share)), share) * 1.5 * math.pi / 2.0
         if abs(sweep) < 0.02:
             return
@@ -149,11 +149,11 @@ class Picture:
         *,
         shortest: float = 0.15,
     ) -> None:
-        """Draw a torque or a force as an arrow whose length says how much of the largest it is.
+        """Draw a torque or a force as an arrow whose length is its share of the largest one.
 
         Args:
             begin: Where it begins [px].
-            along: The way that a positive one points [px].
+            along: Direction of a positive one [px].
             share: Torque or force, as a share of the one that is shown by half of ``length``.
             length: Size of the plant in the picture [px].
             colour: Colour of the arrow.

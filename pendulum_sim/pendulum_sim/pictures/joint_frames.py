@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class JointFrame(NamedTuple):
-    """A joint at a position of the plant; x to the right, y away from who looks, z up.
+    """A joint at a position of the plant; x to the right, y away from the viewer, z up.
 
     Attributes:
         origin: Where the joint is; of one that slides, where it has slid to [m].

@@ -1,7 +1,7 @@
 """``markers``: show torque and disturbance as arcs about the joints, a force as an arrow, in RViz and Foxglove.
 
-RViz has an Effort display of its own, but it draws revolute joints only (ours turns without end, so it is a
-continuous one) and drops messages whose ``frame_id`` is no frame (in ours it is who commands).
+RViz's own Effort display draws revolute joints only (this one turns without end, so it is continuous) and drops
+messages whose ``frame_id`` is no frame (here it is the commander).
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class MarkersNode(Node):
     """Draws the torques of one plant.
 
     Args:
-        stop: Asks the runner to end the process.
+        stop: Requests the runner to end the process.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:

@@ -20,9 +20,9 @@ __all__ = ["MechanismPicture", "seen_from_the_side"]
 
 _LINKS = (LINK, BOB)
 _TILT = math.radians(25.0)
-"""From how far above a plant in space is looked at."""
+"""Elevation of the view of a spatial plant [rad]."""
 _LINES = 26
-"""Lines of text that fill the height of a picture: several joints have more to say than one."""
+"""Lines of text that fill the height of a picture: several joints need more text than one."""
 _RAIL = 10.0
 """How far the rail is drawn to either side of a cart that nothing stops [m]."""
 
@@ -74,7 +74,7 @@ class MechanismPicture(Picture):
             velocity: n velocities to write; empty for none.
             effort: Efforts of driven joints by name, drawn as arcs, at a cart as an arrow [N m or N].
             disturbance: What pushes joints, by name, drawn as arrows at the ends of their links [N m or N].
-            time: Time that is written beside it [s]; None for none.
+            time: Time to write next to it [s]; None for none.
             note: A line of text; None for the plant's name.
         """
         self.canvas.fill(BACKGROUND)
@@ -164,7 +164,7 @@ class MechanismPicture(Picture):
         self.draw_arrow(origin, self._pixel(frame.tip + way) - origin, share, self._length)
 
     def _draw_from_above(self, chain: tuple[Point, ...]) -> None:
-        """Draw a plant in space once more, small, from above: from the side an arm that points at us is a point."""
+        """Draw a spatial plant once more, small, from above: seen from the side, an arm along the view is a point."""
         width, height = self.canvas.get_size()
         middle, scale = np.array([width - 0.5 * self._length, height - 0.55 * self._length]), 0.5 * self._scale
 

@@ -1,4 +1,4 @@
-"""Which plant a picture shows: known by the names of its joints, and by what it says of itself."""
+"""Which plant a picture shows: identified by the names of its joints and by its own description."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class ShownPlant:
 
     Attributes:
         joints: The joints of which states are drawn, in their order: one where the plant is a pendulum.
-        parameters: The plant of several joints; None for a pendulum, and until the plant has said what it is.
+        parameters: The plant of several joints; None for a pendulum, and until the plant's description arrives.
     """
 
     def __init__(self, topic: str) -> None:
@@ -55,7 +55,7 @@ class ShownPlant:
         self._find()
 
     def take_description(self, text: str) -> None:
-        """Take what the plant says of itself in its diagnostics.
+        """Take the plant's description from its diagnostics.
 
         Raises:
             ParameterError: It is no description of plants.

@@ -1,4 +1,4 @@
-"""Which torques a picture of a plant shows: those that act on it, not those that somebody asks for."""
+"""Which torques a picture of a plant shows: those that act on it, not those that are commanded."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 __all__ = ["SHOWN_TOPICS", "ShownTorques"]
 
 SHOWN_TOPICS = (names.APPLIED_EFFORT, names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH)
-"""Topics whose torques :class:`ShownTorques` wants to be told."""
+"""Topics that :class:`ShownTorques` reads."""
 _STALE_NS = NANOSECONDS // 2
 """Age at which a torque is no longer drawn, by the clock of the states [ns]."""
 _TOGETHER_NS = NANOSECONDS // 20
@@ -32,7 +32,7 @@ class ShownTorques:
                 self._newest[topic, joint] = (command.stamp_ns, effort)
 
     def acting_on(self, topic: str, now_ns: int, joints: tuple[str, ...]) -> dict[str, float]:
-        """Return what acts on those of some joints that anybody told of, by name, as :meth:`acting` does."""
+        """Return what acts on those of some joints that were in a message, by name, as :meth:`acting` does."""
         return {joint: self.acting(topic, now_ns, joint) for joint in joints if (topic, joint) in self._newest}
 
     @property

@@ -77,10 +77,10 @@ _DISTURBING = (names.DISTURBANCE, names.PUSH)
 
 
 class ViewerNode(Node):
-    """Shows a plant; takes part in nothing.
+    """Shows a plant; publishes nothing.
 
     Args:
-        stop: Asks the runner to end the process.
+        stop: Requests the runner to end the process.
 
     Raises:
         ParameterError: A parameter is refused, or there is no display for the window.
@@ -116,7 +116,7 @@ class ViewerNode(Node):
             create_wall_timer(self, values["duration"], stop)
 
     def close(self) -> None:
-        """Write the files that were asked for, and close the window."""
+        """Write the requested files, and close the window."""
         self._draw()
         if self._values["png"]:
             save_png(self._values["png"], self._picture.array())

@@ -65,7 +65,7 @@ SPECS: tuple[ParameterSpec, ...] = (
     *LIMIT_SPECS,
 )
 _LATENESS = 2.0
-"""Periods between a state and the first effect of its answer, at most, on a graph."""
+"""Periods between a state and the first effect of the command in reply, at most, on a graph."""
 _HEARD = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Matches publishers of either reliability."""
 _LAST_ZEROS = 5
@@ -73,13 +73,13 @@ _LAST_ZEROS = 5
 
 
 class AdoptNode(PollingNode):
-    """Stands between a plant that knows no rules and everybody else.
+    """Applies the contract's rules to a plant that has none.
 
-    Each of its states goes out with the time at which it came, and is answered with the torque that the rules allow.
-    Until somebody arms, after a fault, an e-stop or without commands, that is zero.
+    Each of its states is republished with its arrival time, and the reply is the torque that the rules allow.
+    Until it is armed, after a fault, an e-stop or without commands, that is zero.
 
     Args:
-        stop: Asks the runner to end the process.
+        stop: Requests the runner to end the process.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:
@@ -111,14 +111,14 @@ class AdoptNode(PollingNode):
         self._commands = self.create_publisher(Float64MultiArray, values["commands"], 10)
         # As bytes: a message that cannot be read must not end the node that holds the e-stop.
         self.create_subscription(JointState, values["states"], self._on_state, _HEARD, raw=True)
-        # Where states stop, nothing else would say so and take the torque away.
+        # Where states stop, nothing else would report it and remove the torque.
         self.create_timer(
             0.25 * values["state_timeout"], self._on_silence, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
         self.get_logger().info(f"adopts joint {self._joint!r} of {values['states']}, efforts to {values['commands']}")
 
     def close(self) -> None:
-        """Disarm, and send zero efforts: whoever takes them may keep the last one for ever."""
+        """Disarm, and send zero efforts: the plant may hold the last one for ever."""
         self._interface.safe_stop("adopt ends")
         for _ in range(_LAST_ZEROS):
             self._send(0.0)
@@ -146,7 +146,7 @@ class AdoptNode(PollingNode):
         quiet = 0.5 * self._settings.values["state_timeout"] * NANOSECONDS
         if sample is None or now_ns - sample.stamp_ns > quiet:
             drive = self._interface.decide(now_ns)
-            # Without a state nothing but a torque that was asked for may go on, and only until it is too old.
+            # Without a state only a commanded torque may continue, and only until the state is too old.
             self._answer(drive if drive.kind is DriveKind.EFFORT else Drive(DriveKind.OFF), sample)
 
     def _answer(self, drive: Drive, sample: JointSample | None) -> None:

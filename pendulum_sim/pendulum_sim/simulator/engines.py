@@ -1,4 +1,4 @@
-"""The simulations that the simulator's node can run: ours, or somebody else's."""
+"""The simulations that the simulator's node can run: the built-in one, and third-party ones."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Simulation(NamedTuple):
 
     Attributes:
         plant: What is stepped, once in a period.
-        name: Preset, file or identifier that was asked for.
-        method: How it is integrated, in words.
-        remarks: What the user should know of what was chosen, one line each.
-        sealed: Whether its parameters are nobody's business.
-        check: Runs it against its equation, of a simulation of others; afterwards it is to be reset.
+        name: Preset, file or identifier that was requested.
+        method: How it is integrated, as text.
+        remarks: Notes for the user on automatic choices, one line each.
+        sealed: Whether its parameters must not be shown.
+        check: Runs a third-party simulation against its equation; to be reset afterwards.
     """
 
     plant: Plant | MechanismPlant
@@ -68,7 +68,7 @@ class Engine:
         description: What it does, one sentence.
         specs: The parameters that are its own.
         make: Makes the simulation that the values of its parameters describe.
-        foreign: Whether somebody else wrote it: nothing it returns is believed, and its steps are timed.
+        foreign: Whether it is third-party: everything it returns is checked, and its steps are timed.
         example: A command line.
     """
 
@@ -255,7 +255,7 @@ GYMNASIUM_PREFIX = "gymnasium:"
 
 
 def find_engine(simulation: str) -> tuple[Engine, dict[str, str]]:
-    """Return who runs a simulation of others, and the parameters that name it.
+    """Return the engine of a third-party simulation, and the parameters that name it.
 
     Args:
         simulation: Path of a model file, or ``gymnasium:ID``.

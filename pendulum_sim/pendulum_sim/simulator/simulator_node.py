@@ -53,7 +53,7 @@ __all__ = ["SPECS", "SimulatorNode", "main", "run_engine"]
 _SENSOR_PREFIX = "sensor."
 _ONE_FOR_ALL = [0.0]
 _LONGEST_COMPILED = 0.005
-"""Longest period that is worth it, and that whoever stops the plant waits for [s]."""
+"""Longest period that is worth compiling, and that stopping the plant may wait for [s]."""
 _LEAST_PERIODS = 2.0
 """Age in periods that a command may reach at least."""
 
@@ -80,10 +80,10 @@ SPECS: tuple[ParameterSpec, ...] = (*OWN.specs, *_SHARED_SPECS)
 
 
 class SimulatorNode(PollingNode):
-    """A simulated pendulum as a plant. Whatever simulates it, the node has the name of the role.
+    """A simulated pendulum as a plant. The node has the name of the role, whatever the engine.
 
     Args:
-        stop: Asks the runner to end the process.
+        stop: Requests the runner to end the process.
         engine: What simulates.
     """
 
@@ -180,7 +180,7 @@ class SimulatorNode(PollingNode):
         self._interface.close()
 
     def _compile(self, period_ns: int) -> tuple[CompiledPeriods | None, str]:
-        """Return what runs ordinary periods compiled, or None, and how to tell of it."""
+        """Return the compiled loop of nominal periods, or None, and its text for diagnostics."""
         try:
             if not self._settings["compiled"]:
                 raise NoMachineCodeError("compiled is false")
@@ -206,7 +206,7 @@ class SimulatorNode(PollingNode):
     # --- the loop ------------------------------------------------------------------------------------------
 
     def run_due(self) -> float:
-        """Let the loop do what is due; return the time until it wants to be called again [s]."""
+        """Let the loop do what is due; return the time until it is due again [s]."""
         due: float = self._loop.run_due()
         return due
 
@@ -216,7 +216,7 @@ class SimulatorNode(PollingNode):
         effort = drive.effort
         if drive.kind is DriveKind.POSITION:
             assert self._servo is not None
-            # The servo knows the weight it carries, so the hand-over's feed-forward would count it twice.
+            # The servo compensates the weight, so the hand-over's feed-forward would count it twice.
             (theta,), (theta_dot,), (limit,) = (
                 self._state.position,
                 self._state.velocity,
@@ -248,7 +248,7 @@ class SimulatorNode(PollingNode):
         return pace.problem(time.monotonic() - begun, (self._wall() - stamp_ns) / NANOSECONDS)
 
     def _fail(self, reason: str) -> None:
-        """Stop where the simulation has failed, say so, and let nobody arm it before it was reset."""
+        """Stop a failed simulation, report it, and refuse to arm before a reset."""
         self._failure = reason
         self._loop.halted = True
         self._supervisor.fault(reason, self._interface.clock())

@@ -254,7 +254,7 @@ def adaptive_step(
     plant: PlantTuple,
 ) -> tuple[float, float]:
     """Adaptive Runge-Kutta of order eight (DOP853) at a relative tolerance of 1e-12; the reference."""
-    # Imported late: nobody who steps in real time should wait for scipy.
+    # Imported late: stepping in real time should not wait for scipy.
     from scipy.integrate import solve_ivp
 
     rise = torque_mid - torque_0

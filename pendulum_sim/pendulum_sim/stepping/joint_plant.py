@@ -34,7 +34,7 @@ class OneJoint:
         return _as_tuples(self.plant.state)
 
     def reset(self, position: Vector, velocity: Vector) -> MechanismState:
-        """Start anew at an angle [rad] and a velocity [rad/s]."""
+        """Restart at an angle [rad] and a velocity [rad/s]."""
         return _as_tuples(self.plant.reset(position[0], velocity[0]))
 
     def step(self, effort: Vector, push: Vector) -> MechanismState:

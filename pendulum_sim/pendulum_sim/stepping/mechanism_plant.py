@@ -107,7 +107,7 @@ class MechanismPlant:
         return MechanismState(self._steps * self.dt, self._position, self._velocity, self._effort)
 
     def reset(self, position: Vector | None = None, velocity: Vector | None = None) -> MechanismState:
-        """Start anew, the actuators without effort and no command on its way.
+        """Restart, the actuators without effort and no command on its way.
 
         Args:
             position: n positions; None for hanging at 0 [rad or m].

@@ -62,7 +62,7 @@ class Plant(Protocol):
         """The present state."""
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Start anew at an angle [rad] and a velocity [rad/s], the actuator without torque."""
+        """Restart at an angle [rad] and a velocity [rad/s], the actuator without torque."""
 
     def step(self, effort: float, push: float = 0.0) -> PlantState:
         """Advance by one period under a commanded torque and a torque on the link [N m].
@@ -215,7 +215,7 @@ class RigidPlant:
         return PlantState(self.steps * self.dt, self.theta, self.theta_dot, self.effort)
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Start anew, the actuator without torque and no command on its way.
+        """Restart, the actuator without torque and no command on its way.
 
         Args:
             theta: Angle [rad].
@@ -274,7 +274,7 @@ def command_within(limit: float, effort: float, push: float) -> float:
     """Return a commanded torque within the limit [N m].
 
     Raises:
-        ParameterError: It, or the push beside it, is not finite: clamped, no number would be the full torque.
+        ParameterError: It, or the push, is not finite: clamping NaN could give the full torque.
     """
     if not (math.isfinite(effort) and math.isfinite(push)):
         raise ParameterError(f"effort is {effort} N m and push {push} N m; expected finite numbers")

@@ -18,7 +18,7 @@ def make_plant(parameters: PlantParameters, dt: float, *, method: str = "auto", 
         dt: Period over which a command is held [s].
         method: One of ``integrators.METHODS``; ``auto`` is ``etd4`` for a rigid plant and ``semi_implicit``
             for a series-elastic one, which has no other.
-        substeps: Integration steps in a period; None for 1 (rigid), or as many as 0.25 ms asks for.
+        substeps: Integration steps in a period; None for 1 (rigid), or as many as steps of 0.25 ms need.
 
     Raises:
         ParameterError: The method does not go with the plant, or an argument is outside its domain.

@@ -2,7 +2,7 @@
 
 The torque command drives the motor in feed-forward, u = tau R / (N V K_t eta), as the actuator does with
 its effort loop off: what slows the link then is the back EMF of the winding, K_t K_e N^2 / R = 11.8 N m
-s/rad, beside 1.4 of motor and gears. The efficiency is in the command alone. Equations and sources:
+s/rad, next to 1.4 of motor and gears. The efficiency is in the command only. Equations and sources:
 ``pendulum_msgs_py.dynamics.series_elastic``.
 """
 
@@ -183,11 +183,11 @@ class SeriesElasticPlant:
 
     @property
     def state(self) -> PlantState:
-        """The present state; the effort is what the deflection of the spring says."""
+        """The present state; the effort is the one of the spring's deflection."""
         return PlantState(self._steps * self.dt, self.theta, self.theta_dot, self.effort)
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Start anew with the spring carrying gravity, the hysteresis loop open and the motor unpowered.
+        """Restart with the spring carrying gravity, the hysteresis loop open and the motor unpowered.
 
         Args:
             theta: Link angle [rad].

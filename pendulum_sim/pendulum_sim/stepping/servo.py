@@ -18,11 +18,11 @@ __all__ = ["PositionServo"]
 
 
 class PositionServo:
-    """Position controller that knows the plant's parameters, and clamps to its effort limit.
+    """Model-based position controller, clamped to the plant's effort limit.
 
     Args:
         parameters: The plant.
-        dt: Period at which it is asked [s].
+        dt: Period at which it is called [s].
     """
 
     def __init__(self, parameters: PlantParameters, dt: float) -> None:

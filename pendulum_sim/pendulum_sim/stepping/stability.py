@@ -2,8 +2,8 @@
 
 Near its two equilibria a rigid pendulum is ``theta'' = tau / M_c - lambda theta' -+ omega^2 theta`` with
 lambda = b_c / M_c and omega^2 = |G_c| / M_c. A step of an integrator maps such a state linearly; the eigenvalues of the
-map are what is left of the plant's poles. Hanging, both poles decay, so both eigenvalues must; upright one pole grows,
-and one eigenvalue may. So no stability function has to be known: the very step that simulates is asked.
+map are those of the discretised plant. Hanging, both poles decay, so both eigenvalues must; upright one pole grows, and
+one eigenvalue may. No stability function is needed: the very step that simulates is evaluated.
 
 Source: Hairer and Wanner, "Solving Ordinary Differential Equations II", IV.2 (stability of one-step methods).
 """
@@ -90,7 +90,7 @@ def check_stability(
         longest_step: The longest of them, where a delay cuts the period [s].
 
     Raises:
-        ParameterError: It is unstable at that step; the message says what would not be.
+        ParameterError: It is unstable at that step; the message has a step that is stable.
     """
     if integrator.name == "adaptive" or _is_stable(integrator, parameters, longest_step):
         return
