@@ -4,8 +4,8 @@
     ros2 launch pendulum_lqr bringup.launch.py --show-args
 
 Include it with ``IncludeLaunchDescription``; behind ``PushRosNamespace`` all its nodes and topics move along. Which
-programs belong to a run, and under which names, is said in
-``pendulum_msgs_py.programs.graph``, which experiments read too.
+programs belong to a run, and under which names, is defined in :mod:`pendulum_msgs_py.programs.graph`, for experiments
+too.
 """
 
 import time
@@ -58,7 +58,7 @@ def recorder(side: str, outer: str, folder: Path) -> Node:
         arguments=["-o", str(folder / side), "--regex", f"^({outer}{side}/.*|/diagnostics|/clock)$"],
         output="screen",
         additional_env=bound_environment({}),
-        # It hears the plants' last words: it gets time to write them.
+        # It records the plants' last messages and needs time to write them.
         sigterm_timeout="10",
     )
 

@@ -25,12 +25,12 @@ _SHARE = 0.9
 
 @dataclass
 class Catch:
-    """LQR at the set-point with hysteresis: takes over inside x' S x <= level, lets go beyond twice the proven level.
+    """LQR at the set-point with hysteresis: takes over inside x' S x <= level, releases beyond twice the proven level.
 
     Attributes:
         gain: Gain and Riccati solution.
         level: Level at which it takes over.
-        release: Level at which it lets go, larger.
+        release: Level at which it releases, larger.
         effort_limit: Largest torque [N m].
         set_point: Angle from upright [rad].
         hold: Torque that holds it [N m].
@@ -51,7 +51,7 @@ class Catch:
         self._s00, self._s01, self._s11 = (float(self.gain.S[row]) for row in ((0, 0), (0, 1), (1, 1)))
 
     def reset(self) -> None:
-        """Let go."""
+        """Release."""
         self.active = False
 
     def holds(self, angle: float, velocity: float) -> bool:
@@ -73,7 +73,7 @@ class Catch:
 
 
 class CatchingController(BaseController):
-    """Brings a rigid pendulum to where an LQR catches it; how it does so is said by its class.
+    """Swings a rigid pendulum up to where an LQR takes over; a subclass defines how.
 
     Attributes:
         catch: LQR with hysteresis at the set-point.
@@ -88,7 +88,7 @@ class CatchingController(BaseController):
         self.catch = Catch(gain, share * level, _LET_GO * level, self.effort_limit, self.set_point, hold)
 
     def reset(self) -> None:
-        """Let go."""
+        """Release."""
         self.catch.reset()
 
     def take_over(self, previous: Controller) -> None:

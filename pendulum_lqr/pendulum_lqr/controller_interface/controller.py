@@ -1,7 +1,7 @@
-"""One interface for every controller, and the table from which a name chooses one.
+"""One interface for every controller, and the table that a name is looked up in.
 
 A controller is a class in a file of its own under ``controllers/`` plus one line in ``CONTROLLERS``. It sees
-x = [wrap(theta - pi), theta_dot] and answers with a torque; it knows no ROS and no clock.
+x = [wrap(theta - pi), theta_dot] and returns a torque; it depends on neither ROS nor a clock.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ CONTROLLERS: dict[str, str] = {
     "playback": "pendulum_lqr.controllers.playback:Playback",
     "policy": "pendulum_lqr.controllers.policy:LearnedPolicy",
 }
-"""Name -> ``module:class``; modules are imported when asked for, so that LQR does not pay for CasADi."""
+"""Name -> ``module:class``; modules are imported on demand, so that LQR does not pay for CasADi."""
 
 COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
     ParameterSpec("set_point", 0.0, "rad", "Angle to hold, from upright.", minimum=-math.pi, maximum=math.pi),
@@ -82,10 +82,10 @@ COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
 
 
 def soft_start(effort: float, limit: float, t: float, start_time: float) -> float:
-    """Return a torque within what may be asked for so long after the first state [N m].
+    """Return a torque within the limit that applies at this time after the first state [N m].
 
     Args:
-        effort: The torque that is wanted [N m].
+        effort: The desired torque [N m].
         limit: Largest torque in the end [N m].
         t: Time since the first state [s].
         start_time: Time in which the largest torque rises from zero to the limit [s].
@@ -95,12 +95,12 @@ def soft_start(effort: float, limit: float, t: float, start_time: float) -> floa
 
 
 class BaseController:
-    """What most controllers share: a limit, a set-point, and nothing to remember.
+    """What most controllers share: a limit, a set-point, and no state.
 
     Attributes:
         effort_limit: Largest torque [N m].
         set_point: Angle to hold, from upright [rad].
-        notice: What the user has to be told while it runs; empty for nothing.
+        notice: Notice for the user while it runs; empty for nothing.
         feedback: What it is near its set-point where that is a gain; None for any other law.
     """
 
@@ -112,14 +112,14 @@ class BaseController:
     SERIES_ELASTIC: ClassVar[bool] = True
     """Whether its design reckons with motor and spring; others refuse such a plant."""
     PREDICTS: ClassVar[bool] = False
-    """Whether it predicts the plant from the torques that it sent, and so has to know which one holds."""
+    """Whether it predicts the plant from the torques that it sent, and so needs the holding torque."""
     STARTS_SOFTLY: ClassVar[bool] = False
-    """Whether it keeps ``start_time`` by itself; for others :class:`SoftStart` does."""
+    """Whether it applies ``start_time`` itself; for others :class:`SoftStart` does."""
     FEEDBACK: ClassVar[bool] = True
     """Whether it closes a loop whose linear model has to be stable."""
 
     TIME_INVARIANT: ClassVar[bool] = True
-    """Whether one state gets one answer at any time, so that the loop has a frequency response."""
+    """Whether a state gives the same command at any time, so that the loop has a frequency response."""
 
     def __init__(self, effort_limit: float, set_point: float = 0.0) -> None:
         self.notice = ""
@@ -192,19 +192,19 @@ class BaseController:
 
 
 class LawController(BaseController):
-    """A controller that is one pure function of numbers: its node can answer states by it in compiled code.
+    """A controller that is one pure function of numbers: its node can run it in compiled code.
 
     Args:
         law: The function, of a module; it begins with ``effort_limit`` and ``set_point`` among its numbers.
         effort_limit: Largest torque [N m].
         set_point: Angle to hold, from upright [rad].
         numbers: The law's own numbers, at most ``MOST_NUMBERS - OWN``.
-        memory: What it remembers before its first state, at most ``MOST_MEMORY``.
+        memory: Its memory before the first state, at most ``MOST_MEMORY``.
 
     Attributes:
         law: The function.
         numbers: All of its numbers.
-        memory: What it remembers.
+        memory: Its state.
     """
 
     def __init__(
@@ -236,7 +236,7 @@ class EstimatedVelocity(BaseController):
 
     Args:
         inner: The controller.
-        estimator: The velocity estimator; it is told the torque of the last answer.
+        estimator: The velocity estimator; its input is the torque of the last command.
     """
 
     def __init__(self, inner: Controller, estimator: VelocityEstimator) -> None:
@@ -271,7 +271,7 @@ class EstimatedVelocity(BaseController):
 
 
 class SoftStart(BaseController):
-    """A controller whose torque begins at zero and may reach its limit after a while; one that predicts does not know.
+    """A controller whose torque begins at zero and may reach its limit after a while; a predictive one ignores it.
 
     Args:
         inner: The controller.
@@ -348,8 +348,8 @@ def make_controller(
         plant: Parameters of the plant to design for.
         period: Sampling period of the loop [s].
         values: Parameters by name; others at their default.
-        checked: Whether a loop that is unstable is refused; not where the period is a guess. Gains that somebody chose
-            by hand (``tuning`` manual) are taken as they are.
+        checked: Whether a loop that is unstable is refused; not where the period is a guess. Gains set by hand
+            (``tuning`` manual) are not checked.
 
     Raises:
         ParameterError: Unknown controller or parameter, a value out of domain, a design that does not exist, or a loop

@@ -21,7 +21,7 @@ class Controller(Protocol):
         """Forget everything: integrals, filters, phases."""
 
     def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque [N m] that answers a state.
+        """Return the torque for a state [N m].
 
         Args:
             t: Time of the state since the controller was started [s]; it increases from call to call.
@@ -45,9 +45,9 @@ class JointController:
     SUMMARY: ClassVar[str] = ""
     """One sentence for tables."""
     SAMPLED: ClassVar[bool] = True
-    """Whether its answers depend on the period at which states come; for others the period is only judged."""
+    """Whether its commands depend on the period of states; for others the period is only checked."""
     DESIGNING: ClassVar[str] = ""
-    """What its design does where that takes seconds, for who waits."""
+    """What its design does, to be logged, where that takes seconds."""
 
     def __init__(self, effort_limits: Vector) -> None:
         self.effort_limits = effort_limits
@@ -75,7 +75,7 @@ class JointController:
 
     @property
     def notice(self) -> str:
-        """What the user has to be told while it runs; empty for nothing."""
+        """Notice for the user while it runs; empty for nothing."""
         return ""
 
     def check(self, period: float) -> None:
@@ -89,7 +89,7 @@ class JointController:
         """Forget everything; nothing by default."""
 
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
-        """Return the m efforts [N m or N] that answer a state.
+        """Return the m efforts for a state [N m or N].
 
         Args:
             t: Time of the state since the controller was started [s]; it increases from call to call.

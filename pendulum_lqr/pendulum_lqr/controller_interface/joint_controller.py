@@ -34,7 +34,7 @@ JOINT_CONTROLLERS: dict[str, str] = {
     "nmpc": "pendulum_lqr.controllers.joint_nmpc:JointNmpc",
     "policy": "pendulum_lqr.controllers.joint_policy:JointPolicy",
 }
-"""Name -> ``module:class``; modules are imported when asked for."""
+"""Name -> ``module:class``; modules are imported on demand."""
 JOINT_CONTROLLER_NAMES = f"{', '.join(list(JOINT_CONTROLLERS)[:-1])} or {list(JOINT_CONTROLLERS)[-1]}"
 """For sentences."""
 

@@ -22,7 +22,7 @@ Law = Callable[[float, float, float, MutableSequence[float], Sequence[float]], f
 """``law(t, angle, velocity, memory, numbers)`` -> torque [N m].
 
 The time since the first state [s], the angle from upright [rad] and the velocity [rad/s] are those of a state, all
-finite; ``numbers`` are what was designed, ``memory`` is what the law keeps from state to state and changes in place.
+finite; ``numbers`` are what was designed, ``memory`` is what the law stores from state to state and changes in place.
 It is compiled as it stands, so it uses numbers, ``math``, indices and functions of this project that do likewise.
 """
 
@@ -36,7 +36,7 @@ def clamped(effort: float, limit: float) -> float:
     """Return a torque within a limit [N m]; what is no number stays none."""
     if effort > limit:
         return limit
-    if effort < -limit:  # not by max(), whose answer for what is no number differs where it is compiled
+    if effort < -limit:  # not by max(), whose result for NaN differs where it is compiled
         return -limit
     return effort
 

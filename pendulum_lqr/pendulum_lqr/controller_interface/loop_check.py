@@ -45,7 +45,7 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
         controller: Any controller; one that predicts has to feed forward the torque that holds. It is reset before
             and after.
         plant: The plant that it meets.
-        period: The period at which it will be asked [s].
+        period: The period at which it will be called [s].
         set_point: The angle that it holds, from upright [rad].
     """
     model = linearise(plant, UPRIGHT + set_point)
@@ -59,7 +59,7 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
         z[model.states.index("motor_angle")] = _START
     A, B = sampled.A, sampled.B[:, 0]
     controller.reset()
-    # A prediction has to be told the truth; whoever makes none may rest wherever its first answer says.
+    # A predictive law needs the true holding torque; any other may rest at its own first command.
     law = controller
     while (inner := getattr(law, "inner", None)) is not None:
         law = inner

@@ -1,6 +1,6 @@
-"""What a policy answers to one state after another: samples, network, rate limit, soft start, and where it gives up.
+"""A policy's commands for successive states: samples, network, rate limit, soft start, and where it gives up.
 
-Nothing here knows how many joints there are: the controllers of one joint and of several share it.
+It holds for any number of joints: the controllers of one joint and of several share it.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _INTERVALS = 15
 
 
 def policy_specs(fallbacks: Sequence[str]) -> tuple[ParameterSpec, ...]:
-    """Return the parameters of a controller that answers with a policy file.
+    """Return the parameters of a controller that runs a policy file.
 
     Args:
-        fallbacks: Who may answer where it gives up, ``ZERO`` first.
+        fallbacks: The controllers that may take over where it gives up, ``ZERO`` first.
     """
     return (
         ParameterSpec("policy", "", "", "Policy file (.npz)."),
@@ -47,7 +47,7 @@ def policy_specs(fallbacks: Sequence[str]) -> tuple[ParameterSpec, ...]:
 
 
 def states_to_hold(policy: Policy, period: float) -> int:
-    """Return for how many states an answer of a policy holds, where they come at a period [s]."""
+    """Return for how many states a command of a policy holds, at their period [s]."""
     return max(1, round(policy.period / period))
 
 
@@ -62,11 +62,11 @@ def check_policy_period(policy: Policy, period: float) -> None:
 
 
 class PolicyAnswers:
-    """The answers of a policy to states of n joints, m efforts each, until it gives up.
+    """The commands of a policy for states of n joints, m efforts each, until it gives up.
 
     Args:
         policy: The policy.
-        hold: States for which an answer holds.
+        hold: States for which a command holds.
         limits: Largest effort of each driven joint [N m or N].
         start_time: Time from the first state until it has all of its effort [s].
 
@@ -130,16 +130,16 @@ class PolicyAnswers:
         return self._effort
 
     def follow(self, efforts: Vector) -> None:
-        """Take note of efforts that another controller applied in place of the last answer [N m or N]."""
+        """Record efforts that another controller applied in place of the last command [N m or N]."""
         self._effort = efforts
 
     def fall_back(self, t: float, state: Sequence[float], answer: Callable[[], Sequence[float]] | None) -> Vector:
-        """Return the efforts of a fallback, softly begun; none without one, or where the state or they are no numbers.
+        """Return the efforts of a fallback, softly started; none without one, or if the state or they are not finite.
 
         Args:
             t: Time since the start [s].
-            state: What the fallback answers: limits would make a full effort of what is no number.
-            answer: Asks the fallback.
+            state: Input of the fallback; checked, since limits would turn NaN into a full effort.
+            answer: Calls the fallback.
         """
         if answer is None or not all(map(math.isfinite, state)):
             return self._still
@@ -153,14 +153,14 @@ class PolicyAnswers:
         )
 
     def describe(self, after: str) -> str:
-        """Return which policy it is, and whether it gave up; ``after`` says who answers then."""
+        """Return which policy it is, and whether it gave up; ``after`` names what commands then."""
         policy = self.policy
         sizes = "-".join(str(size) for size in policy.network.sizes)
         told = f"{policy.name} ({policy.task}, {sizes}) every {policy.period:g} s, fallback {after}"
         return f"{told}; {self.notice}" if self.notice else told
 
     def take_over(self, previous: PolicyAnswers) -> None:
-        """Take over samples and efforts from the answers of the same kind of policy, and that it gave up."""
+        """Take over samples and efforts from another run of the same kind of policy, and whether it gave up."""
         self.notice = previous.notice
         own, other = self.policy, previous.policy
         if (own.layout, own.history, own.velocity_scale, own.effort_limit) == (
@@ -176,7 +176,7 @@ class PolicyAnswers:
             self._wait = min(previous._wait, self.hold - 1)
 
     def _network(self, x: Vector, v: Vector) -> list[float]:
-        """Return the network's answers to the samples up to this one, within [-1, 1]."""
+        """Return the network's outputs for the samples up to this one, within [-1, 1]."""
         policy = self.policy
         sample = []
         for signal, k in self._layout:
@@ -224,7 +224,7 @@ class PolicyAnswers:
                 return
 
     def _watch_period(self, t: float) -> None:
-        """Give up where states come at another rate, whatever was said of it: the network knows no other time."""
+        """Give up where states come at another rate than in training, whatever was configured."""
         self._times.append(t)
         if len(self._times) <= _INTERVALS:
             return

@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 ASSUMED_PERIOD = 0.01
-"""Period of a design whose states nobody has heard yet [s]: that of the thesis's loop."""
+"""Period of a design before the first states [s]: that of the thesis's loop."""
 TOLERANCE = 0.2
 """Share by which the measured period may differ from that of the design: a late state now and then is no other rate."""
 _WINDOW = 15
@@ -44,7 +44,7 @@ class PeriodWatch:
     neither moves the median.
 
     Args:
-        exact: Stamps are simulated time, where one interval says it all and nothing may wait for more.
+        exact: Stamps are simulated time, where one interval is exact and nothing may wait for more.
     """
 
     def __init__(self, *, exact: bool = False) -> None:
@@ -54,7 +54,7 @@ class PeriodWatch:
         self._intervals_ns: deque[int] = deque(maxlen=1 if exact else _WINDOW)
 
     def add(self, stamp_ns: int) -> bool:
-        """Take the stamp of a state [ns]; return whether the plant began anew, so that what was measured is void."""
+        """Take the stamp of a state [ns]; return whether the plant has restarted, which voids earlier intervals."""
         newest, self.newest_ns = self.newest_ns, stamp_ns
         if newest is None or stamp_ns == newest:
             return False
@@ -77,7 +77,7 @@ class PeriodWatch:
 
     @property
     def only_interval_ns(self) -> int | None:
-        """The one interval that says it all in simulated time [ns]; None in real time, or before it is known."""
+        """The one interval that is enough in simulated time [ns]; None in real time, or before it is known."""
         return self._intervals_ns[0] if self._exact and self._intervals_ns else None
 
     @property
@@ -89,7 +89,7 @@ class PeriodWatch:
 
 
 def goes_on(interval_ns: int) -> bool:
-    """Return whether a state so long after another goes on from it [ns], and is not that of a plant that began anew."""
+    """Return whether a state after this interval [ns] is of the same run, not of a restarted plant."""
     return 0 < interval_ns < _GAP_NS
 
 
@@ -99,10 +99,10 @@ def differs(measured: float, designed: float) -> bool:
 
 
 def uses_period(kind: str, velocity: str = "measured") -> bool:
-    """Return whether a controller's answers depend on the sampling period that it was designed for.
+    """Return whether a controller's commands depend on the sampling period that it was designed for.
 
     Args:
-        kind: Name of the controller; one that is not known here counts as if they did.
+        kind: Name of the controller; an unknown one counts as dependent.
         velocity: Where it takes the velocity from; every estimator depends on it.
     """
     return kind not in _IGNORE_PERIOD or velocity != "measured"
@@ -133,10 +133,10 @@ def rate_problem(
     uses: bool,
     set_point: float = 0.0,
 ) -> str:
-    """Return why a controller must not answer states that come at another rate than it was designed for, or nothing.
+    """Return why a controller must not run on states at another rate than it was designed for; empty if it may.
 
-    Refused is what would settle at its own rate and does not at theirs: a controller that never does, such as one of
-    zero torque, is somebody's intention.
+    Refused is what would settle at its own rate and does not at theirs: a controller that never settles, such as
+    one of zero torque, is intended.
 
     Args:
         make: Designs the controller.
@@ -144,7 +144,7 @@ def rate_problem(
         plant: The plant that it was designed for.
         designed: Period of the design [s].
         measured: Period of the states [s].
-        uses: Whether its answers depend on the period, see :func:`uses_period`.
+        uses: Whether its commands depend on the period, see :func:`uses_period`.
         set_point: Angle to hold, from upright [rad].
     """
     own = designed if uses else _FAST_PERIOD

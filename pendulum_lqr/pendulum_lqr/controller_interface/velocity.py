@@ -106,7 +106,7 @@ class SavitzkyGolay:
     def update(self, t: float, position: float, velocity: float, effort: float) -> float:
         """Return the fitted velocity; the measured one until the window is full, and after a gap [rad/s]."""
         samples = self._unwrapped
-        # The coefficients hold for equal steps: after a hole in the samples the window starts anew.
+        # The coefficients hold for equal steps: after a gap in the samples the window restarts.
         if samples and not 0.5 * self.period < t - self._t < 1.5 * self.period:
             samples.clear()
         samples.append(position if not samples else samples[-1] + wrap(position - samples[-1]))
@@ -168,7 +168,7 @@ class KalmanVelocity:
         self._sent.append(effort)
         turn = position - wrap(position - float(x[0])) - float(x[0])
         x = x + self._gain * wrap(position - float(x[0]))
-        # Angles stay on the turn on which they are measured, the motor's beside the link's.
+        # Angles stay on the turn on which they are measured, the motor's and the link's.
         x[[index for index, name in enumerate(self._states) if name in {"theta", "motor_angle"}]] += turn
         self._estimate = x
         return float(x[1])

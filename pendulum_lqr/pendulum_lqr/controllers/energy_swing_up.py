@@ -27,8 +27,8 @@ class EnergySwingUp(CatchingController):
 
     Pumping torque: u = clamp(k (E* (1 + margin) - E) theta_dot + b theta_dot + tau_C sgn(theta_dot) - tau_0), with
     E = M theta_dot^2 / 2 + G (1 - cos(theta - theta_0)) and E* that of rest at the set-point; theta_0 and tau_0 are the
-    plant's offsets. Its first part is passive; the other two put back what friction takes. At rest, where no velocity
-    says where to push and dry friction holds more than it takes in motion, it pushes at the limit where gravity pulls.
+    plant's offsets. Its first part is passive; the other two compensate friction. At rest, where the velocity gives no
+    direction and dry friction holds more than it takes in motion, it pushes at the limit where gravity pulls.
 
     Raises:
         DesignError: Dry friction holds more than the torque limit.

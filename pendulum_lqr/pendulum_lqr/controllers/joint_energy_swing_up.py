@@ -28,12 +28,12 @@ class JointEnergySwingUp(JointController):
     """Pumps energy into a pendulum by moving its hinge until the LQR can catch it.
 
     The energy is that of :mod:`pendulum_lqr.swing_up.mechanism_pump`.
-    Nothing is planned, and an answer takes microseconds: it begins from anywhere, and again wherever it is thrown to.
+    Nothing is planned, and a command takes microseconds: it starts from any state, also after a push.
 
     Args:
         plant: The plant.
-        pump: What pumps.
-        margin: Energy aimed at beyond that of upright, as a share of it [-].
+        pump: The pumping law.
+        margin: Target energy beyond that of upright, as a share of it [-].
         catch: LQR with its sampled region.
     """
 

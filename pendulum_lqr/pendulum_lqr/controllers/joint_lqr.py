@@ -33,7 +33,7 @@ __all__ = [
 JOINT_LIMIT = ParameterSpec(
     "effort_limit", 0.0, "N m", "Largest effort of each driven joint; 0 for the plant's own.", minimum=0.0
 )
-"""A limit for all driven joints, beside their own."""
+"""A limit for all driven joints, in addition to their own."""
 SMALLER_Q = "a faster plant, or a smaller q"
 """What helps a gain that does not settle, where its weights can be chosen."""
 
@@ -55,7 +55,7 @@ def joint_limits(plant: MechanismParameters, limit: float) -> Vector:
 
 
 def require_catching(controller: str, catch: MechanismCatch, period: float) -> None:
-    """Refuse an LQR that would not hold what comes up, asked at a period [s], lag and delay included.
+    """Refuse an LQR that would not hold the plant upright at a period [s], lag and delay included.
 
     Raises:
         DesignError: It does not settle.

@@ -1,4 +1,4 @@
-"""Linear MPC of a plant of several joints: the LQR about upright that knows its limits and the ends of a track."""
+"""Linear MPC of a plant of several joints: the LQR about upright under limits of efforts and of a track."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class JointMpc(JointDiscreteLqr):
     """Minimises the LQR's cost over N samples plus its cost to go, under limits of efforts and positions.
 
     The prediction is that of the linear model about upright, efforts on their way included. Without active limits the
-    answer is that of the discrete LQR. Limits of efforts are hard, those of positions soft.
+    command is that of the discrete LQR. Limits of efforts are hard, those of positions soft.
     """
 
     SUMMARY = "linear MPC with limits of efforts and positions (OSQP)"
@@ -61,7 +61,7 @@ class JointMpc(JointDiscreteLqr):
 
     @property
     def notice(self) -> str:
-        """That it does not look far enough, and how often the solver found no plan."""
+        """That the horizon is too short, and how often the solver found no plan."""
         told = []
         if self._program.horizon < self._enough:
             told.append(

@@ -1,4 +1,4 @@
-"""Nonlinear MPC of a plant of several joints: from anywhere to upright, planned anew as it goes, then LQR."""
+"""Nonlinear MPC of a plant of several joints: from anywhere to upright, replanned continuously, then LQR."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["JointNmpc"]
 class JointNmpc(CaughtController):
     """Plans by iterative LQR over 1.4 s, every 20 ms, and hands over to the LQR in the region from which it catches.
 
-    It is compiled when it is designed, so that its first answer is not late.
+    It is compiled at design time, so that its first command is not late.
 
     Raises:
-        ParameterError: A passive joint has dry friction: plans leave it out, and no effort can make up for it there.
+        ParameterError: A passive joint has dry friction: plans leave it out, and no effort can compensate it there.
     """
 
     SUMMARY = "nonlinear MPC by iterative LQR, then LQR; swings up from anywhere"

@@ -30,13 +30,13 @@ _FALLBACKS = (ZERO, "lqr")
 
 
 class JointPolicy(JointController):
-    """Answers with the network of a policy file, as :class:`pendulum_lqr.controllers.policy.LearnedPolicy` does.
+    """Runs the network of a policy file, as :class:`pendulum_lqr.controllers.policy.LearnedPolicy` does.
 
     Args:
         policy: The policy.
-        hold: States for which an answer holds.
+        hold: States for which a command holds.
         effort_limits: Largest effort of each driven joint [N m or N].
-        fallback: Who answers after it gave up; None for no effort.
+        fallback: Controller that takes over after it gave up; None for no effort.
         start_time: Time from the first state until it has all of its effort [s].
         catch: LQR that takes over near upright; None for none.
     """
@@ -62,7 +62,7 @@ class JointPolicy(JointController):
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
-        """Return the file, who falls back, who catches, and the limit."""
+        """Return the file, the fallback, the catching controller, and the limit."""
         catch = ParameterSpec(
             "catch",
             ZERO,
@@ -124,7 +124,7 @@ class JointPolicy(JointController):
         elif self.catch is not None:
             x = deviation_of(self.policy.coordinates, position + velocity)
             if self.catch.holds(x):
-                # The network hears of the efforts that act: it may have to go on from here.
+                # The network's samples hold the efforts that act: it may have to continue from here.
                 efforts = self._answers.begun(t, self.catch.command(x))
                 self._answers.follow(efforts)
         return efforts

@@ -29,10 +29,10 @@ _FILE = ParameterSpec(
 
 
 class CaughtController(JointController):
-    """What answers to whole states, and ends with an LQR that catches; how it does so is said by its class.
+    """A controller of whole states that ends with an LQR; the inner controller defines how.
 
     Args:
-        inner: Who answers.
+        inner: The controller.
         period: Period at which states come [s].
     """
 
@@ -52,7 +52,7 @@ class CaughtController(JointController):
         require_catching(self.NAME, self._inner.catch, period)
 
     def reset(self) -> None:
-        """Begin anew, at hanging."""
+        """Restart, hanging."""
         self._inner.reset()
 
     def command(self, t: float, position: Vector, velocity: Vector) -> Vector:

@@ -20,12 +20,12 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["LqrTracking"]
 
 _GAP = 0.1
-"""Time without a state after which the reference is joined anew [s]: twice that after which a plant gives up."""
+"""Time without a state after which the reference is rejoined [s]: twice a plant's timeout."""
 _LONGER = (1.0, 2.0, 4.0, 8.0, 16.0)
 """How many times longer the way onto the reference may become where the torque does not suffice."""
 _POINTS = 40
 _AGAIN = 0.1
-"""Time after which a way onto the reference is looked for again [s]."""
+"""Time after which the next search for a way onto the reference starts [s]."""
 
 
 class LqrTracking(BaseController):
@@ -176,7 +176,7 @@ class LqrTracking(BaseController):
 
     def _join(self, t: float, angle: float, velocity: float) -> None:
         """Find a way onto the reference that begins where the pendulum is, with as little torque as may be."""
-        # At its own velocity, or at rest: what damping stops within milliseconds would take torque to be kept up.
+        # At its own velocity, or at rest: sustaining a speed that damping stops within milliseconds would take torque.
         starts = [Motion(angle, velocity, 0.0), Motion(angle, 0.0, 0.0)]
         starts.sort(key=lambda start: abs(self.schedule.feedforward(start)))
         if self._approach_time == 0.0:

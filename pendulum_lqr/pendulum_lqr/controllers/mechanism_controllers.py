@@ -60,7 +60,7 @@ class DifferencedVelocity:
 
 
 class _WholeStates:
-    """A controller of the graph as one that is asked for whole states."""
+    """Adapts a controller of the graph to whole states."""
 
     def __init__(self, inner: JointController, joints: int) -> None:
         self._inner, self._joints = inner, joints
@@ -97,7 +97,7 @@ def make_mechanism_controller(name: str, plant: MechanismParameters, period: flo
     Args:
         name: Of :func:`mechanism_controller_names`, or the path of a policy file, ``FILE.npz``; of ``FILE.npz+lqr``
             an LQR takes over near upright.
-        plant: The plant that it believes in.
+        plant: The plant of its model.
         period: Sampling period [s].
 
     Raises:

@@ -1,4 +1,4 @@
-"""Linear MPC: LQR that knows its limits, as a quadratic program by OSQP."""
+"""Linear MPC: LQR under limits, as a quadratic program by OSQP."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class LinearMpc(Lqg):
 
     The prediction is that of the whole linear model, torques on their way included; what is not measured, and with
     ``offset_noise`` a constant torque too, comes from a Kalman filter.
-    Without active limits the answer is that of the discrete LQR. The torque limit is hard; angle and velocity
-    limits are soft (one slack each, dear), because a hard state limit has no answer once a disturbance has broken it.
+    Without active limits the command is that of the discrete LQR. The torque limit is hard; angle and velocity limits
+    are soft (one slack each, at a high cost): a hard state limit is infeasible once a disturbance has broken it.
     """
 
     SUMMARY = "linear MPC with limits of torque, angle and velocity (OSQP)"

@@ -25,7 +25,7 @@ class NonlinearMpc(CatchingController):
     """Multiple shooting with RK4 over N steps, warm-started from the last plan; LQR takes over near upright.
 
     Minimises the sum of h (q0 2 (1 - cos e) + q1 theta_dot^2 + r (u - u*)^2) and a terminal cost of the same form;
-    2 (1 - cos e) is e^2 near upright and knows no difference between turns.
+    2 (1 - cos e) is e^2 near upright and periodic over turns.
     """
 
     SUMMARY = "nonlinear MPC by multiple shooting, swings up and balances"
@@ -65,7 +65,7 @@ class NonlinearMpc(CatchingController):
         if np.all(np.isfinite(plan)) and float(np.max(np.abs(plan[2::3]))) <= 1.01 * self.effort_limit:
             self._plan = plan
         else:
-            # The last plan, shifted to now, is a better answer than none.
+            # The last plan, shifted to now, is a better command than none.
             self._failures += 1
             self.notice = f"no plan for {self._failures} states: the last plan answered"
             self._plan = guess

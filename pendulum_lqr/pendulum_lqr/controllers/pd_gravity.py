@@ -31,7 +31,7 @@ def pd_gravity_law(
 class PdGravity(LawController):
     """u = (G_c sin(theta - angle_offset) - torque_offset) / gain - k_p (theta - theta*) - k_d theta_dot.
 
-    Holds any angle, upright or not; gain is what the actuator gives per torque asked for, 1 for a rigid plant.
+    Holds any angle, upright or not; gain is the actuator's torque per commanded torque, 1 for a rigid plant.
     """
 
     SUMMARY = "PD with gravity compensation: holds any angle"

@@ -25,25 +25,25 @@ __all__ = ["START_TIME", "LearnedPolicy"]
 
 
 class LearnedPolicy(BaseController):
-    """Answers with the network of a policy file, at the policy's own period.
+    """Runs the network of a policy file, at the policy's own period.
 
-    Where states come a whole number of times as often as the policy was trained for, each of its answers holds for as
-    many states. Outside of the box of states that training visited, or where the network gives no finite number, it
-    gives up: the fallback answers from then on, until the next start.
+    Where states come a whole number of times as often as the policy was trained for, each of its commands holds for as
+    many states. Outside of the box of states that training visited, or where the network's output is not finite, it
+    gives up: the fallback commands from then on, until the next start.
 
-    Its torque, and its fallback's, begins at zero and may reach the limit after ``start_time``: a hanging pendulum asks
-    a swing-up for much at once, and a plant lets nobody begin so (``start_effort_limit``, arming, position control).
+    Its torque, and its fallback's, begins at zero and may reach the limit after ``start_time``: a swing-up from hanging
+    needs much at once, which a plant refuses at the start (``start_effort_limit``, arming, position control).
 
     Args:
         policy: The policy, of one joint.
-        hold: States for which an answer holds.
+        hold: States for which a command holds.
         effort_limit: Largest torque [N m].
-        fallback: Who answers after it gave up; None for zero torque.
+        fallback: Controller that takes over after it gave up; None for zero torque.
         start_time: Time from the first state until it has all of its torque [s].
     """
 
-    STARTS_SOFTLY = True  # it sees the torque that it asked for, so it has to know
-    FEEDBACK = False  # the linear model tells nothing of it: it is judged by what it visited in training
+    STARTS_SOFTLY = True  # it observes its own last torque, so it applies the limit itself
+    FEEDBACK = False  # the linear model does not apply: it is checked by what it visited in training
     SUMMARY = "learned policy from a file, with a fallback outside of what it was trained for"
     PARAMETERS = policy_specs((ZERO, "lqr", "pd_gravity", "energy_swing_up"))
 

@@ -32,7 +32,7 @@ class TimeOptimal(CatchingController):
     )
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
-        # The table takes a second or two and is kept for the next design.
+        # The table takes a second or two and is cached for the next design.
         super().__init__(plant, period, p)
         S = tuple(map(tuple, self.catch.gain.S.tolist()))
         self.table = _table(plant, self.effort_limit, S, self.catch.level, self.set_point, p["grid"])

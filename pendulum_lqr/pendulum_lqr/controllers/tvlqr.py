@@ -64,7 +64,7 @@ class Tvlqr(CatchingController):
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(plant, period, p)
         limit, set_point, catch = self.effort_limit, self.set_point, self.catch
-        # Gravity knows no left and right; a torque offset, or a set-point beside the top, does.
+        # Gravity is symmetric; a torque offset, or a set-point next to the top, is not.
         alike = plant.torque_offset == 0.0 and set_point == plant.angle_offset
         self._signs = (1.0, -1.0) if alike else (1.0,)
         self._centre = plant.angle_offset
@@ -101,13 +101,13 @@ class Tvlqr(CatchingController):
             self._index, self._losses = None, 0
             return self.catch.command(x[0], velocity)
         if self._index is not None:
-            # By time, not by answers: a state that was not answered does not hold up the trajectory.
+            # By time, not by commands: a state without a command does not hold up the trajectory.
             began, first = self._joined
             self._index = first + round((t - began) / self.period)
             if self._index >= len(self.efforts) or self._distance(self._index, angle, velocity) > _LOST:
                 self._index = None
                 self._losses += 1
-        # A plant that cannot be kept on the trajectory differs from the model; energy asks less of the model.
+        # A plant that cannot be kept on the trajectory differs from the model; energy control needs less of it.
         if self._index is None and self._losses < _MOST_LOSSES:
             self._find(t, angle, velocity)
         if self._index is None:
@@ -120,7 +120,7 @@ class Tvlqr(CatchingController):
         return self.clamp(self._sign * (float(self.efforts[k]) - feedback))
 
     def take_over(self, previous: Controller) -> None:
-        """Take over whether the LQR is in charge; a trajectory of its own has to be joined anew."""
+        """Take over whether the LQR is in charge; a trajectory of its own has to be rejoined."""
         super().take_over(previous)
         if isinstance(previous, Tvlqr):
             self.pump.take_over(previous.pump)

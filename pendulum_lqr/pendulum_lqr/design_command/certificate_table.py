@@ -1,4 +1,4 @@
-"""What ``design --machine`` says: which rows of a design table are certified for a measured machine."""
+"""What ``design --machine`` prints: which rows of a design table are certified for a measured machine."""
 
 from __future__ import annotations
 

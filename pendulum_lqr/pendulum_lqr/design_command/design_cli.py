@@ -300,7 +300,7 @@ def _save(
     effort_limit: float,
     folder: Path,
 ) -> list[Path]:
-    # Imported late: without --figures nobody waits for matplotlib.
+    # Imported late: only --figures needs matplotlib.
     from pendulum_lqr.design_command.figures import design_figures
 
     rows = [

@@ -1,6 +1,6 @@
 """A closed loop in time: rise, overshoot, settling, torque of a step; how far a push and dry friction move it.
 
-The linear model answers without a torque limit; ``step_torque`` says from which step on there is one.
+The linear model has no torque limit; ``step_torque`` is the step from which on there is one.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def time_figures(model: LinearModel, K: ArrayLike, plant: RigidPlant | None = No
     Args:
         model: Linear model, its delay counts.
         K: Gain on angle and velocity, shape (2,).
-        plant: The plant of the model, whose dry friction is asked for.
+        plant: The plant of the model, whose dry friction is used.
 
     Source:
         Astrom and Murray, Feedback Systems, 2nd ed., 2021, section 6.3 (step response: rise time, overshoot, settling).

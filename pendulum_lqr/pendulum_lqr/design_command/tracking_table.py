@@ -1,4 +1,4 @@
-"""What ``design`` says of a moving reference: gain, frozen margins and torque along it."""
+"""What ``design`` prints for a moving reference: gain, frozen margins and torque along it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A disturbance's answers by compiled code: what they depend on and change is lent to a loop, and taken back."""
+"""A disturbance in compiled code: what its torques depend on and change is lent to a loop, and taken back."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ DISTURBING = np.dtype(
 
 
 class CompiledDisturbance:
-    """Answers with uniform noise or nothing, :class:`pendulum_msgs_py.loops.answer_record.Answerer`.
+    """Publishes uniform noise or zero, :class:`pendulum_msgs_py.loops.answer_record.Answerer`.
 
     Args:
         loops: A loop for each joint; one joint alone is compiled.
-        ready: Tells whether nothing is left to be done before an answer.
-        refusal: Why no loop is wanted; empty where one is.
+        ready: Returns whether nothing is left to be done before a torque.
+        refusal: Why no loop is used; empty where one is.
     """
 
     def __init__(self, loops: Sequence[DisturbanceLoop], ready: Callable[[], bool], refusal: str = "") -> None:
@@ -51,7 +51,7 @@ class CompiledDisturbance:
             self.kind = LoopKind(DISTURBING, "pendulum_lqr.disturbances.disturbance_kernel:uniform_loop", ())
 
     def lend(self, own: Any) -> bool:
-        """Write what answers depend on into a record; return whether the next state may be an ordinary one."""
+        """Write what torques depend on into a record; return whether the next state may be a nominal one."""
         loop, signal = self._loop, self._loop.signal
         if not isinstance(signal, UniformNoise):
             self.refusal = "only uniform noise is compiled"
@@ -68,6 +68,6 @@ class CompiledDisturbance:
         return True
 
     def take_back(self, record: Any) -> None:
-        """Take over what one answer or more have changed."""
+        """Take over the changes by one or more torques."""
         count = int(record["answers"])
         self._loop.count(record["stamp_ns"][:count].tolist(), float(record["own"]["torque"]))

@@ -1,7 +1,7 @@
 """Disturbance torques as pure functions of (parameters, seed, time since the start).
 
 Time is an integer of nanoseconds and a random signal is a function of (seed, sample index), so simulator, hardware and
-replay get the same torque at the same time, whatever loop asks and however often. A random signal changes every
+replay get the same torque at the same time, independent of the loop and its rate. A random signal changes every
 ``hold_time``; how long a sample is held matters more to the response than the plant does, so it is always explicit.
 """
 

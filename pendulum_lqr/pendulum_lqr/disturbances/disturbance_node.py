@@ -68,12 +68,12 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
 class DisturbanceNode(PollingNode):
     """Publishes the disturbance for each new stamp of ``joint_states``.
 
-    Before the start and after the end it answers with zero, so that a plant in lockstep gets its answer and a plant in
-    real time never keeps an old torque. Events ``noise_start`` and ``noise_end`` mark the first and the last state
+    Before the start and after the end it publishes zero, so that a plant in lockstep gets its reply and a plant in
+    real time never holds an old torque. Events ``noise_start`` and ``noise_end`` mark the first and the last state
     that is disturbed.
 
     Args:
-        stop: Asks the runner to end the process.
+        stop: Requests the runner to end the process.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:
@@ -83,7 +83,7 @@ class DisturbanceNode(PollingNode):
         self._full_name = self.get_fully_qualified_name()
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._joints = _joints(self._settings.values)
-        # One for each joint; all hear the same states, so they begin and end together.
+        # One for each joint; all get the same states, so they start and end together.
         self._loops = [
             DisturbanceLoop(
                 signal,
@@ -113,7 +113,7 @@ class DisturbanceNode(PollingNode):
         live_by_stamps(self, lambda: self._loop.newest_stamp_ns)
 
     def run_due(self) -> float | None:
-        """Answer states for some milliseconds, or leave the turn to others; return when to be called again [s]."""
+        """Process states for some milliseconds, or yield to others; return when it is due again [s]."""
         return self._answers.run_due()
 
     def close(self) -> None:
@@ -149,7 +149,7 @@ class DisturbanceNode(PollingNode):
             self._tell(answers[0].event, stamp_ns)
 
     def _tell_others(self, found: tuple[str, ...]) -> None:
-        """Say once that the states are of other joints: nothing else would tell why nothing is disturbed."""
+        """Log once that the states are of other joints, since no disturbance acts then."""
         if found and not self._told_others:
             self._told_others = True
             self.get_logger().error(

@@ -29,7 +29,7 @@ class DisturbanceAnswer(NamedTuple):
 class DisturbanceLoop:
     """Turns stamps into torques: zero, then the signal from the first state after the start, then zero again.
 
-    The torque that answers a state acts until the next state, so the signal is taken at the middle of that interval.
+    The torque for a state acts until the next state, so the signal is taken at the middle of that interval.
     A plant at the rate of the signal's holds whose stamps jitter by a fraction of a millisecond would otherwise read
     the edges of the holds: some samples twice, others never, and not the signal that another plant gets.
 
@@ -72,7 +72,7 @@ class DisturbanceLoop:
     def stop(self) -> bool:
         """End with the next state; return False if it was not running."""
         was_running = self.running
-        # The end is an event only where there was a beginning, and one that nobody has heard of yet stays to be told.
+        # The end is an event only where there was a beginning, and one that was not published yet stays pending.
         self._ending |= self.start_ns is not None
         self._armed, self.start_ns = False, None
         return was_running
@@ -83,7 +83,7 @@ class DisturbanceLoop:
         self.duration_ns = round(duration * NANOSECONDS)
 
     def answer(self, stamp_ns: int) -> DisturbanceAnswer | None:
-        """Return the torque for a state, or None for a state that was answered or overtaken already.
+        """Return the torque for a state, or None for a state that already has its torque or was overtaken.
 
         Args:
             stamp_ns: Stamp of the state [ns].
@@ -92,7 +92,7 @@ class DisturbanceLoop:
         if newest is not None and stamp_ns <= newest:
             if not self._simulated_time or stamp_ns == newest:
                 self.refused += 1
-                # A plant in lockstep repeats a state when the answer did not reach it: the same answer again.
+                # A plant in lockstep repeats a state if the reply did not reach it: send the same reply again.
                 return DisturbanceAnswer(self.last_torque, "") if self._simulated_time else None
             self._begin_anew()
         elif newest is not None:
@@ -100,7 +100,7 @@ class DisturbanceLoop:
         self.newest_stamp_ns = stamp_ns
         self.answered += 1
         event = ""
-        # One event a state: after an end that is still to be told, a new beginning waits for the next state.
+        # One event a state: after an end that is still pending, a new start waits for the next state.
         if self._armed and not self._ending:
             self._armed, self.start_ns = False, stamp_ns
             event = Event.NOISE_START
@@ -124,11 +124,11 @@ class DisturbanceLoop:
         return self.newest_stamp_ns is not None and not self._armed and not self._ending
 
     def count(self, stamps_ns: Sequence[int], torque: float) -> None:
-        """Take note of states that somebody else has answered, the newest with a torque [N m].
+        """Record states that the compiled loop has replied to, the newest with a torque [N m].
 
         Args:
             stamps_ns: Their stamps, at least one, each after the one before it [ns].
-            torque: The last answer.
+            torque: The last reply.
         """
         for stamp_ns in stamps_ns:
             assert self.newest_stamp_ns is not None
@@ -147,7 +147,7 @@ class DisturbanceLoop:
         armed = self._armed or self._autostart
         self.stop()
         self._armed = armed
-        # A beginning says that what was before has ended.
+        # A start event implies the end of the noise before.
         self._ending &= not armed
         self.intervals_ns.clear()
 

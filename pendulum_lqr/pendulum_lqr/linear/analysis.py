@@ -115,7 +115,7 @@ def closed_loop_poles(model: LinearModel, K: ArrayLike) -> NDArray[np.complex128
 
 
 def analyse(model: LinearModel, K: ArrayLike | None) -> LoopReport:
-    """Return the figures of one gain; ``None`` asks for the plant without feedback.
+    """Return the figures of one gain; ``None`` means the plant without feedback.
 
     Args:
         model: Linear model.
@@ -276,7 +276,7 @@ def last_to_hold(holds: Callable[[float], bool], low: float, high: float) -> tup
     """Return two neighbouring numbers, of which the lower one has a property and the higher one has not.
 
     Args:
-        holds: Tells whether a number has it.
+        holds: Returns whether a number has it.
         low: One that has.
         high: One that has not.
     """

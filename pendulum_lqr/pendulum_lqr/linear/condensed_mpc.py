@@ -5,8 +5,8 @@
     u_k = v_k - K x_k,   x_(k+1) = (A - B K) x_k + B v_k,   K, S of the discrete LQR
     J = x_0' S x_0 + sum of v_k' (R + B' S B) v_k
 
-What is sought is what the limits take off the LQR, v. Powers of A itself would grow with the plant's unstable modes:
-over a second of an acrobot's they are 1e5, squared in a Hessian 1e10, and a solver's answers wrong without a word.
+The unknown v is what the limits subtract from the LQR. Powers of A itself would grow with the plant's unstable modes:
+over a second of an acrobot's they are 1e5, squared in a Hessian 1e10, and the solver's results silently wrong.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _TOLERANCE = 1e-4
 class CondensedMpc:
     """Minimises the cost of the discrete LQR under limits of inputs and states over N samples.
 
-    Limits of inputs are hard. Limits of states are soft, one slack for each, because a hard state limit has no answer
+    Limits of inputs are hard. Limits of states are soft, one slack for each, because a hard state limit is infeasible
     once a disturbance has broken it.
 
     Args:
@@ -97,7 +97,7 @@ class CondensedMpc:
         self.reset()
 
     def reset(self) -> None:
-        """Set the solver up anew: what it learnt from past states (start, step size) would colour the next answers."""
+        """Set the solver up again: its warm start and step size from past states would affect the next results."""
         lower, upper = self._bounds(np.zeros(self.size), -self._scale, self._scale)
         self._solver = osqp.OSQP()
         try:
@@ -112,7 +112,7 @@ class CondensedMpc:
                 eps_rel=_TOLERANCE,
                 max_iter=1000,
                 polishing=False,
-                # By iterations: an adaptation by elapsed time would make answers depend on the machine's load.
+                # By iterations: an adaptation by elapsed time would make results depend on the machine's load.
                 adaptive_rho=1,
                 adaptive_rho_interval=50,
             )
@@ -136,8 +136,8 @@ class CondensedMpc:
             lqr: Matrix = -self._scale * (self._K @ state)
             return lqr
         if not np.abs(self._free_inputs @ state).max() * _TOLERANCE < 1.0:
-            # The LQR asks for so much that the tolerance is a whole limit: signs would be any. What is no number the
-            # solver would not take, and answer what it was told before.
+            # The LQR's inputs are so large that the tolerance is a whole limit: signs would be arbitrary. With NaN the
+            # solver would keep its previous data and return their solution.
             return None
         self._solver.update(l=lower, u=upper)
         result = self._solver.solve(raise_error=False)

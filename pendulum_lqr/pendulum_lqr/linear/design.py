@@ -1,8 +1,7 @@
-"""Optimal gains in continuous time: LQR, LQI, output feedback; the Kalman filter; and what refuses to be designed.
+"""Optimal gains in continuous time: LQR, LQI, output feedback; the Kalman filter; and the checks of a design.
 
-Riccati equations are solved by scipy. python-control enters only where margins and plots are asked for
-(:mod:`pendulum_lqr.linear.analysis`), because it brings matplotlib with it, and a controller on a robot should start
-without.
+Riccati equations are solved by scipy. python-control is imported only for margins and plots
+(:mod:`pendulum_lqr.linear.analysis`), because it imports matplotlib, which a controller on a robot should not need.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ _DISCOUNTS = 60
 
 
 class DesignError(ParameterError):
-    """A controller cannot be designed for what was asked; the sentence says which weight or mode is to blame."""
+    """A controller cannot be designed as requested; the message names the weight or mode at fault."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -233,7 +233,7 @@ def holding_effort(plant: MechanismParameters, position: Sequence[float] | None 
     n = len(q)
     p = plant.packed
     weight = np.array(complex_step(lambda *x: (in_arithmetic(plant.mechanism.potential, cmath)(x, p),), q))[0]
-    # The largest that gravity can do here, so that sin(pi), which is 1.2e-16, asks for nothing.
+    # Relative to the largest torque of gravity, so that sin(pi), which is 1.2e-16, counts as zero.
     still = (0.0,) * n
     around = [tuple(value + 0.5 * turn for value in q) for turn in (-np.pi, np.pi, 0.0, 1.0)]
     forces = [np.array(plant.mechanism.mass(at, p)) @ plant.acceleration(at, still, still) for at in around]
@@ -259,7 +259,7 @@ def low_frequency(model: LinearModel) -> tuple[float, float, float]:
         model: Linear model; its delay is not counted.
     """
     n = model.A.shape[0]
-    # theta = x^0 + x^1 s + ... as the answer to the command that moves theta by 1 at s = 0, order by order in s.
+    # theta = x^0 + x^1 s + ... as the response to the command that moves theta by 1 at s = 0, order by order in s.
     system = np.block([[model.A, model.B], [np.eye(1, n), np.zeros((1, 1))]])
     answer = np.linalg.solve(system, np.append(np.zeros(n), 1.0))
     terms = [float(answer[n])]
@@ -299,7 +299,7 @@ def acceleration_from_upright(
         angle: Measured angle from upright [rad].
         velocity: [rad/s].
         effort: Torque of the actuator [N m].
-        arithmetic: ``math``, ``numpy`` or ``casadi``, whichever the arguments are made for.
+        arithmetic: ``math``, ``numpy`` or ``casadi``, matching the arguments.
         sign_velocity: Width over which Coulomb friction changes its sign, as tanh [rad/s]; 0 leaves it out.
     """
     torque = effort + plant.torque_offset

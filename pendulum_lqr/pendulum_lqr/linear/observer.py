@@ -1,4 +1,4 @@
-"""What is not measured, estimated: motor, spring and lag, and a constant torque that nobody told of.
+"""Estimates of what is not measured: motor, spring and lag, and an unknown constant torque.
 
 A stationary Kalman filter of the sampled linear model. Torques that are on their way are known, since they were sent;
 a constant torque d adds to the command and is modelled as a random walk (disturbance observer):
@@ -75,9 +75,9 @@ class Observer:
         return 0.0 if self._estimate is None or self._estimate.size == self._n else float(self._estimate[-1])
 
     def correct(self, angle: float, velocity: float) -> Array:
-        """Take a measurement and return [x; torques on their way], as the gain of a design wants it, shape (n + m,).
+        """Take a measurement and return [x; torques on their way], as the gain of a design needs it, shape (n + m,).
 
-        Torques count as what they move: the deviation from the holding torque, the constant torque included.
+        Torques are relative: the deviation from the holding torque, the constant torque included.
 
         Args:
             angle: Measured deviation from the fixed point [rad].

@@ -26,10 +26,10 @@ __all__ = ["IDENTIFIED", "UNCERTAIN", "ParameterBox", "WorstCase", "parse_box", 
 UNCERTAIN = ("inertia", "damping", "gravity", "angle_offset", "actuator_time_constant", "transport_delay")
 """Parameters of the linear model that may be uncertain."""
 IDENTIFIED = "identified"
-"""Asks for the intervals of the plant file, with the correlation of its identification where that lies beside it."""
+"""Selects the intervals of the plant file, with the correlation of its identification if that file is next to it."""
 
 _INSIDE = 48
-"""Plants drawn within a box, beside its corners, or on an ellipsoid."""
+"""Plants drawn within a box, in addition to its corners, or on an ellipsoid."""
 
 Array = NDArray[np.float64]
 
@@ -90,7 +90,7 @@ class WorstCase:
     """A gain over many plants.
 
     Attributes:
-        plants: How many were asked.
+        plants: How many were evaluated.
         unstable: How many of them the gain does not hold.
         margins: The worst of each margin over the plants; None if it holds none of them.
         where: Parameters of the plant with the smallest modulus margin, or of the first that is not held.
@@ -113,7 +113,7 @@ def worst_case(plants: Sequence[PlantParameters], K: ArrayLike, theta: float, na
         plants: At least one, of one structure.
         K: Gain on angle and velocity, shape (2,).
         theta: Measured angle that is held, 0 hanging down [rad].
-        names: Parameters to tell of the worst plant.
+        names: Parameters to report of the worst plant.
     """
     unstable, found = 0, []
     lost: PlantParameters | None = None

@@ -41,7 +41,7 @@ _ROUNDING = 1e-12
 
 
 class _Loop(NamedTuple):
-    """What the proof knows of the plant: the limits are those of the deviation from the holding torque."""
+    """The plant as the proof sees it: the limits are those of the deviation from the holding torque."""
 
     inertia: float
     damping: float
@@ -125,12 +125,12 @@ def proven_level(plant: RigidPlant, gain: Gain, effort_limit: float, theta: floa
         -effort_limit - hold,
         effort_limit - hold,
     )
-    # The ellipse must not reach around the circle, where the angle wraps.
+    # The ellipse must not reach around a full turn, where the angle wraps.
     reach = math.pi / float(np.linalg.norm(directions[0]))
     low, high = 0.0, reach
     if _decreases(loop, gain, directions, reach):
         return reach * reach
-    # What is not proven for a thousandth is proven for nothing: a dozen more attempts would take seconds to say so.
+    # A proof that fails for a thousandth fails for all: a dozen more attempts would only take seconds.
     if not _decreases(loop, gain, directions, 1e-3 * reach):
         return 0.0
     for _ in range(12):

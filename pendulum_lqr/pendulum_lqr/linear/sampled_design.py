@@ -198,7 +198,7 @@ def _collected(model: LinearModel, Q: Matrix, time: float) -> Matrix:
 
 
 def _on_their_way(period: float, delay: float) -> tuple[int, float]:
-    """Return how many inputs a delay keeps on their way, and the broken part of a period in it [s]."""
+    """Return how many whole inputs are in a delay, and the remaining fraction of a period [s]."""
     whole = math.floor(delay / period + 1e-9)
     rest = max(delay - whole * period, 0.0)
     if rest < 1e-9 * period:

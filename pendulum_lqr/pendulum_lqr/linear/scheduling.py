@@ -23,7 +23,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["Schedule", "ScheduledMargins", "scheduled_margins"]
 
 _KNOTS = 24
-"""Angles on the circle at which the Riccati equation is solved."""
+"""Angles of a full turn at which the Riccati equation is solved."""
 _CELLS = 720
 """Cells of half a degree, within which is interpolated linearly: no state has time for splines."""
 _FROZEN = 13
@@ -88,8 +88,8 @@ class Schedule:
 def _table(plant: PlantParameters, q: tuple[float, ...], r: float) -> NDArray[np.float64]:
     """Return K_1 [N m/rad], K_2 and b [N m s/rad] and M [kg m^2] at the edges of the cells, shape (cells + 1, 4).
 
-    The Riccati equation is solved on a grid of angles, between which lies a periodic spline. What comes out is kept, so
-    that another reference needs no other solutions.
+    The Riccati equation is solved on a grid of angles, between which lies a periodic spline. The table is cached, since
+    another reference uses the same solutions.
     """
     angles = np.linspace(-math.pi, math.pi, _KNOTS + 1)
     rows = []
@@ -115,7 +115,7 @@ class ScheduledMargins:
         radii: Largest |pole| of the sampled loop at each [-]; below 1.
         moduli: Smallest distance of each L(j w) from -1, the hold and the plant's delay included [-].
         time_constant: Time in which a deviation shrinks to 1/e in the long run along the moving reference [s], by the
-            product of all sampled loops over a period (Floquet), which no frozen loop tells.
+            product of all sampled loops over a period (Floquet), which no frozen loop shows.
     """
 
     angles: tuple[float, ...]

@@ -1,4 +1,4 @@
-"""Which states are answered, as functions of numbers: the loop that runs compiled compiles these very ones."""
+"""Which states get a command, as functions of numbers: the compiled loop compiles these very ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = [
 ]
 
 NEW, STALE, FROM_FUTURE, DUPLICATE, OUT_OF_ORDER = range(5)
-"""What :func:`judge_state` answers."""
+"""Results of :func:`judge_state`."""
 LONGEST = 2**62
 """A timeout that no age comes near [ns]."""
 
@@ -25,8 +25,8 @@ def judge_state(stamp_ns: int, now_ns: int, timeout_ns: int, newest_ns: int) -> 
     Args:
         stamp_ns: Stamp of the state [ns].
         now_ns: Time of its arrival on the clock of the stamps; in simulated time, which has no age, the stamp [ns].
-        timeout_ns: Age beyond which it is not answered, either way, at most ``LONGEST`` [ns].
-        newest_ns: Stamp of the newest state that was answered, or could not be; ``NEVER`` before the first [ns].
+        timeout_ns: Age beyond which it gets no command, either way, at most ``LONGEST`` [ns].
+        newest_ns: Stamp of the newest state that got a command, or could not; ``NEVER`` before the first [ns].
     """
     age_ns = now_ns - stamp_ns
     if age_ns > timeout_ns:

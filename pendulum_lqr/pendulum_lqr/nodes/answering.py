@@ -1,4 +1,4 @@
-"""Which states a controller answers, and what its diagnostics say: the controller node without ROS."""
+"""Which states a controller replies to, and the contents of its diagnostics: the controller node without ROS."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["AnswerLoop", "StateRefusal"]
 
 
 class StateRefusal(str, Enum):
-    """Why a state was not answered; the value is the key in diagnostics."""
+    """Why a state got no command; the value is the key in diagnostics."""
 
     MALFORMED = "malformed"
     NOT_FINITE = "not_finite"
@@ -49,24 +49,24 @@ _REFUSALS = {
 
 
 class AnswerLoop:
-    """Answers each new state once and keeps count.
+    """Replies to each new state once, and counts.
 
     Args:
         controller: The controller.
-        state_timeout: Age beyond which a state is not answered [s]; inf for any age.
-        simulated_time: Stamps are those of a simulator, so that their age says nothing and they may start anew.
-        send: Called with a state and the efforts that answer it [N m or N], before anything is counted.
+        state_timeout: Age beyond which a state gets no command [s]; inf for any age.
+        simulated_time: Stamps are those of a simulator, so that their age has no meaning and they may restart.
+        send: Called with a state and the efforts in reply [N m or N], before anything is counted.
         monotonic: Clock for the compute time [ns].
 
     Attributes:
         controller: The controller.
         simulated_time: Whether stamps are those of a simulator.
-        newest: The newest state that was answered, or could not be; None before the first.
-        kept_answer: The efforts that answered it [N m or N], or None.
+        newest: The newest state that got a command, or could not; None before the first.
+        kept_answer: The efforts in reply to it [N m or N], or None.
         start_ns: Stamp of the first state since a restart [ns]; None before it.
-        timeout_ns: Age beyond which a state is not answered [ns].
-        age: Ages of the states that were answered [ns].
-        compute_time: Times in which they were [ns].
+        timeout_ns: Age beyond which a state gets no command [ns].
+        age: Ages of the states that got a command [ns].
+        compute_time: Times that the commands took [ns].
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class AnswerLoop:
 
     @property
     def newest_stamp_ns(self) -> int | None:
-        """Stamp of the newest state that was answered, or could not be [ns]; None before the first."""
+        """Stamp of the newest state that got a command, or could not [ns]; None before the first."""
         return None if self.newest is None else self.newest.stamp_ns
 
     def restart(self) -> None:
@@ -119,7 +119,7 @@ class AnswerLoop:
         self._take(controller)
 
     def _take(self, controller: Controller | JointController) -> None:
-        """Bind what answers a state: a controller of several joints, or one that sees [angle from upright, speed]."""
+        """Bind the control law: of a controller of several joints, or of one that sees [angle from upright, speed]."""
         self._command: Callable[[float, JointSample], Vector]
         if isinstance(controller, JointController):
             several = controller.command
@@ -134,10 +134,10 @@ class AnswerLoop:
         self._nothing = (0.0,) * len(self._limits)
 
     def answer(self, sample: JointSample | None, now_ns: int, problem: str = "") -> Vector | None:
-        """Send the efforts that answer a state and return them, or None where the state is refused [N m or N].
+        """Send the efforts for a state and return them, or None where the state is refused [N m or N].
 
         Args:
-            sample: The state; None for a message that carries none of our joints.
+            sample: The state; None for a message without the plant's joints.
             now_ns: Time of arrival on the clock of the stamps [ns]; not used in simulated time.
             problem: What is wrong with a message that carries no state.
         """
@@ -145,7 +145,7 @@ class AnswerLoop:
         if refusal is not None:
             self.refused[refusal] += 1
             self.last_reason = problem if sample is None else self._problem(refusal, sample, now_ns)
-            # A plant in lockstep repeats a state when the answer did not reach it: the same answer again, if any.
+            # A plant in lockstep repeats a state if the reply did not reach it: send the same reply again, if any.
             if sample is None or refusal is not StateRefusal.DUPLICATE or not self.simulated_time:
                 return None
             if self.kept_answer is not None:
@@ -160,7 +160,7 @@ class AnswerLoop:
         try:
             effort = self._command((sample.stamp_ns - self.start_ns) / NANOSECONDS, sample)
         except (ArithmeticError, ValueError, RuntimeError) as error:
-            # A solver that gives up must not end the node: without an answer the plant's timeout makes it zero.
+            # A solver that fails must not end the node: without a command the plant's timeout applies zero torque.
             effort, reason = (math.nan,), f"{type(error).__name__}: {error}"
         if not all(map(math.isfinite, effort)):
             unit = " N m" if len(sample.position) == 1 else ""  # of several joints, each has its own
@@ -169,7 +169,7 @@ class AnswerLoop:
             return None
         ended = self._monotonic()
         self.last_effort = self.kept_answer = effort
-        # Somebody waits for it, and in a process that has just woken up counting takes several times as long as later.
+        # Before counting: the plant waits for it, and counting is slow in a process that has just woken up.
         self._send(sample, effort)
         self.compute_time.add(ended - began)
         if not self.simulated_time:
@@ -191,13 +191,13 @@ class AnswerLoop:
         ages_ns: Sequence[int],
         compute_times_ns: Sequence[int],
     ) -> None:
-        """Count answers that went out already.
+        """Count replies that were already sent.
 
         Args:
-            sample: The newest state that was answered.
-            effort: Its answer [N m or N].
-            answered: How many were answered.
-            saturated: How many of the answers were at a limit.
+            sample: The newest state that got a reply.
+            effort: The reply [N m or N].
+            answered: How many got a reply.
+            saturated: How many of the replies were at a limit.
             ages_ns: Their states' ages [ns].
             compute_times_ns: Times that they took [ns].
         """
@@ -257,7 +257,7 @@ class AnswerLoop:
         # Angle and velocity alone: what the torque sensor shows is no part of the state.
         if self.simulated_time and newest is not None and sample[:3] != newest[:3]:
             # One writer's messages never overtake each other, so simulated time that goes back, or another state under
-            # the same stamp, is a simulation that began anew, however short the one before it was.
+            # the same stamp, is a restarted simulation, however short the one before it was.
             self.restarts += 1
             self.restart()
             return None

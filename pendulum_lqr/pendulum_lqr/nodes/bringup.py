@@ -1,4 +1,4 @@
-"""What ``bringup.launch.py`` brings up: its arguments, and the nodes that their values ask for. Knows no launch."""
+"""What ``bringup.launch.py`` brings up: its arguments, and the nodes for their values. Independent of launch."""
 
 from __future__ import annotations
 
@@ -126,8 +126,8 @@ def programs(value: Mapping[str, str]) -> list[NodeProgram]:
 def parameter_file(given: str) -> str:
     """Return the absolute path of the ROS parameter file that all nodes get; empty where none was given.
 
-    ``launch_ros`` only warns of a file that is not there, and starts the plant without the limits that stand in it; rcl
-    says nothing of a section that no node reads.
+    ``launch_ros`` only warns of a missing file, and starts the plant without its limits; rcl does not report a section
+    that no node reads.
 
     Args:
         given: Value of the argument ``params_file``.
@@ -178,7 +178,7 @@ def _bridge(space: str, value: Mapping[str, str], rate: float, lab: LabFile | No
 def _controller_waits(value: Mapping[str, str]) -> dict[str, bool]:
     """Return for each side whether its controller waits to be activated."""
     asked = value["controller_waits"]
-    # Hanging, the angle from upright is pi: whatever balances asks for all it has, before anybody has armed the bridge.
+    # Hanging, the angle from upright is pi: a balancing controller saturates before the bridge is armed.
     upright = value["start"] == "top" and value["plant"] != "hebi"
     return {
         side: asked == "true" or (asked == "auto" and side == "hw" and not upright) for side in SIDES[value["plant"]]

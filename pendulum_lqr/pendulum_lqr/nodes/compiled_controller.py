@@ -1,4 +1,4 @@
-"""A controller's answers by compiled code: what they depend on and change is lent to a loop, and taken back."""
+"""A controller in compiled code: what its commands depend on and change is lent to a loop, and taken back."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LENT = np.dtype(
 )
 """``interval_ns`` is 0 where states may come at any."""
 _NEWEST = np.dtype([("position", "f8"), ("velocity", "f8"), ("measured", "f8"), ("effort", "f8"), ("saturated", "i8")])
-"""The newest state and its answer; ``measured`` is the effort that the state tells of. Answers at the limit."""
+"""The newest state and its reply; ``measured`` is the state's effort. Number of replies at the limit."""
 ANSWERING = np.dtype(
     [
         ("lent", _LENT),
@@ -43,18 +43,18 @@ ANSWERING = np.dtype(
     ],
     align=True,
 )
-"""What is lent for a slice, what it tells of its newest answer, and the law's numbers and memory."""
+"""What is lent for a slice, what it returns of its newest reply, and the law's numbers and memory."""
 
 
 class CompiledController:
-    """Answers by the law of a controller, :class:`pendulum_msgs_py.loops.answer_record.Answerer`.
+    """Runs the law of a controller, :class:`pendulum_msgs_py.loops.answer_record.Answerer`.
 
     Args:
         controller: The first controller. The loop is for its law, whatever is set around it: what is set may change,
             and then nothing may wait for a compiler.
-        watch: Measures the period of the states that it is told of.
-        answering: Returns what answers states, or None where the next one is not an ordinary one.
-        refusal: Why no loop is wanted; empty where one is.
+        watch: Measures the period of states.
+        answering: Returns the answer loop, or None where the next state is not a nominal one.
+        refusal: Why no loop is used; empty where one is.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class CompiledController:
             self.kind = LoopKind(ANSWERING, "pendulum_lqr.nodes.controller_kernel:law_loop", choice)
 
     def lend(self, own: Any) -> bool:
-        """Write what answers depend on into a record; return whether the next state may be an ordinary one."""
+        """Write what commands depend on into a record; return whether the next state may be a nominal one."""
         loop = self._answering()
         if loop is None:
             return False
@@ -115,7 +115,7 @@ class CompiledController:
         return True
 
     def take_back(self, record: Any) -> None:
-        """Take over what one answer or more have changed."""
+        """Take over the changes by one or more replies."""
         loop, count, own = self._answering(), int(record["answers"]), record["own"]
         assert loop is not None
         assert isinstance(loop.controller, LawController)

@@ -110,11 +110,11 @@ _MULTI_ARRAY_TOPIC = "~/commands"
 class ControllerNode(LifecycleNode, PollingNode):
     """Lifecycle node around a controller.
 
-    Unconfigured: parameters are known. Inactive: the gain is designed and printed, states are heard and not answered.
-    Active: every new state is answered once. Deactivation, shutdown and signals send zero torque and stop.
+    Unconfigured: parameters are declared. Inactive: the gain is designed and printed, states are read without reply.
+    Active: every new state gets one reply. Deactivation, shutdown and signals send zero torque and stop.
 
     Args:
-        stop: Asks the runner to end the process.
+        stop: Requests the runner to end the process.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:
@@ -138,7 +138,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._period = self._settings["period"] or ASSUMED_PERIOD
         self._period_measured = False
         if takes_time:
-            # Nothing interrupts a compiler: who asks once waits for it, and nothing is commanded.
+            # Nothing interrupts a compiler: the first Ctrl-C waits for it, and nothing is commanded.
             self.get_logger().info(f"{takes_time}; Ctrl-C waits for it, a second one does not")
         # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
         self._pending: Controller | JointController | None = self._design(self._settings.values)
@@ -175,7 +175,7 @@ class ControllerNode(LifecycleNode, PollingNode):
             self._autostart()
 
     def run_due(self) -> float | None:
-        """Answer states for some milliseconds, or leave the turn to others; return when to be called again [s]."""
+        """Process states for some milliseconds, or yield to others; return when it is due again [s]."""
         return self._answers.run_due()
 
     # --- lifecycle -----------------------------------------------------------------------------------------
@@ -223,13 +223,13 @@ class ControllerNode(LifecycleNode, PollingNode):
         return super().on_shutdown(state)
 
     def close(self) -> None:
-        """Send zero torque while the context is still valid, and give it time to be heard."""
+        """Send zero torque while the context is still valid, and give it time to arrive."""
         self._send_zero()
         wait_until_heard(self._command_publisher)
         self._publish_diagnostics()
 
     def _may_lend(self) -> AnswerLoop | None:
-        """Return what answers states, where nothing is left to be done before an answer; else None."""
+        """Return the answer loop, where nothing is left to be done before a reply; else None."""
         ready = self._active and self._period_known and (self._first_answer.gone or not self._simulated_time)
         return self._loop if ready else None
 
@@ -276,15 +276,15 @@ class ControllerNode(LifecycleNode, PollingNode):
     # --- pieces --------------------------------------------------------------------------------------------
 
     def _choose(self, name: str) -> str:
-        """Return which controller or plant is asked for, before its own parameters can be declared."""
+        """Return which controller or plant is selected, before its own parameters can be declared."""
         spec = next(spec for spec in NODE_SPECS if spec.name == name)
         given = self._parameter_overrides.get(spec.name)
         return str(spec.check(spec.default if given is None else given.value))
 
-    # A design may take seconds, in which nobody is answered: plants on the same core are not to wait for it.
+    # A design may take seconds without replies; plants on the same core are not to wait for it.
     @as_ordinary()
     def _design(self, values: Mapping[str, Any]) -> Controller | JointController:
-        # As long as nobody knows the period, nobody can say whether the loop is stable at it.
+        # Until the period is known, the loop's stability cannot be checked.
         known = bool(values["period"]) or self._period_measured
         if isinstance(self._plant, MechanismParameters):
             own = self._own_values(values)
@@ -299,7 +299,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         return {name: value for name, value in values.items() if name not in self._own}
 
     def _design_for(self, period: float) -> None:
-        """Take another period, and design anew where that makes a difference."""
+        """Take another period, and redesign where that makes a difference."""
         before, self._period = self._period, period
         if self._loop is None or not self._uses_period():
             return
@@ -325,8 +325,8 @@ class ControllerNode(LifecycleNode, PollingNode):
                 return True
             self.trigger_deactivate()
             return False
-        # What depends on the period and was not told it waits for the first few states. In lockstep there is no
-        # second state without an answer to the first; and whoever has been answering goes on while a plant comes back.
+        # A controller that needs the period, if it is not set, waits for the first few states. In lockstep there is no
+        # second state without a reply to the first; and a running controller continues while a plant restarts.
         waits = self._uses_period() and not self._settings["period"] and not self._simulated_time
         return not waits or (self._loop is not None and self._loop.answered > 0)
 
@@ -342,7 +342,7 @@ class ControllerNode(LifecycleNode, PollingNode):
                     self._period = measured
                 elif not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:
                     self._design_for(measured)
-                # Not by another design, which may take longer than after what a plant counts as begun anew.
+                # Not by another design, which may take longer than the gap that counts as a plant's restart.
                 if self._loop is not None and isinstance(self._loop.controller, JointController):
                     self._loop.controller.check(measured)
                 self._period_known = True
@@ -366,14 +366,14 @@ class ControllerNode(LifecycleNode, PollingNode):
         return True
 
     def _own_controller(self) -> BaseController | None:
-        """Return the controller that answers, without what estimates its velocity."""
+        """Return the running controller, without its velocity estimator."""
         if self._loop is None or isinstance(self._loop.controller, JointController):
             return None
         inner = unwrapped(self._loop.controller)
         return inner if isinstance(inner, BaseController) else None
 
     def _notice(self) -> str:
-        """Return what the user has to be told of the controller that answers."""
+        """Return the running controller's notice for the user."""
         if self._loop is not None and isinstance(self._loop.controller, JointController):
             return self._loop.controller.notice
         own = self._own_controller()
@@ -397,7 +397,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         if self._multi_array:
             self._command_publisher.publish(Float64MultiArray(data=[0.0] * len(self._driven)))
             return
-        # Right behind the last answer, with whose stamp it would be a duplicate: so it ends what that one commanded.
+        # Just after the last command: with the same stamp it would be refused as a duplicate.
         if (newest := self._loop.newest_stamp_ns) is not None:
             nothing = (0.0,) * len(self._driven)
             self._command_publisher.publish(encode_joints(newest + 1, self._full_name, self._driven, (), (), nothing))

@@ -1,8 +1,8 @@
-"""What an effort controller of ros2_control does not know and our plants need: which state a torque answers.
+"""Adds what commands of ros2_control's effort controllers lack: the stamp of the state that they reply to.
 
 ros2_control's commands bear no stamp that a plant could check, and its effort controllers hold the last one for ever.
-Here each command becomes one torque, as the answer to the newest state; nothing is ever said twice, so that who falls
-silent meets the plant's rule for stale commands.
+Here each command becomes one torque, as the reply to the newest state; none is ever repeated, so that a silent
+controller meets the plant's rule for stale commands.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _finite(effort: float) -> float:
 class EffortAdapter:
     """Pairs commands with states.
 
-    A command answers the newest state at once; where that one is answered already it waits for the next, and a later
+    A command replies to the newest state at once; if that one has a reply it waits for the next, and a later
     command takes its place.
 
     Args:
@@ -84,13 +84,13 @@ class EffortAdapter:
         return self._answer(now_ns)
 
     def state(self, stamp_ns: int, now_ns: int) -> tuple[int, float] | None:
-        """Take a state and return what answers it, if a command was waiting.
+        """Take a state and return the reply to it, if a command was waiting.
 
         Args:
             stamp_ns: Its stamp [ns].
             now_ns: Time on the same steady clock [ns].
         """
-        # A plant that was restarted, or set back, begins anew.
+        # The plant was restarted or reset.
         self._newest_ns = stamp_ns
         if stamp_ns < self._answered_ns:
             self._answered_ns = -1

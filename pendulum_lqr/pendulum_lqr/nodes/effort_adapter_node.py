@@ -53,12 +53,12 @@ _COUNTS = ("commands", "answers", "replaced", "too_old", "refused")
 
 
 class EffortAdapterNode(Node):
-    """Publishes each command of ros2_control's kind as the answer to the newest state.
+    """Publishes each command of ros2_control's kind as the reply to the newest state.
 
-    While there is more than one publisher of commands none is passed on: nothing in them says whose they are.
+    While there is more than one publisher of commands none is passed on: they do not name their source.
 
     Args:
-        stop: Asks the runner to end the process.
+        stop: Requests the runner to end the process.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:

@@ -1,6 +1,6 @@
-"""What became of a trajectory that a plant was given as a goal, read off its events.
+"""The result of a trajectory that was sent to a plant as a goal, by the plant's events.
 
-A plant takes trajectories on a topic and tells on ``events`` what it does with them. An action has one end: reached,
+A plant takes trajectories on a topic and reports on ``events``. An action has one end: reached,
 cancelled, or given up for a reason.
 """
 
@@ -17,7 +17,7 @@ from pendulum_msgs_py.contract.names import JOINT, Event
 __all__ = ["End", "Outcome", "PlantFollowing", "goal_problem"]
 
 _COMMANDED_BY = "commanded by "
-"""How a plant begins to say that it takes torques from somebody."""
+"""Start of a plant's reason for being under effort control."""
 _POSITION, _EFFORT = Mode.POSITION.value, Mode.EFFORT.value
 
 
@@ -64,8 +64,8 @@ def goal_problem(joints: list[str], other_joints: list[str], tolerances: Mapping
 class PlantFollowing:
     """One plant, and at most one goal that it follows.
 
-    The plant says nothing of who gave it a trajectory, and nothing when a new one takes the place of one that it
-    follows. So a goal is begun only while it follows none, and given up when somebody else sends one.
+    The plant does not report the sender of a trajectory, nor that a new one replaces the one that it follows. So a
+    goal is started only while it follows none, and given up when another sender publishes one.
     """
 
     def __init__(self) -> None:
@@ -76,7 +76,7 @@ class PlantFollowing:
 
     @property
     def busy(self) -> bool:
-        """Whether the plant is on its way along a trajectory, whoever gave it."""
+        """Whether the plant follows a trajectory of any sender."""
         return self._busy
 
     def begin(self) -> None:
@@ -84,7 +84,7 @@ class PlantFollowing:
         self.active, self._begun, self._cancelled = True, False, False
 
     def cancel(self) -> None:
-        """Note that the plant was asked to hold where it is."""
+        """Record that the plant was requested to hold its position."""
         self._cancelled = True
 
     def on_event(self, event: Mapping[str, Any]) -> End | None:
@@ -122,11 +122,11 @@ class PlantFollowing:
         return None
 
     def on_other_trajectory(self) -> End | None:
-        """Note that somebody else sent the plant a trajectory."""
+        """Record that another sender published a trajectory."""
         return self._end(Outcome.LEFT, "somebody else sent the plant a trajectory") if self.active else None
 
     def on_wait(self, seconds: float, patience: float) -> End | None:
-        """Note how long ago the plant was asked for something; give the goal up where it has told nothing of that.
+        """Record the time since a request; give the goal up where the plant has not reported on it.
 
         Args:
             seconds: Time since a trajectory was sent to the plant [s].
@@ -139,7 +139,7 @@ class PlantFollowing:
         return self._end(Outcome.LEFT, f"plant did not begin within {patience:g} s, and did not say why")
 
     def on_silence(self, seconds: float) -> End | None:
-        """Note that the plant has said nothing for so long [s]."""
+        """Record the time since the plant's last message [s]."""
         if not self.active:
             return None
         return self._end(Outcome.LEFT, f"plant has been silent for {seconds:.1f} s; whether it moves is not known")

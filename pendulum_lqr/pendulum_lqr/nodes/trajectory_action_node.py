@@ -49,10 +49,10 @@ _AT_ONCE = 0.0
 
 
 class TrajectoryActionNode(Node):
-    """Passes goals on to the plant's ``joint_trajectory``, one at a time, and ends them by what its ``events`` tell.
+    """Passes goals on to the plant's ``joint_trajectory``, one at a time, and ends them by its ``events``.
 
     Args:
-        stop: Asks the runner to end the process.
+        stop: Requests the runner to end the process.
 
     Raises:
         ParameterError: The package that has the action's type is not installed.
@@ -77,7 +77,7 @@ class TrajectoryActionNode(Node):
         create_wall_timer(self, _FEEDBACK_PERIOD, self._on_time)
 
     def close(self) -> None:
-        """Leave no plant on its way without somebody who watches it."""
+        """Hold the plant: it must not follow a trajectory unsupervised."""
         if self._plant.active:
             self._hold()
             wait_until_heard(self._publisher)
@@ -138,7 +138,7 @@ class TrajectoryActionNode(Node):
         self._publisher.publish(data)
 
     def _hold(self) -> None:
-        """Ask the plant to stay where it is, under position control."""
+        """Request the plant to hold its position, under position control."""
         assert self._sample is not None
         here = Trajectory((TrajectoryPoint(_AT_ONCE, self._sample.position[0], 0.0),))
         self._send(trajectory_to_message(here))
@@ -155,7 +155,7 @@ class TrajectoryActionNode(Node):
             return
         self._sample, self._heard = sample, time.monotonic()
         if self._server is None:
-            # Who waits for the server waits for a plant, too.
+            # A client that waits for the server needs a plant, too.
             self._server = ActionServer(
                 self,
                 self._action,

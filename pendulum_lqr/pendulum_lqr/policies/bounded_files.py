@@ -51,11 +51,11 @@ def read_parts(
     Args:
         content: The archive.
         kind: What it is expected to be, for messages.
-        check: Refuses names and sizes before anything is unpacked, and returns the parts that are wanted.
+        check: Refuses names and sizes before anything is unpacked, and returns the parts to read.
 
     Returns:
-        One content for each part. It has one byte more than the directory says where there is more of it: what the
-        directory says of the size is not believed either.
+        One content for each part. It has one byte more than the directory's size where there is more of it, since the
+        directory's size is not trusted.
 
     Raises:
         DataError: It is no whole archive, or ``check`` refuses it.
@@ -80,6 +80,6 @@ def shown(value: object) -> str:
 
 
 def sentence_of(error: BaseException) -> str:
-    """Return what an error of a library says, as a part of one sentence."""
+    """Return the text of a library's error, as a part of one sentence."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 160 else f"{text[:157]}..."

@@ -1,7 +1,7 @@
 """Policies as ONNX models, written without the library ``onnx``.
 
 One input ``observation`` (N, in) and one output ``action`` (N, out) within [-1, 1], in single precision: Gemm, Tanh or
-Relu, and Clip or Tanh at the end. What the policy file's header says is in the model's ``metadata_props``, each value
+Relu, and Clip or Tanh at the end. The policy file's header is in the model's ``metadata_props``, each value
 as JSON, with ``observation``, the meaning of each input.
 
 Source: ONNX, ``onnx.proto3`` (intermediate representation 8), operators of opset 13; Protocol Buffers, "Encoding".

@@ -1,14 +1,14 @@
-"""A learned policy: what it is for, what it sees, and its network.
+"""A learned policy: its task, its observation, and its network.
 
-A policy sees the last ``history`` samples of its joints and answers with an effort for each driven one::
+A policy sees the last ``history`` samples of its joints and returns an effort for each driven one::
 
     sample_k = [cos(x_k), sin(x_k), q_k / angle_box, q'_k / velocity_scale, u_(k-1) / effort_limit]
     y_k = bounded(network([sample_(k-history+1), ..., sample_k])),  |y_k| <= 1
     u_k = u_(k-1) + clamp(effort_limit y_k - u_(k-1), effort_rate period)
 
 with x the angle from upright of each joint that turns, in [-pi, pi), q the deviation of each that slides, and u of each
-driven one; a policy may see a part of these, or x itself. Before the first sample there was the first sample, at zero
-effort. Vectors hold one value for each joint, in the order of ``joints``, those of efforts one for each driven joint;
+driven one; a policy may see a part of these, or x itself. Samples before the first equal the first, at zero effort.
+Vectors hold one value for each joint, in the order of ``joints``, those of efforts one for each driven joint;
 training and controller share this module, so that they agree.
 """
 
@@ -53,7 +53,7 @@ MODELS = ("rigid_pendulum", "mechanism")
 """What a policy is for: the pendulum, or a plant file's mechanism of several joints."""
 SIGNALS = ("angle", "cos", "sin", "position", "velocity", "effort")
 """What a sample may hold of each joint, in this order: angle, cosine and sine of those that turn, the position of those
-that slide, the velocity of all, and of those that are driven the ``effort`` of the last answer."""
+that slide, the velocity of all, and of those that are driven the ``effort`` of the last command."""
 DEFAULT_SIGNALS = ("cos", "sin", "velocity", "effort")
 """What policies of our own training see: an angle jumps where cosine and sine do not."""
 ACTIVATIONS = ("tanh", "relu")
@@ -122,14 +122,14 @@ class Network:
 
 @dataclass(frozen=True)
 class Policy:
-    """A network with everything that says where it may be used.
+    """A network with the conditions of its use.
 
     Attributes:
         network: The network.
         name: Its name, for logs.
         task: What it was trained for.
         joints: Names of the joints, n of them, m driven; vectors of efforts have m values, the others n.
-        period: Time between two answers [s].
+        period: Time between two commands [s].
         plant: The plant at the centre of training.
         ranges: Lowest and highest value of each parameter of the plant that differed in training, by name.
         effort_limit: Largest effort of each driven joint [N m or N].
@@ -139,7 +139,7 @@ class Policy:
         velocity_box: Largest speed that training visited [rad/s or m/s].
         signals: What it sees of each joint, a part of ``SIGNALS`` in their order.
         history: Samples that it sees.
-        provenance: How it came about: settings, seed, versions, what was measured; plain JSON values.
+        provenance: How it was trained: settings, seed, versions, results; plain JSON values.
 
     Raises:
         DataError: The parts do not go together.
@@ -269,10 +269,10 @@ def fingerprint(plant: AnyPlant) -> str:
 
 
 def plant_problem(policy: Policy, plant: AnyPlant) -> str:
-    """Return in words why a policy is not for a plant, or nothing where it is.
+    """Return as text why a policy is not for a plant; empty where it is.
 
     Each parameter has to lie within the range that was trained, or be that of the policy's plant within 0.1 %. A larger
-    effort limit is no obstacle: the policy keeps its own; nor is an end stop that its box does not reach.
+    effort limit is accepted: the policy applies its own; so is an end stop that its box does not reach.
     """
     own = policy.plant
     if isinstance(own, MechanismParameters) or isinstance(plant, MechanismParameters):
@@ -335,7 +335,7 @@ def require_plant(policy: Policy, plant: AnyPlant) -> None:
     """Refuse a plant that a policy is not for.
 
     Raises:
-        ParameterError: The plant is another; the message says in what.
+        ParameterError: The plant is another; the message has the difference.
     """
     problem = plant_problem(policy, plant)
     if problem:

@@ -103,10 +103,10 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def named_controller(text: str) -> tuple[str, dict[str, str]]:
-    """Return kind and parameters of a controller that is named, or of the one that answers with a policy file.
+    """Return kind and parameters of a named controller, or of the one that runs a policy file.
 
     Args:
-        text: A name, or the path of a policy file, known by ``POLICY_SUFFIX``.
+        text: A name, or the path of a policy file, which ends in ``POLICY_SUFFIX``.
 
     Raises:
         DataError: The file cannot be read.
@@ -118,10 +118,10 @@ def named_controller(text: str) -> tuple[str, dict[str, str]]:
 
 
 def policy_record(parameters: Mapping[str, Any]) -> dict[str, str]:
-    """Return what a run's record says of a controller's policy file beside its path: it may be another one tomorrow.
+    """Return the entry of a run's record that identifies a controller's policy file, which may change later.
 
     Returns:
-        The digest of the file under ``policy_sha256``; nothing where no policy answers or its file cannot be read.
+        The digest of the file under ``policy_sha256``; empty without a policy, or where its file cannot be read.
     """
     path = parameters.get("policy")
     if not isinstance(path, str) or not path:
@@ -155,7 +155,7 @@ def loads_policy(content: bytes, where: str = "policy") -> Policy:
 
 
 def header_of(policy: Policy) -> dict[str, Any]:
-    """Return all that a file says of a policy beside its weights, as JSON values."""
+    """Return all that a file holds of a policy except its weights, as JSON values."""
     network = policy.network
     return {
         "format": FORMAT,

@@ -1,4 +1,4 @@
-"""Make a policy of ours of an actor that another library trained: what it sees and asks for has to be told."""
+"""Make a policy of an actor that another library trained: its inputs and outputs have to be specified."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _BOX_MARGIN = 1.001
 
 @dataclass(frozen=True)
 class Told:
-    """What an archive does not say of its actor.
+    """What an archive does not define of its actor.
 
     Attributes:
         plant: The plant of its training.
-        period: Time between two answers [s].
+        period: Time between two commands [s].
         observation: What it sees of a sample, in its order: words of ``SIGNALS``, with a minus where it sees the
             negative (``-cos`` is the cosine of an angle from hanging); empty to know it by the spaces.
         history: Samples that it sees, the oldest first.
@@ -64,10 +64,10 @@ _KNOWN = (
 
 
 def policy_of_actor(actor: Actor, told: Told, *, name: str, provenance: Mapping[str, Any]) -> Policy:
-    """Return the policy that answers as an actor does.
+    """Return the policy with the outputs of an actor.
 
     Raises:
-        ParameterError: What was told and what the actor says of its spaces do not go together, or too little was told.
+        ParameterError: The specification is incomplete, or contradicts the actor's spaces.
         DataError: The parts do not make a policy.
     """
     if actor.actions.high.size != 1:
@@ -136,7 +136,7 @@ def _signs(words: Sequence[str], history: int) -> NDArray[np.float64]:
 
 
 def _boxes(space: Space, words: Sequence[str], told: Told) -> tuple[float, float]:
-    """Return the largest angle [rad] and velocity [rad/s], after a look at the bounds of each value."""
+    """Return the largest angle [rad] and velocity [rad/s], after a check of the bounds of each value."""
     angle, velocity = math.pi, told.velocity_box
     # Stacked samples: the bounds lie in another order than the values (VecFrameStack repeats each bound).
     bounds = dict(zip(_plain(words), zip(space.low, space.high, strict=True), strict=True)) if told.history == 1 else {}

@@ -1,7 +1,7 @@
 """Actors of Stable-Baselines3: PPO, A2C, SAC and TQC archives, read without that library and without torch.
 
 The archive is a zip file with ``data`` (JSON, whose pickled parts are left alone) and ``policy.pth`` (the weights).
-What an actor answers is what ``model.predict(observation, deterministic=True)`` does::
+An actor's output is that of ``model.predict(observation, deterministic=True)``::
 
     PPO, A2C    u = clip(network(o), low, high), tanh between the layers by default
     SAC, TQC    u = high tanh(network(o)), relu between the layers by default
@@ -73,7 +73,7 @@ _SETTINGS = (
     "optimizer_class", "optimizer_kwargs", "share_features_extractor", "normalize_images", "full_std",
     "use_expln", "clip_mean",
 )  # fmt: skip
-"""Settings of a policy that leave its network as it is, or that are looked at here."""
+"""Settings of a policy that do not change its network, or that are handled here."""
 
 
 @dataclass(frozen=True)
@@ -91,15 +91,15 @@ class Space:
 
 @dataclass(frozen=True)
 class Actor:
-    """What an archive says of an actor.
+    """The contents of an actor's archive.
 
     Attributes:
         network: From observations to actions within [-1, 1], in units of the largest action.
-        observations: What it sees.
-        actions: What it answers, in the units of its environment.
+        observations: Space of its inputs.
+        actions: Space of its outputs, in the units of its environment.
         algorithm: Of its training.
         version: Of Stable-Baselines3.
-        steps: Steps of its training; None where the archive does not say.
+        steps: Steps of its training; None where the archive lacks it.
         sha256: Of the archive.
     """
 
@@ -155,7 +155,7 @@ def _read(content: bytes) -> Actor:
         )
     pairs = _layers(kind, read_state(weights))
     if output == "clip":
-        # In units of the largest action, as our networks answer.
+        # In units of the largest action, as a policy's output is.
         scale = actions.high.astype(np.float32)
         pairs[-1] = pairs[-1][0] / scale[:, None], pairs[-1][1] / scale
     network = Network(tuple(w for w, _ in pairs), tuple(b for _, b in pairs), activation, output)

@@ -1,6 +1,6 @@
 """Weights from a file that ``torch.save`` wrote, read without torch and without executing anything.
 
-Such a file is a zip archive: ``data.pkl`` says by a pickle which tensors there are, ``data/<key>`` holds their numbers.
+Such a file is a zip archive: ``data.pkl`` is a pickle that lists the tensors, ``data/<key>`` holds their numbers.
 The pickle is not unpickled: its operations are read one by one, and only those that put tensors into a dictionary mean
 anything. Any other one, and any name of code but the four of ``_NAMES``, refuses the file.
 
@@ -192,7 +192,7 @@ class _Reader:
         self.set_items([key, value])
 
     def build(self, _: Any) -> None:
-        """Drop what torch says of the versions of its modules (``_metadata``)."""
+        """Drop torch's versions of its modules (``_metadata``)."""
         self._stack.pop()
 
 

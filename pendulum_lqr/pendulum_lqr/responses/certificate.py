@@ -5,10 +5,10 @@ Two certificates, both by Vinnicombe's theorem and both with the upper confidenc
 ``gap``        one number for the machine (the nu-gap in the task's units) below one number for the design, b(P, K)
 ``frequency``  at each frequency, with the weights that certify most (:func:`.gap_metric.loop_distance`)
 
-Both speak of the linear machine, on a grid dense enough for lightly damped loops
-(:mod:`pendulum_lqr.responses.machine_response` says how it is made of measured lines). From the highest line to the
+Both concern the linear machine, on a grid dense enough for lightly damped loops
+(:mod:`pendulum_lqr.responses.machine_response` defines how it is made of measured lines). From the highest line to the
 Nyquist frequency the machine is taken to be smooth, or, where lines end well below, to roll off. Both take the machine
-to have as many unstable poles as the model, a pendulum upright one. Neither speaks of saturation, or of dry friction at
+to have as many unstable poles as the model, a pendulum upright one. Neither covers saturation, or dry friction at
 rest.
 """
 
@@ -142,7 +142,7 @@ class Certificate:
 
     @property
     def undecided(self) -> bool:
-        """Whether the measurement's error alone keeps it from being certified: a longer one may do it."""
+        """Whether only the measurement's error prevents certification: a longer measurement may certify it."""
         return self.possible and not self.certified
 
     @property

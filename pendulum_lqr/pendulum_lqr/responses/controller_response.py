@@ -1,8 +1,8 @@
-"""The linear part of any controller as a frequency response: what it answers to small angles and velocities.
+"""The linear part of any controller as a frequency response: its output for small angles and velocities.
 
 A controller with an integral, an observer or an optimisation inside has no gain to read off. Run in closed loop with
 the model it was designed on, where everything stays bounded, it is disturbed at the measured angle and, in a second
-run, at the measured velocity, both by a small multisine. The two answers give both entries of K(e^{j w h}),
+run, at the measured velocity, both by a small multisine. The two responses give both entries of K(e^{j w h}),
 
     u = -K y,    K = -U Y^-1    (U: 1 x 2, Y: 2 x 2 at each frequency)
 """
@@ -31,14 +31,14 @@ _LENGTH = 20.0
 _MOST_PERIODS = 5
 """Periods after which a loop that does not repeat itself counts as unstable."""
 _REPEATS = 1e-3
-"""Largest change of the state from period to period, beside its largest value, that counts as repeating."""
+"""Largest change of the state from period to period, relative to its largest value, that counts as repeating."""
 _ANGLE, _VELOCITY = 1e-4, 1e-2
 """Size of the excitation, small enough for limits to stay away [rad, rad/s]."""
 _FALLEN = 0.5
 
 
 def require_time_invariant(name: str) -> None:
-    """Refuse a controller that answers by the clock, and so has no frequency response.
+    """Refuse a controller that depends on time, and so has no frequency response.
 
     Raises:
         ParameterError: It follows a reference that moves, or plays torques.

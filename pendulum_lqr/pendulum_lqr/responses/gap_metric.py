@@ -58,7 +58,7 @@ class SignalScaling(ABC):
 
     @abstractmethod
     def sentence(self) -> str:
-        """Say it in words."""
+        """Return the result as a sentence."""
 
     def plant(self, response: ArrayLike) -> Complex:
         """Return a response, shape (outputs, n), in scaled units."""
@@ -105,7 +105,7 @@ class Scaling(SignalScaling):
         return self.torque
 
     def sentence(self) -> str:
-        """Say it in words."""
+        """Return the result as a sentence."""
         return (
             f"One unit is {self.angle:g} rad of angle, {self.velocity:g} rad/s of velocity and "
             f"{self.torque:g} N m of torque: the deviations that the task allows, and the torque it has for them."
@@ -162,7 +162,7 @@ class JointScaling(SignalScaling):
         return self.effort
 
     def sentence(self) -> str:
-        """Say it in words."""
+        """Return the result as a sentence."""
         parts = [f"{v:.3g} {unit} of {name}" for name, unit, v in zip(self.names, self.units, self.values, strict=True)]
         return (
             f"One unit is {', '.join(parts)} and {self.effort:.3g} {self.effort_unit} of effort: what the plant's own "
@@ -259,14 +259,14 @@ def loop_distance(first: ArrayLike, second: ArrayLike, radius: ArrayLike = 0.0) 
     """Return, at each frequency, how far a second loop is from the first for the best weight, shape (n,); < 1 is safe.
 
     The theorem may be used with any weights. With W of the plant and 1/W of the controller, the condition is linear in
-    |W|^2, so that the best weight at a frequency is one of two limits: the loops differ by little beside the return
+    |W|^2, so that the best weight at a frequency is one of two limits: the loops differ little relative to the return
     difference (additive), |L2 - L1| < |1 + L1|, or their inverses do, |1 - L1/L2| < |1 + L1|. No other scaling
     certifies more, and no scale has to be chosen.
 
     Args:
         first: Loop K P1, shape (n,), stable.
         second: Loop K P2, shape (n,).
-        radius: Radius of the confidence disc of the second loop, shape (n,); the worst loop in it counts.
+        radius: Radius of the confidence disc of the second loop, shape (n,); the worst loop in it is used.
     """
     one, two = np.asarray(first, dtype=np.complex128), np.asarray(second, dtype=np.complex128)
     r = np.broadcast_to(np.asarray(radius, dtype=np.float64), two.shape)

@@ -92,7 +92,7 @@ class Machine:
 
     @classmethod
     def beside(cls, measured: MeasuredResponse, model: LinearModel) -> Machine:
-        """Return the machine of a measurement of several joints, interpolated beside a model.
+        """Return the machine of a measurement of several joints, interpolated relative to a model.
 
         Args:
             measured: The measurement.
@@ -156,7 +156,7 @@ def _grid(lines: Array) -> Array:
 
 
 def _splined(lines: Array, curve: Complex, grid: Array) -> tuple[Complex, Array]:
-    """Return a curve on the grid, and the error between lines as a share of it: what each tells of one left out.
+    """Return a curve on the grid, and its relative error between lines, by leaving one line out at a time.
 
     Of lines that are mirrored at 0 the mirror image is left out with its line: it is no measurement of its own.
     """
@@ -169,7 +169,7 @@ def _splined(lines: Array, curve: Complex, grid: Array) -> tuple[Complex, Array]
 
 
 def _larger_neighbour(lines: Array, values: Array, grid: Array) -> Array:
-    """Return at each point the larger of the values at the lines beside it."""
+    """Return at each point the larger of the values at the neighbouring lines."""
     right = np.clip(np.searchsorted(lines, grid, side="left"), 1, lines.size - 1)
     return np.asarray(np.maximum(values[right - 1], values[right]), dtype=np.float64)
 

@@ -41,9 +41,9 @@ class MeasuredResponse:
         coherence: Share of the output's power that the excitation explains, shape (2, n), 0 to 1.
         sensitivity: Torque at the plant for one newton metre of excitation, 1/(1 + K P), shape (n,).
         blocks: Number of independent periods (or segments) behind it.
-        distortion: Angle and velocity on lines that were not excited, beside those that were, shape (2,); NaN where
+        distortion: Angle and velocity on unexcited lines, relative to those on excited ones, shape (2,); NaN where
             that was not measured [-].
-        facts: What else a reader should know: source, excitation, duration, largest angle and torque.
+        facts: Further facts for a reader: source, excitation, duration, largest angle and torque.
         joints: Names of the k joints; none for a plant of one.
         driven: Which of them the torque drives.
     """

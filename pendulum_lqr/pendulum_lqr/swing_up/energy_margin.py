@@ -16,7 +16,7 @@ class EnergyMargin:
 
     Args:
         first: Margin at the start, as a share of the energy of upright [-].
-        rest: Velocity below which noise says which way it goes, and nothing is learnt [rad/s].
+        rest: Velocity below which noise decides the direction, and the margin stays [rad/s].
 
     Attributes:
         value: The margin [-].

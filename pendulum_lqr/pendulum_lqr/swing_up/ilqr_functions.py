@@ -51,7 +51,7 @@ def step_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
     where = np.array(driven)
     along = numba.njit(along_functions(n), **WITHIN)
     pick = numba.njit(_TUPLES[n], **WITHIN)
-    # Written into its callers: machine code that is told no functions can be kept on disk.
+    # Inlined: machine code without function arguments can be cached on disk.
     rk4 = numba.njit(_fresh(rk4_joints), forceinline=True, **WITHIN)
     forward = numba.njit(_fresh(mechanism.forward), error_model="numpy", **WITHIN)
     forward_c = numba.njit(in_arithmetic(mechanism.forward, cmath), error_model="numpy", **WITHIN)
@@ -226,5 +226,5 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
 
 
 def _fresh(function: Any) -> Any:
-    """Return a copy of a function, so that what numba keeps of it is this kernel's own."""
+    """Return a copy of a function, so that numba's cache of it is this kernel's own."""
     return FunctionType(function.__code__, function.__globals__, function.__name__, function.__defaults__)

@@ -63,8 +63,8 @@ def deviation_of(coordinates: Coordinates, x: Vector) -> Array:
 def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion:
     """Return the largest ellipsoid x' S x <= level from whose sampled states u = -K x, limited, comes to rest upright.
 
-    The level grows until a sampled state is lost, or hits an end stop, and is bisected then; nine tenths of what is
-    found are returned. Each plant and gain is sampled once in a process: a controller that is designed anew for another
+    The level grows until a sampled state is lost, or hits an end stop, and is bisected then; nine tenths of it are
+    returned. Each plant and gain is sampled once in a process: a controller that is redesigned for another
     parameter has its region at once.
 
     Args:
@@ -79,7 +79,7 @@ def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion
 
 @lru_cache(maxsize=32)
 def _sampled(plant: MechanismParameters, *numbers: tuple[Any, ...]) -> CaughtRegion:
-    """Return what :func:`sample_caught_region` says, of the numbers of K, S and poles."""
+    """Return the result of :func:`sample_caught_region`, by the numbers of K, S and poles."""
     gain = Gain(*map(np.array, numbers))
     n = len(plant.joints)
     unit = _samples_of_level_1(gain, n)
@@ -151,7 +151,7 @@ class MechanismCatch:
         plant: The plant.
         gain: K and S.
         region: Where it takes over.
-        leave: Multiple of the region's level at which it lets go.
+        leave: Multiple of the region's level at which it releases.
         active: Whether it is in charge.
     """
 
@@ -172,7 +172,7 @@ class MechanismCatch:
         return float(deviation @ self.gain.S @ deviation) / self.region.level
 
     def holds(self, deviation: Array) -> bool:
-        """Return whether it is in charge of a deviation from upright; it may take over or let go by this."""
+        """Return whether it is in charge of a deviation from upright; the call may make it take over or release."""
         self.active = self.share(deviation) <= (self.leave if self.active else 1.0)
         return self.active
 

@@ -26,5 +26,5 @@ class MechanismController(Protocol):
 
 
 def within_limits(wanted: Iterable[float], limits: Vector) -> Vector:
-    """Return efforts within limits either way; of what is no number no effort is made: who sends it refuses it."""
+    """Return efforts within limits either way; NaN stays NaN, which the sender refuses."""
     return tuple(top if u > top else max(float(u), -top) for u, top in zip(wanted, limits, strict=True))

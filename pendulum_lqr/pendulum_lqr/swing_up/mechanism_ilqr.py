@@ -108,11 +108,11 @@ class IlqrProblem:
             u: Efforts at the start, m values.
             efforts: The guess, shape (N, m); not changed.
             iterations: Largest number of iterations; 0 only follows the guess.
-            around: A plan whose feedback follows the guess, of as many intervals: on an unstable plant a guess
-                that begins a little beside its plan ends anywhere without.
+            around: A plan whose feedback follows the guess, of as many intervals; without it, a guess for an unstable
+                plant that starts slightly off its plan diverges.
 
         Raises:
-            ParameterError: The start is not finite: limits would make efforts of what is no number.
+            ParameterError: The start is not finite: limits would turn NaN into efforts.
         """
         if not all(map(math.isfinite, (*q, *v, *u))):
             raise ParameterError(f"plan begins at {written((*q, *v, *u))}; expected finite numbers")

@@ -26,7 +26,7 @@ PATIENCE, RETRIES = 8, 2
 
 
 class MechanismMpc:
-    """Follows the first interval of a plan, plans anew from where it is, and hands over to the LQR near upright.
+    """Follows the first interval of a plan, replans from where it is, and hands over to the LQR near upright.
 
     Args:
         period: Sampling period [s].
@@ -60,8 +60,8 @@ class MechanismMpc:
             self._plan = self._best(x, None, PLAN.guesses)
             self._planned, self._age = t, 0
         elif t - self._planned > 2.0 * step:
-            # A plan that nobody followed for a while begins elsewhere. In real time that is one whose search took too
-            # long for its answer to be applied: it is a better start than none, and another search would be as late.
+            # A plan that was not followed for a while starts elsewhere. In real time its search took too long for its
+            # reply to be applied: it is a better start than none, and another search would be as late.
             late = self.search.solve(x, self._before, self._plan.efforts, PLAN.iterations)
             self._plan = self._best(x, late, RETRIES)
             self._planned, self._age = t, 0

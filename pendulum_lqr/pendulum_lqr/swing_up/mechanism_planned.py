@@ -21,11 +21,11 @@ _PLAN = PlanSettings(_SPRINT, step=0.01, nodes=100, guesses=200, iterations=40)
 _REFINED = 100
 """Largest number of iterations of the plan that is taken."""
 _TUBE = 10.0
-"""Width of the tube about a plan, as a multiple of the caught region's level; beyond it, it plans anew."""
+"""Width of the tube about a plan, as a multiple of the caught region's level; beyond it, it replans."""
 
 
 class PlannedSwingUp:
-    """Plans to the end, follows the plan by time-varying LQR, and plans anew only where that leads nowhere.
+    """Plans to the end, follows the plan by time-varying LQR, and replans only where tracking fails.
 
     A search takes about a second: simulated time waits for it, a real plant does not.
 

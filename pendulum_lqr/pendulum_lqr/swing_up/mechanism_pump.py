@@ -38,7 +38,7 @@ _PUSH = 0.05
 _LEAST_COUPLING = 0.3
 """Share of the coupling of hanging below which friction is not made up for: a level pole feels nothing of its cart."""
 _MOST_FRICTION = 0.015
-"""Largest dry friction of the pendulum, by the torque of its level weight. The LQR that catches knows none, and with
+"""Largest dry friction of the pendulum, by the torque of its level weight. The LQR's model has none, and with
 more it does not bring every mechanism to rest (pendubot: 5 of 5 at 0.015, none at 0.02)."""
 _ANGLES = 32
 
@@ -191,7 +191,7 @@ class EnergyPump:
         wanted = self._gain * (share - 1.0 - margin) * coupling * swing
         wanted -= self._friction(velocity[p]) * coupling / max(coupling**2, self._least_coupling**2)
         if share < _HANGING and abs(swing) < self._rest:
-            # Where it hangs still no velocity says which way to push: either will do.
+            # Hanging at rest it may be pushed either way.
             wanted -= math.copysign(self._push, coupling * swing)
         wanted -= self._stiffness * error + self._damping * speed
         wanted = self._within_reach(wanted, error, speed)

@@ -55,7 +55,7 @@ def tracking_gains(
     P[-1] = terminal
     for k in range(len(efforts) - 1, -1, -1):
         J = np.array(complex_step(flow, (*map(float, states[k]), *map(float, efforts[k]))))
-        # Two terms of the exponential: the periods are short beside the motion.
+        # Two terms of the exponential: the periods are short compared to the motion.
         half = np.eye(2 * n) + 0.5 * period * J[:, : 2 * n]
         A, B = np.eye(2 * n) + period * J[:, : 2 * n] @ half, period * half @ J[:, 2 * n :]
         PB = P[k + 1] @ B
@@ -121,7 +121,7 @@ class MechanismTvlqr:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew, at hanging."""
+        """Restart, hanging."""
         self.catch.active = False
         self._following = True
         self._began: float | None = None
@@ -132,7 +132,7 @@ class MechanismTvlqr:
     def followed(self, t: float, x: Vector) -> Vector | None:
         """Return the efforts that follow the trajectory; None where it has ended, or from where it was left once."""
         if self._began is None:
-            # Hanging is hanging, however often it has turned before: the trajectory knows nothing of whole turns.
+            # The trajectory starts on turn 0, so the turns made before are subtracted.
             self._began, self._turned = t, whole_turns(self.plant, x)
         k = round((t - self._began) / self.period)
         if self._following and k < len(self.efforts):

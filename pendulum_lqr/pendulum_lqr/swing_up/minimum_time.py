@@ -95,7 +95,7 @@ def minimum_time(
         effort_limit: Torque limit [N m].
         target: (S, c) of the set x' S x <= c.
         centre: Where the set lies, from upright [rad].
-        angles: Grid points around the circle.
+        angles: Grid points of a full turn.
         velocities: Grid points in velocity, odd so that rest is one of them.
     """
     # 1.3 times the speed of a free fall from upright.

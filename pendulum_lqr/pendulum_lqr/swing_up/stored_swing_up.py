@@ -23,7 +23,7 @@ __all__ = [
 CALM_WEIGHTS = ((1.0, 1.0, 1.0, 1.0), 10.0)
 """Weights of catch and tracking behind a swing-up, for two joints: of gains as low as still catch from far."""
 _TUBE = 10.0
-"""Width of the tube about a swing-up: beyond it, planning anew is better than tracking."""
+"""Width of the tube about a swing-up: beyond it, replanning is better than tracking."""
 
 
 def stored_trajectory(plant: MechanismParameters) -> MechanismTrajectory:
@@ -67,7 +67,7 @@ def tracked_swing_up(plant: MechanismParameters, period: float, *, recovers: boo
     Args:
         plant: The plant.
         period: Sampling period [s].
-        recovers: Whether it plans anew where it is thrown off; otherwise it goes on following.
+        recovers: Whether it replans where it leaves the tube; otherwise it continues to follow.
 
     Raises:
         ParameterError: There is none for this plant.
