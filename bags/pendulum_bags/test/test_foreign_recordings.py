@@ -209,6 +209,7 @@ def test_position_and_velocity_in_rows_of_their_own_are_both_read(tmp_path, drop
     np.testing.assert_allclose(recording.position, ANGLE, atol=1e-6)
     expected = np.interp(TIME, TIME + 0.002, SPEED)
     np.testing.assert_allclose(recording.velocity, expected, atol=1e-6)
+    assert "each is taken from its own rows, the velocity by interpolation" in " ".join(data_notes(recording))
     if driven:
         np.testing.assert_allclose(recording.input_stamps, TIME + 0.004)
         np.testing.assert_allclose(recording.input, TORQUE)
@@ -266,3 +267,11 @@ def test_a_table_without_names_is_not_told_to_skip_lines(tmp_path, before, way):
     names = "time,position,velocity,torque\n" * bool(before)
     with pytest.raises(DataError, match=way):
         read_recording(save(tmp_path / "run.csv", f"1.0,2.0\n{before}{names}{table}"))
+
+
+def test_a_sparse_table_of_other_names_says_which_it_has(tmp_path):
+    path = save(tmp_path / "run.csv", "__time,/joint0/position,/u\n0.0,0.1,\n0.1,,0.2\n0.2,0.1,\n")
+    with pytest.raises(
+        DataError, match=r"has no column 'time' for time .*; it has __time, /joint0/position, /u; `--map"
+    ):
+        read_recording(path)

@@ -139,7 +139,7 @@ def read_csv(
     by_topic = {} if also else _rows_by_topic(rules, names, table)
     if by_topic:
         table = by_topic.pop("position")
-        meta["rows_by_topic"] = True
+        meta["rows_by_topic"] = sorted(by_topic)
     elif rules.get("drop_nan") is True:
         known = np.isfinite(table[:, [name.casefold() in wanted for name in names]])
         whole = known[:, known.any(axis=0)].all(axis=1)
@@ -313,8 +313,6 @@ def _read_table(
     except ValueError as error:
         if bad := _first_bad_cell(body, names, delimiter, skip + line, used):
             raise DataError(f"{source}: {bad}") from error
-        if not used:
-            raise DataError(f"{source}: {error}") from error
         rows = [row for row in csv.reader(io.StringIO(body), delimiter=delimiter) if _is_row(row)]
         table = np.full((len(rows), len(names)), np.nan)
         table[:, used] = [[float(row[index].strip() or "nan") for index in used] for row in rows]

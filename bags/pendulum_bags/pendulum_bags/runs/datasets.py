@@ -173,7 +173,8 @@ def data_notes(recording: Recording) -> list[str]:
     if recording.meta.get("no_effort"):
         notes.append("there is no effort in the bag: it is taken for a free swing.")
     if recording.meta.get("rows_by_topic"):
-        notes.append("rows do not hold all quantities: each is taken from its own rows, a velocity between them.")
+        between = ", the velocity by interpolation" * ("velocity" in recording.meta["rows_by_topic"])
+        notes.append(f"no row holds all quantities: each is taken from its own rows{between}.")
     if recording.meta.get("repeated_stamps"):
         notes.append(f"{recording.meta['repeated_stamps']} samples repeat the stamp before them and are left out.")
     if recording.meta.get("unwrapped"):
