@@ -69,21 +69,23 @@ def mutants(
                 else:
                     row.survived += 1
                     survivors.append(mutant)
+                    print(f"survived: {row.module}, line {mutant.line}: {mutant.key}", file=sys.stderr)
 
             try:
                 try_mutants(target, found, workers, note)
             except TargetError as error:
                 print(f"error: {error}", file=sys.stderr)
                 return 2
+            # A whole run takes an hour: what is known so far is kept, and shown where there is no bar.
+            _write(out, rows, survivors, {key: reasons[key] for key in sorted(used)})
+            if not console.is_terminal:
+                print(f"{row.module}: {row.killed} of {row.mutants} killed, {row.survived} survived", file=sys.stderr)
     table = WholeTable("rules", "mutants", "killed", "equivalent", "survived")
     for row in rows:
         table.add_row(row.module, *(str(value) for value in (row.mutants, row.killed, row.equivalent, row.survived)))
     console.print(table)
-    for mutant in survivors:
-        print(f"survived: line {mutant.line}: {mutant.key}")
     if not only and (gone := sorted(reasons.keys() - used)):
         print("no longer there, strike them off equivalent.yaml: " + "; ".join(gone), file=sys.stderr)
-    _write(out, rows, survivors, {key: reasons[key] for key in sorted(used)})
     return int(bool(survivors))
 
 
