@@ -159,7 +159,7 @@ def test_a_pause_is_a_gap_and_no_wrong_unit(tmp_path, kind, pause):
     assert gap[1] - gap[0] == pytest.approx(pause + 0.01, abs=1e-6)
 
 
-@pytest.mark.parametrize("back", [0.08, 0.5, 50.0])
+@pytest.mark.parametrize("back", [0.02, 0.08, 0.5, 50.0])
 @pytest.mark.parametrize("kind", ["bag", "csv"])
 def test_a_clock_that_steps_back_is_cut_there_and_nothing_is_mixed(tmp_path, kind, back):
     if kind == "csv":
@@ -274,4 +274,11 @@ def test_a_sparse_table_of_other_names_says_which_it_has(tmp_path):
     with pytest.raises(
         DataError, match=r"has no column 'time' for time .*; it has __time, /joint0/position, /u; `--map"
     ):
+        read_recording(path)
+
+
+def test_two_machines_in_one_table_are_refused(tmp_path):
+    angle = ANGLE + 0.3 * (np.arange(TIME.size) % 2)
+    path = save(tmp_path / "two.csv", "time,position,torque\n" + rows(TIME, angle, TORQUE))
+    with pytest.raises(DataError, match=r"two\.csv holds two motions .* jump by 0\.29 rad and back"):
         read_recording(path)

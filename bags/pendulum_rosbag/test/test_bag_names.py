@@ -8,12 +8,13 @@ import pandas as pd
 import pytest
 from mcap.writer import Writer
 
+from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.convert.rewrite import Choice, rewrite
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.export_cli import main as export_main
 from pendulum_rosbag.reader.info_cli import main as info_main
 from pendulum_rosbag.reader.topic_info import ros_topic, ros_type
-from pendulum_rosbag.storage import message_type
+from pendulum_rosbag.storage import BagWriter, message_type
 from pendulum_testing.bag_readers import JOINT_STATE, state
 
 COUNT = 50
@@ -122,3 +123,17 @@ def test_a_topic_that_cannot_be_read_costs_that_topic_alone_and_a_line(
         assert export_main([str(bag), "-t", "/odd", "-o", str(tmp_path / "none"), "--format", format]) == 2
         assert not (tmp_path / "none").exists()
         assert reason in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", [".", "inside/.."])
+def test_a_bag_given_by_where_one_is_keeps_its_name_as_origin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
+) -> None:
+    bag = tmp_path / "monday"
+    with BagWriter(bag) as writer:
+        writer.add_topic("/joint_states", JOINT_STATE)
+        writer.write("/joint_states", 1, encode_joint_state(1, position=0.0))
+    (bag / "inside").mkdir()
+    monkeypatch.chdir(bag)
+    with read_bag(rewrite([Path(given)], tmp_path / "out").path) as written:
+        assert Path(written.metadata["pendulum.origin"][0]["bag"]).name == "monday"

@@ -172,7 +172,8 @@ def _open(path: Path, stack: ExitStack) -> _Input:
     sources = open_sources(folder, verify=True)
     for source in sources:
         stack.callback(source.close)
-    return _Input(path, folder, sources)
+    # (`.` and `..` name no bag)
+    return _Input(path.resolve() if path.name in {"", ".."} else path, folder, sources)
 
 
 def _from_ros1(path: Path, scratch: Path) -> Path:

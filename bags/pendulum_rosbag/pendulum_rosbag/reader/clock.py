@@ -53,7 +53,7 @@ def steps_back(times: Int64) -> list[int]:
     sizes = period - intervals
     large = sizes > CLOCK_JUMP * 1e9
     # Of steady messages a smaller step shows, too, as long as it is none of the usual irregularities.
-    small = ~large & (sizes > max(2 * period, 10 * float(np.quantile(np.abs(sizes), 0.9))))
+    small = ~large & (sizes > max(1.5 * period, 10 * float(np.quantile(np.abs(sizes), 0.9))))
     limit = min(_MOST, 1 + len(times) // 50)
     back = np.zeros(len(sizes), bool)
     for kind in (large, small):
