@@ -127,6 +127,20 @@ def test_a_drive_that_is_prepared_during_a_stop_of_category_1_waits_while_it_wen
     assert rig.bridge.act().fault == ""
 
 
+def test_setpoints_that_a_port_keeps_count_as_in_force_from_when_they_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig().armed()
+    rig.see()
+    sent_ns = rig.port.time_ns
+
+    def flush() -> None:
+        rig.port.time_ns += 7 * MILLISECOND
+
+    monkeypatch.setattr(rig.port, "flush", flush, raising=False)
+    rig.drive()
+    # A record of before may still show what was in force until then.
+    assert [times[:2] for times in rig.monitor._sent][-1] == (sent_ns, sent_ns + 7 * MILLISECOND)
+
+
 def test_a_drive_is_not_prepared_with_a_present_fault() -> None:
     rig = Rig()
     rig.bridge.connect()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import select
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -52,7 +53,7 @@ class Plant:
         self.interface.publish_diagnostics = lambda: self.said.append("diagnostics")  # type: ignore[method-assign]
         self.interface.publish_event = lambda name, **details: self.said.append(f"{name}: {details}")  # type: ignore[method-assign]
         logger = self.node.get_logger()
-        for level in ("info", "error"):
+        for level in ("info", "warning", "error"):
             setattr(logger, level, lambda text, level=level, **_: self.said.append(f"{level}: {text}"))
 
     def arm(self, wanted: bool = True) -> str:
@@ -293,14 +294,14 @@ def test_a_switch_whose_clock_drifts_is_heard_for_hours_and_one_whose_clock_is_s
     assert plant.supervisor._held_ns == NOW
     plant.arm(wanted=False)
     # Set once, it is late each time.
-    switch.say(monkeypatch, 5000 * _MS)
-    assert plant.arm().startswith("enable switch is silent for 4000 ms")
-    switch.say(monkeypatch, 4999 * _MS)
-    assert plant.arm().startswith("enable switch is silent for 3998 ms")
-    switch.say(monkeypatch, 4999 * _MS)
+    switch.say(monkeypatch, 2500 * _MS)
+    assert plant.arm().startswith("enable switch is silent for 1500 ms")
+    switch.say(monkeypatch, 2499 * _MS)
+    assert plant.arm().startswith("enable switch is silent for 1498 ms")
+    switch.say(monkeypatch, 2499 * _MS)
     assert plant.arm() == ""
     # What is late by no more than the timeout is old by as much, and no message makes up for it.
-    for late, old in ((5500, 500), (5501, 500), (5502, 500)):
+    for late, old in ((3000, 500), (3001, 500), (3002, 500)):
         switch.say(monkeypatch, late * _MS)
         assert plant.supervisor._held_ns == NOW - old * _MS
 
@@ -329,6 +330,30 @@ def test_what_a_switch_said_while_the_plant_was_prepared_is_heard_before_it_is_a
     plant.supervisor._prepare = prepare
     plant.supervisor._measure = plant.interface.measured
     assert plant.arm() == ""
+
+
+def test_a_switch_is_heard_by_one_thread_at_a_time(switch: Switch) -> None:
+    hearing = threading.Thread(target=switch.plant.interface.measured)
+    with switch.plant.supervisor.alone():
+        hearing.start()
+        hearing.join(0.2)
+        assert hearing.is_alive()
+    hearing.join(30.0)
+    assert not hearing.is_alive()
+
+
+def test_a_decision_that_differs_from_the_one_before_is_logged_and_published_once(plant: Plant) -> None:
+    for _ in range(2):
+        assert plant.interface.decide().kind is DriveKind.OFF
+    assert plant.arm() == ""
+    for _ in range(2):
+        assert plant.interface.decide().starved
+    disarmed, armed = "disarmed: not armed yet", "armed_effort: no fresh command: zero torque"
+    assert [text for text in plant.said if text.startswith(("info", "warning"))] == [
+        f"info: {disarmed}",
+        f"warning: {armed}",
+    ]
+    assert len([text for text in plant.said if text.startswith("plant_mode")]) == 2
 
 
 def test_a_release_is_heard_by_the_very_next_decision(switch: Switch) -> None:

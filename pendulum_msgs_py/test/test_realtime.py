@@ -17,7 +17,13 @@ import pytest
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs import realtime
-from pendulum_msgs_py.programs.realtime import as_ordinary, may_run_in_real_time, priority_kept, run_in_real_time
+from pendulum_msgs_py.programs.realtime import (
+    as_ordinary,
+    may_run_in_real_time,
+    priority_kept,
+    run_ahead,
+    run_in_real_time,
+)
 
 _ASK = """
 import json, os, sys, threading
@@ -261,3 +267,29 @@ def test_who_asks_whether_it_may_and_who_is_ordinary_stay_as_they_are() -> None:
     worker.start()
     worker.join()
     assert told == [os.SCHED_BATCH] * 2
+
+
+def test_threads_run_ahead_where_this_user_may_and_the_others_of_them_do_not_wait_for_one_that_may_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    promoted: list[tuple[int, int, int]] = []
+
+    def promote(thread: int, policy: int, param: os.sched_param) -> None:
+        if thread == 2:
+            raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+        promoted.append((thread, policy, param.sched_priority))
+
+    monkeypatch.delenv(realtime.NO_REALTIME, raising=False)
+    monkeypatch.setattr(os, "sched_setscheduler", promote)
+    run_ahead([1, 2, 3])
+    assert promoted == [(1, os.SCHED_FIFO, 50), (3, os.SCHED_FIFO, 50)]
+    promoted.clear()
+    monkeypatch.setenv(realtime.NO_REALTIME, "1")
+    run_ahead([1, 2, 3])
+    assert promoted == []
+
+
+def test_no_thread_runs_ahead_on_a_system_without_such_priorities(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(realtime.NO_REALTIME, raising=False)
+    monkeypatch.delattr(os, "sched_setscheduler")
+    run_ahead([threading.get_native_id()])

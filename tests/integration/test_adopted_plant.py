@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Bool, Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract import names
@@ -169,10 +169,13 @@ def test_a_robot_that_dies_is_a_fault_a_new_one_gets_no_torque_by_itself_and_the
     peer.until(lambda: peer.sent[-1] == 0.0, "zero torque at last")
 
 
-def test_states_that_are_not_finite_or_of_another_joint_are_refused(processes: ProcessGroup, peer: Peer) -> None:
+def test_states_of_another_joint_or_not_finite_are_refused_and_a_switch_is_asked_for(
+    processes: ProcessGroup, peer: Peer
+) -> None:
     robot = peer.node.create_publisher(JointState, "/robot/joint_states", 10)
     peer.node.create_subscription(Float64MultiArray, EFFORTS, lambda message: None, 10)
-    adopt(processes, "/sim", joint="hip", command_index=0, sign=1, zero=0.0, state_timeout=2.0)
+    adopt(processes, "/sim", joint="hip", command_index=0, sign=1, zero=0.0, state_timeout=2.0, enable_timeout=1.0)
+    switch = peer.node.create_publisher(Bool, names.ENABLE_INPUT, 10)
 
     def speak(name: str, position: float, velocity: tuple[float, ...] = (0.0,)) -> None:
         robot.publish(JointState(name=[name], position=[position], velocity=velocity))
@@ -188,7 +191,15 @@ def test_states_that_are_not_finite_or_of_another_joint_are_refused(processes: P
         speak("hip", 0.1)
         peer.until(lambda before=count: len(peer.states) > before, "the next sound state")  # type: ignore[misc]
         assert peer.states[-1].position[0] == 0.1
-    assert peer.arm().success
+    assert peer.arm().message.startswith("enable switch is not held")
+
+    def held() -> bool:
+        switch.publish(Bool(data=True))
+        speak("hip", 0.1)
+        return bool(peer.arm().success)
+
+    peer.until(held, "a switch that is held")
+    switch.publish(Bool(data=True))
     speak("hip", math.nan)
     peer.until(lambda: peer.diagnostics.get("mode") == "fault", "the fault")
     assert peer.diagnostics["reason"] == "its state is not finite: nan rad, 0.0 rad/s"

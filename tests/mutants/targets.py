@@ -73,7 +73,7 @@ TARGETS: tuple[Target, ...] = (
     Target(
         "pendulum_msgs_py.contract.ordinary",
         ("lend", "take_back", "_may_act", "_lend_gate", "_take_gate_back"),
-        ("pendulum_msgs_py/test/test_plant_rules_on_records.py",),
+        (f"{_MESSAGES}/test_plant_rules_on_records.py", f"{_MESSAGES}/test_supervisor_enable.py"),
     ),
     Target("pendulum_msgs_py.contract.drive", ("PlantLimits", "Mode"), _RULES),
     Target(
@@ -230,10 +230,22 @@ TARGETS: tuple[Target, ...] = (
             "PlantInterface._on_e_stop_reset",
             "PlantInterface._is_outdated",
             "PlantInterface._unread_press",
+            "PlantInterface._hear_enable",
+            "PlantInterface._on_enable",
+            "PlantInterface.decide",
             "PlantInterface.e_stop",
+            "PlantInterface.measured",
+            "_came_before",
         ),
         (f"{_MESSAGES}/test_plant_requests.py",),
     ),
+    Target("pendulum_msgs_py.programs.starter", ("_watch", "bound_environment"), (f"{_MESSAGES}/test_starter.py",)),
+    Target(
+        "pendulum_msgs_py.contract.plant_specs",
+        ("limits_from_parameters",),
+        (f"{_MESSAGES}/test_plant_limits.py", f"{_MESSAGES}/test_supervisor_enable.py"),
+    ),
+    Target("pendulum_msgs_py.programs.realtime", ("run_ahead",), (f"{_MESSAGES}/test_realtime.py",), choose="ahead"),
     Target(
         "pendulum_msgs_py.ros.runner",
         ("_watch_signals", "_next_stop_signal"),

@@ -167,11 +167,9 @@ class PlantSupervisor:
             gate.reset()
         self._handover = None
         self._trajectory = None
-        self._stop = None
         self._applied = self._last_effort = self._nothing
         self._last_decision_ns = self._commanded_ns = now_ns
         self._commanding = None
-        self._gap_from = None
         self._enter(Mode.EFFORT, "armed", now_ns)
         return ""
 
@@ -283,9 +281,9 @@ class PlantSupervisor:
             self._trajectory_start_ns += lost
             if self._handover is not None:
                 self._handover.start_ns += lost
-            if self._stop is not None:
+            if self._stop is not None and elapsed < 0:
                 # A stop waits for nothing, but a clock that steps back must not give it its torque back.
-                self._stop.start_ns += min(0, lost)
+                self._stop.start_ns += elapsed
 
     def _decide_position(self, now_ns: int, sample: JointSample, push: Vector) -> Drive | None:
         trajectory = self._trajectory

@@ -72,7 +72,7 @@ def run_ahead(threads: Iterable[int]) -> None:
     Args:
         threads: The kernel's numbers of threads of this process.
     """
-    for thread in () if os.environ.get(NO_REALTIME) else threads:
+    for thread in () if os.environ.get(NO_REALTIME) or not _is_known() else threads:
         with contextlib.suppress(ParameterError):
             _promote(thread, _AHEAD)
 

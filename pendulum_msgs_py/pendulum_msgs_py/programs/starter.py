@@ -45,7 +45,6 @@ def _watch(starter: int) -> None:
         pass  # ended while this program was loading
     else:
         select.select([descriptor], [], [])
-        os.close(descriptor)
     # A second one would be a wish to leave at once, a recorder's last messages or an experiment's plants left behind.
     if not stops:
         os.kill(os.getpid(), signal.SIGINT)
