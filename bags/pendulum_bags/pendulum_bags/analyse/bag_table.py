@@ -1,7 +1,7 @@
 """The same questions to many bags: one row for each plant of each bag, one for each run folder; here or on a cluster.
 
-What can be asked stands in :data:`~pendulum_bags.analyse.questions.QUESTIONS`. Each bag is a piece of its own: what
-has been answered stays when the analysis is interrupted, and is asked again only when the bag has changed.
+:data:`~pendulum_bags.analyse.questions.QUESTIONS` lists the questions. Each bag is a piece of its own: finished pieces
+survive an interruption, and are computed again only when the bag has changed.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Piece:
     is_run: bool
 
     def fingerprint(self, questions: Sequence[str]) -> str:
-        """Return a hash of what it holds, by sizes and times of its files, of what is asked, and of who answers."""
+        """Return a hash of what it holds, by sizes and times of its files, of the questions, and of the program."""
         path = Path(self.path)
         inside = (file for file in path.rglob("*") if file.name == METADATA_NAME or is_storage_file(file))
         files = [path] if path.is_file() else sorted(filter(Path.is_file, inside))
@@ -65,12 +65,12 @@ class Piece:
 
 
 ANSWERING = ("pendulum_bags", "pendulum_lqr", "pendulum_msgs_py", "pendulum_rosbag", "pendulum_sim")
-"""Packages of the project that answers depend on."""
+"""Packages of the project that results depend on."""
 
 
 @cache
 def program_hash() -> str:
-    """Return a hash of the files that answers depend on: another version of the program answers anew."""
+    """Return a hash of the files that results depend on: another version of the program computes them again."""
     digest = hashlib.sha256()
     for package in ANSWERING:
         folder = Path(str(resources.files(package)))
@@ -82,12 +82,12 @@ def program_hash() -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """What was found.
+    """The results.
 
     Attributes:
         bags: A row for each plant of each bag, in the order of their names.
         runs: A row for each run folder.
-        kept: How many pieces an earlier call had answered.
+        kept: How many pieces an earlier call had finished.
         wall: Time that this call took [s].
     """
 
@@ -103,7 +103,7 @@ class Table:
 
 
 def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece]:
-    """Return every bag, and every run folder where one is asked about, below some folders, ordered by name.
+    """Return every bag, and every run folder where a question needs them, below some folders, ordered by name.
 
     Raises:
         BagError: A folder does not exist, or there is no bag in any of them.
@@ -151,20 +151,20 @@ def analyse_bags(
     connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Table:
-    """Ask every piece what has not been answered yet, and write ``bags.csv``, ``runs.csv`` and their JSON.
+    """Compute what is missing of every piece, and write ``bags.csv``, ``runs.csv`` and their JSON.
 
     Args:
-        folder: Where answers and tables go; with one answer a piece, it is gone on with.
-        pieces: What to ask.
+        folder: Where results and tables go; with results of some pieces, it is continued.
+        pieces: The bags and run folders.
         questions: Names of ``QUESTIONS``.
-        connect: To a Dask cluster (`cluster_client`) that sees the bags under the same paths; by default one after
-            the other is asked in this process.
+        connect: To a Dask cluster (`cluster_client`) that sees the bags under the same paths; by default the pieces
+            run one after the other in this process.
         on_progress: Called with pieces done and in all.
     """
     began = time.monotonic()
     answers = folder / "answers"
     answers.mkdir(parents=True, exist_ok=True)
-    # What an answer is kept under tells bag and questions, so that a changed bag is asked again.
+    # The key of a result covers bag and questions, so that a changed bag is analysed again.
     keys = [piece.fingerprint(questions) for piece in pieces]
     rows = {index: found for index, key in enumerate(keys) if (found := _kept(answers / f"{key}.json")) is not None}
     kept = len(rows)
@@ -189,7 +189,7 @@ def analyse_bags(
 
 
 def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: int | None) -> list[Row]:
-    """Return the rows of a piece; what cannot be answered is told in the row and stops nobody else."""
+    """Return the rows of a piece; a failure is reported in the row and does not stop the others."""
     pieces, questions, out = job
     piece = pieces[index]
     if not Path(piece.path).exists():
@@ -226,7 +226,7 @@ def _answer(row: Row, questions: Sequence[Callable[..., Mapping[str, Any]]], *ar
 
 
 def _sentence(error: Exception) -> str:
-    """Return why there is no answer; what the program did not expect is told with its kind."""
+    """Return why there is no result; an unexpected error is reported with its type."""
     if isinstance(error, PendulumError):
         return str(error)
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
@@ -238,7 +238,7 @@ def _plants(bag: Bag) -> list[str]:
 
 
 def _told(bag: Bag) -> Row:
-    """Return what the bag says of its run, as far as a table has room for it."""
+    """Return the bag's facts about its run that fit a table."""
     run = run_record(bag.metadata)
     controller = run.get("controller")
     kind = controller.get("kind") if isinstance(controller, Mapping) else controller

@@ -1,4 +1,4 @@
-"""By how much one recording lags another: normalised cross-correlation, with the whole curve to look at."""
+"""By how much one recording lags another: normalised cross-correlation, with the whole curve for inspection."""
 
 from __future__ import annotations
 

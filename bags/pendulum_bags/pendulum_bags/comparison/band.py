@@ -17,14 +17,14 @@ _ORDER = 4
 
 
 def common_band(band: float, *series: Series) -> float:
-    """Return the band [Hz] in which all series can be compared: the one asked for, or less where one is too slow."""
+    """Return the band [Hz] in which all series can be compared: the requested one, or less where one is too slow."""
     return min(band, HIGHEST_SHARE / max(one.period for one in series))
 
 
 class SlowClock:
-    """The stamps of the slower of two motions, at which the faster one is looked at too.
+    """The stamps of the slower of two motions, at which the faster one is evaluated too.
 
-    A plant that is sampled at 100 Hz under noise that changes every 10 ms is seen at one phase of that noise only; its
+    A plant that is sampled at 100 Hz under noise that changes every 10 ms is sampled at one phase of it only; its
     velocity at that phase spreads by up to a quarter more or less than over all phases. No filter undoes that, for
     what was not sampled is lost. So the faster motion is taken at the very same phases, where it has the same images,
     and both are filtered alike after that.

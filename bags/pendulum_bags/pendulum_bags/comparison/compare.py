@@ -48,10 +48,10 @@ class Comparison:
         verdict: Verdict on the paired comparison, or on the unpaired one where the disturbances differ.
         unpaired_verdict: Verdict on the unpaired comparison.
         tested: The runs that the verdicts rest on; the others are shown.
-        looks: How often the data have been looked at.
-        left_out: What was recorded and does not count, and why, in words.
-        unproved: What could be checked of a plant only in part, in words.
-        stalls: Run folder, reason and logs of each run that a stalled machine broke off before the one that counts.
+        looks: Number of interim analyses so far.
+        left_out: What was recorded and is excluded, and why, as text.
+        unproved: What could be checked of a plant only in part, as text.
+        stalls: Run folder, reason and logs of each run that a stalled machine aborted before the one that counts.
     """
 
     pairs: Sequence[Pair]
@@ -90,7 +90,7 @@ class Comparison:
 
     @property
     def delay(self) -> float:
-        """By how much the hardware answers later: that of the test, else where the velocities correlate most [s].
+        """Delay of the hardware's response: that of the test, else where the velocities correlate most [s].
 
         NaN where the test finds no peak of likeness, and so no delay.
         """
@@ -106,7 +106,7 @@ class Comparison:
 
     @property
     def is_tested_in_pairs(self) -> bool:
-        """Whether the verdict's tests look at both motions at the same times, under one disturbance."""
+        """Whether the verdict's tests compare both motions at the same times, under one disturbance."""
         return self.is_paired and not self.unlike_references
 
     @cached_property
@@ -171,7 +171,7 @@ class Comparison:
         return summarise_metrics({"sim": episode_of(pair.simulation.window), "hw": episode_of(pair.hardware.window)})
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything that a program may want to read; numbers that do not exist are None."""
+        """Return everything for other programs; undefined numbers are None."""
         told = run_record(self.pairs[0].hardware.metadata)
         content = {
             "seed": told.get("seed"),
@@ -207,7 +207,7 @@ def compare(
         pairs: (simulation, hardware) of each run, at least one.
         own: Simulations under the thesis's own protocol.
         margin: What difference does not matter; see :meth:`Margins.parse`.
-        looks: How often the data have been looked at, where more are recorded until they decide.
+        looks: Number of interim analyses, where data are added until they decide.
         shown: Runs, by their place among the pairs, that are shown and not tested; some other run is tested.
 
     Raises:
@@ -298,7 +298,7 @@ def compare_folders(
     Args:
         folders: Run folders.
         margin: What difference does not matter; see :meth:`Margins.parse`.
-        looks: How often the data have been looked at; by default what the folders say.
+        looks: Number of interim analyses; by default that of the folders.
         joint: Joint of plants of several.
         open_bag: How bags are opened.
 
@@ -349,7 +349,7 @@ _PHASE = (
 
 
 def _in_words(stalls: Sequence[Mapping[str, str]]) -> str:
-    """Say that runs were broken off, and why: a fault of the bridge's own may look the same."""
+    """Return that runs were aborted, and why: a fault of the bridge's own may look the same."""
     told = "; ".join(stall["reason"] + (f" (logs: {stall['logs']})" if stall["logs"] else "") for stall in stalls)
     runs, does, what = ("run", "does", "a standstill") if len(stalls) == 1 else ("runs", "do", "standstills")
     return (

@@ -154,7 +154,7 @@ def compare(
 def _judge(
     results: Mapping[str, Comparison], kept: Sequence[Path], machine: Path | None, designs: Sequence[str]
 ) -> tuple[Answer, dict[str, Any], Sequence[DesignResult]]:
-    """Return the answer, all of it for JSON, and designs of which it is known whether they carry over."""
+    """Return the answer, its JSON, and the designs with a known certificate."""
     from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
     from pendulum_bags.verdict.answer import answer_of, answer_of_joints
 

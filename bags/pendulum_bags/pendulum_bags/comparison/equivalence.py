@@ -195,9 +195,9 @@ class Verdict:
 
     Args:
         outcome: Equivalent if all are, not equivalent if one is not, undecided otherwise.
-        sentence: The verdict in words.
+        sentence: The verdict as text.
         tests: The tests.
-        margins: What was asked for.
+        margins: The margins.
         more_runs: Runs to record in addition for a decision; 0 where decided, None where more hardly help.
     """
 

@@ -57,7 +57,7 @@ def _check_sides(simulation: RunData, hardware: RunData) -> None:
             f"{simulation.source} is a recording of hardware and {hardware.source} one of the simulation; "
             "expected the simulation first"
         )
-    # A bag may hold both plants, so it is the motion that tells.
+    # A bag may hold both plants, so only equal motions prove the same recording.
     if np.array_equal(simulation.window.position, hardware.window.position) and np.ptp(hardware.window.position) > 0.0:
         raise DataError(
             f"{simulation.source} and {hardware.source} hold one and the same recording; expected one of each plant"
@@ -117,7 +117,7 @@ def _check_seeds(runs: Sequence[RunData]) -> None:
 
 
 def _value(key: str, value: Any) -> str:
-    """Return what two runs must have in common: of a plant file what it says, not where it lies."""
+    """Return what two runs must have in common: of a plant file its contents, not its path."""
     if key in _PLANTS and isinstance(value, str):
         with suppress(ParameterError):
             return describe_plants([load_plant(value)])

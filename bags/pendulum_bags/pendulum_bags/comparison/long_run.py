@@ -170,7 +170,7 @@ def _modal(inputs: Array, poles: Array) -> Array:
 def _poles(clock: SlowClock, motions: Array, inputs: Array, slowest: float) -> Array:
     """Return real poles, an octave apart, and the oscillating ones that the motions show.
 
-    Real poles alone explain an oscillation badly; which frequencies there are, a model of low order tells.
+    Real poles alone fit an oscillation badly; a model of low order gives the frequencies.
     """
     period = clock.period
     octaves = np.arange(1 + math.floor(math.log2(max(2.0, 2.0 * slowest / period))))

@@ -87,11 +87,11 @@ class Margins:
         mean_angle: Difference of the mean angles.
         spread_angle, spread_velocity, spread_torque: Difference of the standard deviations: in a unit, or as a share,
             which allows factors from 1 / (1 + share) to 1 + share.
-        delay: By which one plant answers the disturbance later than the other.
+        delay: Delay of one plant's response to the disturbance relative to the other's.
         path_angle, path_velocity: Root mean square distance of the motions under one disturbance.
         band: Frequency up to which velocities, torques and paths are compared.
         mean_position: Difference of the mean positions of a joint that slides.
-        stated: Names of the margins that the user stated; the others are defaults, and the verdict says so.
+        stated: Names of the margins that the user stated; the others are defaults, and the verdict reports it.
     """
 
     mean_angle: Margin
@@ -149,10 +149,10 @@ class Margins:
 
     @classmethod
     def of_run(cls, folder: Path) -> Margins | None:
-        """Return the margins with which a run folder was last compared; None where it keeps none.
+        """Return the margins with which a run folder was last compared; None where it has none.
 
         Raises:
-            ParameterError: The file that keeps them is no margins file.
+            ParameterError: The file is no margins file.
         """
         path = folder / _OF_RUN
         return cls.parse(path) if path.is_file() else None

@@ -31,7 +31,7 @@ class Episode:
         error: Angle minus set-point, shape (n,) [rad].
         velocity: Shape (n,) [rad/s].
         effort: Torque of the controller, shape (n,) [N m].
-        step: Size of the step that it answers: angle at the start minus set-point [rad]; 0 for regulation.
+        step: Size of the step: angle at the start minus set-point [rad]; 0 for regulation.
     """
 
     t: Array

@@ -71,7 +71,7 @@ class Pair:
 
     Args:
         simulation, hardware: The runs.
-        signal: The disturbances beside each other; None where they were not recorded.
+        signal: The disturbances of both; None where they were not recorded.
         response: Alignment of the motions.
         difference: As recorded.
         aligned: After the response delay has been taken out of the hardware.
@@ -142,7 +142,7 @@ class Pair:
 
     @property
     def unlike_noise(self) -> str:
-        """In what the disturbances are not even of one kind, so that unpaired statistics say nothing; else empty."""
+        """How the disturbances differ in kind, so that unpaired statistics mean nothing; else empty."""
         if self.signal is None:
             return ""
         if not 1.0 / AMPLITUDE <= self.signal.amplitude <= AMPLITUDE:
@@ -178,7 +178,7 @@ class Pair:
 
     @property
     def delay(self) -> float:
-        """By how much the hardware answers later, counted from the disturbance as each plant had it [s]."""
+        """Delay of the hardware's response, relative to the disturbance as each plant had it [s]."""
         return self.response.delay - (self.clock.delay if self.clock is not None else 0.0)
 
     @property

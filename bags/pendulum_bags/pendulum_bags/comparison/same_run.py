@@ -5,7 +5,7 @@ below one band: the difference of the means; the ratio of the standard deviation
 velocity is nearest to the hardware's; the rms distance per standard deviation of the hardware, as it is and less that
 delay.
 
-The long-run variances are estimated as :mod:`pendulum_bags.comparison.long_run` says, all intervals by a jackknife
+The long-run variances are estimated by :mod:`pendulum_bags.comparison.long_run`, all intervals by a jackknife
 over blocks of time. "Equivalent" needs each test's interval inside its margin, which errs with alpha at most whatever
 the number of tests (Berger, Technometrics 24, 1982); one test suffices for "not equivalent", so each has its share of
 alpha (Bonferroni).
@@ -33,16 +33,16 @@ from pendulum_msgs_py.errors import ParameterError
 __all__ = ["Looks", "paired_tests", "unpaired_tests"]
 
 LONGEST_DELAY = 0.1
-"""Delays beyond this are not looked for [s]."""
+"""Largest delay of the search [s]."""
 LEAST_LIKENESS = 0.5
-"""Correlation of the velocities from which a peak is a delay: 0.92 beside 1 N m of dry friction, 0.13 by chance."""
+"""Correlation of the velocities from which a peak is a delay: 0.92 with 1 N m of dry friction, 0.13 by chance."""
 LAG_STEP = 0.001
 """Resolution of the lags near the delay; between two of them the slope of the distance is interpolated [s]."""
 _AHEAD = LAG_STEP * np.array([1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0])
 _LAGS = np.concatenate((-_AHEAD[::-1], [0.0], _AHEAD))
 _QUANTITIES = ("angle", "velocity", "torque")
 _TESTS = 9
-"""Tests that may each say "not equivalent"."""
+"""Tests that may each result in "not equivalent"."""
 _BLOCKS = (6, 20)
 """Fewest and most blocks of a run: fewer make wide intervals, and those of short blocks are not independent."""
 _BLOCK_TIME = 2.0
@@ -54,16 +54,16 @@ Statistic = Callable[[Array, Array], Array]
 
 @dataclass(frozen=True)
 class Looks:
-    """How often data have been looked at, and what that leaves for the error of this look.
+    """The number of interim analyses, and the share of the error that is left for this one.
 
-    The k-th look may err with probability alpha 2^-k on each side of a margin: over all looks, however many there will
-    be and whenever one stops, that is at most alpha (union bound). Each look should have about twice the data of the
-    one before, so that the wider intervals cost little: Student's quantile grows with the root of k, the error halves
-    with every second look.
+    The k-th analysis may err with probability alpha 2^-k on each side of a margin: over all analyses, for any number of
+    them and any stopping rule, that is at most alpha (union bound). Each should have about twice the data of the one
+    before, so that the wider intervals cost little: Student's quantile grows with the root of k, the error halves with
+    every second analysis.
 
     Args:
-        number: 1 for the first look; 0 where data are looked at once, and never added to.
-        alpha: Probability of an error on one side of a margin over all looks.
+        number: 1 for the first analysis; 0 where data are analysed once, and never added to.
+        alpha: Probability of an error on one side of a margin over all analyses.
     """
 
     number: int = 0
@@ -71,7 +71,7 @@ class Looks:
 
     @property
     def level(self) -> float:
-        """Probability of the interval of this look, which is two one-sided tests."""
+        """Probability of the interval of this analysis, which is two one-sided tests."""
         return 1.0 - 2.0 * self.alpha * 0.5**self.number
 
     def level_of_each(self, tests: int) -> float:
@@ -84,7 +84,7 @@ class _Kind:
     """What all tests of some motions have in common.
 
     Args:
-        looks: How often the data have been looked at.
+        looks: Number of interim analyses.
         runs: Runs that the intervals rest on.
         slides: Whether the motions are those of a joint that slides.
         driven: Whether any of them had a controller's torque: 0 and 0 are no test.
@@ -143,7 +143,7 @@ def paired_tests(
         pairs: Simulation and hardware of each run under one disturbance, on one clock.
         margins: The margins.
         noises: The disturbance of each run on that clock, where it is white and known.
-        looks: How often these data have been looked at.
+        looks: Number of interim analyses of these data.
         runs_differ: Whether runs may differ by more than their seeds.
     """
     band = min(common_band(margins.band.si, *pair) for pair in pairs)
@@ -176,7 +176,7 @@ def unpaired_tests(
     looks: Looks = Looks(),
     runs_differ: bool = True,
 ) -> list[EquivalenceTest]:
-    """Test means and spreads of runs that share no disturbance, each side by itself.
+    """Test means and spreads of runs that share no disturbance, simulation and hardware each by itself.
 
     Args:
         simulations: Motions of the simulation.
@@ -308,8 +308,8 @@ def _find_delay(seen: Sequence[_Seen]) -> float | None:
     """Return the delay at which the velocities are most alike, over all runs, to a whole ``LAG_STEP`` [s].
 
     Returns:
-        The delay; None where they are most alike at an end of what is looked at, which is no peak, or where they are
-        hardly alike even there: of a machine that is later than all that is looked at, the noise has small peaks.
+        The delay; None where they are most alike at an end of the searched range, which is no peak, or where they are
+        hardly alike even there: for a delay beyond the range, the noise has small peaks.
     """
     reach = LONGEST_DELAY - float(_LAGS[-1])
     lags = np.arange(-reach, reach + 0.5 * LAG_STEP, LAG_STEP)
@@ -381,7 +381,7 @@ def _no_delay(margins: Margins, kind: _Kind) -> EquivalenceTest:
     end = scale * LONGEST_DELAY
     interval = Interval(math.nan, -end, end, kind.looks.level, math.nan, 1)
     test = equivalence_test("delay", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
-    # However wide the margin, the delay may lie beyond all that was looked for.
+    # However wide the margin, the delay may lie beyond the searched range.
     return replace(test, outcome=Outcome.UNDECIDED, more_runs=None, smallest_margin=math.nan)
 
 

@@ -15,7 +15,7 @@ from pendulum_bags.runs.series import Signal
 __all__ = ["SharedSignal", "compare_signals"]
 
 LEAST_CORRELATION = 0.6
-"""Correlation that one signal keeps although late loops skip and repeat samples of it."""
+"""Least correlation of one signal where late loops skip and repeat samples of it."""
 CHANCE = 1e-3
 """Probability with which independent signals may be taken for one."""
 AMPLITUDE = 1.1
@@ -24,7 +24,7 @@ AMPLITUDE = 1.1
 
 @dataclass(frozen=True)
 class SharedSignal:
-    """Two recorded disturbances beside each other.
+    """Two recorded disturbances compared.
 
     Args:
         alignment: Their cross-correlation.

@@ -43,7 +43,7 @@ class Spectra:
 def spectra_of(first: Series, second: Series, segment: float = 1.0) -> Spectra:
     """Compare the velocities of two motions in frequency.
 
-    Each density is estimated at (a multiple of) the rate of its own motion, and told up to half the slower rate. The
+    Each density is estimated at (a multiple of) the rate of its own motion, and given up to half the slower rate. The
     coherence needs common samples: the faster motion is brought to the slower rate behind an anti-alias filter.
 
     Args:

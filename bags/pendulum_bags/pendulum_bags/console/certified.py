@@ -18,14 +18,14 @@ PICTURES = {
     "certified_weights.png": f"Map of LQR weights, q11/r and q22/r: {_KINDS}",
     "certified_gains.png": f"Map of gains, kp and kd: {_KINDS}; the designs are marked",
 }
-"""File in the folder of figures, and what it shows to whom cannot see it."""
+"""File in the folder of figures, and its alternative text."""
 
 
 class CertifiedDesigns:
     """Maps of certified LQR weights and gains, with the layer's sentence and a link to the page.
 
     Args:
-        jobs: Knows the folder of runs.
+        jobs: Provides the folder of runs.
     """
 
     def __init__(self, jobs: Jobs) -> None:
@@ -54,13 +54,13 @@ class CertifiedDesigns:
         with self._row:
             for name, text in PICTURES.items():
                 if (folder / "figures" / name).is_file():
-                    # The time keeps a browser from showing an older measurement under the same name.
+                    # The time prevents a browser from showing a cached older measurement.
                     source = f"/runs/{folder.name}/figures/{name}?{self._newest.written:.0f}"
                     ui.element("img").props(f'src="{source}" alt="{text}" loading="lazy"')
 
 
 def _sentence(folder: Path) -> str:
-    """Return what the layer says, empty where the folder keeps none."""
+    """Return the layer's sentence, empty where the folder has none."""
     try:
         found = read_layers(folder)
     except DataError as error:

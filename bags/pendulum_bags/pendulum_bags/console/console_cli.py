@@ -25,8 +25,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: Arguments; by default those of the process.
     """
-    # Two seconds of imports kept a loop at 500 Hz waiting for 9 ms. The thread is niced, not the process: a stop that
-    # is pressed later must not wait behind anybody.
+    # Two seconds of imports delayed a loop at 500 Hz by 9 ms. The thread is niced, not the process: a later stop
+    # must not wait behind other processes.
     loading = threading.Thread(target=_load)
     loading.start()
     loading.join()
@@ -42,6 +42,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _load() -> None:
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
-    # What fails here fails again in the main thread, which tells it.
+    # What fails here fails again in the main thread, which reports it.
     with contextlib.suppress(Exception):
         importlib.import_module(_CONSOLE)

@@ -52,23 +52,23 @@ __all__ = ["Hub", "main"]
 _LOOK_PERIOD = 0.3
 _SLICE = 0.2
 _TIMEOUT = 3.0
-"""Longest wait for an answer of a node [s]."""
+"""Longest wait for a response of a node [s]."""
 _TORQUES = {
     "command": names.EFFORT_COMMAND,
     "disturbance": names.DISTURBANCE,
     "applied": names.APPLIED_EFFORT,
 }
 _SILENT = 2.0
-"""Age at which what a node said of itself counts no more [s]; nodes say it twice a second."""
+"""Age at which a node's diagnostics are ignored [s]; nodes publish them twice a second."""
 _STOP_SERVICE = "/e_stop"
 _STOP_TICK = 0.02
 _STOP_WAIT = 0.4
-"""How long a press waits for the plants' answers before it says who has not answered yet [s]."""
+"""How long a stop request waits for the plants before the ones without response are reported [s]."""
 
 
 @dataclass
 class _Plant:
-    """What is known of one plant; ``taps`` are read by whoever draws, not by an executor."""
+    """State of one plant; ``taps`` are read by the drawing code, not by an executor."""
 
     namespace: str
     node: str
@@ -84,8 +84,8 @@ class _Plant:
 class Hub:
     """The console's end of the graph.
 
-    States and torques come at up to 2 kHz and are drawn 60 times a second. Their inputs keep one message and are looked
-    at when a picture is due: what is not drawn costs no Python at all.
+    States and torques come at up to 2 kHz and are drawn 60 times a second. Their inputs hold one message and are polled
+    when a picture is due: what is not drawn costs no Python at all.
     """
 
     def __init__(self) -> None:
@@ -144,7 +144,7 @@ class Hub:
         with self._lock:
             return {plant.namespace: plant.node for plant in self._plants.values()}
 
-    # --- what a person asks for ----------------------------------------------------------------------------
+    # --- requests of the operator --------------------------------------------------------------------------
 
     async def e_stop(self, nodes: Sequence[str] = ()) -> dict[str, Any] | None:
         """Order these plants, or all, to stop until a person has seen that they have; return the order's state."""
@@ -163,12 +163,12 @@ class Hub:
         return self.stop_state()
 
     def stop_state(self) -> dict[str, Any] | None:
-        """Return what each plant answered to the stop that is in force; None where none is."""
+        """Return each plant's response to the stop in force; None where none is."""
         with self._order_lock:
             return self._order.state(time.monotonic())
 
     def acknowledge_stop(self) -> list[str]:
-        """End the order for the plants that are stopped; return those that do not answer, for which it stays."""
+        """End the order for the plants that are stopped; return those without response, for which it stays."""
         with self._order_lock:
             return self._order.acknowledge(time.monotonic())
 
@@ -190,7 +190,7 @@ class Hub:
         return await self.trigger(f"{node}/e_stop_reset")
 
     def _keep_stopping(self) -> None:
-        """Ask, on a thread of its own: neither the page nor its server's loop can hold a stop up."""
+        """Repeat requests on a thread of its own: neither the page nor its server's loop can delay a stop."""
         while not self._leaving.is_set():
             with self._order_lock:
                 now = time.monotonic()
@@ -219,7 +219,7 @@ class Hub:
 
     def _ask_to_stop(self, node: str, now: float) -> None:
         client = self._stop_client(node)
-        # An answer that takes longer than this is one of a plant that was held up: it has been asked again since.
+        # A later response is of a plant that was blocked; the request has been repeated since.
         calls = self._stop_calls.setdefault(node, [])
         for _, call in [entry for entry in calls if now - entry[0] > _TIMEOUT]:
             client.remove_pending_request(call)
@@ -245,7 +245,7 @@ class Hub:
         call.add_done_callback(take)
 
     def _is_asked_to_stop(self, node: str) -> bool:
-        # A request to a plant that was ended before it answered is never answered.
+        # A request to a plant that ended before its response never completes.
         since = time.monotonic() - _TIMEOUT
         with self._order_lock:
             return any(asked > since and not call.done() for asked, call in self._stop_calls.get(node, ()))
@@ -264,7 +264,7 @@ class Hub:
         return any(names.full_name(space, name) == node for name, space in found)
 
     def said(self, node: str) -> str:
-        """Return what a node said of itself last; nothing once it is silent."""
+        """Return a node's latest diagnostics; empty once it is silent."""
         with self._lock:
             text, heard = self._said.get(node, ("", 0.0))
         return text if time.monotonic() - heard < _SILENT else ""
@@ -288,7 +288,7 @@ class Hub:
             raise FaultError(f"{node} refuses {name} = {value}: {result.reason}")
 
     async def describe(self, node: str) -> dict[str, Description]:
-        """Return what a node says of its parameters, asked once for each set of names."""
+        """Return a node's parameter descriptions, requested once for each set of names."""
         wanted = sorted(self.parameters.get(node, {}))
         key = (node, *wanted)
         if key not in self._described:
@@ -332,19 +332,19 @@ class Hub:
         while not self._done.done():
             try:
                 self._executor.spin_until_future_complete(self._done, _SLICE)
-            # A callback that broke over one message must not keep the answers to a stop away.
+            # A callback that failed on one message must not block the responses to a stop.
             except Exception as error:  # noqa: BLE001
                 self._node.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=1.0)
 
     def _look(self) -> None:
-        """Find plants by their e-stop: who has one is a plant."""
+        """Find plants by their e-stop service."""
         self._reader.look(forget=True)
         found = {
             name.removesuffix(_STOP_SERVICE)
             for name, types in self._node.get_service_names_and_types()
             if name.endswith(_STOP_SERVICE)
             and "std_srvs/srv/Trigger" in types
-            # A name stays listed for as long as anybody, we too, has a client of it.
+            # A name stays listed as long as any node, this one included, has a client of it.
             and self._node.count_services(name)
         }
         with self._lock:
@@ -378,7 +378,7 @@ class Hub:
                 String, f"{space}/{names.EVENTS}", lambda message: _on_event(plant, message), qos.EVENTS
             )
         )
-        # Made now, and kept: a stop must not wait for a client to find its service.
+        # Created now: a stop must not wait for a client to discover its service.
         self._stop_client(node)
         return plant
 
@@ -389,7 +389,7 @@ class Hub:
                 plant = self._plants.get(status.name.partition(":")[0])
                 if plant is not None:
                     plant.figures = {pair.key: pair.value for pair in status.values}
-                    # For who joined late; what was written before the newest event would take it back.
+                    # For a late joiner; a mode older than the newest event would revert it.
                     if stamp_from_message(message.header.stamp) > plant.mode_stamp_ns:
                         plant.mode, plant.reason = plant.figures.get("mode", plant.mode), status.message
 

@@ -19,16 +19,16 @@ from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 __all__ = ["ControllerChoice", "offered"]
 
 _NEED_A_FILE = frozenset({"playback", "policy"})
-"""Controllers that cannot start without a file; whoever has one starts them in a terminal."""
+"""Controllers that cannot start without a file, and are started from a terminal."""
 
 
 def offered(plant: str) -> list[str]:
     """Return the controllers that can start for a plant with nothing but their defaults.
 
     Args:
-        plant: Preset or plant file; empty where nobody says.
+        plant: Preset or plant file; empty where unknown.
     """
-    # A file of another machine, or an emulator's, is no reason to offer nothing: the controller says what it refuses.
+    # A file of another machine, or an emulator's, is no reason to offer nothing: the controller reports refusals.
     with contextlib.suppress(PendulumError):
         if plant and is_mechanism(plant):
             return [kind for kind in JOINT_CONTROLLERS if kind not in _NEED_A_FILE]
@@ -85,7 +85,7 @@ class ControllerChoice:
         self._state = ui.label().classes("small").props('role="status"')
 
     def refresh(self) -> None:
-        """Show what the controller says of itself; offer those that fit, once the plant has said what it is."""
+        """Show the controller's diagnostics; offer those that fit, once the plant's description is known."""
         if self._plant != self._offered_for:
             self._offered_for = self._plant
             kinds = offered(self._plant)

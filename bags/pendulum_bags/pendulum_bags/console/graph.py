@@ -9,7 +9,7 @@ __all__ = ["Description", "Graph"]
 
 
 class Description(NamedTuple):
-    """What a node says of one of its parameters: text with the unit, domain in words, whether it can be set."""
+    """A node's description of a parameter: text with the unit, domain as text, whether it can be set."""
 
     text: str
     domain: str
@@ -30,13 +30,13 @@ class Graph(Protocol):
         """Return namespace -> full node name."""
 
     async def e_stop(self, nodes: Sequence[str] = ()) -> dict[str, Any] | None:
-        """Order these plants, or all, to stop; return what each has answered."""
+        """Order these plants, or all, to stop; return the response of each."""
 
     def stop_state(self) -> dict[str, Any] | None:
         """Return the state of the stop that is in force."""
 
     def acknowledge_stop(self) -> list[str]:
-        """End the stop for the plants that have answered; return those that have not."""
+        """End the stop for the plants that have confirmed it; return those that have not."""
 
     def release_stop(self, node: str) -> None:
         """Stop asking one plant."""
@@ -54,7 +54,7 @@ class Graph(Protocol):
         """Return whether a node is on the graph, by its full name."""
 
     def said(self, node: str) -> str:
-        """Return what a node said of itself last, in words; empty once it is silent."""
+        """Return a node's latest diagnostics as text; empty once it is silent."""
 
     async def activate(self, node: str, *, on: bool) -> str:
         """Activate or deactivate a controller."""
@@ -63,4 +63,4 @@ class Graph(Protocol):
         """Set a parameter."""
 
     async def describe(self, node: str) -> dict[str, Description]:
-        """Return what a node says of its parameters."""
+        """Return a node's descriptions of its parameters."""

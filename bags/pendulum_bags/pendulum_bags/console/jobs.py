@@ -109,11 +109,11 @@ class Jobs:
         return self._start(f"move{namespace}", ["move", goal, "--namespace", namespace], "", os.environ)
 
     def control(self, namespace: str, kind: str, plant: str) -> Job:
-        """Start a controller beside a plant; it waits inactive.
+        """Start a plant's controller; it waits inactive.
 
         Args:
             namespace: Of the plant.
-            kind: Which controller.
+            kind: Name of the controller.
             plant: Preset or plant file to design for; empty for the controller's own default.
         """
         given = {"controller": kind, **({"plant": plant} if plant else {}), "autoactivate": "false"}
@@ -122,7 +122,7 @@ class Jobs:
         return self._start(f"control{namespace}", arguments, "", os.environ, package="pendulum_lqr")
 
     def disturb(self, namespace: str) -> Job:
-        """Start a disturbance beside a plant; it waits to be started.
+        """Start a plant's disturbance node; it waits to be started.
 
         Args:
             namespace: Of the plant.
@@ -171,10 +171,10 @@ class Jobs:
 
 
 class NewestPage:
-    """The page of a name that was written last, for who shows it anew only where it changed.
+    """The newest page of a name, to be shown again only where it changed.
 
     Args:
-        jobs: Knows the folder of runs.
+        jobs: Provides the folder of runs.
         page: Its file name.
 
     Attributes:
@@ -189,7 +189,7 @@ class NewestPage:
         self.written = 0.0
 
     def changed(self) -> bool:
-        """Look again; return whether it is another page, or another writing of it, than at the last look."""
+        """Poll the folder; return whether the page is another one, or was rewritten, since the last poll."""
         before = self.folder, self.written
         self.folder = self._jobs.newest(self._page)
         self.written = (self.folder / self._page).stat().st_mtime if self.folder is not None else 0.0

@@ -28,7 +28,7 @@ class JointValues:
         self._efforts: dict[tuple[str, str], tuple[float, float]] = {}
 
     def take_state(self, fields: JointStateFields) -> None:
-        """Take a state; one without a position and a velocity for each joint says nothing."""
+        """Take a state; one without a position and a velocity for each joint is ignored."""
         if not fields.joints or not len(fields.joints) == len(fields.position) == len(fields.velocity):
             return
         if fields.joints != tuple(joint.name for joint in self._joints):
@@ -44,9 +44,9 @@ class JointValues:
         """Take efforts of some joints.
 
         Args:
-            kind: Whose they are: ``command``, ``disturbance`` or ``applied``.
+            kind: Their source: ``command``, ``disturbance`` or ``applied``.
             fields: The message.
-            now: When it was heard [s].
+            now: When it arrived [s].
         """
         # One effort without a name is for the one joint there is.
         names = fields.joints or tuple(joint.name for joint in self._joints)

@@ -1,4 +1,4 @@
-"""The console's answer of the run that was compared last: one sentence, and what each layer says."""
+"""The console's card of the last comparison: the answer in one sentence, and each layer's result."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LayersCard:
     """The answer, the four layers with their marks and reasons, and which run they are of.
 
     Args:
-        jobs: Knows the folder of runs.
+        jobs: Provides the folder of runs.
     """
 
     def __init__(self, jobs: Jobs) -> None:

@@ -26,7 +26,7 @@ python -m pendulum_sim simulator --ros-args -r __ns:=/sim
 python -m pendulum_hw_bridge bridge --ros-args -r __ns:=/hw -p backend:=emulator"""
 """Commands that start plants."""
 REFRESH_PERIOD = 0.5
-"""Time between two looks at what changes by itself [s]."""
+"""Time between two polls of what changes by itself [s]."""
 
 
 class _Card(NamedTuple):
@@ -78,7 +78,7 @@ class Layout:
                 ui.html('<canvas id="pendulum" role="img" aria-label="pendulums, drawn live"></canvas>', sanitize=False)
                 ui.html('<div id="plants"></div>', sanitize=False)
                 ui.html('<div id="joints"></div>', sanitize=False)
-                # Beside the plots, where it moves no button when a plant comes.
+                # Next to the plots, where it moves no button when a plant appears.
                 with ui.element("div").classes("hint") as self._hint:
                     ui.label("Start one in a terminal with the same ROS_DOMAIN_ID; it appears here by itself:")
                     ui.html(f"<pre>{as_typed(_PLANTS)}</pre>", sanitize=False)
@@ -108,9 +108,9 @@ class Layout:
     # --- pieces --------------------------------------------------------------------------------------------
 
     def _show_plants(self, plants: Mapping[str, str]) -> None:
-        """Give each plant a card, the newest last; one that has gone keeps its place.
+        """Give each plant a card, the newest last; the card of a vanished plant stays.
 
-        No button may move by itself: who presses one as another plant comes or goes would press that plant's.
+        No button may move by itself: a click while a plant appears or vanishes would hit another plant's button.
         """
         for space, node in sorted(plants.items()):
             card = self._cards.get(space)
@@ -137,7 +137,7 @@ class Layout:
         with ui.row():
             _button("Arm", lambda: self._carefully(self._graph.arm(node, on=True)), filled=True, of=space)
             _button("Disarm", lambda: self._carefully(self._graph.arm(node, on=False)), of=space)
-            # The page's script sends it, as it does the e-stop of all: repeated until it is answered.
+            # The page's script sends it, as it does the e-stop of all: repeated until there is a response.
             _button("Stop", lambda: None, of=space, danger=True).props(f'data-stop="{node}"')
             _button("Reset e-stop", lambda: self._carefully(self._graph.reset(node)), of=space)
         with ui.row():
@@ -189,7 +189,7 @@ class Layout:
             await self._carefully(self._graph.trigger(f"{space}/{service}"))
 
     async def _add_disturbances(self) -> None:
-        """Start a disturbance beside each plant that has none; it adds no torque until it is started."""
+        """Start a disturbance for each plant that has none; it adds no torque until it is started."""
         spaces = [space for space in self._graph.plants() if not self._graph.has_node(f"{space}/disturbance")]
         if not spaces:
             self._notices.say("each plant has a disturbance already" if self._graph.plants() else "there is no plant")
@@ -197,7 +197,7 @@ class Layout:
             self._try(partial(self._jobs.disturb, space))
 
     def _ask_to_move(self, space: str, goal: str) -> None:
-        """Say what a plant will do, and let it do so when the person agrees."""
+        """Show what a plant will do, and start it on confirmation."""
         end = "the controller takes over" if goal == "upright" else "the plant is disarmed"
         with ui.dialog() as dialog, ui.card():
             ui.label(
@@ -250,7 +250,7 @@ def _heading(text: str) -> None:
 def _button(
     text: str, work: Callable[[], Any], *, filled: bool = False, danger: bool = False, of: str = ""
 ) -> ui.button:
-    """Make a button whose colours keep the contrast that WCAG AA asks for, and whose name says which plant it moves."""
+    """Make a button with the contrast that WCAG AA requires, and the plant that it moves in its name."""
     button = ui.button(text, on_click=work, color=None).props("unelevated no-caps")
     button.classes("filled" if filled else "danger" if danger else "plain")
     return button.props(f'aria-label="{text} {of}"') if of else button

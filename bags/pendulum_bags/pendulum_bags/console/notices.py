@@ -1,4 +1,4 @@
-"""What the page answers to a press: words in its header, where they cover no control and move none."""
+"""Notices of the page in reply to a click: text in its header, where it covers and moves no control."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _LONG_WORD = re.compile(r"(\S{60})\S{61,}(\S{60})")
 
 
 class Notices:
-    """The newest few notices, newest first; the same words once, with how often they were said."""
+    """The newest few notices, newest first; equal texts once, with their count."""
 
     def __init__(self) -> None:
         self._said: dict[str, tuple[ui.element, int]] = {}
 
     def build(self) -> None:
         """Make their place."""
-        # Longer ones scroll, also by keyboard; a screen reader reads them when it has finished what it says.
+        # Longer ones scroll, also by keyboard; a screen reader reads them after its present text.
         self._place = ui.element("div").classes("notices").props('role="status" tabindex="0" aria-label="Notices"')
 
     def say(self, text: str, *, bad: bool = False) -> None:
@@ -33,7 +33,7 @@ class Notices:
 
         Args:
             text: One sentence.
-            bad: It says why something was refused.
+            bad: It is the reason of a refusal.
         """
         text = _LONG_WORD.sub(r"\1…\2", text)
         count = self._said[text][1] + 1 if text in self._said else 1

@@ -1,4 +1,4 @@
-"""The server of the console's page; knows the graph through a :class:`Graph` only."""
+"""The server of the console's page; it uses the graph through a :class:`Graph` only."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def serve(
         yield
 
     app = FastAPI(lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
-    # Tells a page that this server knows nothing of what the last one was told.
+    # Lets a page detect a restarted server, which has lost the state of the last one.
     server = secrets.token_hex(4)
     jobs.runs.mkdir(parents=True, exist_ok=True)
     app.mount("/runs", StaticFiles(directory=jobs.runs), name="runs")
@@ -94,7 +94,7 @@ def serve(
         Layout(graph, jobs).build()
 
     ui.run_with(app, dark=None, show_welcome_message=False)
-    # Quasar's bar for requests has no name for a screen reader, and says nothing that the page does not say itself.
+    # Quasar's bar for requests has no name for a screen reader, and adds nothing to the page.
     pages.config.quasar_config["loadingBar"]["skipHijack"] = True
     uvicorn.run(
         Guard(app, token),

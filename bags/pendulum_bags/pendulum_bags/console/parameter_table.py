@@ -1,4 +1,4 @@
-"""Parameters of the same kind of node beside every plant: a row a parameter, a column a plant, differences marked."""
+"""Parameters of the same kind of node of every plant: a row a parameter, a column a plant, differences marked."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ class ParameterTable:
 
     Args:
         graph: The ROS graph.
-        kind: Name of the node beside each plant.
-        carefully: Awaits work and shows what refuses it.
+        kind: Name of the node of each plant.
+        carefully: Awaits work and shows its errors.
     """
 
     def __init__(self, graph: Graph, kind: str, carefully: Callable[[Awaitable[Any]], Awaitable[bool]]) -> None:
@@ -75,14 +75,14 @@ class ParameterTable:
         self._place = ui.element("div").classes("parameters")
 
     async def refresh(self, spaces: Sequence[str]) -> None:
-        """Show the values in force, also when somebody else has set them; draw anew when nodes come or go."""
+        """Show the values in force, whichever client set them; redraw when nodes appear or vanish."""
         known = {space: values for space in spaces if (values := self._graph.parameters.get(f"{space}/{self._kind}"))}
         drawn = {space: sorted(values) for space, values in known.items()}
         if drawn != self._drawn:
             try:
                 descriptions = {space: await self._graph.describe(f"{space}/{self._kind}") for space in known}
             except PendulumError:
-                return  # it went while it was asked; the next look asks again
+                return  # it vanished meanwhile; the next poll retries
             self._drawn = drawn
             self._draw(known, descriptions)
         for (space, name), field in self._fields.items():
@@ -164,7 +164,7 @@ class ParameterTable:
                 await self._carefully(_raise(error))
             else:
                 await self._carefully(self._graph.set_parameter(node, name, value))
-        # Forgotten, so that the next look shows the value in force: also after an emptied field or a refusal.
+        # Dropped, so that the next poll shows the value in force: also after an emptied field or a refusal.
         self._shown.pop((space, name), None)
 
 

@@ -1,4 +1,4 @@
-"""Who may talk to the console: pages of its own only, and from other machines only with the token."""
+"""Access control of the console: its own pages only, and from other machines only with the token."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def listen(host: str, port: int, backlog: int = 1) -> socket.socket:
 def refusal(headers: dict[str, str], query: str, token: str) -> str:
     """Return why a request is refused, or an empty text.
 
-    A page of another site that is open in the same browser could else press our buttons (it sends its own ``Origin``),
-    or pass for us under a name that it lets point here (``Host``).
+    A page of another site in the same browser could otherwise send requests (with its own ``Origin``), or impersonate
+    the console under a name that it resolves to this machine (``Host``).
 
     Args:
         headers: Headers by their names in lower case.
@@ -79,7 +79,7 @@ def refusal(headers: dict[str, str], query: str, token: str) -> str:
 
 
 class Guard:
-    """ASGI middleware that asks :func:`refusal` before every request and every websocket.
+    """ASGI middleware that calls :func:`refusal` before every request and every websocket.
 
     Args:
         app: The application behind it.
@@ -91,7 +91,7 @@ class Guard:
         self._token = token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer, or refuse to."""
+        """Pass the request on, or refuse it."""
         if scope["type"] not in {"http", "websocket"}:
             await self._app(scope, receive, send)
             return

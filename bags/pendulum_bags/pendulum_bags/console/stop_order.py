@@ -1,8 +1,8 @@
-"""A stop that stays in force: asked of every plant again and again until each has answered and a person has seen it.
+"""A stop that stays in force: repeated to every plant until each has confirmed and the operator acknowledges.
 
-A plant may be frozen, restarting or out of reach when the stop is pressed. So a press is no request but an order: every
-plant that is known, or comes while the order stands, is asked until it answers, and goes on being asked, in case it is
-started anew. What each answered stands until somebody acknowledges it.
+A plant may be frozen, restarting or unreachable when the stop is pressed. So a press is not a request but an order:
+every plant that is known, or appears while the order stands, gets requests until it confirms, and further ones in case
+it restarts. Each response is shown until the operator acknowledges it.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from typing import Any
 __all__ = ["ASK_AGAIN", "SILENT_AFTER", "StopOrder"]
 
 ASK_AGAIN = 0.2
-"""Time after which a plant that has not answered is asked again [s]."""
+"""Period of requests to a plant that has not confirmed [s]."""
 CONFIRM_AGAIN = 0.5
-"""Time after which a plant that has answered is asked again: it may have been started anew [s]."""
+"""Period of requests to a plant that has confirmed: it may have restarted [s]."""
 SILENT_AFTER = 1.5
-"""Age of the newest answer from which on a plant counts as silent [s]."""
+"""Age of the newest response from which on a plant counts as silent [s]."""
 
 
 @dataclass
 class _Row:
-    """What one plant was asked and said; times in seconds of the caller's clock."""
+    """Requests to and responses of one plant; times in seconds of the caller's clock."""
 
     pressed: float
     asked: float = float("-inf")
@@ -33,7 +33,7 @@ class _Row:
 
 
 class StopOrder:
-    """Whom to ask for a stop, and who has answered. Knows no ROS and no clock."""
+    """The plants to stop, and their responses. Independent of ROS and of a clock."""
 
     def __init__(self) -> None:
         self._rows: dict[str, _Row] = {}
@@ -60,7 +60,7 @@ class StopOrder:
             self._rows[plant] = _Row(now)
 
     def press_one(self, plant: str, now: float) -> None:
-        """Order one plant to stop, whether it is on the graph or not; what others were told stands.
+        """Order one plant to stop, whether it is on the graph or not; orders to others stand.
 
         Args:
             plant: Its node name.
@@ -71,10 +71,10 @@ class StopOrder:
         self._rows[plant] = _Row(now)
 
     def due(self, plants: Iterable[str], now: float) -> list[str]:
-        """Return the plants to ask now, and note that they were asked.
+        """Return the plants to request a stop of now, and record the requests.
 
         Args:
-            plants: Node names of the plants on the graph. Who comes while an order to all stands is stopped, too.
+            plants: Node names of the plants on the graph. New ones are stopped too while an order to all stands.
             now: Time [s].
         """
         if self._pressed is None:
@@ -95,7 +95,7 @@ class StopOrder:
         return plant in self._rows
 
     def answer(self, plant: str, text: str, now: float) -> None:
-        """Note that a plant said it is stopped."""
+        """Record that a plant confirmed its stop."""
         row = self._rows.get(plant)
         if row is not None:
             row.answered, row.text = now, text
@@ -103,7 +103,7 @@ class StopOrder:
                 row.first_answer = now
 
     def problem(self, plant: str, text: str) -> None:
-        """Note why a plant cannot be asked, or what else it answered."""
+        """Record why a plant cannot be reached, or its other response."""
         row = self._rows.get(plant)
         if row is not None:
             row.text = text
@@ -115,18 +115,18 @@ class StopOrder:
         self._end_without_rows()
 
     def acknowledge(self, now: float) -> list[str]:
-        """End the order for the plants that say they are stopped; return those that still do not answer."""
+        """End the order for the plants that confirmed their stop; return those without response."""
         for plant in [plant for plant, row in self._rows.items() if now - row.answered < SILENT_AFTER]:
             self.release(plant)
         self._end_without_rows()
         return list(self._rows)
 
     def state(self, now: float) -> dict[str, Any] | None:
-        """Return what a person has to see; None where no stop is in force.
+        """Return what the operator has to see; None where no stop is in force.
 
         That is the time since the press [s], whether it was for all plants, and a row for each plant. A row's
-        ``state`` is ``asked`` (no answer yet), ``stopped`` or ``silent`` (answered once, no longer), its ``after`` the
-        time from the press to the first answer and ``silent_for`` the time without one [s].
+        ``state`` is ``asked`` (no response yet), ``stopped`` or ``silent`` (once confirmed, no longer), its ``after``
+        the time from the press to the first response and ``silent_for`` the time without one [s].
         """
         if self._pressed is None:
             return None

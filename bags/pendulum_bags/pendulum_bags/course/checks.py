@@ -1,4 +1,4 @@
-"""Right or wrong: the answer to each exercise, computed anew from the project's own model, analysis and emulator."""
+"""Judges the answer to each exercise, by the project's own model, analysis and emulator."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 WEIGHTS = (100.0, 0.01)
-"""Q of every loop whose R alone is told."""
+"""Q of every loop of which only R is given."""
 PERIOD = {"sim": HOLD_STEP, "hw": 0.01}
 PLANT_TOLERANCES = {"inertia": 0.03, "gravity": 0.03, "damping": 0.15, "coulomb_friction": 0.15}
 """Share by which each parameter of the hidden plant may be off."""
@@ -53,7 +53,7 @@ _WATCHED = 0.5
 _LONGEST_GAP = 0.12
 """Longest time without a torque in the recording around the fault [s].
 
-A bridge at 100 Hz tells one each 10 ms; on two busy cores 66 ms without one were seen.
+A bridge at 100 Hz publishes one each 10 ms; on two busy cores gaps of 66 ms occurred.
 """
 _LEAST_RATE = 30.0
 """Fewest torques a second [Hz]: a third of the bridge's, since a busy computer skips periods."""
@@ -61,7 +61,7 @@ _LEAST_RATE = 30.0
 
 @dataclass(frozen=True)
 class Judgement:
-    """Whether an answer is right, and a sentence that says why.
+    """Whether an answer is right, and a sentence with the reason.
 
     Attributes:
         right: Whether it is.
@@ -97,7 +97,7 @@ def check_gains(tasks: Tasks, q: tuple[float, float], r: float) -> Judgement:
 
 
 def check_plant(truth: PlantParameters, found: PlantParameters) -> Judgement:
-    """Judge an identified plant by the hidden one, without telling the hidden one.
+    """Judge an identified plant by the hidden one, without revealing it.
 
     Args:
         truth: The hidden plant.
@@ -159,7 +159,7 @@ def check_noise(tasks: Tasks, ratio: float, cause: str) -> Judgement:
 
 
 def check_fault(tasks: Tasks, bag: Path) -> Judgement:
-    """Judge a recording of the bridge in which it was driven into the fault that is asked for.
+    """Judge a recording of the bridge in which it was driven into the required fault.
 
     Args:
         tasks: The tasks.

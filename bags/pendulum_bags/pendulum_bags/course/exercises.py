@@ -1,4 +1,4 @@
-"""The exercises of a course in words, with the numbers of its seed, and their answers."""
+"""The exercises of a course as text, with the numbers of its seed, and their answers."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def exercises_text(tasks: Tasks, course: str) -> str:
 
 
 def answers(tasks: Tasks, plant: PlantParameters) -> dict[str, str]:
-    """Return the answer to each exercise in words, for the teacher."""
+    """Return the answer to each exercise as text, for the teacher."""
     units = {spec.name: spec.unit for spec in PLANT_SPECS}
     named = ("inertia", "damping", "gravity", "coulomb_friction")
     winner = "a" if tasks.controller_a > tasks.controller_b else "b"

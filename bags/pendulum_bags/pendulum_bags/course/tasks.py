@@ -1,4 +1,4 @@
-"""What the exercises of one course ask for: drawn from a seed, kept in a file that students may read."""
+"""Numbers of one course's exercises: drawn from a seed, stored in a file that students may read."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ FAULTS = {
     "module_restarted": "module_reboot",
     "motion_disagreement": "position_frozen",
 }
-"""Faults that the last exercise may ask for, with the emulator's fault that leads to each.
+"""Faults that the last exercise may require, with the emulator's fault that leads to each.
 
-Feedback that is frozen is none of them: a bridge without measurements tells no torque, so no recording could show it.
+Frozen feedback is none of them: a bridge without measurements publishes no torque, so no recording shows it.
 """
 CAUSES = {
     "power": "noise that is held longer has more power at low frequencies, and the loop answers to those alone",
@@ -34,7 +34,7 @@ CAUSES = {
 }
 """Explanations that the fourth exercise offers; the first is the right one."""
 _KEPT_FROM_THESIS = 0.05
-"""The first exercise asks for no time constant this near to that of the thesis, which the pages give away [s]."""
+"""The first exercise has no time constant this near to that of the thesis, which the documentation has [s]."""
 _THESIS_TIME_CONSTANT = 0.372
 _LIMITS = {
     "time_constant": (0.05, 5.0, "s"),
@@ -57,13 +57,13 @@ class Tasks:
 
     Attributes:
         time_constant: To design for [s].
-        delay_weight: R of the loop whose delay is sought [1/(N m)^2].
-        hold_time: How long noise is held beside 2 ms [s].
+        delay_weight: R of the loop whose largest delay is to be found [1/(N m)^2].
+        hold_time: Hold time of the noise that is compared with 2 ms [s].
         causes: Names in ``CAUSES``, in the order in which they are offered as a, b, c, d.
         controller_a: R of controller A [1/(N m)^2].
         controller_b: R of controller B [1/(N m)^2].
         noise_seed: Noise under which A and B are compared.
-        fault: What the bridge is to say.
+        fault: The fault that the bridge has to report.
     """
 
     time_constant: float

@@ -21,7 +21,7 @@ DURATION = 5.0
 
 
 def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], None] = lambda name: None) -> Judgement:
-    """Run both controllers on the emulated machine, and judge which was said to win.
+    """Run both controllers on the emulated machine, and judge the predicted winner.
 
     Args:
         tasks: The tasks.
@@ -31,7 +31,7 @@ def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], 
 
     Raises:
         ParameterError: The name is another.
-        FaultError: A program ended or did not answer.
+        FaultError: A program ended or did not respond.
     """
     weights = {"a": tasks.controller_a, "b": tasks.controller_b}
     if name not in weights:
@@ -71,7 +71,7 @@ def spread_on_machine(bag: Path, r: float, seed: int, hosts: HostPool | None = N
     try:
         recorded = record_run(bag, spec, hosts=hosts)
     except PlantStoppedError as error:
-        # The bridge's own fault is an answer; that somebody stopped it, or a program did not start, is none.
+        # The bridge's own fault is a result; a stop from outside, or a program that did not start, is none.
         if error.mode == "fault":
             return math.inf
         raise

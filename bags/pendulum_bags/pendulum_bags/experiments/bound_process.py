@@ -22,12 +22,12 @@ def start_bound_process(
     niceness: int = 0,
     pass_fds: Sequence[int] = (),
 ) -> subprocess.Popen[bytes]:
-    """Start a program of ours in a process group of its own, so that Ctrl-C reaches it through us, in order.
+    """Start a program in a process group of its own, so that this process passes Ctrl-C on, in order.
 
     Args:
         command: Program and arguments.
         environment: All of its variables.
-        output: Gets what it prints.
+        output: Receives its output.
         niceness: Scheduling priority to give away, or to take where it is negative and permitted.
         pass_fds: Descriptors that it keeps open.
     """

@@ -45,7 +45,7 @@ _T = TypeVar("_T")
 
 
 class Conductor:
-    """An rclpy context and node of its own, spun only while it waits; Ctrl-C ends any wait at once.
+    """An rclpy context and node, spun only while waiting; Ctrl-C ends any wait at once.
 
     Args:
         domain: ROS domain.
@@ -53,8 +53,8 @@ class Conductor:
         on_wait: Called between two slices with nothing to do but show progress.
 
     Attributes:
-        listened: For how long it has listened [s]; a pause of this program does not count.
-        after_listening: Called each time that it has listened, for what is worth a look now and then.
+        listened: For how long it has spun [s]; a pause of this program does not count.
+        after_listening: Called after each slice of spinning, for occasional checks.
     """
 
     def __init__(
@@ -97,12 +97,12 @@ class Conductor:
 
         Args:
             what: What is waited for, for the message.
-            predicate: Asked between slices.
+            predicate: Evaluated between slices.
             timeout: Longest time to wait [s].
-            until: Ends a slice when it is done, so that the predicate is asked at once.
+            until: Ends a slice when it is done, so that the predicate is evaluated at once.
 
         Raises:
-            FaultError: It did not come to hold in time.
+            FaultError: It did not hold in time.
         """
         deadline = time.monotonic() + timeout
         while not (value := predicate()):
@@ -115,7 +115,7 @@ class Conductor:
         """Call a service and return its response.
 
         Raises:
-            FaultError: The service is not there or does not answer in time.
+            FaultError: The service is missing or does not respond in time.
         """
         self.wait_for_service(client, timeout)
         future = client.call_async(request)
@@ -150,7 +150,7 @@ class PlantClient:
     """One plant with its controller and its disturbance, as the conductor sees them.
 
     Args:
-        conductor: Who conducts.
+        conductor: The orchestrator.
         namespace: Namespace of the plant's topics, such as ``/sim``.
         plant: Name of the plant's node.
         controller: Name of its controller's node, empty for none.
@@ -193,18 +193,18 @@ class PlantClient:
 
     @property
     def is_heard(self) -> bool:
-        """Whether any of its states has come, of whichever joints."""
+        """Whether any of its states has arrived, of whichever joints."""
         return self.sample is not None or bool(self._foreign_joints)
 
     def watch(self) -> None:
-        """Subscribe to the plant's states, and look at the newest now and then: nobody is woken for each of them."""
+        """Subscribe to the plant's states, and poll the newest: no callback runs for each of them."""
         self._watching = self.conductor.node.create_polled_input(
             JointState, f"{self.namespace}/{names.JOINT_STATES}", qos.NEWEST_STATE
         )
         self.conductor.after_listening.append(self._look)
 
     def look_away(self) -> None:
-        """Subscribe to its states no longer: to hear a run in lockstep takes a tenth of what the run takes."""
+        """Unsubscribe from its states: receiving them costs a tenth of a run in lockstep."""
         if self._watching is not None:
             self.conductor.after_listening.remove(self._look)
             self.conductor.node.destroy_polled_input(self._watching)
@@ -234,10 +234,10 @@ class PlantClient:
         )
 
     def wait_until_moves_are_recorded(self, timeout: float) -> None:
-        """Wait until what this program asks to be followed reaches a recorder: one side of a match knows of it first.
+        """Wait until a recorder is matched with the trajectory publisher, and the match is known at both ends.
 
         Raises:
-            FaultError: No recorder comes in time [s].
+            FaultError: No recorder appears in time [s].
         """
         topic, node = f"{self.namespace}/{names.JOINT_TRAJECTORY}", self.conductor.node
 
@@ -247,7 +247,7 @@ class PlantClient:
         self.conductor.wait_for(
             f"a recorder on {topic}", lambda: (self.namespace or "/", names.RECORDER) in listeners(), timeout
         )
-        # Some never match: who asks for old moves, or for a deadline. Who does match does so within moments.
+        # Some never match: those that request old moves, or a deadline. The others match within moments.
         deadline = time.monotonic() + _MATCHING
         while self._trajectory.get_subscription_count() < len(listeners()) and time.monotonic() < deadline:
             self.conductor.spin(_SLICE)
@@ -265,10 +265,10 @@ class PlantClient:
         """Arm the plant.
 
         Args:
-            timeout: Longest time until it answers [s]; a bridge offers the service before it is connected.
+            timeout: Longest time until it responds [s]; a bridge offers the service before it is connected.
 
         Raises:
-            FaultError: It refuses, and the message has its reason; or it does not answer in time.
+            FaultError: It refuses, and the message has its reason; or it does not respond in time.
         """
         response = self.conductor.call(self._arm, SetBool.Request(data=True), f"{self.namespace} to arm", timeout)
         if not response.success:
@@ -279,10 +279,10 @@ class PlantClient:
         self.conductor.call(self._arm, SetBool.Request(data=False), f"{self.namespace} to disarm")
 
     def call(self, service: str) -> None:
-        """Call a Trigger service of a node beside the plant, such as ``procedure/start``.
+        """Call a Trigger service of another node in the plant's namespace, such as ``procedure/start``.
 
         Raises:
-            FaultError: It is not there, or refuses.
+            FaultError: It is missing, or refuses.
         """
         client = self.conductor.node.create_client(Trigger, f"{self.namespace}/{service}")
         response = self.conductor.call(client, Trigger.Request(), f"{self.namespace}/{service}")
@@ -294,7 +294,7 @@ class PlantClient:
         self.conductor.call(self._pause, SetBool.Request(data=False), f"{self.namespace} to go on", timeout)
 
     def disarm_quietly(self) -> None:
-        """Disarm on the way out, where a plant that no longer answers must not keep others from being disarmed."""
+        """Disarm on the way out, where a plant without response must not prevent others from being disarmed."""
         if not self._arm.service_is_ready():
             return
         future = self._arm.call_async(SetBool.Request(data=False))
@@ -309,14 +309,14 @@ class PlantClient:
         self._trajectory.publish(trajectory_to_message(trajectory))
 
     def is_following(self) -> bool:
-        """Return whether the plant has taken up the move last asked for; raises as :meth:`trajectory_finished`."""
+        """Return whether the plant has started the last requested move; raises as :meth:`trajectory_finished`."""
         return self.trajectory_finished() or any(
             event["name"] == Event.PLANT_MODE and event.get("mode") == "armed_position"
             for event in self.events[self._finished_before :]
         )
 
     def trajectory_finished(self) -> bool:
-        """Return whether the move last asked for has ended.
+        """Return whether the last requested move has ended.
 
         Raises:
             PlantStoppedError: The plant faulted, or was stopped or disarmed.
@@ -325,7 +325,7 @@ class PlantClient:
         self.check_alive()
         for event in self.events[self._finished_before :]:
             if event["name"] == Event.TRAJECTORY_REFUSED:
-                # One that stopped just before the move was asked for refuses it: what stopped it is the cause.
+                # A plant that stopped just before the request refuses the move: the stop is the cause.
                 self.check_mode()
                 raise FaultError(f"{self.namespace} refused the trajectory: {event.get('reason')}")
             if event["name"] == Event.PLANT_MODE and event.get("mode") in {"fault", "e_stop", "disarmed"}:
@@ -351,7 +351,7 @@ class PlantClient:
             raise FaultError(f"{self.namespace} controller does not {what}; its log says why")
 
     def start_disturbance(self) -> Future:
-        """Ask the disturbance to start with the next state; returns at once."""
+        """Request the disturbance to start with the next state; returns at once."""
         return self._start.call_async(Trigger.Request())
 
     def mark(self, name: str, **details: Any) -> None:
@@ -364,7 +364,7 @@ class PlantClient:
         return next((event for event in reversed(self.events) if event["name"] == name), None)
 
     def newest_mode(self) -> str:
-        """Return the plant's mode, as its newest event says; empty where none was heard."""
+        """Return the plant's mode by its newest event; empty before the first."""
         event = self.newest_event(Event.PLANT_MODE)
         return "" if event is None else str(event.get("mode"))
 
@@ -377,7 +377,7 @@ class PlantClient:
         return bool(self._get_state.service_is_ready() and self._change_state.service_is_ready())
 
     def controller_is_active(self) -> bool:
-        """Ask the controller's lifecycle."""
+        """Query the controller's lifecycle."""
         state = self.conductor.call(self._get_state, GetState.Request(), f"{self.namespace} controller's state")
         return bool(state.current_state.id == State.PRIMARY_STATE_ACTIVE)
 
@@ -420,7 +420,7 @@ class RecorderClient:
     """The recorder of one plant.
 
     Args:
-        conductor: Who conducts.
+        conductor: The orchestrator.
         namespace: Namespace of the plant.
     """
 
@@ -433,10 +433,10 @@ class RecorderClient:
         return set(self._ask().get("matched", []))
 
     def wait_until_heard(self, topics: Collection[str], timeout: float) -> None:
-        """Wait until it is connected with a publisher of each topic: what is said before is in no bag.
+        """Wait until it is matched with a publisher of each topic: earlier messages are in no bag.
 
         Raises:
-            FaultError: It does not hear one of them in time [s].
+            FaultError: It is not matched with one of them in time [s].
         """
         deadline = time.monotonic() + timeout
         while missing := set(topics) - self.heard():

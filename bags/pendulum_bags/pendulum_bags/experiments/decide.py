@@ -1,4 +1,4 @@
-"""Look at what was recorded, and record more of it, until it decides or the budget is spent."""
+"""Analyse the recordings, and record more, until they decide or the budget is spent."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Budget:
     """How long an experiment may go on.
 
     Args:
-        seconds: Wall time for repeats beyond the first look; 0 for one look at one run [s].
+        seconds: Wall time for repeats beyond the first analysis; 0 for one analysis of one run [s].
         clock: Monotonic clock [s].
     """
 
@@ -40,16 +40,15 @@ def decide(
 ) -> Comparison:
     """Compare a run folder, and record repeats into it until the comparison is decided.
 
-    Only an emulator or a simulation is asked for more: a machine moves when its operator wants it to. Each look costs a
-    share of the error that all looks together may make, so that stopping as soon as it is decided errs no more often
-    than one look.
+    Only an emulator or a simulation is repeated: a machine moves when its operator wants it to. Each interim analysis
+    costs a share of the error of all, so that stopping as soon as it is decided errs no more often than one analysis.
 
     Args:
-        folder: Folder of the run, recorded; a repeat whose hardware's side lies in there already is used at once.
+        folder: Folder of the run, recorded; a repeat whose hardware recording exists already is used at once.
         settings: Settings of the run.
         margins: What difference does not matter.
-        budget: When to give up.
-        on_look: Told the number of a repeat and how much noise it has [s] before it is recorded.
+        budget: Limit of the repeats.
+        on_look: Called with the number of a repeat and its duration of noise [s] before it is recorded.
         on_wait: Called while waiting.
         record: Records what a repeat lacks.
     """

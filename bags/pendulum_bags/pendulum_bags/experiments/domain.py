@@ -1,4 +1,4 @@
-"""A ROS domain of its own for each experiment on a machine, so that two of them never hear each other."""
+"""A ROS domain of its own for each experiment on a machine, so that two of them never share a graph."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ def reserve_domain(requested: int | None = None) -> Iterator[int]:
     """Reserve a ROS domain while the context lasts.
 
     Args:
-        requested: The domain to use; None takes ``ROS_DOMAIN_ID`` or else the first one that nobody uses.
+        requested: The domain to use; None takes ``ROS_DOMAIN_ID`` or else the first free one.
 
     Raises:
-        ParameterError: The domain asked for is no domain.
-        FaultError: Another experiment runs in the domain asked for, or all domains are in use.
+        ParameterError: The requested domain is no domain.
+        FaultError: Another experiment runs in the requested domain, or all domains are in use.
     """
     requested = check_domain(requested)
     folder = Path(tempfile.gettempdir(), f"pendulum_domains_{os.getuid()}")
     folder.mkdir(exist_ok=True)
     if requested is not None:
-        # A file of its own: who reserves a domain for a while may ask for experiments in it, but for one at a time.
+        # A file of its own: the holder of a reserved domain may run experiments in it, but one at a time.
         with (folder / f"{requested}.experiment.lock").open("w") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -58,7 +58,7 @@ def reserve_domain(requested: int | None = None) -> Iterator[int]:
 
 
 def check_domain(requested: int | None) -> int | None:
-    """Return the domain that the user or ``ROS_DOMAIN_ID`` asks for, None for any.
+    """Return the domain of the user or of ``ROS_DOMAIN_ID``, None for any.
 
     Raises:
         ParameterError: It is no domain.

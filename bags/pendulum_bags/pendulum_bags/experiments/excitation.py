@@ -1,7 +1,7 @@
-"""Play a designed excitation on a plant: torque through the disturbance node, beside a controller that commands zero.
+"""Play a designed excitation on a plant: torque through the disturbance node, while a controller commands zero.
 
-A plant gives no torque without a controller's answer. Here that is a playback of zero torque, started for the run and
-ended with it: whatever ends the run, no answers come any more and the plant goes to zero torque by its own rules.
+A plant applies no torque without a controller's replies. Here a playback of zero torque sends them, started and ended
+with the run: whatever ends the run, the replies stop and the plant goes to zero torque by its own rules.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class ExcitationPlay:
         effort: Limit of the torque [N m].
         speed: Limit of the joint speed [rad/s].
         angle: Limit of the distance from hanging down [rad].
-        prediction: What the bag should say of the design: ``predicted`` half widths by parameter, ``kind``, ``plant``.
+        prediction: The bag's metadata of the design: ``predicted`` half widths by parameter, ``kind``, ``plant``.
     """
 
     file: Path
@@ -80,7 +80,7 @@ class _LockstepRun(RunSpec):
         return self.sampling
 
     def metadata(self) -> dict[str, Any]:
-        """Return what the bag says about its run, the prediction with it."""
+        """Return the bag's metadata of its run, with the prediction."""
         return {**super().metadata(), "pendulum.excitation": dict(self.prediction)}
 
 
@@ -95,7 +95,7 @@ def play_in_lockstep(
     design_plant: str,
     domain: int | None = None,
 ) -> Path:
-    """Start a simulator or an emulated actuator, play on it as fast as it answers, and record.
+    """Start a simulator or an emulated actuator, play on it as fast as it replies, and record.
 
     Args:
         bag: Folder of the bag.
@@ -157,7 +157,7 @@ def play_on_running_plant(
 
     Raises:
         BagError: The bag exists.
-        FaultError: There is no plant, somebody else commands it, it does not hang at rest, it is not armed, or it left
+        FaultError: There is no plant, it has another commander, it does not hang at rest, it is not armed, or it left
             the limits; it is at zero torque when this is raised.
     """
     refuse_existing(bag)
@@ -185,7 +185,7 @@ def play_on_running_plant(
         plant.wait_until_ready(START_TIMEOUT)
         wanted = {f"{namespace}/{topic}" for topic in (names.JOINT_STATES, names.APPLIED_EFFORT, names.DISTURBANCE)}
         RecorderClient(conductor, namespace).wait_until_heard(wanted, START_TIMEOUT)
-        # Beyond its limits, or interrupted: the drive lets go now, not when the programs have ended.
+        # Beyond its limits, or interrupted: the drive is released now, not when the programs have ended.
         session.drives(plant)
         if not armed:
             plant.arm()
@@ -194,7 +194,7 @@ def play_on_running_plant(
         conductor.spin(_REST)
         if not armed:
             session.let_go()
-        # Who had armed it has it again: no trouble with the bag disarms it.
+        # The plant is its commander's again: an error of the bag must not disarm it.
         session.leaves(plant)
         session.close(recorder)
     return bag

@@ -374,7 +374,7 @@ def _analyse(
 def _summary(settings: RegulationSettings, comparison: Comparison, answer: Answer) -> dict[str, Any]:
     return {
         **comparison.to_json(),
-        # What was asked for: where the first run does not count, the comparison tells the seed of a repeat.
+        # The requested seed: where the first run is excluded, the comparison has that of a repeat.
         "experiment": "thesis",
         "hardware": settings.hardware,
         "seed": settings.noise.seed,

@@ -1,4 +1,4 @@
-"""A plant that runs on the graph already, as one side of an experiment: somebody else started it, and will end it."""
+"""A plant that runs on the graph already, as one side of an experiment, which neither starts nor ends it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ __all__ = ["PREFIX", "find_plant", "join", "running_namespace"]
 PREFIX = "ros:"
 _NAMESPACE = re.compile(r"(?:/[A-Za-z][A-Za-z0-9_]*)+")
 _PATIENCE = 20.0
-"""Longest wait for a node that is to answer [s]."""
+"""Longest wait for a node's response [s]."""
 _HALF_TURN = 3.15
 """Farthest from hanging at 0 that a ramp to upright starts, with room for noise [rad]."""
 _COMMANDS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.JOINT_TRAJECTORY)
 _OURS = ("controller", "disturbance", names.RECORDER)
-"""Names of the nodes that an experiment starts beside a plant."""
+"""Names of the nodes that an experiment starts with a plant."""
 
 
 def running_namespace(name: str) -> str | None:
@@ -58,15 +58,15 @@ def find_plant(conductor: Conductor, namespace: str) -> str:
 
 
 def join(conductor: Conductor, space: str) -> PlantClient:
-    """Return a client of a running plant that is at rest and that nobody else commands.
+    """Return a client of a running plant that is at rest and has no other commander.
 
     Args:
-        conductor: Who conducts.
-        space: Namespace of a plant behind the contract, ours or one that ``adopt`` stands before; whatever is found
-            there, nothing is sent to it.
+        conductor: The orchestrator.
+        space: Namespace of a plant behind the contract, its own or that of ``adopt``; whatever is found there, nothing
+            is sent to it.
 
     Raises:
-        FaultError: There is no such plant, somebody else commands it, it is armed, has other joints, or does not hang
+        FaultError: There is no such plant, it has another commander, it is armed, has other joints, or does not hang
             near 0.
     """
     from pendulum_bags.experiments.conductor_node import PlantClient
@@ -75,9 +75,9 @@ def join(conductor: Conductor, space: str) -> PlantClient:
     _refuse_others(conductor, space)
     client = PlantClient(conductor, space, node)
     client.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
-    # What is on the graph by then has been met: what it says of itself is no older than its services.
+    # By then discovery is complete: the node information is no older than its services.
     conductor.spin(0.5)
-    # Who commands it may be met later than the plant.
+    # The commander may be discovered later than the plant.
     _refuse_others(conductor, space)
     if client.is_armed():
         raise FaultError(

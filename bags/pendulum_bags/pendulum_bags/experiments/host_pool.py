@@ -21,7 +21,7 @@ from pendulum_bags.experiments.bound_process import start_bound_process
 __all__ = ["AGAIN", "BEGUN", "LAST", "HostPool", "HostedProgram", "keep_pool", "kept_pool", "open_pool"]
 
 BEGUN = "begun"
-"""Line that a host sends when its program may be asked to end."""
+"""Line that a host sends when its program accepts signals."""
 AGAIN, LAST = "again", "last"
 """What follows the exit code in the line behind it: whether the host takes another order."""
 _HOST = "pendulum_bags.experiments.program_host"
@@ -81,7 +81,7 @@ class HostedProgram:
             self._host.process.send_signal(number)
 
     def _listen(self, enough: Callable[[], bool], timeout: float | None) -> None:
-        """Take what the host says until it is enough, for a time at most [s]."""
+        """Read the host's lines until they are enough, for a time at most [s]."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while not enough():
             left = None if deadline is None else max(0.0, deadline - time.monotonic())
@@ -93,7 +93,7 @@ class HostedProgram:
                 heard = b""
             if not heard:
                 self._host.connection.close()
-                # Whatever the host says of itself, the program has not said that it went well.
+                # Whatever the host's exit code is, the program has not reported success.
                 self.returncode = self._host.process.wait() or 1
                 return
             *lines, self._heard = (self._heard + heard).split(b"\n")
@@ -115,7 +115,7 @@ class HostedProgram:
 
 @dataclass
 class HostPool:
-    """Hosts of programs, kept from one run to the next; leaving the context ends them all."""
+    """Hosts of programs, reused from run to run; leaving the context ends them all."""
 
     _idle: list[_Host] = field(default_factory=list)
     _all: list[_Host] = field(default_factory=list)
@@ -164,7 +164,7 @@ class HostPool:
                 self._idle.remove(host)
             try:
                 host.connection.sendall(text)
-            except OSError:  # somebody has ended it while it waited: the next one
+            except OSError:  # it was ended while it waited: try the next one
                 _end([host])
                 continue
             return HostedProgram(host, self._idle.append)

@@ -36,7 +36,7 @@ class RunArrays:
         position: [rad].
         velocity: [rad/s].
         effort: Measured torque [N m].
-        command: The controller's answers; NaN where it gave none [N m].
+        command: The controller's commands; NaN where it gave none [N m].
         disturbance: [N m].
         applied: Torque that acted from each state on [N m].
     """
@@ -67,7 +67,7 @@ def simulate_plant(spec: RunSpec, parameters: PlantParameters, sensors: Sensors 
     """Run a run of the simulator on any plant and with any sensors, for what-if questions.
 
     Args:
-        spec: The run; its ``plant`` is not looked at.
+        spec: The run; its ``plant`` is ignored.
         parameters: The plant.
         sensors: What the controller sees; None for the truth. They must not drop samples.
     """

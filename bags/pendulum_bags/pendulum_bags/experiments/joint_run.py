@@ -45,7 +45,7 @@ Array = NDArray[Any]
 _UNCHANGED = frozenset(
     {"gravity", "gear_ratio", "stribeck_velocity", "lower_stop", "upper_stop", "effort_limit", "time_constant"}
 )
-"""Values of a plant file that nobody has to identify: constants, limits, and what belongs to a model of friction."""
+"""Values of a plant file that are not identified: constants, limits, and what belongs to a model of friction."""
 _DELAY = "transport_delay"
 HOLDING = ("lqr", "discrete_lqr", "lqi", "lqg", "mpc")
 """Controllers that hold a plant upright; ``tvlqr`` and ``ilqr`` begin at hanging, and ``nmpc`` is an LQR there."""
@@ -189,7 +189,7 @@ class JointRun:
         return graph.disturbance(self.namespace, **self._noise(), autostart=True, use_sim_time=True)
 
     def metadata(self) -> dict[str, Any]:
-        """Return what the bag says about its run."""
+        """Return the bag's metadata of its run."""
         return {
             RUN_RECORD: {
                 "experiment": "joints",
@@ -255,7 +255,7 @@ def stand_in_for(plant: MechanismParameters, *, share: float, delay: float, seed
 def design_for(plant: MechanismParameters) -> MechanismParameters:
     """Return the plant on which the LQR is designed: dry friction of passive joints as viscous friction.
 
-    A linear model has no dry friction, and no motor can make up for that of a passive joint: an LQR that knows nothing
+    A linear model has no dry friction, and no motor can compensate that of a passive joint: an LQR without a model
     of it loses acrobot and pendubot as soon as they move. b = F / v has the same force at the velocity v.
     """
     driven = plant.coordinates.driven_names
@@ -268,7 +268,7 @@ def design_for(plant: MechanismParameters) -> MechanismParameters:
 
 
 def design_file(folder: Path, plant: MechanismParameters) -> str:
-    """Return the file of the plant on which the LQR is designed, kept in a folder; empty where that is the plant."""
+    """Return the file of the plant on which the LQR is designed, stored in a folder; empty where that is the plant."""
     told = design_for(plant)
     if told is plant:
         return ""
@@ -311,20 +311,20 @@ def record_joints(
 ) -> None:
     """Record both sides over DDS, in lockstep, as the bags ``sim`` and ``hw`` of a run folder.
 
-    Where the plant of the design is another than the simulated one, it is kept there as ``design.yaml``.
+    Where the plant of the design is another than the simulated one, it is stored there as ``design.yaml``.
 
     Args:
         folder: The run folder.
         settings: What to run.
-        machine: Plant file that stands in for the machine.
+        machine: Plant file of the surrogate of the machine.
         excitation: Parameters of the disturbance that differ from those of the noise.
         hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
-        on_side: Told each side, in words, when it begins.
+        on_side: Called with each side's name when it starts.
         on_wait: Called while waiting.
 
     Raises:
         BagError: A bag exists, or cannot be written.
-        FaultError: A program ended or did not answer, or a plant fell or faulted; told of both sides.
+        FaultError: A program ended or did not respond, or a plant fell or faulted; it reports both sides.
     """
     plant = load_mechanism(settings.plant)
     design = design_file(folder, plant)

@@ -172,7 +172,7 @@ def joints(
                         on_wait=progress.refresh,
                     )
                 except (FaultError, DataError) as error:
-                    # What was recorded under the noise has its answer all the same.
+                    # The comparison under noise stays valid.
                     console.print(f"The frequencies were not measured: {error}", style="yellow", soft_wrap=True)
             if rank_seeds:
                 found = rank_joints(

@@ -1,4 +1,4 @@
-"""One run of the nodes over DDS: in step with each other as fast as they answer, or in step with the wall."""
+"""One run of the nodes over DDS: in lockstep as fast as they reply, or in real time."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ from pendulum_msgs_py.programs.graph import NodeProgram
 __all__ = ["GraphRun", "lockstep_spec", "longest_run", "record_run", "run_lockstep"]
 
 _LAST_WORDS = 0.2
-"""Time in which the recorder hears the end of a run in real time [s]."""
+"""Time for the recorder to receive the end of a run in real time [s]."""
 _SLOWEST = 60.0
 """Slowest pace at which a lockstep run is expected to end, wall time per simulated time: 45 were seen on two cores that
 ten other programs wanted."""
 _PATIENCE = START_TIMEOUT
-"""Time between two looks at how far a run in lockstep has come [s]."""
+"""Time between two checks of the progress of a run in lockstep [s]."""
 _ALIVE = 10
-"""States that must come between two looks; less is no slow run but one that stands still."""
+"""States that must arrive between two checks; fewer means a run that has stopped."""
 _LISTENERS = 3
-"""Those who hear the plant's states: controller, disturbance, recorder. The conductor makes one more."""
+"""Subscribers of the plant's states: controller, disturbance, recorder. The orchestrator makes one more."""
 _RUN_LISTENERS = {
     names.JOINT_STATES: _LISTENERS,
     names.EFFORT_COMMAND: 2,
@@ -73,7 +73,7 @@ def run_lockstep(
 
     Raises:
         BagError: The bag exists.
-        FaultError: A program ended or did not answer.
+        FaultError: A program ended or did not respond.
     """
     return record_run(bag, lockstep_spec(settings, side=side), domain=domain, on_wait=on_wait, hosts=hosts)
 
@@ -109,7 +109,7 @@ def longest_run(duration: float) -> float:
 
 
 class GraphRun(Protocol):
-    """What a run over DDS has to say of itself; a :class:`RunSpec` does."""
+    """What a run over DDS has to provide; a :class:`RunSpec` does."""
 
     @property
     def namespace(self) -> str:
@@ -136,7 +136,7 @@ class GraphRun(Protocol):
         """Whether the plant is the bridge, which no parameter arms."""
 
     def metadata(self) -> dict[str, Any]:
-        """Return what the bag says about its run."""
+        """Return the bag's metadata of its run."""
 
     def plant_program(self, listeners: int) -> NodeProgram:
         """Return the plant, which waits for so many subscriptions to its states."""
@@ -156,7 +156,7 @@ def record_run(
     on_wait: Callable[[], None] = lambda: None,
     hosts: HostPool | None = None,
 ) -> Path:
-    """Carry out one run over DDS, in lockstep or in real time as it says, and record it.
+    """Carry out one run over DDS, in lockstep or in real time, and record it.
 
     Args:
         bag: Folder of the bag.
@@ -167,7 +167,7 @@ def record_run(
 
     Raises:
         BagError: The bag exists.
-        FaultError: A program ended or did not answer, or the plant faulted.
+        FaultError: A program ended or did not respond, or the plant faulted.
     """
     refuse_existing(bag)
     namespace, simulated = spec.namespace, spec.simulated_time

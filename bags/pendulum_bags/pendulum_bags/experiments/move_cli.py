@@ -27,9 +27,9 @@ _STOPS = {
     "stop": (names.E_STOP, "e-stop, latched; end it with: move reset"),
     "reset": (names.E_STOP_RESET, "e-stop ended; the plant is disarmed"),
 }
-"""Goals that are no place: service of the plant, and what is said then."""
+"""Goals that are no position: service of the plant, and the text to print."""
 _PATIENCE = 20.0
-"""Longest wait for a node that is to answer [s]."""
+"""Longest wait for a node's response [s]."""
 _SOON = 3.0
 """Time after which a user reads that an e-stop is not confirmed yet [s]."""
 
@@ -91,7 +91,7 @@ def move(
 
 @contextmanager
 def _unless_confirmed(namespace: str) -> Iterator[None]:
-    """Say what to do where a plant does not confirm its e-stop, soon and at the end.
+    """Print what to do where a plant does not confirm its e-stop, soon and at the end.
 
     Raises:
         FaultError: It was not confirmed.
@@ -127,13 +127,13 @@ def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: b
     if isinstance(goal, float):
         end = goal
     else:
-        # The nearest turn's goal, so that nobody winds a cable up.
+        # The nearest turn's goal, so that no cable is wound up.
         turns = round((where - (math.pi if goal == "upright" else 0.0)) / (2 * math.pi))
         end = 2 * math.pi * turns + (math.pi if goal == "upright" else 0.0)
     ramp = thesis_ramp(where, end)
     duration = ramp.duration
     if not plant.is_armed():
-        # From rest a controller would ask for all it has, and the plant would not be armed.
+        # From rest a controller would saturate, and the plant would refuse to arm.
         if controlled and plant.controller_is_active():
             print(f"{space}: deactivating the controller", flush=True)
             plant.switch_controller(on=False)
@@ -143,7 +143,7 @@ def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: b
     plant.follow(ramp, "move" if isinstance(goal, float) else f"move_{goal}")
     wait = plant.conductor.wait_for
     wait(f"{space} to follow the ramp", plant.is_following, _PATIENCE)
-    # A controller that is awake at the end would take over there; until now it may have held the pendulum.
+    # An active controller would take over at the end; until now it may have held the pendulum.
     if controlled and plant.controller_is_active():
         print(f"{space}: under position control; deactivating the controller", flush=True)
         plant.switch_controller(on=False)

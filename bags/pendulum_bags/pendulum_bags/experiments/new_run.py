@@ -1,4 +1,4 @@
-"""The folder of a run while it is recorded: an empty one does not stay behind, and Ctrl-C tells what is in it."""
+"""The folder of a run while it is recorded: an empty one is removed, and Ctrl-C reports its contents."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def new_run(
     """Create the folder of a run, as :func:`create_run_folder` does, and remove it if nothing is recorded into it.
 
     Args:
-        out: Where the user wants it; None for ``bags/runs/<UTC>_<experiment>``.
+        out: The user's choice; None for ``bags/runs/<UTC>_<experiment>``.
         experiment: Name of the experiment.
-        console: Where an interruption is told.
-        ended: What has ended by then, in words.
-        recorded: What the folder keeps then, in words.
+        console: Where an interruption is reported.
+        ended: What has ended by then, as text.
+        recorded: What the folder holds then, as text.
 
     Raises:
         BagError: The folder exists and is not empty, or cannot be written.

@@ -41,11 +41,11 @@ class RealMachine:
     lab: LabFile
 
     def bridge_program(self, strategy: str, bag: Path | None = None) -> NodeProgram:
-        """Return the bridge to the machine; an emulator gets patience, as far as the lab file leaves it open.
+        """Return the bridge to the machine; an emulator gets longer timeouts, unless the lab file sets them.
 
         Args:
             strategy: How the actuator turns wanted torque into PWM.
-            bag: A real actuator's own log is written beside it.
+            bag: A real actuator's own log is written next to it.
         """
         patience = EMULATOR_PATIENCE if self.patient else {}
         told = {name: value for name, value in patience.items() if name not in self.lab.values}
@@ -53,7 +53,7 @@ class RealMachine:
         return graph.bridge("/hw", lab_file=str(self.path), effort_strategy=strategy, **told)
 
     def log_parameters(self, bag: Path | None) -> dict[str, ParameterArgument]:
-        """Return what makes hebi-py write its own log beside a bag; nothing for an emulator, which has none."""
+        """Return the parameters for hebi-py's own log next to a bag; empty for an emulator, which has none."""
         if bag is None or self.emulated or self.lab.values["backend"] != "hebi":
             return {}
         return {"hebi_log": str(bag.resolve().with_suffix(".hebilog"))}
@@ -65,7 +65,7 @@ class RealMachine:
 
     @property
     def patient(self) -> bool:
-        """Whether the bridge may be told to wait for a busy computer: not where it keeps a real machine's limits."""
+        """Whether the bridge may wait for a busy computer: not where it enforces a real machine's limits."""
         return self.lab.values["backend"] in EMULATED_BACKENDS
 
     @property
@@ -98,17 +98,17 @@ def real_machine(hardware: str, lab: str | Path | None) -> RealMachine | None:
 def confirmed(
     machine: RealMachine | None, bridge: NodeProgram, plan: str, *, yes: bool, flat: bool = False
 ) -> Iterator[None]:
-    """Keep what the module is set to, go through the checklist, ask the operator; give the settings back at the end.
+    """Save the module's settings, run the checklist, ask the operator; restore the settings at the end.
 
     Args:
         machine: The machine; None for the emulator, which needs none of this.
         bridge: The bridge as it will be started.
         plan: What will happen, one sentence or more.
-        yes: The operator has said yes on the command line.
+        yes: The operator has confirmed on the command line.
         flat: Whether the pendulum lies flat.
 
     Raises:
-        FaultError: The settings cannot be read, the checklist is not passed, or the operator does not say yes.
+        FaultError: The settings cannot be read, the checklist fails, or the operator does not confirm.
     """
     if machine is None:
         yield
@@ -172,7 +172,7 @@ def run_checklist(bridge: NodeProgram, console: Console, *, flat: bool = False) 
 
 
 def _refusals(printed: str, said: str) -> str:
-    """Return what speaks against arming: the lines of the checklist that fail, or why there is none."""
+    """Return the reasons against arming: the failed lines of the checklist, or why there is none."""
     try:
         items = json.loads(printed)["items"]
     except (ValueError, KeyError):
@@ -189,10 +189,10 @@ def ask_yes(
     yes: bool,
     read: Callable[[], str] = input,
 ) -> None:
-    """Say what will move, and wait for the operator's yes.
+    """Print what will move, and wait for the operator's confirmation.
 
     Raises:
-        FaultError: The answer is another, or nobody can answer.
+        FaultError: The answer is another, or there is no terminal for it.
     """
     what = "an EMULATED machine (a rehearsal)" if machine.emulated else "a REAL machine"
     moves = f"{what}: {machine.lab.describe()}, lab file {machine.path}"
@@ -202,17 +202,17 @@ def ask_yes(
 def ask_for_running(
     places: Sequence[str], domain: int, plan: str, *, yes: bool, read: Callable[[], str] = input
 ) -> None:
-    """Ask before plants move that run already; what is behind them only the operator knows.
+    """Ask before moving plants that run already, of which the hardware is unknown here.
 
     Args:
-        places: Their namespaces; where there are none, nobody is asked.
+        places: Their namespaces; without any there is no question.
         domain: ROS domain.
         plan: What will happen, one sentence or more.
-        yes: The operator has said yes on the command line.
+        yes: The operator has confirmed on the command line.
         read: Reads the answer.
 
     Raises:
-        FaultError: The answer is another, or nobody can answer.
+        FaultError: The answer is another, or there is no terminal for it.
     """
     if not places:
         return

@@ -1,4 +1,4 @@
-"""Options that say which plants an experiment is of; each command that takes them names them alike."""
+"""Options for the plants of an experiment, with the same names in each command."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def equation_file(foreign: ForeignSimulation | None, target: Path, *, accept_dif
     """Write the equation of a foreign simulation, on which controllers are designed, and return its plant file.
 
     Args:
-        foreign: The simulation; None for ours, which has no such file.
-        target: Folder of what is recorded, which may have to be new: the file goes beside it, into ``logs``.
-        accept_differences: Whether the simulation may move otherwise.
+        foreign: The simulation; None for the built-in one, which has no such file.
+        target: Folder of the recording, which may have to be new: the file goes next to it, into ``logs``.
+        accept_differences: Whether the simulation may deviate from it.
 
     Raises:
-        ParameterError: It does, or is refused.
+        ParameterError: It deviates, or is refused.
     """
     if foreign is None:
         return ""

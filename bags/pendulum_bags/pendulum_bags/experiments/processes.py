@@ -23,9 +23,9 @@ from pendulum_msgs_py.programs.graph import NodeProgram
 __all__ = ["Child", "ProcessSet", "ros_environment", "start_recorder"]
 
 _RECORDER_NICENESS = -5
-"""Priority of a recorder, where we may take it: behind those who keep deadlines, ahead of all else on the machine.
+"""Priority of a recorder, where permitted: below the nodes with deadlines, above all else on the machine.
 
-Kept waiting for seconds, it finds that publishers have overwritten what it had not taken yet.
+After a wait of seconds, publishers have overwritten messages that it had not taken yet.
 """
 _PATIENCE = 8.0
 """Time that a child has to end after SIGINT before it is killed [s]."""
@@ -36,7 +36,7 @@ _PREFIX = re.compile(r"^(?:\[[A-Z]+\] \[[\d.]+\] \[[^\]]+\]: |error: )")
 
 
 _TOO_LATE = re.compile(r"\bwithin \d|did not (?:answer|run)")
-"""What the last words of a program that other programs kept waiting have in them."""
+"""Pattern of the last output of a program that other programs blocked."""
 
 
 def _busy_note(words: str) -> str:
@@ -61,7 +61,7 @@ class Child:
     ends_by_itself: bool = False
 
     def last_words(self, lines: int = 3) -> str:
-        """Return the end of its output, for messages; what a node logs and then ends with is told once."""
+        """Return the end of its output, for messages; a line that a node logs and then ends with is returned once."""
         with contextlib.suppress(OSError):
             text: list[str] = []
             for line in self.log.read_text(errors="replace").splitlines():
@@ -121,9 +121,9 @@ class ProcessSet:
         environment: Mapping[str, str] | None = None,
         alone: bool = False,
     ) -> Child:
-        """Start a command in a process group of its own, so that Ctrl-C reaches it through us, in order.
+        """Start a command in a process group of its own, so that this process passes Ctrl-C on, in order.
 
-        Where there are hosts and the command is a program of ours, one of them runs it.
+        Where there are hosts and the command is a program of this project, one of them runs it.
 
         Args:
             name: For messages and the log file.
@@ -185,7 +185,7 @@ class ProcessSet:
         self.check()
 
     def stop(self, keep: Collection[Child] = ()) -> None:
-        """End all programs, recorders last: plants say a last zero torque that should be on record.
+        """End all programs, recorders last: plants publish a last zero torque that should be recorded.
 
         Args:
             keep: Those that go on.
@@ -203,7 +203,7 @@ class ProcessSet:
         with contextlib.suppress(ProcessLookupError):
             if child.process.poll() is None:
                 child.process.send_signal(signal.SIGINT)
-                # One that stands still would hear it only when somebody lets it go on.
+                # A stopped process would get the signal only after it is continued.
                 child.process.send_signal(signal.SIGCONT)
 
     @staticmethod

@@ -1,10 +1,10 @@
-"""A process that runs programs of ours one after the other, so that a hundred runs load Python's modules once.
+"""A process that runs programs one after the other, so that a hundred runs load Python's modules once.
 
-To start a node takes half a second of a processor, nearly all of it to load numpy, scipy and rclpy; to make and destroy
-the node takes a sixteenth of that. ``python -m pendulum_bags.experiments.program_host DESCRIPTOR`` takes orders, a line
-of JSON each, from the socket with that number, and answers each with a line when its program has ended. A program sees
-what it would see alone: its own variables, folder, output and signals, a fresh ROS context, exit codes. The host ends
-when its socket does.
+Starting a node takes half a second of processor time, nearly all of it to load numpy, scipy and rclpy; creating and
+destroying the node takes a sixteenth of that. ``python -m pendulum_bags.experiments.program_host DESCRIPTOR`` reads
+orders, a line of JSON each, from the socket with that number, and replies with a line when a program ends. A program
+has what it would have alone: its own variables, folder, output and signals, a fresh ROS context, exit codes. The host
+ends when its socket does.
 
 :mod:`pendulum_bags.experiments.host_pool` is the other side.
 """
@@ -33,7 +33,7 @@ __all__ = ["main"]
 
 _TASKS = Path("/proc/self/task")
 _MOST_PROGRAMS = 200
-"""Programs after which a host makes place for another: what the middleware keeps of each adds up."""
+"""Programs after which a host is replaced: the middleware leaks some memory for each."""
 
 
 def main() -> int:
@@ -41,7 +41,7 @@ def main() -> int:
     if len(sys.argv) != 2 or not sys.argv[1].isdigit():
         print("error: a program host is started by the experiments; expected the number of a socket", file=sys.stderr)
         return EXIT_USAGE
-    # Between two programs nobody is asked to end: the socket tells.
+    # Between two programs the socket ends the host, not a signal.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_starter()
     with (

@@ -56,7 +56,7 @@ class PhaseProgress:
             self._console.print(f"{name} ({expected:.0f} s)", highlight=False)
 
     def start_again(self, why: str) -> None:
-        """Begin anew, and say why."""
+        """Restart, and print the reason."""
         self._console.print(why, style="yellow", highlight=False, markup=False, soft_wrap=True)
         self._done = self._length = 0.0
         self._bar.reset(self._task)

@@ -1,7 +1,7 @@
 """Repeats of the thesis's experiment with new noise, in lockstep: more of the same where the first run cannot decide.
 
 The emulated hardware runs as nodes over DDS, as ever. The simulation runs in this process, which gives the numbers of
-its nodes to the last bit in a tenth of the time; both are kept as bags.
+its nodes to the last bit in a tenth of the time; both are stored as bags.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def record_repeat(
 
     Raises:
         BagError: A bag cannot be written.
-        FaultError: A program ended or did not answer.
+        FaultError: A program ended or did not respond.
     """
     chosen = repeat_settings(settings, number)
     place = repeat_folder(folder, number)

@@ -49,11 +49,11 @@ EMULATOR_PATIENCE: Mapping[str, graph.ParameterArgument] = {
     "feedback_watchdog": EMULATOR_WATCHDOG,
     "command_lifetime": EMULATOR_LIFETIME,
 }
-"""What the bridge to an emulator in real time is told: its feedback is as punctual as this machine, which may be a busy
-one. A real actuator keeps the default."""
+"""Parameters of the bridge to an emulator in real time: its feedback is as punctual as this machine, which may be busy.
+A real actuator keeps the default."""
 _AT_REST = 1e-9
 BEGINS_ANYWHERE = {"start_effort_limit": 0.0}
-"""Of a simulated plant whose run begins at an angle of its own, with the torque that its controller asks for there."""
+"""Of a simulated plant whose run begins at an angle of its own, with the torque of its controller there."""
 THESIS_METHOD = "euler"
 """Integrator of the thesis's simulation, for rigid plants."""
 PERIODS = {"sim": 0.002, "hw": 0.01}
@@ -81,8 +81,8 @@ class RunSpec:
         method: Integrator of the simulator; Euler as in the thesis, which a plant with motor and spring has not.
         plant_parameters: Further parameters of the plant's node, such as sensor noise.
         storage: Storage of the bag.
-        clock: ``lockstep`` for as fast as the nodes answer each other, ``realtime`` for the wall's time.
-        simulation: A simulation of others in the place of ``plant``, a model file or ``gymnasium:ID``; empty for ours.
+        clock: ``lockstep`` for as fast as the nodes reply, ``realtime`` for wall time.
+        simulation: A third-party simulation in place of ``plant``, a model file or ``gymnasium:ID``; empty for none.
         mapping: Its mapping file; empty for none.
     """
 
@@ -112,7 +112,7 @@ class RunSpec:
             raise ParameterError(f"clock is {self.clock!r}; expected lockstep or realtime")
         off_rest = min(abs(self.theta), abs(self.theta - UPRIGHT))
         if self.clock == "realtime" and self.has_bridge and off_rest > _AT_REST:
-            # Nobody holds it between its start and the moment in which it is armed.
+            # Nothing holds it between its start and its arming.
             raise ParameterError(
                 f"start angle is {self.theta} rad; expected upright or bottom, where a machine in real time is at rest"
             )
@@ -183,7 +183,7 @@ class RunSpec:
         return {**values, "seed": self.seed}
 
     def plant_program(self, listeners: int) -> NodeProgram:
-        """Return the plant; it takes its first step when the conductor has armed or resumed it, and hears it too.
+        """Return the plant; it takes its first step when the orchestrator has armed or resumed it, and subscribes too.
 
         Args:
             listeners: Subscriptions to its states that it waits for.
@@ -229,10 +229,10 @@ class RunSpec:
         )
 
     def metadata(self) -> dict[str, Any]:
-        """Return what the bag says about its run."""
+        """Return the bag's metadata of its run."""
         values = self.to_json()
         foreign = self.foreign
-        # Told by what it is, not by the path that it was started from.
+        # Identified by its contents, not by its path.
         del values["simulation"], values["mapping"]
         return {
             RUN_RECORD: {
@@ -269,7 +269,7 @@ class RunSpec:
 def lockstep_parameters(
     listeners: int, duration: float, inputs: Sequence[str] = (names.EFFORT_COMMAND, names.DISTURBANCE)
 ) -> dict[str, graph.ParameterArgument]:
-    """Return what a plant in lockstep is told: how many hear its states, how long it runs [s], who answers a state."""
+    """Return parameters of a plant in lockstep: number of subscribers, duration [s], inputs that reply."""
     return {
         "clock": "lockstep",
         "lockstep_inputs": list(inputs),

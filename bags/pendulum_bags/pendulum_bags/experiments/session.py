@@ -1,4 +1,4 @@
-"""What every run over DDS has around its phases: its programs, who conducts them, its recorders, and a safe end."""
+"""What every run over DDS has around its phases: its programs, their orchestrator, its recorders, and a safe end."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ __all__ = [
 START_TIMEOUT = 60.0
 """Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
 PLANT_PRIORITY = 50
-"""Real-time priority of a plant, where we may take it, as of ros2_control's controller manager."""
+"""Real-time priority of a plant, where permitted, as of ros2_control's controller manager."""
 ANSWER_PRIORITY = PLANT_PRIORITY - 2
-"""Real-time priority of who answers a plant's states: behind a plant's loop too, which is one behind its process."""
+"""Real-time priority of nodes that reply to a plant: below its loop, which is one below its process."""
 RECORDER_PRIORITY = ANSWER_PRIORITY - 2
-"""Real-time priority of a recorder: behind who has a deadline, whose messages would be lost for an ordinary one."""
+"""Real-time priority of a recorder: below nodes with deadlines; without one it would lose messages."""
 LOOP_NICENESS = -10
-"""Priority among ordinary programs of those who keep deadlines, where we may take it."""
+"""Niceness of nodes with deadlines, where permitted."""
 
 
 @dataclass
@@ -52,7 +52,7 @@ class Session:
 
     Attributes:
         processes: The programs.
-        conductor: Who conducts.
+        conductor: The orchestrator.
         logs: Folder of their logs.
     """
 
@@ -69,9 +69,9 @@ class Session:
         Args:
             bag: Folder of the bag.
             namespace: Namespace of the plant.
-            metadata: What the bag says about its run.
+            metadata: The bag's metadata of its run.
             storage: ``mcap`` or ``sqlite3``.
-            simulated: Whether time is that of the plant and not that of the wall.
+            simulated: Whether time is the plant's and not wall time.
         """
         told = self.logs / f"{bag.name}_metadata.json"
         write_json(told, dict(metadata))
@@ -92,15 +92,15 @@ class Session:
     ) -> None:
         """Close the bag of a run in lockstep when it holds everything.
 
-        Simulated time stands still by then: what the nodes say on their way out is no part of the run.
+        Simulated time has stopped by then: messages of ending nodes are no part of the run.
 
         Args:
             recorder: The recorder.
             plant: The plant.
             states: How many states the plant has published.
             steps_are_told_on: Relative names of the topics that have a message for each step, of which there is one
-                less. A publisher may know of the recorder only after the recorder knows of it, and what it says
-                meanwhile goes to nobody: a short run can be over by then.
+                less. A publisher may match the recorder only after the recorder matches it, and what it publishes
+                meanwhile is lost: a short run can be over by then.
 
         Raises:
             FaultError: Messages were lost.
@@ -120,7 +120,7 @@ class Session:
         self._driven = [one for one in self._driven if one is not plant]
 
     def let_go(self) -> None:
-        """Disarm what this session drives; a plant that no longer answers goes to rest by its own rules."""
+        """Disarm what this session drives; a plant without response goes to rest by its own rules."""
         for plant in self._driven:
             plant.disarm_quietly()
 
@@ -132,7 +132,7 @@ class Session:
         Args:
             namespace: Namespace of the plant.
             listeners: How many subscriptions each topic of the plant must have, by relative name.
-            clock: Whether the plant keeps simulated time, which is recorded too.
+            clock: Whether the plant publishes simulated time, which is recorded too.
         """
         conductor, node = self.conductor, self.conductor.node
 
@@ -147,7 +147,7 @@ class Session:
         recorded = {f"{namespace}/{topic}" for topic, count in listeners.items() if count}
         recorded |= {names.CLOCK} if clock else set()
         RecorderClient(conductor, namespace).wait_until_heard(recorded, START_TIMEOUT)
-        # What one side of a match knows, the other side knows a moment later.
+        # The two ends of a match complete it a moment apart.
         conductor.spin(0.5)
 
 
@@ -181,13 +181,13 @@ def conduct(
 
 
 def start_loop(processes: ProcessSet, program: NodeProgram, priority: int, *, simulated: bool = False) -> Child:
-    """Start a node that keeps deadlines: before all else on the machine, where we may.
+    """Start a node with deadlines, at real-time priority where permitted.
 
     Args:
         processes: Of the run.
         program: The node.
         priority: Its real-time priority.
-        simulated: Time is the plant's: there are no deadlines, and nobody else is to wait.
+        simulated: Time is the plant's: there are no deadlines, and other programs are not to wait.
     """
     if simulated:
         return processes.start_node(program)
@@ -207,12 +207,12 @@ def in_real_time(program: NodeProgram, priority: int) -> NodeProgram:
 
 
 def permitted(priority: int) -> int:
-    """Return a real-time priority, or 0 where we may not have that of a plant.
+    """Return a real-time priority, or 0 where that of a plant is not permitted.
 
-    Nor do we take it where ``PENDULUM_NO_REALTIME`` is set: experiments at once on one computer would keep each other,
-    and whatever else is to be punctual there, from running.
+    It is 0 too where ``PENDULUM_NO_REALTIME`` is set: several experiments at once on one computer would block each
+    other, and other programs with deadlines.
 
-    All or none: who answers states must not go before a plant that has to do without.
+    All or none: a controller must not have priority over a plant without it.
 
     Args:
         priority: That of a plant at most.

@@ -61,7 +61,7 @@ RAMP_SPEEDS = (0.05, 0.8)
 1.5 rad/s follows whatever gap to where the pendulum stands it has to close meanwhile, by up to 0.3 rad/s [rad/s]."""
 _LARGEST_OF_LIMIT = 0.9
 """Largest speed of a ramp, as a share of the machine's limit: a pendulum that stands upright is not where the ramp down
-begins, and one that was refused there would be let go where it stands."""
+begins, and a refused ramp would release it where it stands."""
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ class RegulationSettings:
 
     @property
     def strategy(self) -> str:
-        """How the actuator turns wanted torque into PWM: as given, as the lab file says, or ``direct_pwm``."""
+        """How the actuator turns torque into PWM: as given, as in the lab file, or ``direct_pwm``."""
         machine = self.machine
         of_lab = machine.lab.values.get("effort_strategy", "") if machine is not None else ""
         return self.effort_strategy or of_lab or DEFAULT_STRATEGY
@@ -263,7 +263,7 @@ class RegulationSettings:
 
         Args:
             side: ``sim`` or ``hw``.
-            bag: The hardware's bag: a real one's own log is written beside it.
+            bag: The hardware's bag: a real one's own log is written next to it.
         """
         if self.running(side) is not None:
             return None
@@ -276,10 +276,10 @@ class RegulationSettings:
         return graph.simulator("/sim", plant=self.plant, method=self.method, clock="realtime")
 
     def bridge_program(self, bag: Path | None = None) -> NodeProgram:
-        """Return the bridge to the actuator, or the simulation in its place.
+        """Return the bridge to the actuator, or the simulation in place of it.
 
         Args:
-            bag: A real actuator's own log is written beside it.
+            bag: A real actuator's own log is written next to it.
         """
         if (foreign := self.foreign_of("hw")) is not None:
             return foreign.program("/hw", clock="realtime")
@@ -322,7 +322,7 @@ class RegulationSettings:
         return run_identity(self.plant) if side == "sim" else run_identity("thesis", self.strategy)
 
     def metadata(self, experiment: str, *, side: str = "sim", **more: Any) -> dict[str, Any]:
-        """Return what one side's bag says about its run."""
+        """Return the metadata of one side's bag."""
         foreign = self.foreign_of(side) or self.foreign
         return {
             RUN_RECORD: {

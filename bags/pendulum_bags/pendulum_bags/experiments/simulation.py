@@ -1,4 +1,4 @@
-"""A simulation that somebody else wrote, as one side of an experiment."""
+"""A third-party simulation as one side of an experiment."""
 
 from __future__ import annotations
 
@@ -100,10 +100,10 @@ class ForeignSimulation:
             )
 
     def require_equation(self) -> None:
-        """Refuse a simulation that does not move as the equation that a controller would be designed on.
+        """Refuse a simulation that deviates from the equation that a controller would be designed on.
 
         Raises:
-            ParameterError: It does not; the message says by how much, where, and why where that could be tested.
+            ParameterError: It deviates; the message has by how much, where, and the cause if it could be tested.
         """
         if not (check := _facts(self.name, self.mapping).check).agrees:
             raise ParameterError(
@@ -144,7 +144,7 @@ class ForeignSimulation:
         return identity_of(self.label, equation, *map(Path, filter(None, (self.name, self.mapping))))
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a bag says about it."""
+        """Return its entry in a bag's metadata."""
         facts = _facts(self.name, self.mapping)
         return {
             "name": self.label,
@@ -157,7 +157,7 @@ class ForeignSimulation:
 
 
 def recorded_difference(bag: Path, namespace: str, plant: str) -> str:
-    """Say how far a plant that ran already moved as the equation that its user gave, as far as it moved at all.
+    """Return how far a plant that ran already followed the user's equation, as far as it moved at all.
 
     Args:
         bag: Its recording.

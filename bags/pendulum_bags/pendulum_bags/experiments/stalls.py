@@ -1,7 +1,7 @@
-"""A run that a stalled machine broke off is no result: it is told, kept on record, and measured again a few times.
+"""A run that a stalled machine aborted is no result: it is reported, recorded, and repeated a few times.
 
-An emulator is as punctual as the machine that it runs on. Where that stands still for longer than the bridge waits, the
-bridge faults, as it must: it cannot know that nobody can be hurt. A real machine is never started again by itself.
+An emulator is as punctual as its machine. If that stalls for longer than the bridge's timeout, the bridge faults, as
+it must: it cannot rule out real hardware. A real machine is never restarted automatically.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ __all__ = ["ATTEMPTS", "is_stall", "run_undisturbed"]
 ATTEMPTS = 3
 """Times that a run is carried out at most."""
 STALLS = ("host_stalled", "feedback_lost", "feedback_late", "motion_disagreement")
-"""Faults of the bridge that an emulator, whose feedback this machine makes, has where the machine stands still: between
-records that are far apart position and velocity tell different motions."""
+"""Faults of the bridge that an emulator, whose feedback this machine makes, has where the machine stalls: in records
+that are far apart position and velocity disagree."""
 SAID = ("is the machine too busy", "no command for", "no fresh command")
-"""What a plant says whose states are too old, and one whose controller stood still."""
+"""Reasons of a plant with old states, and of one whose controller stalled."""
 _LOGS = "logs"
 
 
@@ -44,9 +44,9 @@ def run_undisturbed(
 
     Args:
         run: Records into the folder.
-        folder: The run's folder; of a stalled run there remain its logs and its reason, which the result tells.
-        emulated: Whether the hardware is emulated; a real machine moves when its operator wants it to.
-        tell: Told what happened, one sentence.
+        folder: The run's folder; of a stalled run its logs and its reason remain, for the result.
+        emulated: Whether the hardware is emulated; a real machine moves only on its operator's command.
+        tell: Called with a sentence on each stall.
 
     Raises:
         FaultError: It failed for another reason, or the machine stalled each time.

@@ -65,12 +65,12 @@ def run_thesis(
         session.drives(*plants)
         beside = _regulate(session, plants, settings, progress, folder if repeat else None)
         progress.phase("closing the bags", 2.0)
-        # Before anything is waited for: what is said from here on is no part of the experiment.
+        # Before any wait: messages from here on are no part of the experiment.
         for recorder in recorders:
             session.close(recorder)
         for plant in plants:
             session.leaves(plant)
-        # Nothing else computes beside what is still to be simulated.
+        # Nothing else computes while the repeat is still simulated.
         session.processes.stop(keep=beside)
         if settings.running("sim") is None:
             _simulate_own_protocol(folder, settings)
@@ -85,7 +85,7 @@ def _start(
 ) -> tuple[tuple[PlantClient, PlantClient], list[Child]]:
     """Start all programs; return both plants, and their recorders.
 
-    Plants that run already are looked at first, and only looked at.
+    Plants that run already are checked first, without commands.
     """
     conductor = session.conductor
     joined = {side: join(conductor, running) for side in SIDES if (running := settings.running(side)) is not None}
@@ -121,7 +121,7 @@ def _regulate(
     progress: PhaseProgress,
     repeated: Path | None,
 ) -> list[Child]:
-    """Carry out the phases, ramp to ramp; return what was started beside them: a repeat for a run's folder, if any."""
+    """Carry out the phases, ramp to ramp; return what was started meanwhile: a repeat for a run's folder, if any."""
     conductor, processes, noise = session.conductor, session.processes, settings.noise
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
@@ -153,7 +153,7 @@ def _regulate(
     durations = _start_move(conductor, plants, settings, 0.0, "ramp_down", progress)
     # The ramp leaves the machine idle: emulated hardware gets new noise, in case that this run alone does not decide.
     beside = [] if repeated is None else [_start_repeat(processes, repeated, settings)]
-    # Before the ramp ends: a controller that is still awake then would be handed a pendulum half a turn from upright.
+    # Before the ramp ends: a controller that is still active then would take over a pendulum half a turn from upright.
     for plant in plants:
         plant.switch_controller(on=False)
     _wait_for_goal(conductor, plants, durations)

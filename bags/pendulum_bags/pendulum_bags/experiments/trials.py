@@ -28,7 +28,7 @@ __all__ = ["GRAVITY", "INERTIA_DAMPING", "TrialKind", "TrialSettings", "run_tria
 _SLOWEST = 3.0
 """Slowest pace at which a trial still counts as alive, wall time per simulated time."""
 _LONGEST_BY_HAND = 600.0
-"""Time after which a trial by hand that nobody ends is given up [s]."""
+"""Timeout of a trial by hand [s]."""
 _MARGIN = 1.0
 """Time beyond the steps of the staircase, whose ramps end on whole increments [s]."""
 
@@ -42,8 +42,8 @@ class TrialKind:
         procedure: What the bridge's procedure plays.
         trials: How many, as in the thesis.
         flat: Whether the pendulum lies on a table, without gravity.
-        inputs: Inputs of the plant that answer each state.
-        longest: Time that the simulated hand takes at most [s]; 0 where the settings tell.
+        inputs: Inputs of the plant with a reply to each state.
+        longest: Time that the simulated hand takes at most [s]; 0 where the settings have it.
     """
 
     name: str
@@ -127,7 +127,7 @@ class TrialSettings:
         return 4.0 + self.expected_duration / (10.0 if self.lockstep else 1.0)
 
     def plant_program(self, trial: int, bag: Path | None = None) -> graph.NodeProgram:
-        """Return the bridge; a real actuator's own log is written beside the bag, where there is one."""
+        """Return the bridge; a real actuator's own log is written next to the bag, where there is one."""
         if (machine := self.machine) is not None:
             return machine.bridge_program("direct_pwm", bag)
         parameters: dict[str, graph.ParameterArgument] = {"plant": self.plant, "effort_strategy": "direct_pwm"}
@@ -158,7 +158,7 @@ class TrialSettings:
 
 
 _LISTENERS = 2
-"""Those who hear the bridge's states beside the conductor: procedure and recorder."""
+"""Subscribers of the bridge's states besides the orchestrator: procedure and recorder."""
 
 
 def run_trials(
@@ -175,7 +175,7 @@ def run_trials(
         settings: What to run.
         domain: ROS domain, or None for any free one.
         progress: Shows where it is.
-        ask: Shows a sentence to the person at the pendulum and returns when they have pressed Enter.
+        ask: Shows an operator prompt and returns on Enter.
 
     Raises:
         FaultError: A program ended, or the plant refused or faulted; the drive is at rest when this is raised.
@@ -248,7 +248,7 @@ def _topics(settings: TrialSettings) -> dict[str, int]:
         "actuator/feedback": 1,
     }
     if settings.kind.procedure == "hand":
-        # The real bridge has no such input: nobody but a person pushes a real pendulum.
+        # The real bridge has no such input: a real pendulum is pushed by hand.
         topics[names.PUSH] = 0 if settings.by_person else 2
     else:
         topics[names.JOINT_TRAJECTORY] = 2

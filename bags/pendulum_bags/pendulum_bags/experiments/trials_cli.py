@@ -95,7 +95,7 @@ def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_out
     from pendulum_bags.experiments.trials import run_trials
     from pendulum_bags.identification import identify_cli
 
-    # A minute of somebody's machine is not spent on what could not be evaluated afterwards.
+    # Checked first: a recording that cannot be evaluated is not worth machine time.
     if importlib.util.find_spec("statsmodels") is None:
         raise ModuleNotFoundError("No module named 'statsmodels'", name="statsmodels")
     check_domain(domain)
@@ -135,7 +135,7 @@ def _plan(settings: TrialSettings) -> str:
 
 
 def _ask(console: Console, sentence: str) -> None:
-    """Show a sentence and wait for Enter; no Enter can come where nobody sits at a terminal.
+    """Show a sentence and wait for Enter; without a terminal there is no Enter.
 
     Raises:
         PendulumError: The input has ended.

@@ -1,4 +1,4 @@
-"""When states and answers came."""
+"""Times of states and commands."""
 
 from __future__ import annotations
 
