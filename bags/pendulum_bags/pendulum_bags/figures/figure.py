@@ -1,4 +1,4 @@
-"""A figure as data: what is drawn, with labels and units, told once and rendered for files and for the page alike."""
+"""A figure as data: what is drawn, with labels and units, defined once and rendered for files and for the page."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ ROLES: dict[str, Style] = {
     "stable": Style("#222222", "solid", 1.0, "circle"),
     "unstable": Style("#222222", "solid", 1.0, "cross"),
 }
-"""Role -> look; a new role is one line."""
+"""Role -> style; a new role is one line."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Mark:
     Args:
         value: Where.
         axis: ``x`` for a vertical line at that x, ``y`` for a horizontal one.
-        label: Text beside it.
+        label: Text next to it.
     """
 
     value: float
@@ -153,7 +153,7 @@ class Figure:
 
 
 def thinned(x: ArrayLike, y: ArrayLike, most: int = 1200) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a curve with at most about ``most`` points that looks the same: first, least, greatest of each bin.
+    """Return a curve with at most about ``most`` points that plots the same: first, least, greatest of each bin.
 
     Args:
         x: Shape (n,), increasing.

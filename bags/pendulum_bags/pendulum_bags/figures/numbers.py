@@ -26,7 +26,7 @@ def quantity(value: float, unit: str = "", digits: int = 3) -> str:
 
 
 def ratio_in_words(ratio: float) -> str:
-    """Return a ratio as a reader would say it, such as ``12 % smaller`` or ``2.2 times as large``."""
+    """Return a ratio as text, such as ``12 % smaller`` or ``2.2 times as large``."""
     if 0.995 <= ratio <= 1.005:
         return "equal within half a per cent"
     if ratio >= 1.75:

@@ -48,7 +48,7 @@ def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str
     Args:
         figures: What to draw.
         folder: Where.
-        formats: File suffixes that matplotlib knows.
+        formats: File suffixes of matplotlib.
 
     Returns:
         The files written.

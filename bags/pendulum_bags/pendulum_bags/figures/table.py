@@ -21,7 +21,7 @@ class Table:
         head: Column headings; the first column holds row names.
         rows: Cells as text.
         section: Heading of the section it belongs to; empty on a page without sections.
-        folded: Whether a page shows it only to who asks, for its length; paper shows it always.
+        folded: Whether a page folds it for its length; paper shows it always.
     """
 
     title: str

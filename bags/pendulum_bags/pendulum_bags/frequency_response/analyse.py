@@ -39,11 +39,11 @@ __all__ = [
 
 
 MACHINE = "hw_response.json"
-"""File in which a run folder keeps the measured response of its hardware."""
+"""File of a run folder with the measured response of its hardware."""
 LONGER_OF_JOINTS = "python -m pendulum_bags experiment joints --periods 40"
 """Measures plants of several joints longer than by default."""
 NUMBERS = "frequency_response.json"
-"""File in which it keeps what was found."""
+"""File of it with the results."""
 
 
 def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, list[str]]:
@@ -73,13 +73,13 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, 
         told = {"emulated": label == "hw" and stands_in(facts), IDENTITY: facts.get(IDENTITY, "")}
         found.append(replace(measured, label=label, facts={**measured.facts, **told}))
     if len(found) == 2 and found[0].label == found[1].label:
-        # Two of one kind: the order in which they were given tells which is held against which.
+        # Two of one kind: their order decides which is the reference.
         found = [replace(one, label=label) for one, label in zip(found, ("sim", "hw"), strict=True)]
     return sorted(found, key=lambda response: response.label, reverse=True), plant, list(policies)
 
 
 def _read(path: Path) -> tuple[Record, Mapping[str, Any]]:
-    """Return the excited plant of a bag, of one joint or several, and what the bag says of its run."""
+    """Return the excited plant of a bag, of one joint or several, and the bag's metadata of its run."""
     from pendulum_bags.runs.kept_bags import KeptBags
     from pendulum_bags.runs.run_data import joints_of, read_run
 
@@ -98,7 +98,7 @@ def _read(path: Path) -> tuple[Record, Mapping[str, Any]]:
 
 
 def _design_plant(bag: Path, facts: Mapping[str, Any]) -> str:
-    """Return the plant on which the controller of a run was designed, which may lie beside its bag; empty for none."""
+    """Return the plant on which the controller of a run was designed, which may be next to its bag; empty for none."""
     controller = facts.get("controller")
     linearised = controller.get("linearised") if isinstance(controller, Mapping) else None
     if isinstance(linearised, str) and (bag.parent / linearised).is_file():
@@ -116,7 +116,7 @@ def analyse_responses(
     recorded: bool = False,
     longer: str = "",
 ) -> Analysis:
-    """Return what responses tell.
+    """Return the analysis of responses.
 
     Args:
         responses: Simulation first.
@@ -125,7 +125,7 @@ def analyse_responses(
         scaling: Units of the gap; None for the thesis's task, or for those that the LQR weights of several joints are.
         margin: Gap between the plants that does not matter; None for 0.2, of several joints for the margin of the
             plant's own LQR: a smaller gap keeps that one stable.
-        recorded: Whether the designs come from a recording, not from who asks now.
+        recorded: Whether the designs come from a recording, not from the caller.
         longer: The command that measures longer.
 
     Raises:
@@ -181,7 +181,7 @@ def _refuse_other_joints(parameters: MechanismParameters, measured: MeasuredResp
 
 
 def find_machine(folders: Sequence[Path]) -> Path | None:
-    """Return the first folder that keeps the measured response of a machine, None where none does."""
+    """Return the first folder with the measured response of a machine, None where none has one."""
     return next((folder for folder in folders if (folder / MACHINE).is_file()), None)
 
 
@@ -189,11 +189,11 @@ def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = (), ran:
     """Return which designs carry over to a machine that was measured before.
 
     Args:
-        machine: Measured response, or the folder that keeps it.
+        machine: Measured response, or its folder.
         plant: Preset or file of the plant that designs are made on.
         designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them; by default those that
             were certified when it was measured, and else the four combinations of the thesis.
-        ran: Policy files that ran in the recording; they are asked about too, unless ``designs`` says of what.
+        ran: Policy files that ran in the recording; they are certified too, unless ``designs`` are given.
 
     Raises:
         DataError: The file holds no response.
@@ -218,7 +218,7 @@ class _Kept(NamedTuple):
 
 
 def _kept(machine: Path) -> _Kept:
-    """Return what lies beside a measured response; defaults where nothing does."""
+    """Return the files next to a measured response; defaults where there are none."""
     path = (machine if machine.is_dir() else machine.parent) / NUMBERS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

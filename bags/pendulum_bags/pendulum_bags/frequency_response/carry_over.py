@@ -24,8 +24,8 @@ def carry_over(
 
     Args:
         comparison: The comparison.
-        folders: Folders that may keep a measured response; the first that does counts.
-        machine: Measured response, or the folder that keeps it, before all others.
+        folders: Folders that may have a measured response; the first one is used.
+        machine: Measured response, or its folder, before all others.
         designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them.
 
     Returns:

@@ -29,7 +29,7 @@ _ERROR = 0.05
 
 @dataclass(frozen=True)
 class Difference:
-    """What tells two plants apart; both as they are at the second one's sampling period.
+    """The difference of two plants, both at the second one's sampling period.
 
     Attributes:
         frequency: Shape (n,) [Hz].
@@ -41,8 +41,8 @@ class Difference:
         gap_high: Upper joint limit of it, shape (n,).
         nu_gap: Largest gap with its joint interval; 1 where the winding number condition fails.
         gap_at: Frequency of the largest gap [Hz].
-        delay: By which the second answers later than the first [s].
-        gain: Second's answer beside the first's, over the octaves [-].
+        delay: Of the second's response relative to the first's [s].
+        gain: Second's response over the first's, over the octaves [-].
         scaling: Units of the gap.
     """
 

@@ -25,7 +25,7 @@ __all__ = ["DesignResult", "certify_designs", "design_rows", "design_text", "des
 _NUMBER = r"[-+0-9.eE]+"
 _WEIGHTS = re.compile(rf"q=({_NUMBER}),({_NUMBER})(?:[ ;]+r=({_NUMBER}))?")
 _LARGER = 10.0
-"""A law is linear near upright if it answers to disturbances of this size as to those of size 1 ..."""
+"""A law is linear near upright if it responds to disturbances of this size as to those of size 1 ..."""
 _NOT_LINEAR = 0.1
 """... within this share at each frequency, angle and velocity counted in units of the task."""
 _GAIN = re.compile(rf"k=({_NUMBER}),({_NUMBER})")
@@ -40,8 +40,8 @@ class DesignResult:
         K: Gain on [theta, theta_dot] [N m/rad, N m s/rad], or on those of k joints; None for a controller that is no
             gain.
         certificate: What is known of it.
-        unknown: Why nothing is known of it, in words; empty where the certificate speaks.
-        text: What :func:`certify_designs` reads for it, where the name does not tell.
+        unknown: Why nothing is known of it, as text; empty where there is a certificate.
+        text: What :func:`certify_designs` reads for it, where that is not the name.
     """
 
     name: str
@@ -90,7 +90,7 @@ def certify_designs(
         plant: The plant.
         model: Its linear model.
         certifier: Of the model and the measured machine.
-        recorded: Whether somebody named them earlier: a policy file that cannot be read any more is then unknown.
+        recorded: Whether they are from an earlier run: a policy file that cannot be read any more is then unknown.
 
     Raises:
         ParameterError: A text is no design, or a policy is not for the plant.
@@ -145,10 +145,10 @@ def design_text(name: str) -> str:
 
 
 def policies_of(record: Mapping[str, Any]) -> list[str]:
-    """Return the policy file that answered in a recorded run, as a list; none for any other controller.
+    """Return the policy file that ran in a recorded run, as a list; empty for any other controller.
 
     Args:
-        record: What a bag says of its run.
+        record: A bag's metadata of its run.
     """
     controller = record.get("controller")
     told = controller.get("policy") if isinstance(controller, Mapping) else None
@@ -156,7 +156,7 @@ def policies_of(record: Mapping[str, Any]) -> list[str]:
 
 
 def _policy(path: str, plant: PlantParameters, certifier: Certifier, *, recorded: bool) -> DesignResult:
-    """Return what is known of a learned policy around upright, by its answers to disturbances of two sizes."""
+    """Return what is known of a learned policy around upright, by its responses to disturbances of two sizes."""
     machine = certifier.machine
     name, text = f"policy {Path(path).name}", str(Path(path).expanduser().resolve())
     nothing = certifier.feedback(np.zeros((2, machine.frequency.size), dtype=np.complex128), stable=False)

@@ -1,13 +1,13 @@
 """The frequency response of a plant in closed loop, from a known excitation.
 
 Feedback makes the torque depend on the plant's own noise, so that output over torque is biased towards the inverse of
-the controller. The joint input-output estimate is not: both are measured against the excitation r, which noise does
-not know,
+the controller. The joint input-output estimate is not: both are measured against the excitation r, which is
+independent of noise,
 
     G = S_yr / S_ur
 
 A periodic excitation is averaged over its periods, without leakage; any other is cut into windowed segments that
-overlap by half. What the blocks do not share is noise, and tells the confidence: ``|G_hat - G|^2 / deviation^2``
+overlap by half. What the blocks do not share is noise, and gives the confidence: ``|G_hat - G|^2 / deviation^2``
 follows F(2, 2 (blocks - 1)).
 
 Source: Ljung, System Identification, 2nd ed., 1999, section 13.5; Pintelon and Schoukens, System Identification: A
@@ -169,7 +169,7 @@ def _joint(record: Record, frequency: Array, r: Complex, u: Complex, y: Complex,
 
 
 def _distortion(y: Complex, harmonics: NDArray[np.int64]) -> tuple[float, float]:
-    """Return how strong angle and velocity of the worst joint are on odd lines between the excited, beside those."""
+    """Return the worst joint's angle and velocity on odd lines, relative to those on the excited lines."""
     top = min(int(harmonics[-1]), y.shape[2] - 1)
     odd = np.setdiff1d(np.arange(1, top + 1, 2), harmonics)
     excited = harmonics[harmonics <= top]

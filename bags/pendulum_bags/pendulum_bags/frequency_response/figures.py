@@ -100,7 +100,7 @@ def _bode(analysis: Analysis) -> Figure:
 
 
 def difference_sentence(difference: Difference) -> str:
-    """Say where two plants differ."""
+    """Return where two plants differ, as a sentence."""
     if not difference.found:
         return f"No difference above {100.0 * SMALLEST:g} % was found between simulation and hardware."
     n, total = difference.lines_that_differ, difference.frequency.size
@@ -138,7 +138,7 @@ def _quality(responses: Sequence[MeasuredResponse]) -> Figure:
 
 
 def gap_figure(certifier: Certifier, difference: Difference | None, designs: Sequence[DesignResult]) -> Figure:
-    """Draw the gap per frequency beside the margins of designs."""
+    """Draw the gap per frequency with the margins of designs."""
     profile = certifier.profile
     shown = profile.frequency > 0.0
     x = profile.frequency[shown]
@@ -153,7 +153,7 @@ def gap_figure(certifier: Certifier, difference: Difference | None, designs: Seq
         for design in designs
         if design.certificate.stable_on_model and not design.unknown
     ]
-    # Labels on top of each other say nothing: the smallest and the largest margin serve.
+    # Overlapping labels are not readable: the smallest and the largest margin suffice.
     marks = [min(marks, key=lambda m: m.value), max(marks, key=lambda m: m.value)] if len(marks) > 2 else marks
     passing = sum(design.certificate.by_gap and not design.unknown for design in designs)
     sentence = (

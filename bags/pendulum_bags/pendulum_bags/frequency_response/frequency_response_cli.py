@@ -230,7 +230,7 @@ def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output
 
 
 def _extent(facts: Mapping[str, Any]) -> str:
-    """Say how far a plant moved and how hard it was driven while it was measured."""
+    """Return a plant's largest motion and torque during the measurement, as text."""
     if "largest_deviation" in facts:
         told = ", ".join(f"{joint} {value:.3g}" for joint, value in facts["largest_deviation"].items())
         return f"largest deviations {told} rad or m, largest effort {facts['largest_effort']:.3g} N m or N"

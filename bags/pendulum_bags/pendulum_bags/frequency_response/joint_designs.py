@@ -22,7 +22,7 @@ _NUMBERS = r"[-+0-9.eE]+(?:,[-+0-9.eE]+)*"
 _WEIGHTS = re.compile(rf"q=({_NUMBERS})(?:[ ;]+r=({_NUMBERS}))?")
 _GAIN = re.compile(rf"k=({_NUMBERS})")
 _OTHER_COSTS = (1.0, 0.1, 10.0, 100.0)
-"""Costs of the effort of the designs that nobody chose, beside that of the plant's own LQR."""
+"""Costs of the effort of the default designs, in addition to that of the plant's own LQR."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class JointDesign:
 
     Attributes:
         name: As in tables.
-        text: As somebody wrote it.
+        text: As it was given.
         K: Gain on positions and velocities, shape (2 k,).
         weights: q and r of an LQR; None for a gain.
     """

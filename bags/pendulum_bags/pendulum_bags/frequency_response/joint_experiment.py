@@ -17,9 +17,9 @@ from pendulum_bags.verdict import write_layer
 __all__ = ["FOLDER", "JointMultisine", "measure_joints"]
 
 FOLDER = "frequency_response"
-"""Folder within a run folder that holds the recordings under the multisine, and all that they tell."""
+"""Folder within a run folder that holds the recordings under the multisine, and their analysis."""
 _HIGHEST = 100.0
-"""End of the band [Hz]. The loops of all presets are small there, where no line says what comes beyond."""
+"""End of the band [Hz]. The loops of all presets are small there, and there are no lines beyond."""
 _LINES = 48
 
 
@@ -66,22 +66,22 @@ def measure_joints(
     on_analysis: Callable[[str], None] = lambda what: None,
     on_wait: Callable[[], None] = lambda: None,
 ) -> Analysis:
-    """Record both sides under the multisine, and keep what it tells: two layers of the run folder's answer.
+    """Record both sides under the multisine, and store the analysis: two layers of the run folder's answer.
 
     Args:
         folder: The run folder; the recordings, numbers, figures and the page go to its ``frequency_response``.
         multisine: What to run.
-        machine: Plant file that stands in for the machine.
+        machine: Plant file of the surrogate of the machine.
         designs: As :func:`pendulum_bags.frequency_response.joint_designs.certify_joint_designs` reads them.
         hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
-        on_side: Told each side, in words, when it begins.
-        on_analysis: Told what is done with them afterwards.
+        on_side: Called with each side's name when it starts.
+        on_analysis: Called with the next step's text afterwards.
         on_wait: Called while waiting.
 
     Raises:
         BagError: A bag exists, or cannot be written.
         DataError: A plant was not excited enough.
-        FaultError: A program ended or did not answer, or a plant fell or faulted.
+        FaultError: A program ended or did not respond, or a plant fell or faulted.
         ParameterError: A text is no design.
     """
     place = folder / FOLDER

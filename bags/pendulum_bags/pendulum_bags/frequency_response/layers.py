@@ -13,7 +13,7 @@ from pendulum_lqr.responses.measured_response import MeasuredResponse
 __all__ = ["GAP_MARGIN", "LONGER", "same_plant", "which_controllers"]
 
 GAP_MARGIN = 0.2
-"""Gap that does not matter: a loop with a margin b(P, K) above it, as an LQR on this plant has, keeps its stability."""
+"""Gap that does not matter: a loop with a margin b(P, K) above it, as an LQR on this plant has, stays stable."""
 _CLOSE = {True: "close enough for feedback, not identical", False: "close enough for feedback"}
 """By whether a difference at single frequencies was found."""
 _WEAK_COHERENCE = 0.5

@@ -1,4 +1,4 @@
-"""All that measured frequency responses tell."""
+"""The analysis of measured frequency responses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Analysis"]
 
 @dataclass(frozen=True)
 class Analysis:
-    """All that responses tell.
+    """The analysis of responses.
 
     Attributes:
         responses: Simulation, hardware, or both.
@@ -27,7 +27,7 @@ class Analysis:
         plant: Its name.
         difference: Of simulation and hardware, None for one of them.
         certifier: Of model and hardware, None without hardware.
-        designs: What was found of each.
+        designs: The result of each.
         layers: Layers of the verdict.
         scaling: Units of the gap.
     """

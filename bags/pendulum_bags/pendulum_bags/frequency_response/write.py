@@ -1,4 +1,4 @@
-"""Write what measured responses tell: numbers, layers of the verdict, figures and a page."""
+"""Write the analysis of measured responses: numbers, layers of the verdict, figures and a page."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class Body:
             gravity where no motor is [N m or N].
         row: Its parameters as the kernel takes them, shape (p,).
         columns: Which of them a parameter is, by name.
-        ratios: Columns of static and Coulomb friction, and their ratio that stays, of each joint that has any.
+        ratios: Columns of static and Coulomb friction, and their fixed ratio, of each joint that has any.
         offsets: Columns of the constant effort at each driven joint.
         longest: Longest step of the integrator [s].
         advance: Compiled: motion, parameters, efforts, delays, kicks, period and longest step to the next motion.
@@ -393,7 +393,7 @@ def _mechanism_kernel(name: str, goal: tuple[float, ...]) -> Any:
 
 
 def _kernel(goal: tuple[float, ...], prepare: Any, forward: Any) -> Any:
-    """Return the compiled loop over plants, in which the effort that answers a state acts after its delay."""
+    """Return the compiled loop over plants, in which the effort for a state acts after its delay."""
     n = len(goal)
     load = tuple_loader(n, 1)
 
@@ -409,7 +409,7 @@ def _kernel(goal: tuple[float, ...], prepare: Any, forward: Any) -> Any:
             held, pending, arrives = load(row, 3 * n), load(row, 4 * n), row[5 * n]
             push, newest = load(pushes[j], 0), load(efforts[j], 0)
             first = min(max(arrives, 0.0), period)
-            # No answer overtakes the one before it, and none is later than two periods.
+            # No command overtakes the one before it, and none is later than two periods.
             comes = min(max(late[j], arrives), 2.0 * period)
             second = min(max(comes, first), period)
             for part in range(3):

@@ -1,6 +1,6 @@
 """Many plants that a policy learns on, each with parameters, a delay and noise of its own.
 
-The effort that answers a state begins to act after the delay; until then the one before it acts. One joint is n = 1.
+The effort for a state begins to act after the delay; until then the one before it acts. One joint is n = 1.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _KICK_TIME = 0.05
 _EDGE, _END = 0.55, 0.7
 """Shares of the way to the stop from which on going further costs, and costs most [-]; the travel ends at 0.8."""
 _PRICE, _LAST_PRICE = 2.0, 5.0
-"""What it costs most, in the first third of a training and in the last: who may never go there does not learn to swing
-up, and who has learned it can learn to do without."""
+"""The largest cost, in the first third of a training and in the last: a policy that may never go there does not learn
+to swing up; one that has learned it can learn to do without."""
 _MIDDLE = 0.5
-"""Share of the way to the stop within which it is near the middle: who rests far from it has no way left to recover."""
+"""Share of the way to the stop within which it is near the middle: from rest far from it a joint cannot recover."""
 _AGAIN, _UP, _LEARNED = 0.75, 0.3, 0.6
-"""With a passive joint, the chance that who did not end upright [rad], or left its travel, meets the same plant again,
-and after which share of the training: plants that are hard to swing up are rare, and else are not learned; who cannot
-swing up any plant yet has to see all of them."""
+"""With a passive joint, the chance that the plant of an episode that did not end upright [rad], or left its travel, is
+drawn again, and after which share of the training: plants that are hard to swing up are rare, and else are not
+learned; a policy that cannot swing up any plant yet has to train on all of them."""
 _ENDS = 0.5
 """Of one joint, the share of parameters that lie at an end of their range: drawn evenly, plants of which several are
 extreme are too rare for a policy to learn to brake them."""
@@ -39,8 +39,8 @@ _SPUN, _FASTEST_SPIN = 0.1, 3.0
 """Of one joint, the share of episodes that begin with any speed up to so many scales: else no policy meets what goes
 round and round with its torque."""
 _HELD, _FULL = 0.1, 1.5
-"""Of one joint, the share of episodes that begin where gravity and effort balance, which dry friction and an unchanging
-answer would keep for ever; efforts are drawn up to so many limits and clipped: most get stuck at the limit."""
+"""Of one joint, the share of episodes that begin where gravity and effort balance, which dry friction and a constant
+command would hold for ever; efforts are drawn up to so many limits and clipped: most get stuck at the limit."""
 _MOST_DRAWS = 50
 
 
@@ -115,7 +115,7 @@ class SwingUp:
         return self._samples.copy(), np.concatenate(extra, axis=1).astype(np.float32)
 
     def step(self, actions: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Answer with efforts, actions times the limit, rate-limited; return rewards and whose time is over."""
+        """Apply efforts, actions times the limit, rate-limited; return rewards and which episodes are over."""
         task, draw, n = self.task, self._generator, self._n
         change = self.limit * actions.astype(np.float64) - self.effort
         change = np.clip(change, -self.step_limit, self.step_limit)
@@ -198,9 +198,9 @@ class SwingUp:
         """Let episodes that just began start elsewhere.
 
         Args:
-            rows: Which.
+            rows: Their rows.
             states: Deviations from upright and velocities, shape (k, 2n).
-            efforts: That act already, and that the last answers asked for, shape (k, m).
+            efforts: That act already, and equal the last commands, shape (k, m).
         """
         n = self._n
         self.motion[rows] = 0.0
@@ -220,7 +220,7 @@ class SwingUp:
         self.motion[rows, 2 * n : 5 * n] = np.tile(efforts, (1, 3))
 
     def _meets_again(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return who gets the plant of the episode that ends once more."""
+        """Return which rows repeat the plant of the episode that ends."""
         if self.body.excess is None or self.progress < _LEARNED:
             return np.zeros(rows.size, dtype=np.bool_)
         down = np.any(np.abs(wrap(self.motion[rows, : self._n][:, self._turns])) > _UP, axis=1)
@@ -249,7 +249,7 @@ class SwingUp:
         return np.where(self._generator.uniform(0.0, 1.0, size) < _ENDS, nearest, values)
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Return what a checkpoint keeps."""
+        """Return the arrays of a checkpoint."""
         return {
             "motion": self.motion, "parameters": self.parameters, "delay": self.delay, "effort": self.effort,
             "push": self.push, "zero": self._zero, "kick_left": self._kick_left, "left": self._left,

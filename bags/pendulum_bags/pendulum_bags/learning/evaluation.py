@@ -57,7 +57,7 @@ class Trial:
 def trials_of(
     policy: Policy, task: SwingUpTask, count: int, seed: int, duration: float = 10.0, *, hanging: bool = False
 ) -> list[Trial]:
-    """Return trials with start, plant, delay and kicks all drawn anew, each from the ranges of training.
+    """Return trials with start, plant, delay and kicks all drawn again, each from the ranges of training.
 
     Kicks last 50 ms and come each second, with up to the trained share of the effort limit, or of the largest torque of
     gravity at a joint without a motor.
@@ -68,7 +68,7 @@ def trials_of(
         count: How many.
         seed: Of what is drawn.
         duration: Of each [s].
-        hanging: They start hanging at rest and nobody kicks: of a policy that knows one way up and no other.
+        hanging: They start hanging at rest without kicks: for a policy of one way up only.
     """
     rng = np.random.default_rng(seed)
     found = []
@@ -160,7 +160,7 @@ def is_up(policy: Policy, trial: Trial, rows: NDArray[np.float64]) -> NDArray[np
     """
     up = np.ones(rows.shape[1], dtype=np.bool_)
     for joint, row in zip(policy.coordinates.joints, np.abs(rows), strict=False):
-        # Who has left the track once was not up before that either.
+        # A trial that has left the track does not count as up before that either.
         up &= row <= UP if joint.turns else bool(np.all(row <= trial.travel))
     return up
 

@@ -24,21 +24,21 @@ _PASSES, _PARTS = 2, 12
 _LED = 0.2
 """Share of the training in which the teacher leads some of the plants instead of the pupil, ever fewer."""
 _NEAR, _LOST = 2.0, 6.0
-"""Costs of a deviation up to which an episode starts, and from which on it is given up: the teacher knows no way."""
+"""Costs of a deviation up to which an episode starts, and from which it is aborted for lack of a path."""
 _AT_ENDS = 0.15
 """Shares of the episodes that start at the first node, and at rest upright; the others on the way."""
 _NOISE = 0.02
-"""Standard deviation of what is added to answers, so that states beside the way are seen, as a share of the limit."""
+"""Standard deviation of the noise on commands, which visits states off the trajectory, as a share of the limit."""
 
 
 class Imitation:
-    """A learner like :class:`pendulum_bags.learning.ppo.Ppo` that is told what to do.
+    """A learner like :class:`pendulum_bags.learning.ppo.Ppo` that fits a teacher's commands.
 
     Args:
         environment: The plants; episodes start along the teacher's swing-up.
         settings: Widths of the network and the horizon.
         generator: Draws first weights, starts, noise and the order of the data.
-        teacher: Whom to imitate.
+        teacher: The law to imitate.
     """
 
     def __init__(
@@ -52,13 +52,13 @@ class Imitation:
         self._restart(np.ones(environment.count, dtype=np.bool_))
 
     def update(self, remaining: float = 1.0) -> dict[str, float]:
-        """Gather states with the present policy and fit it to what the teacher would do there.
+        """Gather states with the present policy and fit it to the teacher's commands there.
 
         Args:
             remaining: Share of the training that is left.
 
         Returns:
-            Mean reward a step, mean squared error of the answers as ``divergence``, no spread.
+            Mean reward a step, mean squared error of the commands as ``divergence``, no spread.
 
         Raises:
             FaultError: A parameter is no longer finite.
@@ -81,7 +81,7 @@ class Imitation:
         return {"reward": reward, "divergence": float(np.mean(losses)), "spread": 0.0}
 
     def _gather(self, led: float) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-        """Return observations and what the teacher would answer, shapes (N, k) and (N, m), and the mean reward."""
+        """Return observations and the teacher's commands, shapes (N, k) and (N, m), and the mean reward."""
         env, draw = self.environment, self.generator
         follows = draw.random(env.count) < led
         seen, told, rewards = [], [], []
@@ -111,7 +111,7 @@ class Imitation:
         self.environment.start_at(rows, *self.teacher.around(nodes, _NEAR, self.generator))
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Return what a checkpoint keeps."""
+        """Return the arrays of a checkpoint."""
         kept: dict[str, NDArray[Any]] = {f"actor_{k}": each for k, each in enumerate(self.actor.parameters)}
         return kept | {f"adam_{key}": each for key, each in self._adam.state().items()}
 

@@ -109,7 +109,7 @@ class Adam:
             np.subtract(value, np.float32(size) * m / (np.sqrt(v) + np.float32(1e-7)), out=value)
 
     def state(self) -> dict[str, NDArray[np.generic]]:
-        """Return what a checkpoint keeps."""
+        """Return the arrays of a checkpoint."""
         kept: dict[str, NDArray[np.generic]] = {"count": np.array(self.count)}
         for k, (m, v) in enumerate(zip(self.first, self.second, strict=True)):
             kept[f"first_{k}"], kept[f"second_{k}"] = m, v

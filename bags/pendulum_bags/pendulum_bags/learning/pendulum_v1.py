@@ -50,7 +50,7 @@ class PendulumV1:
         self._left[:] = generator.integers(1, EPISODE + 1, count)
 
     def observe(self) -> tuple[Floats, Floats]:
-        """Return cosine, sine and velocity in units of 8 rad/s, shape (N, 3), and nothing beside."""
+        """Return cosine, sine and velocity in units of 8 rad/s, shape (N, 3), and nothing privileged."""
         seen = np.stack([np.cos(self.angle), np.sin(self.angle), self.velocity / _MOST_SPEED], axis=1)
         return seen.astype(np.float32), np.empty((self.count, 0), dtype=np.float32)
 
@@ -72,7 +72,7 @@ class PendulumV1:
         self._left[which] = EPISODE
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Return what a checkpoint keeps."""
+        """Return the arrays of a checkpoint."""
         return {"angle": self.angle, "velocity": self.velocity, "left": self._left}
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:

@@ -1,6 +1,6 @@
 """Proximal policy optimisation on a batch of environments.
 
-The actor answers with the mean of a normal distribution; the critic also sees what only a simulation knows (the true
+The actor outputs the mean of a normal distribution; the critic also sees what only a simulation has (the true
 plant). The learning rate follows the distance between the old and the new policy.
 
 Sources: Schulman et al., Proximal policy optimization algorithms, 2017, eq. 7; Schulman et al., High-dimensional
@@ -34,7 +34,7 @@ class BatchEnvironment(Protocol):
     action_size: int
 
     def observe(self) -> tuple[Floats, Floats]:
-        """Return what the policy sees, shape (N, observations), and what the critic sees beside, (N, privileged)."""
+        """Return the policy's observations, shape (N, observations), and the critic's further ones, (N, privileged)."""
 
     def step(self, actions: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Take actions of shape (N, actions), within [-1, 1] after a clip; return rewards and whose time is over."""
@@ -212,7 +212,7 @@ class Ppo:
         return moved
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Return what a checkpoint keeps."""
+        """Return the arrays of a checkpoint."""
         kept: dict[str, NDArray[Any]] = {"rate": np.array(self.rate), "log_spread": self.log_spread}
         for name, network in (("actor", self.actor), ("critic", self.critic)):
             kept |= {f"{name}_{k}": each for k, each in enumerate(network.parameters)}

@@ -25,11 +25,11 @@ class SwingUpTask:
     """Swing up from anywhere and hold upright.
 
     Attributes:
-        period: Time between two answers [s].
+        period: Time between two commands [s].
         share: Half width of the range of each parameter, as a share of its value; a plant file's interval, where it
             is wider, counts instead [-].
         delay: Longest mean delay from state to torque; each episode draws one from 0 to this [s].
-        jitter: Standard deviation of the delay from answer to answer [s].
+        jitter: Standard deviation of the delay from command to command [s].
         angle_noise: Standard deviation of measured angles [rad].
         velocity_noise: Standard deviation of measured velocities [rad/s].
         offset: Largest error of the zero angle [rad], and of the torque as a share of the limit [-].

@@ -1,6 +1,6 @@
 """A swing-up with its tracking gains as a law of the state alone, which a network can imitate.
 
-Of all nodes of the swing-up the nearest answers, by the tracking's own cost, and the last node is rest upright::
+Of all nodes of the swing-up the nearest one's law applies, by the tracking's own cost; the last node is upright::
 
     k = argmin_k e_k' P_k e_k,  e_k = x - x_k (wrapped where a joint turns),  u = clamp(u_k - K_k e_k)
 """
@@ -22,7 +22,7 @@ __all__ = ["Teacher", "TeacherAnswers"]
 
 
 class TeacherAnswers(NamedTuple):
-    """What a teacher says of N states.
+    """A teacher's output for N states.
 
     Attributes:
         efforts: Within the limits, shape (N, m) [N m or N].
@@ -38,7 +38,7 @@ class Teacher:
 
     Args:
         plant: A preset with a stored swing-up, or a file of its name.
-        period: Of the answers [s].
+        period: Of the commands [s].
 
     Attributes:
         states: Its nodes, deviations from upright and velocities, shape (K, 2n).
@@ -87,7 +87,7 @@ class Teacher:
         """
         direction = generator.standard_normal((nodes.size, self.states.shape[1]))
         direction /= np.linalg.norm(direction, axis=1)[:, None]
-        # Most of them near: there the answers have to be exact.
+        # Most of them near: there the commands have to be exact.
         direction *= np.sqrt(cost) * generator.random((nodes.size, 1)) ** 2
         states = self.states[nodes] + np.einsum("kij,kj->ki", self._roots[nodes], direction)
         return states, np.where(nodes[:, None] > 0, self.efforts[nodes - 1], 0.0)

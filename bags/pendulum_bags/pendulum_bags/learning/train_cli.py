@@ -35,8 +35,8 @@ _TAUGHT = {
     "kick": 0.05,
 }  # fmt: skip
 _TAUGHT_OFFSET = 1e-3
-"""What differs where a teacher is imitated, unless it is given: a swing-up's gains are high, and where little is known
-of plant and state there is no one answer to learn."""
+"""What differs where a teacher is imitated, unless it is given: a swing-up's gains are high, and where plant and state
+are poorly known there is no single command to learn."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -149,14 +149,14 @@ def _settings(
         if teacher != "none":
             settings = replace(settings, updates=300)
         elif several:
-            # There is more to learn: more steps, actions that go on to vary, and a swing-up is longer than the 2 s that
+            # There is more to learn: more steps, a lasting spread, and a swing-up is longer than the 2 s that
             # the discount of one joint looks ahead.
             settings = replace(settings, ppo=replace(settings.ppo, least_spread=0.1, discount=0.998), updates=1500)
     return replace(settings, updates=updates) if updates else settings
 
 
 def _write_curves(out: Path, settings: Training, curves: Any) -> Path:
-    """Draw the curves of a training, as it returns them, beside the policy file; return the path."""
+    """Draw the curves of a training, as it returns them, next to the policy file; return the path."""
     from pendulum_bags.figures.figure import Figure, Panel, Trace
     from pendulum_bags.figures.render_files import write_figures
 

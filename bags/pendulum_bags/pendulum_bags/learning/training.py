@@ -35,7 +35,7 @@ __all__ = ["EPISODES", "TASKS", "TEACHERS", "TRIALS", "Training", "checkpoint_pa
 
 TASKS = ("swing_up", "pendulum_v1")
 TEACHERS = ("none", "tvlqr")
-"""Whom a policy imitates: nobody, so that it learns from its reward, or the stored swing-up of its plant."""
+"""What a policy imitates: nothing, so that it learns from its reward, or the stored swing-up of its plant."""
 _CHECKPOINT_EVERY = 10
 _LARGEST_CHECKPOINT = 500_000_000
 TRIALS, EPISODES = 60, 100

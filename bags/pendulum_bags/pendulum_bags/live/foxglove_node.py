@@ -37,23 +37,23 @@ _TAKE_PERIOD = 0.02
 """Time between two visits to the middleware [s]: that of a picture, and enough for several messages to go together."""
 _LOOK_PERIOD = 0.3
 _TIMEOUT = 3.0
-"""Longest wait for an answer of a node [s]."""
+"""Longest wait for a response of a node [s]."""
 _NO_PLANT_AFTER = 3.0
-"""Time after which it is said that there is no plant [s]."""
+"""Time after which a missing plant is reported [s]."""
 _BACKLOG = 16384
-"""Messages kept for a client that is slow: two seconds of two plants at 500 Hz with all their topics."""
+"""Messages queued for a slow client: two seconds of two plants at 500 Hz with all their topics."""
 _OF_PARAMETERS = ("rcl_interfaces/", "type_description_interfaces/")
 _E_STOP = f"/{names.E_STOP.removeprefix('~/')}"
 
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Where to listen, and for whom.
+    """Where to listen, and which clients to admit.
 
     Args:
         host: Address to listen on.
         port: Port; 0 for any.
-        token: What a client must bear; empty on loopback.
+        token: Token of a client; empty on loopback.
         origins: Origins of pages that may connect to loopback besides the known viewers.
     """
 
@@ -67,11 +67,11 @@ class LiveNode(PollingNode):
     """Serves what is on the graph to clients of the Foxglove WebSocket protocol.
 
     Args:
-        options: Where to listen, and for whom.
-        stop: Asks the runner to end the process.
+        options: Where to listen, and which clients to admit.
+        stop: Requests the runner to end the process.
 
     Raises:
-        ParameterError: The port cannot be had.
+        ParameterError: The port is not available.
     """
 
     def __init__(self, options: LiveOptions, stop: Callable[[], None]) -> None:
@@ -117,7 +117,7 @@ class LiveNode(PollingNode):
         print(f"handed on {self._sent} messages; {self._lost} were lost on the way from their publishers", flush=True)
 
     def _print_told(self) -> None:
-        """Print what the gate told: its threads would write into the middle of each other's lines and of ours."""
+        """Print the gate's lines here: its threads would write into each other's lines."""
         while not self._told.empty():
             print(self._told.get(), flush=True)
 
@@ -180,7 +180,7 @@ class LiveNode(PollingNode):
             name: types[0]
             for name, types in self.get_service_names_and_types()
             if not (name.startswith(own) or types[0].startswith(_OF_PARAMETERS) or "/_" in name)
-            # A name stays listed for as long as anybody, we too, has a client of it.
+            # A name stays listed as long as any node, this one included, has a client of it.
             and self.count_services(name)
         }
         for name in self._callable.keys() - there.keys():
@@ -194,7 +194,7 @@ class LiveNode(PollingNode):
                 self._unknown.add(name)
                 self.get_logger().warning(f"{name} cannot be called from a viewer: {error}")
                 continue
-            # Made now, and kept: a stop must not wait for a client to find its service.
+            # Created now: a stop must not wait for a client to discover its service.
             self._callable[name] = self.create_client(kind, name)
             self._server.add_services([offered])
 
@@ -218,7 +218,7 @@ class LiveNode(PollingNode):
         return foxglove.Service(name, schema=schema, handler=answer)
 
     def _call(self, client: Any, name: str, request: Any) -> Any:
-        """Ask a node and wait for its answer, in a thread of the server."""
+        """Call a node and wait for its response, in a thread of the server."""
         deadline = time.monotonic() + _TIMEOUT
         while not client.service_is_ready():
             if time.monotonic() > deadline:
@@ -277,7 +277,7 @@ class LiveNode(PollingNode):
 
 
 class _Listener(ServerListener):
-    """What the library asks about parameters.
+    """The library's callbacks for parameters.
 
     Args:
         shown: Returns parameters by their names; all of them where none is named.
@@ -289,11 +289,11 @@ class _Listener(ServerListener):
         self._set_all = set_all
 
     def on_get_parameters(self, client: Any, param_names: list[str], request_id: str | None = None) -> list[Any]:
-        """Answer a viewer that asks for parameters."""
+        """Return parameters to a viewer."""
         return self._shown(param_names)
 
     def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:
-        """Set parameters for a viewer, and answer what is in force then."""
+        """Set parameters for a viewer, and return those in force then."""
         self._set_all(parameters)
         return self._shown([parameter.name for parameter in parameters])
 

@@ -1,7 +1,7 @@
-"""The gate before the websocket server: lets in who may, and carries bytes in both directions.
+"""The gate before the websocket server: admits permitted clients, and carries bytes in both directions.
 
-The server's library asks nobody for a token or an origin, so it listens where only this program finds it, and whoever
-connects comes through here.
+The server's library checks neither token nor origin, so it listens on an address that only this program has, and all
+clients connect through here.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ _END = b"\r\n\r\n"
 
 
 class Gate:
-    """Listens, and connects those who are admitted to a server.
+    """Listens, and connects admitted clients to a server.
 
     Args:
         host: Address to listen on.
         port: Port to listen on; 0 for any.
         server: Address and port of the server behind.
-        refusal: Says why a request is refused, or nothing; called in any thread.
-        tell: Gets a line about each who comes, goes or is refused; called in any thread.
+        refusal: Returns why a request is refused, or nothing; called in any thread.
+        tell: Called with a line on each client that connects, leaves or is refused, in any thread.
 
     Raises:
-        ParameterError: The address or the port cannot be had.
+        ParameterError: The address or the port is not available.
 
     Attributes:
         port: The port that it listens on.
@@ -63,7 +63,7 @@ class Gate:
         self._start(self._accept)
 
     def close(self) -> None:
-        """Listen no more, and hang up on everybody."""
+        """Stop listening, and close all connections."""
         with self._lock:
             self._closing = True
             sockets = [self._listener, *self._open]

@@ -1,7 +1,7 @@
-"""Who may open a websocket: programs and viewers of this machine, pages that the user named, bearers of the token.
+"""Access control of websockets: programs and viewers of this machine, pages that the user named, the token.
 
 A page of any site that is open in a browser here can reach ``localhost``, and would find a service that arms a plant.
-The browser sends the page's ``Origin`` with it, which is what tells it from a viewer.
+The browser sends the page's ``Origin`` with it, which distinguishes it from a viewer.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ VIEWERS = frozenset({"https://app.foxglove.dev", "file://"})
 """Origins that are let in besides those of this machine: Foxglove in a browser, and desktop programs (Electron)."""
 NEWER = "foxglove.sdk.v1"
 OLDER = "foxglove.websocket.v1"
-"""Name under which the same messages went before, and by which Lichtblick asks for them."""
+"""Older name of the same protocol, which Lichtblick requests."""
 _PROTOCOL = "sec-websocket-protocol"
 
 
@@ -38,12 +38,12 @@ class Request:
 
     @property
     def is_websocket(self) -> bool:
-        """Whether a websocket is asked for, and not a page."""
+        """Whether a websocket is requested, and not a page."""
         return self.headers.get("upgrade", "").lower() == "websocket"
 
     @property
     def protocols(self) -> list[str]:
-        """Names of the protocols that the client speaks, in its order."""
+        """Names of the client's protocols, in its order."""
         return [name.strip() for name in self.headers.get(_PROTOCOL, "").split(",") if name.strip()]
 
 
@@ -89,7 +89,7 @@ def to_server(head: bytes) -> bytes:
 
 
 def as_asked(head: bytes, request: Request) -> bytes:
-    """Return the head of the server's answer with the name of the protocol that the client asked for."""
+    """Return the head of the server's response with the name of the protocol that the client requested."""
     if NEWER in request.protocols or OLDER not in request.protocols:
         return head
     return _rename(head, NEWER, OLDER)

@@ -1,4 +1,4 @@
-"""One topic as viewers get it: the bytes of the graph, subscribed to while somebody looks."""
+"""One topic as viewers get it: the bytes of the graph, subscribed to while there is a viewer."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class LiveTopic:
         ImportError: The type of the messages is not installed.
 
     Attributes:
-        sent: Messages that were handed on.
-        lost: Messages that are missing between them, as their numbers tell; counted while one publisher is there.
+        sent: Messages that were passed on.
+        lost: Messages missing between them, by their sequence numbers; counted while there is one publisher.
     """
 
     def __init__(self, node: PollingNode, topic: str, type_name: str, context: Any) -> None:
@@ -51,7 +51,7 @@ class LiveTopic:
         self.lost = 0
 
     def take(self) -> None:
-        """Hand on what has arrived, if anybody looks; subscribe to the topic, or let go of it, as that changes."""
+        """Pass on what has arrived, if there is a viewer; subscribe to the topic, or unsubscribe, as that changes."""
         if not self._channel.has_sinks():
             self._let_go()
             return
@@ -67,11 +67,11 @@ class LiveTopic:
             self._newest = number
 
     def look(self) -> None:
-        """Take note of who publishes: the numbers of several count nothing."""
+        """Update the publishers: sequence numbers of several are of no use."""
         self._has_one_publisher = self._node.count_publishers(self._topic) == 1
 
     def close(self) -> None:
-        """Tell viewers that the topic is gone."""
+        """Close the viewers' channel."""
         self._let_go()
         self._channel.close()
 
@@ -81,8 +81,8 @@ class LiveTopic:
             self._source = self._newest = None
 
     def _subscribe(self) -> PolledInput:
-        # What is kept for latecomers comes to reliable subscribers alone. Of the rest nothing is acknowledged: that
-        # would cost the plants time, for a picture.
+        # Latched messages come to reliable subscribers only. The others are best effort: acknowledging them would cost
+        # the plants time, for a picture.
         _, latched = wanted_qos(self._node.get_publishers_info_by_topic(self._topic))
         profile = QoSProfile(
             depth=_DEPTH,

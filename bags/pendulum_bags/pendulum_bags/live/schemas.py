@@ -1,4 +1,4 @@
-"""Schemas as viewers want them: the text of messages and of both halves of services."""
+"""Schemas in the form that viewers need: the text of messages and of both halves of services."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def service_text(half: Any) -> str:
     """Return the definition of a service's request or response, with those of the messages in it (``ros2msg``).
 
     Args:
-        half: The class, as ``Trigger.Request``; its ``get_fields_and_field_types`` says what it holds.
+        half: The class, as ``Trigger.Request``; its ``get_fields_and_field_types`` lists its fields.
 
     Raises:
         BagError: A message in it is of no known type.

@@ -1,4 +1,4 @@
-"""Pages of HTML that need nothing else, no network and no folder beside them: all that they show is within them."""
+"""Self-contained pages of HTML, without network or further files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def render(
         template: Name of its template.
         figures: All that it shows, each of another name.
         pictures: The same as PNG by name, for paper and for readers without scripts.
-        content: What else the template asks for.
+        content: The template's other variables.
     """
     graphs = {
         figure.name: {f"{figure.name}-{i}": graph for i, graph in enumerate(graphs_of(figure))} for figure in figures
@@ -48,7 +48,7 @@ def render(
 
 
 def render_plain(template: str, **content: Any) -> str:
-    """Return a page of text, tables and pictures, by a template and what it asks for; it explains no terms."""
+    """Return a page of text, tables and pictures, by a template and its variables; it explains no terms."""
     return _render(template, Terms({}), **content)
 
 

@@ -35,7 +35,7 @@ def write_layer_page(
         figures: Drawn in order.
         tables: Before the figures, behind the evidence of each layer.
         notes: Sentences at the end.
-        emulated: Whether an emulator took the place of the hardware; all texts say so then.
+        emulated: Whether the hardware was emulated; all texts name it so then.
 
     Raises:
         BagError: The file cannot be written.
@@ -49,7 +49,7 @@ def write_layer_page(
 
 
 def evidence_table(result: LayerResult) -> Table:
-    """Return what a layer of the answer rests on."""
+    """Return the evidence of a layer of the answer."""
     rows = []
     for row in result.evidence:
         ends = ("–" if end is None else quantity(end) for end in (row.low, row.high))

@@ -19,8 +19,8 @@ class Sentence:
     """A sentence at the top of a page.
 
     Attributes:
-        text: What it says.
-        alarming: Whether nobody should overlook it.
+        text: Its text.
+        alarming: Whether it is highlighted.
     """
 
     text: str
@@ -43,7 +43,7 @@ def write_sheet(
     Args:
         path: File.
         title: Heading.
-        sentences: What it says; the first one stands above everything.
+        sentences: Its sentences; the first one stands above everything.
         tables: Those with rows are shown, between the first picture and the others.
         pictures: PNG files; the first one stands under the first sentence.
         kicker: Line above the heading.

@@ -18,7 +18,7 @@ class Html(str):
     __slots__ = ()
 
     def __html__(self) -> str:
-        """Return itself, as templates ask."""
+        """Return itself, by the protocol of templates."""
         return self
 
 
@@ -194,7 +194,7 @@ _COMMANDS = re.compile(
 
 
 class Terms:
-    """Marks commands and terms in the texts of one page, and knows which terms the page used.
+    """Marks commands and terms in the texts of one page, and records which terms the page used.
 
     Args:
         explained: The terms, by the anchors of their sentences: those of comparisons, or none where words mean others.

@@ -1,4 +1,4 @@
-"""Costs of controllers from folders of runs: studies, or any bags that say which controller ran on which side."""
+"""Costs of controllers from folders of runs: studies, or any bags with metadata of their controller and side."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _collect(folder: Path, weights: Sequence[float], runs: list[_Run], unread: l
         except (PendulumError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             unread.append(f"{record} ({_why(error)})")
     for bag in bags_below(folder):
-        # What repair keeps as BAG.broken has its whole messages in BAG.
+        # The whole messages of BAG.broken, which repair leaves, are in BAG.
         repaired = ".broken" in bag.name and bag.with_name(bag.name.split(".broken")[0]).exists()
         if repaired or any(parent in studied for parent in (bag.resolve(), *bag.resolve().parents)):
             continue
@@ -171,7 +171,7 @@ def _recorded_run(bag: Path, weights: Sequence[float]) -> _Run | None:
 
 
 def _name(told: Mapping[str, Any]) -> str:
-    """Return the name of the controller that a run tells of; two policies of one file name are two."""
+    """Return the name of a run's controller; two policies of one file name are two."""
     controller = told["controller"]
     digest, file = told.get("policy_sha256"), controller.get("policy")
     if isinstance(digest, str) and isinstance(file, str):

@@ -5,7 +5,7 @@ such pairs (s_i, h_i), and N more simulated runs, the mean cost on the hardware 
 
     h = mean h_i + b (mean of all n + N simulated costs - mean s_i),    b from the n pairs
 
-The simulation need not be right: its bias cancels, and one that tells nothing has b = 0 in the mean. The variance is
+The simulation need not be right: its bias cancels, and an uncorrelated one has b = 0 in the mean. The variance is
 that of the regression's residuals, at n - 2 degrees of freedom, and what N leaves uncertain of the simulation's mean.
 
 Source: Cochran, Sampling Techniques, 3rd ed., 1977, section 12.6 (double sampling with regression); Angelopoulos et

@@ -24,7 +24,7 @@ from pendulum_rosbag.reader import read_bag
 __all__ = ["COST", "DURATION", "FOLDER", "joint_cost_parts", "rank_joints", "rankable"]
 
 FOLDER = "ranking"
-"""Folder within a run folder that holds the recordings of all designs, and what they tell."""
+"""Folder within a run folder that holds the recordings of all designs, and their ranking."""
 COST = "Cost: mean of x' Q x + u' R u with the weights of the plant's own LQR, whatever design ran."
 DURATION = 5.0
 """Longest noise of each run [s]."""
@@ -88,22 +88,22 @@ def rank_joints(
     on_run: Callable[[str], None] = lambda what: None,
     on_wait: Callable[[], None] = lambda: None,
 ) -> Ranking:
-    """Record every design on both sides under every seed, and return what their costs say about the simulation.
+    """Record every design on both sides under every seed, and return the ranking of their costs.
 
     Args:
         folder: Where the recordings go.
         settings: Plant and noise; the seed is taken from ``seeds``.
-        machine: Plant file that stands in for the machine.
+        machine: Plant file of the surrogate of the machine.
         designs: As :func:`rankable` returns them.
         seeds: Of the noise; one alone gives no interval.
         hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
-        on_run: Told which run begins.
+        on_run: Called with the text of each run that starts.
         on_wait: Called while waiting.
 
     Raises:
         BagError: A bag exists, or cannot be written.
         DataError: Fewer than two designs hold the plant on both sides.
-        FaultError: A program ended or did not answer.
+        FaultError: A program ended or did not respond.
     """
     plant = load_mechanism(settings.plant)
     folder.mkdir(parents=True, exist_ok=True)

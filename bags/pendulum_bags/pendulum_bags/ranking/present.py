@@ -202,7 +202,7 @@ def write_ranking(
         formats: Of the figure.
         words: How its runs were made.
         notes: Sentences at the end of the page.
-        emulated: Whether an emulator took the place of the hardware; figure and page say so then.
+        emulated: Whether the hardware was emulated; figure and page name it so then.
         case: The plants that ran.
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -57,7 +57,7 @@ class WrongPair:
 
 @dataclass(frozen=True)
 class Ranking:
-    """What a set of contenders says about a simulation.
+    """A simulation's ranking of a set of contenders, judged by the hardware's.
 
     Attributes:
         names: Contenders, best on the hardware first.
@@ -75,7 +75,7 @@ class Ranking:
         failures: Contenders that fail on one side only.
         pick_failed: How many of the pick's runs on the hardware failed.
         pick_runs: How many there were.
-        no_interval: Why the regret has no interval, in words; empty where it has one.
+        no_interval: Why the regret has no interval, as text; empty where it has one.
     """
 
     names: Sequence[str]
@@ -112,7 +112,7 @@ def _mmrv(sim: Array, hw: Array) -> Array:
 
 
 def rank(contenders: Sequence[Contender], generator: np.random.Generator | None = None) -> Ranking:
-    """Return what contenders say about a simulation.
+    """Return a simulation's ranking of contenders, judged by the hardware's.
 
     Args:
         contenders: At least three, with runs on both sides.

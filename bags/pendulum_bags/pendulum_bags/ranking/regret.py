@@ -20,8 +20,8 @@ def regret_share(contenders: Sequence[Contender], pick: int) -> tuple[Interval, 
 
     The regret is the largest of the pick's shares over all others. Its upper limit is the largest of their upper
     limits by Student's t over the runs: the true best is among them, so that no correction is due. The lower limit is
-    the largest of the lower ones, corrected for their number (Bonferroni). Resampled runs would not do: three of which
-    all lie low know nothing of what lies higher.
+    the largest of the lower ones, corrected for their number (Bonferroni). Resampling runs would not do: three runs
+    that all happen to be low carry no information on higher values.
 
     A pick that fails on the hardware has an infinite regret, and so has one that costs something where another costs
     nothing. The ends are NaN, with a reason, where neither the pick nor another was repeated.

@@ -33,15 +33,15 @@ SETTLED = 1e-9
 
 @dataclass(frozen=True)
 class ControllerReplay:
-    """What a controller would have commanded, beside what was commanded.
+    """What a controller would have commanded, and what was commanded.
 
     Args:
         controller: Its name.
         description: Its gains in one line.
-        t: Time of each state that was answered, since the first of them, shape (n,) [s].
+        t: Time of each state that got a command, since the first of them, shape (n,) [s].
         recorded: Torque that was commanded, shape (n,) [N m].
-        replayed: Torque that the controller answers now, shape (n,) [N m].
-        unanswered: States between the first and the last answer that nobody answered.
+        replayed: Torque of the controller now, shape (n,) [N m].
+        unanswered: States between the first and the last command that got none.
     """
 
     controller: str
@@ -107,7 +107,7 @@ def recorded_controller(metadata: Mapping[str, Any]) -> tuple[str, dict[str, Any
     """Return name, parameters and plant of the controller that made a recording, from the bag's metadata.
 
     Raises:
-        DataError: The bag does not tell.
+        DataError: The bag lacks it.
     """
     run = run_record(metadata)
     told = run.get("controller")
@@ -128,7 +128,7 @@ def replay_controller(
     values: Mapping[str, object] | None = None,
     prefix: str | None = None,
 ) -> ControllerReplay:
-    """Feed the states of a bag to a controller, in order, and pair its answers with the recorded ones by their stamp.
+    """Feed the states of a bag to a controller, in order, and pair its commands with the recorded ones by their stamp.
 
     Args:
         path: Bag with ``joint_states`` and ``effort_command``.
@@ -138,7 +138,7 @@ def replay_controller(
         prefix: Namespace of the topics; None for that of the only plant.
 
     Raises:
-        DataError: The bag lacks states or commands, or no command answers a state.
+        DataError: The bag lacks states or commands, or no command has the stamp of a state.
         ParameterError: No such controller or plant, or a value out of domain.
     """
     with read_bag(path) as bag:

@@ -32,7 +32,7 @@ def replay_fit(recording: Recording, plant: str | Path | PlantParameters, *, win
 
     Args:
         recording: Data with any input.
-        plant: Plant file with the JSON of its identification beside it, or that JSON; for a free swing any rigid plant.
+        plant: Plant file with its identification's JSON next to it, or that JSON; for a free swing any rigid plant.
         window: Length of the windows [s], > 0.
 
     Raises:

@@ -46,16 +46,16 @@ def replay_recording(
         plant: Plant file, preset or parameters.
         window: Length of the windows [s].
         mapping: Mapping file of a CSV.
-        hold: Of the input of a CSV, ``zero`` or ``linear``; by default what its mapping says.
+        hold: Of the input of a CSV, ``zero`` or ``linear``; by default that of its mapping.
         effort: For bags, ``applied`` or ``measured`` torque.
         start: Leave out what comes before, from the beginning of the recording [s].
         stop: Leave out what comes after [s].
         namespace: For bags with several plants, such as ``/sim``.
 
-    A voltage, a set point or a free swing drives the fit that identification left beside the plant file.
+    A voltage, a set point or a free swing drives the fit that identification wrote next to the plant file.
 
     Raises:
-        DataError: The recording is damaged, or nothing here takes its input.
+        DataError: The recording is damaged, or its input is not supported.
         ParameterError: The plant file is refused.
     """
     recording = read_recording(path, mapping, effort=effort, namespace=namespace, hold=hold)

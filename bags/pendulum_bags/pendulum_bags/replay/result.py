@@ -43,7 +43,7 @@ class HorizonError:
 
 @dataclass(frozen=True)
 class InputReplay:
-    """A plant driven by a recorded input, beside what was measured.
+    """A plant driven by a recorded input, and the measurement.
 
     Args:
         name: Name of the recording.
@@ -55,7 +55,7 @@ class InputReplay:
         window_time, window_angle: Simulated angle in windows, shape (n,) [s], [rad].
         time, measured, free_run: Measured angle, and simulated from the first state alone, shape (n,) [s], [rad].
         horizons: Errors of predictions over growing horizons.
-        driven_by: What drove the plant, in words.
+        driven_by: What drove the plant, as text.
     """
 
     name: str

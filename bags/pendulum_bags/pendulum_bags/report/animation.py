@@ -1,4 +1,4 @@
-"""The animation of a report: both plants drawn over each other, small deviations enlarged and said to be."""
+"""The animation of a report: both plants drawn over each other, small deviations enlarged and labelled so."""
 
 from __future__ import annotations
 

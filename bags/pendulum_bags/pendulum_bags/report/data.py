@@ -31,17 +31,17 @@ __all__ = ["ReportData", "read_trials"]
 
 @dataclass(frozen=True)
 class ReportData:
-    """Everything that figures and tables draw on.
+    """The data of all figures and tables.
 
     Args:
         comparison: The comparison.
         summary: Content of ``summary.json``.
-        replays: Real recordings driven through our plant.
+        replays: Real recordings driven through the plant's model.
         names: Names of the run folders.
         trials: The thesis's identification experiments, where they were recorded.
         answer: The sum of all layers that were measured; by default of the comparison alone.
         certified: Which designs carry over to the hardware, where its frequency response was measured.
-        open_bag: How a bag is opened that tells more than the comparison.
+        open_bag: How a bag is opened for data beyond the comparison.
     """
 
     comparison: Comparison
@@ -60,7 +60,7 @@ class ReportData:
 
     @property
     def run(self) -> Mapping[str, Any]:
-        """Return what the simulation's bag says about its run."""
+        """Return the simulation's bag's metadata of its run."""
         return run_record(self.comparison.pairs[0].simulation.metadata)
 
     @cached_property
@@ -69,14 +69,14 @@ class ReportData:
         try:
             return load_plant(str(self.run.get("plant", "thesis")))
         except ParameterError:
-            # The file that the run was made with is gone: figures of the model are left out, and say so.
+            # The file that the run was made with is gone: figures of the model are left out, with this reason.
             return None
 
 
 def read_trials(folder: str | os.PathLike[str]) -> TrialSet:
     """Read the bags ``trial_1``, ``trial_2``, ... of a folder and regress them as the thesis does.
 
-    Staircases are told from motions by hand by their holds.
+    Staircases are distinguished from motions by hand by their holds.
 
     Raises:
         BagError: A bag cannot be read.

@@ -22,7 +22,7 @@ Maker = Callable[[ReportData], Figure | str]
 
 
 def _of_experiment(number: int, draw: Callable[[TrialSet], Figure | str]) -> Maker:
-    """Return what draws a figure from the trials of an experiment, or says that it needs them."""
+    """Return a function that draws a figure from an experiment's trials, or returns that they are missing."""
     kind = {1: "inertia_damping", 2: "gravity"}[number]
 
     def make(data: ReportData) -> Figure | str:
@@ -33,7 +33,7 @@ def _of_experiment(number: int, draw: Callable[[TrialSet], Figure | str]) -> Mak
 
 
 def _certified(draw: Callable[[Analysis, Certifier], Figure]) -> Maker:
-    """Return what draws a figure of the designs that carry over to a measured machine, or says that it needs one."""
+    """Return a function that draws a figure of certified designs, or returns that a measured machine is missing."""
 
     def make(data: ReportData) -> Figure | str:
         found = data.certified

@@ -30,10 +30,10 @@ def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: 
     Args:
         comparisons: The comparison of each joint, by its name, at least one.
         answer: The answer for all joints.
-        title: What the page is about.
+        title: Heading of the page.
     """
     first = next(iter(comparisons.values()))
-    # What a bag says of its run it says of all joints.
+    # The bag's metadata of its run hold for all joints.
     data = ReportData(first, {"seed": seed_of(first.pairs[0].simulation)}, answer=answer)
     differences = joint_differences(comparisons)
     figures = [

@@ -87,7 +87,7 @@ def gravity_fit(data: ReportData) -> Figure | str:
     gives = "; ".join(words)
     sentence = f"Least squares of the measured torque on sin θ, θ′ and a constant over the way up gives {gives}."
     if len(panels) == 2 and "strategy" in run_record(data.comparison.pairs[0].hardware.metadata):
-        # 11.8 beside 0.002 would look like a wrong model.
+        # 11.8 next to 0.002 would suggest a wrong model.
         sentence += (
             " G is comparable, b is not: the simulation's torque overcomes the motor's damping as well, while the "
             "spring of a series-elastic actuator measures only what reaches the link."
@@ -104,7 +104,7 @@ def gravity_fit(data: ReportData) -> Figure | str:
 
 
 def replay(data: ReportData) -> Figure | str:
-    """Return measured and simulated angle of a real pendulum that our plant was driven beside."""
+    """Return measured and simulated angle of a real pendulum under its recorded input."""
     if not data.replays:
         return "no recording of a real pendulum is at hand"
     return data.replays[0].figure()

@@ -1,4 +1,4 @@
-"""The report as one HTML file that needs nothing else: no network, no folder beside it."""
+"""The report as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -40,39 +40,39 @@ SECTIONS = (
 
 
 OF_ONE_RUN = ("Paired comparison", "Plants under noise", "The thesis's analysis", "Dynamic phase", "Timing")
-"""Sections that show the first run only, where there are several, and say so."""
+"""Sections that show the first run only, where there are several, with a note."""
 FOLDED = (
     "Repeated runs", "The thesis's analysis", "Dynamic phase", "Timing", "Experiment 1: inertia and damping",
     "Experiment 2: gravity", "Model", "A real pendulum",
 )  # fmt: skip
-"""Sections that are closed when the page opens: the answer does not rest on them."""
+"""Sections that are closed when the page opens: the answer does not depend on them."""
 _LEADS = ("both_together", "joints_together")
-"""Figures whose first panel stands beside the answer, too."""
+"""Figures whose first panel is also next to the answer."""
 _MOST_SEEDS = 3
 """Seeds at the head of a page; the table of provenance has them all."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """What stands on a report.
+    """The contents of a report.
 
     Attributes:
         title: What it is about.
         answer: The answer, with its layers.
         hardware: What the simulation was compared with, as in sentences.
-        emulated: Whether an emulator stood in for the hardware; all texts say so then.
+        emulated: Whether the hardware was emulated; all texts name it so then.
         is_paired: Whether both sides had one disturbance.
         facts: Names and values at the head.
         notes: Sentences below the answer, such as what was left out.
         figures: Figures, drawn on the page by a script.
         tables: Tables.
         provenance: Tables of where the data come from.
-        stand_in: What stood in for the hardware where none was measured.
-        animation: What moves, as :func:`pendulum_bags.report.animation.animation_of` says; None for nothing.
+        stand_in: The surrogate of the hardware where none was measured.
+        animation: Output of :func:`pendulum_bags.report.animation.animation_of`; None for no animation.
         missing: Figures that the data do not allow, each with the reason.
-        runs: How many runs there are; sections that show the first of several say so.
-        unpaired: The answer without pairs, told with the thesis's analysis.
-        noise_note: A sentence about noise that was held differently, told there too.
+        runs: How many runs there are; sections that show the first of several have a note.
+        unpaired: The answer without pairs, shown with the thesis's analysis.
+        noise_note: A sentence about noise that was held differently, shown there too.
     """
 
     title: str
@@ -200,7 +200,7 @@ def _without_mark(answer: Answer) -> str:
 
 
 def _noise_note(data: ReportData) -> str:
-    """Say how long each side held its noise, where that differs: it matters more than the plant."""
+    """Return how long each side held its noise, where that differs: it matters more than the plant."""
     hold = data.comparison.unpaired["noise_hold_time"]
     sim, hw = hold["sim"], hold["hw"]
     if not sim or not hw or abs(sim - hw) < 1e-6:

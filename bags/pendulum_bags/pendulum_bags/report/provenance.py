@@ -32,7 +32,7 @@ def provenance_table(data: ReportData) -> Table:
     summary, run = data.summary, data.run
     revision = str(run.get("git_revision") or summary.get("git_revision") or "unknown")
     rows: list[tuple[str, str]] = [
-        # Of several runs each tells its own below.
+        # Of several runs each has its own below.
         *([("seed", str(summary.get("seed", "unknown")))] if len(data.comparison.pairs) == 1 else []),
         ("effort strategy", str(summary.get("strategy", "unknown"))),
         ("revision", revision),
@@ -66,7 +66,7 @@ def provenance_table(data: ReportData) -> Table:
 def _runs(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
     """Return the bags of every run; of several runs each run's seed, command, revision and versions too."""
     rows = []
-    # That of the first run is told already.
+    # That of the first run is listed already.
     commands = {"", str(run_record(pairs[0].simulation.metadata).get("command", ""))}
     for number, pair in enumerate(pairs, start=1):
         of = f"run {number}, " if len(pairs) > 1 else ""
@@ -101,12 +101,12 @@ def _made_with(pair: Pair) -> str:
 
 
 def seed_of(run: RunData) -> str:
-    """Return the seed that a run's bag tells."""
+    """Return the seed of a run's bag."""
     return str(run_record(run.metadata).get("seed", "unknown"))
 
 
 def _occasion(data: ReportData) -> list[tuple[str, str]]:
-    """Return when, on which computers and by which command the first run was recorded, as far as its bags say."""
+    """Return when, on which computers and by which command the first run was recorded, as far as its bags have it."""
     rows = []
     if when := _began(data):
         rows.append(("recorded", f"{when:%Y-%m-%d %H:%M} UTC"))
@@ -129,7 +129,7 @@ def _began(data: ReportData) -> datetime | None:
 
 
 def emulator_table(data: ReportData) -> Table | None:
-    """Return the constants of the emulator of the first run; None where none was used, or its bag does not tell."""
+    """Return the constants of the emulator of the first run; None where none was used, or its bag lacks them."""
     hardware = data.comparison.pairs[0].hardware
     plant = _emulated_plant(hardware, data.open_bag) if is_emulated(hardware) else None
     if plant is None:
@@ -148,7 +148,7 @@ def emulator_table(data: ReportData) -> Table | None:
 
 
 def _emulated_plant(run: RunData, open_bag: OpenBag) -> PlantParameters | None:
-    """Return the plant with a drivetrain that a run's diagnostics tell of."""
+    """Return the plant with a drivetrain of a run's diagnostics."""
     space = str(run_record(run.metadata).get("namespace", "")).rstrip("/") + "/"
     try:
         with open_bag(run.source) as bag:
@@ -195,7 +195,7 @@ def _setting(value: Any) -> str:
 
 
 def citation(version: str, revision: str, year: str = "n.d.") -> str:
-    """Return how to cite the software that made a report, in APA style, with what CITATION.cff says.
+    """Return how to cite the software that made a report, in APA style, by CITATION.cff.
 
     Args:
         version: Of the software; empty where it is unknown.
@@ -217,6 +217,6 @@ def _plant_in_words(plant: PlantParameters) -> str:
 
 
 def _short_path(path: str) -> str:
-    """Return run folder and bag, of a repeat what lies between: the rest of the path is nobody else's business."""
+    """Return run folder and bag, of a repeat what lies between: the rest of the path is private."""
     parts = Path(path).parts
     return "/".join(parts[-4:] if parts[-3:-2] == (REPEATS,) else parts[-2:])

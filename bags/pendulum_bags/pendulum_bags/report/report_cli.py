@@ -123,7 +123,7 @@ def report(
 
 
 def _of_joint(folder: Path, joint: str) -> dict[str, object] | None:
-    """Return what the run's own comparison says of a joint; a damaged or missing one is no obstacle."""
+    """Return the run's own comparison of a joint; empty if damaged or missing."""
     try:
         content = json.loads((folder / "comparison.json").read_text(encoding="utf-8"))
         found = content["joints"][joint]
@@ -133,7 +133,7 @@ def _of_joint(folder: Path, joint: str) -> dict[str, object] | None:
 
 
 def _summary(folder: Path) -> dict[str, object] | None:
-    """Return the run's own summary: it knows what was set; a damaged one is no obstacle."""
+    """Return the run's own summary, which has its settings; a damaged one is ignored."""
     try:
         content = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -34,7 +34,7 @@ def make_tables(data: ReportData) -> list[Table]:
 
 
 def _is_further(result: LayerResult) -> bool:
-    """Return whether a layer was measured beside the tests of the run, which have a table of their own."""
+    """Return whether a layer was measured apart from the tests of the run, which have a table of their own."""
     return result.layer is not Layer.SAME_RUN and result.mark is not Mark.NOT_MEASURED and bool(result.evidence)
 
 

@@ -55,11 +55,11 @@ def write_report(
         comparison: A comparison that has been made already.
         folders: Run folders to pool.
         trials: Folders of the thesis's identification experiments, each with bags ``trial_1``, ``trial_2``, ...
-        recordings: Recordings of real pendulums to replay; ``None`` for the one that lies beside the project, if any:
-            the project's own experiment shows that one, a report of other runs only what was asked for.
+        recordings: Recordings of real pendulums to replay; ``None`` for the one next to the project, if any:
+            the project's own experiment shows that one, a report of other runs only those given.
         formats: Formats of the figures.
-        answer: The sum of all layers; by default of the comparison and of what the run folder keeps.
-        certified: Which designs carry over to the measured machine; by default as the run folder's response says.
+        answer: The sum of all layers; by default of the comparison and of the run folder.
+        certified: Which designs carry over to the measured machine; by default by the run folder's response.
         open_bag: How bags are opened.
 
     Returns:
@@ -127,7 +127,7 @@ def write_joint_report(
 def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
     """Write the figures, then the page with the same figures for paper."""
     figures = [name_in(figure, emulated=page.emulated) for figure in page.figures]
-    # Paper has no scripts: whoever prints the page gets these pictures.
+    # Paper has no scripts: a printed page has these pictures.
     drawn = write_figures(figures, out / "figures", formats)
     text = render_page(page, {path.stem: _for_paper(path) for path in drawn if path.suffix == ".png"})
     target = out / "report.html"
@@ -158,9 +158,9 @@ def title_of(folders: Sequence[Path], runs: int) -> str:
 
 
 def find_real_recording() -> Path | None:
-    """Return the recording of a real pendulum that lies beside the project, None where there is none.
+    """Return the recording of a real pendulum next to the project, None where there is none.
 
-    ``PENDULUM_SHARED_DATA`` names the folder of recordings; by default it is looked for as ``shared/data`` beside
+    ``PENDULUM_SHARED_DATA`` names the folder of recordings; by default it is ``shared/data`` next to
     the folder that holds this checkout.
     """
     told = os.environ.get("PENDULUM_SHARED_DATA")
@@ -174,7 +174,7 @@ def _replay(path: Path, *, required: bool) -> list[InputReplay]:
     try:
         return [replay_recording(path, "dfki")]
     except PendulumError:
-        # What merely lies beside the project must not cost us the report; what was asked for must.
+        # A recording that happens to be there must not break the report; a requested one must.
         if required:
             raise
         return []

@@ -1,4 +1,4 @@
-"""Work in numbered pieces: here or on a Dask cluster, kept on disk, gone on with after an interruption.
+"""Work in numbered pieces: here or on a Dask cluster, stored on disk, continued after an interruption.
 
 A piece is a pure function of a job and its number, so a result depends neither on the number of workers nor on the
 order in which they finish, and a worker that dies costs time only.
@@ -140,7 +140,7 @@ def cluster_client(scheduler: str = "", workers: int = 0) -> Iterator[Any]:
         with closing(client):
             yield client
         return
-    # What it says of a worker that died and was replaced is for those who run a cluster, not for whom it serves; its
+    # Its log of workers that died and were replaced is for administrators of clusters, not for users; its
     # status page takes any free port of this machine alone, so that two clusters do not meet on the usual one.
     local = LocalCluster(
         n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL
@@ -170,13 +170,13 @@ def _on_cluster(
 
 
 def open_results(folder: Path, what: str, fingerprint: str, settings: Mapping[str, Any]) -> None:
-    """Make the folder of results, or check that the one that is there holds results of the same settings.
+    """Make the folder of results, or check that an existing one holds results of the same settings.
 
     Args:
         folder: Where the results go.
         what: Their name, for messages.
         fingerprint: Hash of all that they depend on.
-        settings: For whoever reads the folder.
+        settings: For readers of the folder.
 
     Raises:
         BagError: The folder holds something else.
@@ -206,7 +206,7 @@ def kept_settings(folder: Path, fingerprint: str) -> dict[str, Any]:
 
 
 def write_results_marker(folder: Path, fingerprint: str, settings: Mapping[str, Any]) -> None:
-    """Say in the folder what its results are of."""
+    """Write into the folder what its results are of."""
     write_json(folder / _MARKER, {"fingerprint": fingerprint, "settings": settings})
 
 

@@ -209,7 +209,7 @@ def entry_of(
         plant: As the board names it.
         controller: Kind.
         run: Carries out the plain run.
-        perturbed: Kind and runs of each perturbation; not asked for where the plain run fails.
+        perturbed: Kind and runs of each perturbation; not evaluated where the plain run fails.
         patience: Wall time of the plain run beyond which no perturbation is tried [s].
     """
     began = time.perf_counter()

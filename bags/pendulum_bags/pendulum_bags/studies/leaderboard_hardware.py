@@ -101,7 +101,7 @@ def evaluate_hardware(
         "design_plant": _PLANT,
         "strategy": _STRATEGY,
         "controller": controller,
-        # A bridge lets nobody begin with much torque, and a hanging pendulum asks a swing-up for all of it.
+        # A bridge refuses to start with much torque, and a swing-up from hanging needs all of it.
         "controller_parameters": {"start_time": START_TIME, **(parameters or {})},
         "theta": 0.01,
         "duration": duration,
@@ -112,7 +112,7 @@ def evaluate_hardware(
             for kind, vary in HARDWARE_PERTURBATIONS.items() if robustness else ():
                 yield kind, [partial(run, RunSpec(**{**spec, **change})) for change in vary(Path(folder), duration)]
 
-    # Not those of whoever started this process: lines are computed at once, in forks of it.
+    # Not the hosts of the parent process: lines are computed at once, in forks of it.
     with HostPool() if hosts is None else nullcontext(hosts) as pool:
         run = partial(_run, hosts=pool)
         return entry_of(HARDWARE, controller, lambda: run(RunSpec(**spec)), perturbed(run))
@@ -125,7 +125,7 @@ def _run(spec: RunSpec, hosts: HostPool) -> RunArrays:
 
 @contextmanager
 def _any_domain() -> Iterator[None]:
-    """Let a run find a free ROS domain, whoever else runs beside it and whatever the user's is."""
+    """Let a run find a free ROS domain, whatever other runs there are and whatever the user's is."""
     own = os.environ.pop("ROS_DOMAIN_ID", None)
     try:
         yield

@@ -59,7 +59,7 @@ def write_page(path: Path, entries: Sequence[Entry], duration: float) -> Path:
 
 
 def best_sentence(entries: Sequence[Entry]) -> str:
-    """Return who is first on each plant, and by how much."""
+    """Return the best controller on each plant, and its lead, as a sentence."""
     said = []
     for plant in dict.fromkeys(entry.plant for entry in entries):
         able = [entry for entry in entries if entry.plant == plant and entry.success]

@@ -1,4 +1,4 @@
-"""YAML with the line of each value, so that an error in a study file says where it is."""
+"""YAML with the line of each value, so that an error in a study file has its place."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Trail = tuple[Any, ...]
 
 
 class LocatedMapping:
-    """A mapping out of a YAML file that knows the lines of its keys.
+    """A mapping from a YAML file with the lines of its keys.
 
     Args:
         values: The mapping.

@@ -149,7 +149,7 @@ def criteria_of(plant: MechanismParameters, times: Array, states: Array, efforts
     """Return the criteria of a recorded swing-up.
 
     ``swingup_time`` is when the tip rises above the line for good, the last sample's time where it never does; like the
-    public implementation it looks at neither the first nor the last sample.
+    public implementation it ignores the first and the last sample.
 
     Args:
         plant: The plant.

@@ -1,4 +1,4 @@
-"""The swing-ups of a benchmark as a picture that a greyscale print keeps."""
+"""The swing-ups of a benchmark as a picture that is readable in a greyscale print."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def write_swing_up_figure(path: Path, plant: MechanismParameters, rows: Sequence
     """Draw the best swing-up as a row of poses, and height and torque of all over time; return the path.
 
     Args:
-        path: The picture; its ending says of what kind.
+        path: The picture; its suffix is the format.
         plant: The plant.
         rows: What was run.
     """

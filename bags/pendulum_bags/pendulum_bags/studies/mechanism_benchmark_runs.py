@@ -104,7 +104,7 @@ class Disturbances:
     """What is done to a run.
 
     Attributes:
-        values: Parameters of the plant that the controller does not know, by name.
+        values: Parameters of the plant that differ from the controller's model, by name.
         damping: b of each joint, below zero too [N m s/rad].
         coulomb: c of each joint, in c arctan(100 v), below zero too [N m].
         velocity_noise: Standard deviation of the noise on measured velocities [rad/s].
@@ -193,9 +193,9 @@ def simulate(
     """Return a run from hanging at rest.
 
     Args:
-        plant: The plant that the controller believes in; what it does not know is in ``disturbances``.
+        plant: The plant of the controller's model; differences from it are in ``disturbances``.
         stepper: Of :func:`make_stepper`.
-        answer: Torques of both joints that answer (time, measured state).
+        answer: Torques of both joints for (time, measured state).
         steps: Steps of 2 ms.
         disturbances: None for none.
         seed: Of the noise.
@@ -254,7 +254,7 @@ def robustness_trials(plant: MechanismParameters, seed: int = 1) -> list[Trial]:
 
     Args:
         plant: The plant.
-        seed: Of noise and kicks; the public implementation draws them anew each time.
+        seed: Of noise and kicks; the public implementation draws new ones each time.
     """
     trials: list[Trial] = []
 

@@ -1,4 +1,4 @@
-"""What several runs of a named experiment say together: equivalence over all noises, parameters over all hands."""
+"""Pooled results of several runs of a named experiment: equivalence over all noises, parameters over all hands."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _number(value: float | None) -> float:
 def _alike(runs: Sequence[tuple[StudyRun, Path]]) -> dict[tuple[str, ...], list[Path]]:
     """Return the folders of runs that differ in their seed alone; a seed that was repeated counts once.
 
-    The same noise again is no independent run, and runs of other plants or controllers answer another question.
+    The same noise again is no independent run, and runs of other plants or controllers are of another question.
     """
     groups: dict[tuple[str, ...], dict[Any, Path]] = {}
     for run, place in runs:

@@ -110,7 +110,7 @@ class RandomRuns(ABC):
 
     @abstractmethod
     def summarise(self, folder: Path) -> dict[str, Any]:
-        """Return what the files of a folder say, by :func:`figures_of_runs`."""
+        """Return the figures of a folder's files, by :func:`figures_of_runs`."""
 
     @property
     def steps(self) -> int:
@@ -185,10 +185,10 @@ def run_monte_carlo(
     connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Run all chunks that are not on disk yet, one Parquet file each, sum up and write that beside them.
+    """Run all chunks that are not on disk yet, one Parquet file each, sum up and write that next to them.
 
     Args:
-        folder: Where the files go; a folder of the same settings is gone on with, one of fewer runs is added to.
+        folder: Where the files go; a folder of the same settings is continued, one of fewer runs is added to.
         settings: What to run.
         connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
         on_progress: Called with chunks done and in all.
@@ -230,7 +230,7 @@ def figures_of_runs(
         settings: Of the Monte Carlo.
         columns: To read; each has its quantiles.
         farthest: Returns each run's farthest distance from upright, of the columns.
-        row: Returns what is told of one of the worst runs, by its number and its distance.
+        row: Returns the entry of one of the worst runs, by its number and its distance.
     """
     parts: dict[str, list[Array]] = {name: [] for name in columns}
     for index in range(settings.chunks):

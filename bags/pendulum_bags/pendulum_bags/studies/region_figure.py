@@ -1,4 +1,4 @@
-"""The map of starts as a picture that a greyscale print keeps: shares as greys, curves told apart by their dashes."""
+"""The map of starts as a picture for greyscale prints too: shares as greys, curves with different dashes."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class _Picture:
     Attributes:
         x, y: Deviations from upright along both axes, shape (n,) each.
         labels: Of both axes.
-        curve: Edge of a region that something else tells, shape (k, 2).
-        told: What that is, for the legend.
+        curve: Edge of a region from another source, shape (k, 2).
+        told: Its text in the legend.
         title: Above all.
     """
 
@@ -59,7 +59,7 @@ def write_region_figure(path: Path, result: RegionResult | JointRegionResult) ->
     """Draw the map and return the path.
 
     Args:
-        path: The picture; its ending says of what kind.
+        path: The picture; its suffix is the format.
         result: The map.
     """
     from matplotlib import patheffects
@@ -97,7 +97,7 @@ def write_region_figure(path: Path, result: RegionResult | JointRegionResult) ->
 
 
 def region_sentence(result: RegionResult | JointRegionResult) -> str:
-    """Return what the map says."""
+    """Return the map's result as a sentence."""
     plants = result.settings.plants
     runs, reached = plants * result.share.size, 100.0 * float(result.share.mean())
     sure, never = (100.0 * float(np.mean(result.share == share)) for share in (1.0, 0.0))

@@ -1,4 +1,4 @@
-"""What the runs of a study say: metrics of each run, and means with intervals over seeds."""
+"""Results of a study's runs: metrics of each run, and means with intervals over seeds."""
 
 from __future__ import annotations
 

@@ -59,9 +59,9 @@ def default_workers(study: Study) -> int:
 
 
 def open_study_folder(folder: Path, study: Study) -> Study:
-    """Make the folder of a study, or check that the one that is there holds this study, or less of it.
+    """Make the folder of a study, or check that an existing one holds this study, or less of it.
 
-    A study may grow: by seeds, repeats, plants, whatever its file is given. What was carried out keeps its number.
+    A study may grow: by seeds, repeats, plants or other entries of its file. Finished runs keep their numbers.
 
     Returns:
         The study, with the numbers that its runs have in the folder.
@@ -89,9 +89,9 @@ def _write_study(folder: Path, study: Study) -> None:
 
 
 def _renumbered(runs: Sequence[StudyRun], known: Mapping[str, str], folder: Path) -> tuple[StudyRun, ...]:
-    """Give runs the numbers under which a folder knows them, and new ones those behind.
+    """Give runs their numbers in a folder, and new runs the next ones.
 
-    What a run is called but its number, and what it is made of, tell which it is; repeats are told by their order.
+    A run is identified by its name without the number, and by its parts; repeats by their order.
     """
     numbers: dict[tuple[str, str], list[int]] = {}
     for name, fingerprint in sorted(known.items()):
@@ -224,7 +224,7 @@ def _start(folder: Path, run: StudyRun, processes: ProcessSet, threads: ThreadPo
     command = [sys.executable, "-m", "pendulum_bags", "experiment"]
     if run.spec is None:
         command += [*run.arguments, "--out", str(place / "run")]
-        # The operator was asked before it was started; it has no terminal to ask on.
+        # The operator has confirmed before; this process has no terminal for a prompt.
         command += ["--yes"] if run.lab else []
     else:
         command += ["run", str(place / "spec.json"), "--bag", str(place / "bag")]

@@ -81,7 +81,7 @@ class StartGrid(ABC):
 
     @abstractmethod
     def summarise(self, folder: Path) -> Any:
-        """Return what the files of a folder say: its figures by ``to_json``, the map, a row a start, by ``columns``."""
+        """Return a folder's results: the figures by ``to_json``, the map, a row a start, by ``columns``."""
 
     @property
     def plants_of_chunk(self) -> int:
@@ -144,7 +144,7 @@ def _run_chunk(job: tuple[StartGrid, Any], index: int, threads: int | None) -> C
 
 
 def inside_ellipse(S: Array, level: float, x: Array, y: Array) -> NDArray[np.bool_]:
-    """Tell which of the states (x, y) are in the ellipse (x, y) S (x, y)' <= level."""
+    """Return which of the states (x, y) are in the ellipse (x, y) S (x, y)' <= level."""
     inside: NDArray[np.bool_] = S[0, 0] * x * x + 2.0 * S[0, 1] * x * y + S[1, 1] * y * y <= level
     return inside
 

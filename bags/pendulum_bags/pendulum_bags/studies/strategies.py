@@ -64,9 +64,9 @@ def analyse(folder: Path, study: Study) -> list[dict[str, Any]]:
 
 
 def commanded_recording(bag_folder: Path, spec: RunSpec) -> Recording:
-    """Return the motion of a run with the torque that controller and disturbance asked for, as its input.
+    """Return the motion of a run with the commanded torque of controller and disturbance as its input.
 
-    Not ``applied_effort``: what the actuator makes of the wish is what the strategies differ in.
+    Not ``applied_effort``: what the actuator makes of the command is what the strategies differ in.
     """
     with read_bag(bag_folder) as bag:
         states = bag[f"{spec.namespace}/joint_states"]
@@ -121,7 +121,7 @@ def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def sentence(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return what the table says, computed from it."""
+    """Return the table's result as a sentence."""
     hardware = [row for row in rows if row["side"] == "hw"]
     if not hardware:
         return "There is no run on the hardware."

@@ -77,7 +77,7 @@ class StudyRun:
 
     @property
     def name(self) -> str:
-        """Name of the run's folder: its number and what tells it from others."""
+        """Name of the run's folder: its number and what distinguishes it from others."""
         labels = [self.labels[axis] for axis in ("plant", "controller", "disturbance", "start")]
         parts = [f"{label:.4g}" if isinstance(label, float) else str(label) for label in labels]
         name = "_".join([f"{self.number:05}", *(p for p in parts if p), f"seed{self.labels['seed']}"])
@@ -109,11 +109,11 @@ class Study:
 
     Attributes:
         name: Its name.
-        description: What it asks, one sentence.
+        description: Its question, one sentence.
         experiment: What each cell is: ``run`` in lockstep, or one of the experiments with a name.
         analysis: What is made of the runs.
         runs: The matrix.
-        text: The file, as it is kept beside the results.
+        text: The file, as it is stored next to the results.
         clock: ``lockstep``, as fast as possible, or ``realtime``.
         left_out: Why each optional controller is left out whose library is not installed, one sentence each.
     """
@@ -234,7 +234,7 @@ def _law(file: LocatedMapping, name: str, entry: LocatedMapping) -> tuple[str, d
 
 
 def _missing(file: LocatedMapping) -> dict[str, str]:
-    """Return the optional controllers whose library is not installed, each with the sentence that says which."""
+    """Return the optional controllers whose library is not installed, each with the sentence that names it."""
     controllers = _axis(file, "controllers")
     found = {}
     for name in file.get("optional", list, [], "a list of controllers"):
@@ -342,7 +342,7 @@ def _named_runs(
             plants[plant].fail("hardware is 'hebi' without a lab file; expected lab: FILE", "hardware")
         arguments = [experiment, "--seed", str(seed), "--hardware", str(settings.get("hardware", "emulator"))]
         if settings.get("lab"):
-            # A file beside the study is found from wherever the study is started.
+            # A file next to the study is found from any working folder.
             arguments += ["--lab", str((file.path.resolve().parent / str(settings["lab"])).resolve())]
         arguments += ["--plant", str(settings.get("plant", "thesis"))]
         if experiment == "thesis":

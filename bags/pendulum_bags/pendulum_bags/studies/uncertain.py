@@ -152,7 +152,7 @@ def parse_uncertainty(text: str, plant: str) -> Uncertainty:
 
 
 def uncertainty_of(plant_file: str) -> Uncertainty:
-    """Return what an identification found: its covariance, from the JSON beside the plant file, else its intervals.
+    """Return an identification's uncertainty: its covariance, from the JSON next to the plant file, else its intervals.
 
     Raises:
         ParameterError: The file has no intervals.

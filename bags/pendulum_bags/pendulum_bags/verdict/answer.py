@@ -1,4 +1,4 @@
-"""The answer for a comparison, or for those of several joints, with the other layers that a run folder keeps."""
+"""The answer for a comparison, or for those of several joints, with the other layers of a run folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _HOW = {
     Layer.WHICH_CONTROLLERS: "{} measures it where one joint is driven.",
     Layer.SAME_CHOICE: "{} --rank-seeds 3 measures it.",
 }
-"""How a layer is measured that nobody measured, of a plant of several joints."""
+"""How a missing layer is measured, for a plant of several joints."""
 
 
 def answer_of(
@@ -33,12 +33,12 @@ def answer_of(
 
     Args:
         comparison: The first layer.
-        folders: Folders in which further layers may be kept: of the run, or of experiments that measured them.
+        folders: Folders that may have further layers: of the run, or of experiments that measured them.
         more: How to record more, where that is what is missing.
-        anew: Layers that were judged anew, and stand for those that the folders keep.
+        anew: Layers that were judged again, and replace those of the folders.
 
     Raises:
-        DataError: A kept layer cannot be read, is kept in two of the folders, or is of other plants.
+        DataError: A stored layer cannot be read, is in two of the folders, or is of other plants.
     """
     first = same_run_layer(comparison, more=more)
     known = {Layer.SAME_RUN, *(one.layer for one in anew)}
@@ -47,7 +47,7 @@ def answer_of(
 
 
 def join_joints(results: Mapping[str, LayerResult]) -> LayerResult:
-    """Return what a layer says of a plant, from what it says of each joint: yes where it does of all.
+    """Return a layer's result for a plant, from those for each joint: yes if all are.
 
     Since all joints have to agree, more of them make a wrong yes no likelier (an intersection-union test).
 

@@ -1,7 +1,7 @@
 """The answer to "is the simulation good enough to design a controller on?" as the sum of four layers of evidence.
 
-Each layer answers a question of its own, with a mark, a sentence, evidence with intervals, and what to do next. A layer
-is a value: whoever measures it makes a :class:`LayerResult`, and :func:`sum_up` makes one answer of those there are.
+Each layer has a question of its own, a mark, a sentence, evidence with intervals, and what to do next. A layer is a
+value: its measurement makes a :class:`LayerResult`, and :func:`sum_up` makes one answer of those there are.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ __all__ = [
 ]
 
 FOLDER = "layers"
-"""Folder within a run folder in which layers are kept, each in a file ``<key>.json``."""
+"""Folder within a run folder in which layers are stored, each in a file ``<key>.json``."""
 
 
 class Mark(str, Enum):
-    """What a layer, or one row of its evidence, says."""
+    """The result of a layer, or of one row of its evidence."""
 
     YES = "yes"
     NO = "no"
@@ -88,14 +88,14 @@ class Evidence:
     """One measured quantity of a layer.
 
     Args:
-        quantity: What was measured, in words.
+        quantity: What was measured, as text.
         unit: Its unit; empty for none.
         estimate: Its value; None where it does not exist.
         low: Lower end of its interval; None for none.
         high: Upper end; None for none.
-        expected: What it was held against, in words, such as ``within ±0.3 deg``; empty where it only tells.
-        mark: What it says.
-        note: Anything that a reader must know.
+        expected: What it was compared with, as text, such as ``within ±0.3 deg``; empty where it only informs.
+        mark: Its result.
+        note: A remark for the reader.
     """
 
     quantity: str
@@ -119,17 +119,17 @@ class Evidence:
 
 @dataclass(frozen=True)
 class LayerResult:
-    """What one layer found.
+    """The result of one layer.
 
     Args:
-        layer: Which.
+        layer: The layer.
         mark: Its answer.
-        sentence: The answer in words: one sentence that stands alone.
-        evidence: What it rests on.
+        sentence: The answer as one sentence that stands alone.
+        evidence: Its evidence.
         next_steps: What to do next, one sentence or command each; empty where there is nothing to do.
-        reason: Half a sentence for the answer as a whole, without a full stop: why it says no or is undecided, such as
+        reason: Half a sentence for the answer as a whole, without a full stop: why it is no or undecided, such as
             "the spread of the velocity is 31 % smaller on the hardware".
-        holds: Half a sentence: what may be relied on although another layer says no, such as "designs with a margin
+        holds: Half a sentence: what may be relied on although another layer is no, such as "designs with a margin
             above 0.21 stabilise the hardware too"; empty for nothing.
         case: The plants that it is of.
     """
@@ -186,7 +186,7 @@ class Answer:
 
     Args:
         mark: Yes, no or undecided.
-        sentence: The answer in words.
+        sentence: The answer as text.
         layers: One result for each layer, in order.
         next_steps: What to do next.
     """
@@ -220,13 +220,13 @@ def sum_up(
 ) -> Answer:
     """Return one answer from the layers that were measured.
 
-    One layer that says no makes it no: each asks something that designing needs. It is yes where at least one layer was
-    measured and all of those say yes; the sentence then names what was not measured. What a layer certifies stays true
-    where another says no, and is said too.
+    One layer with no makes it no: each covers something that designing needs. It is yes where at least one layer was
+    measured and all of those are yes; the sentence then names what was not measured. What a layer certifies stays true
+    where another is no, and is in the sentence too.
 
     Args:
         results: At most one for each layer; the others count as not measured.
-        emulated: Whether an emulator took the place of the hardware; the text then says so.
+        emulated: Whether the hardware was emulated; the text then names it so.
         how: The command that measures a layer of these plants, where it is not that of :data:`HOW`.
 
     Raises:
@@ -281,7 +281,7 @@ def write_layer(folder: Path, result: LayerResult) -> Path:
 
 
 def read_layers(folder: Path, case: Case = UNKNOWN) -> list[LayerResult]:
-    """Return the layers that are kept in a run folder, in order.
+    """Return the stored layers of a run folder, in order.
 
     Args:
         folder: The folder.

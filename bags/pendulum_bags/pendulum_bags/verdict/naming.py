@@ -1,4 +1,4 @@
-"""Texts say ``emulated hardware`` where an emulator took the place of the hardware."""
+"""Names hardware that was emulated ``emulated hardware`` in texts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _HARDWARE = re.compile(r"(?<![-/\w])(?<!emulated )(H|h)ardware\b(?!/)")
 
 
 def name_hardware(text: str, *, emulated: bool) -> str:
-    """Return a text that says ``emulated hardware`` for hardware where an emulator stood in for it."""
+    """Return a text with ``emulated hardware`` in place of hardware where that was emulated."""
     if not emulated:
         return text
     return _HARDWARE.sub(lambda found: "Emulated hardware" if found[1] == "H" else "emulated hardware", text)

@@ -1,4 +1,4 @@
-"""The first layer: what the tests of one run, or of several alike, say in the words of a person."""
+"""The first layer: the tests of one run, or of several alike, in plain words."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["design_plant", "how_to_measure", "in_words", "same_run_layer", "seen
 
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
-"""Reasons that a sentence tells with their size; it names the rest, and the table has them all."""
+"""Reasons that a sentence has with their size; it names the rest, and the table has them all."""
 _MOST_RECORDINGS = 4
 """Recordings that the command names from which the plant is identified."""
 
@@ -30,7 +30,7 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
     Args:
         comparison: The comparison.
         more: How to record more where that is what is missing, such as ``make experiment ARGS="--budget 120"``; by
-            default the number of runs is told.
+            default the number of runs is given.
     """
     verdict = comparison.verdict
     tests = verdict.tests
@@ -154,7 +154,7 @@ def design_plant(comparison: Comparison) -> str:
 
 
 def _each_once(failed: Sequence[EquivalenceTest]) -> list[EquivalenceTest]:
-    """Leave out distances that a delay or a spread, which is told too, explains."""
+    """Leave out distances that a delay or a spread, which is reported too, explains."""
     plain = [test for test in failed if not test.quantity.startswith("distance")]
     return plain or list(failed)
 

@@ -73,7 +73,7 @@ def print_tests(console: Console, comparison: Comparison) -> None:
 
 
 def print_answer(console: Console, answer: Answer) -> None:
-    """Print layers, the answer in one sentence, and what to do next; the answer is what is read last."""
+    """Print layers, the answer in one sentence, and what to do next, near the prompt."""
     console.print(layers_table(answer))
     console.print("\nIs the simulation good enough to design a controller on?")
     console.print(Text(answer.sentence, _STYLES[answer.mark]), highlight=False)

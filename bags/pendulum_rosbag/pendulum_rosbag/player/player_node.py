@@ -105,7 +105,7 @@ class Player(Node):
 
     Args:
         options: What to play, and how.
-        stop: Asks the runner to end the process.
+        stop: Requests the runner to end the process.
 
     Raises:
         BagError: There is no readable bag.
@@ -138,7 +138,7 @@ class Player(Node):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop publishing and say what was done."""
+        """Stop publishing and log what was done."""
         self._leave.set()
         self._thread.join()
         print(
@@ -171,7 +171,7 @@ class Player(Node):
         self._stop()
 
     def _wait_for_subscribers(self) -> bool:
-        """Give subscribers time to match; False when asked to leave."""
+        """Give subscribers time to match; False on a request to end."""
         end = time.monotonic() + self._options.wait
         while time.monotonic() < end and not all(output.get_subscription_count() for output in self._outputs):
             if self._leave.wait(_LONGEST_WAIT):
@@ -179,7 +179,7 @@ class Player(Node):
         return True
 
     def _play_once(self) -> bool:
-        """Publish everything once; False when asked to leave."""
+        """Publish everything once; False on a request to end."""
         clock_due = 0
         times, order, datas = self._times.tolist(), self._order.tolist(), self._datas
         for time_ns, topic, data in zip(times, order, datas, strict=True):
@@ -243,7 +243,7 @@ def _schedule(bag: Bag, options: PlayOptions) -> tuple[Any, Any, list[bytes], li
 
 
 def _recorded_qos(text: str) -> QoSProfile:
-    """Return the reliability and durability that the publishers had, where the bag tells."""
+    """Return the reliability and durability that the publishers had, where the bag has them."""
     recorded = profiles_of(text)
     best_effort = any(profile.reliability == "best_effort" for profile in recorded)
     latched = bool(recorded) and all(profile.durability == "transient_local" for profile in recorded)

@@ -18,7 +18,7 @@ MAX_BYTES = 128 << 20
 _AFTER_NS = NANOSECONDS
 """Time that is awaited after a fault, for the stop that it causes [ns]."""
 _OLDEST_NS = 2 * NANOSECONDS
-"""Age of an event beyond which it is one that its topic kept for latecomers [ns]."""
+"""Age beyond which an event is a latched one of the past [ns]."""
 _STOPS = {Mode.FAULT.value, Mode.E_STOP.value}
 
 _Source = TypeVar("_Source")
@@ -49,7 +49,7 @@ class BlackBox(Generic[_Source]):
             self._bytes -= len(self._messages.popleft()[2])
 
     def look(self, event: bytes, now_ns: int) -> None:
-        """Note whether an event tells of a fault or an e-stop.
+        """Record whether an event reports a fault or an e-stop.
 
         Args:
             event: CDR bytes of a ``std_msgs/String``.
@@ -72,7 +72,7 @@ class BlackBox(Generic[_Source]):
         return self._due_ns is not None and now_ns >= self._due_ns
 
     def empty(self) -> list[tuple[_Source, int, bytes]]:
-        """Return what is kept, in the order of its arrival, and begin with nothing."""
+        """Return the stored messages, in the order of their arrival, and clear them."""
         messages = sorted(self._messages, key=lambda message: message[1])
         self._messages.clear()
         self._bytes, self._due_ns = 0, None

@@ -15,7 +15,7 @@ _PATIENCE = 200
 
 @dataclass
 class _Doubt:
-    """What a sample may mean that continues nobody, told under the last number of whom it could belong to.
+    """The two explanations of a sample that continues no publisher, by the last number of the nearest one.
 
     Attributes:
         gap: Samples that are missing, if it belongs to that publisher.
@@ -31,18 +31,18 @@ class _Doubt:
 class GapCounter:
     """Follows the sequence numbers of one topic and counts what is missing between them.
 
-    DDS numbers the samples of each publisher from 1 on, but rclpy does not tell which publisher a sample is from.
+    DDS numbers the samples of each publisher from 1 on, but rclpy does not report which publisher a sample is from.
     So every publisher seen so far is remembered by its last number, and a sample belongs to the one that it
-    continues. A sample that continues none is the first of a new publisher (who may have published before it met
-    us), or there is a gap before it. Where more publishers have been met than heard, both are possible, and what comes
-    next tells: the publisher whose number it could have continued goes on, or has left, or the gap was real.
+    continues. A sample that continues none is the first of a new publisher (which may have published before it was
+    matched), or there is a gap before it. If more publishers were matched than received from, both are possible, and
+    later samples decide: the publisher whose number it could have continued goes on, or has left, or the gap was real.
 
     Args:
-        matched: Returns how many publishers have been met since the beginning, and how many are there now.
+        matched: Returns how many publishers were matched since the beginning, and how many are now.
 
     Attributes:
         missing: Samples that are missing between others of their publisher.
-        unmet: Samples that publishers had sent before the first that was heard of them.
+        unmet: Samples that publishers had sent before the first that was received from them.
     """
 
     def __init__(self, matched: Callable[[], tuple[int, int]]) -> None:
@@ -55,7 +55,7 @@ class GapCounter:
         self._doubts: dict[int, _Doubt] = {}
 
     def go_on_from(self, before: GapCounter) -> None:
-        """Know the publishers that another subscription to the topic has heard, by their last numbers."""
+        """Take over the publishers of another subscription to the topic, by their last numbers."""
         self._last = list(before._last)
         self._heard = len(before._last)
 
@@ -78,8 +78,8 @@ class GapCounter:
         before = sequence - 1
         lower = max((number for number in self._last if number < sequence), default=0)
         gap = before - lower
-        # A first sample may come before the middleware has told that its publisher was met; one that is no later than
-        # all others is another's in any case.
+        # A first sample may come before the middleware has reported the match; one that is no later than all others is
+        # another publisher's in any case.
         another = self._heard < total or not lower
         if another or gap > _LARGEST_GAP:
             if another:
@@ -98,7 +98,7 @@ class GapCounter:
         return gap
 
     def _judge_doubts(self, continued: int) -> int:
-        """Drop the doubt about a publisher that goes on; return the gaps of those that have been silent for long."""
+        """Settle the open case of a publisher that goes on; return the gaps of those that were silent for long."""
         if continued in self._doubts:
             self.unmet += self._doubts.pop(continued).unmet
         found = 0

@@ -1,4 +1,4 @@
-"""What a recorder is asked to do, checked before anything is created."""
+"""Options of a recorder, checked before anything is created."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class RecorderOptions:
         return topic not in ALWAYS_LEFT_OUT
 
     def unmet(self, met: Iterable[str]) -> dict[str, str]:
-        """Return what was asked for that nobody published, and why it is missing.
+        """Return the requested topics that were not published, and why each is missing.
 
         Args:
             met: Topics that had a publisher while there was a recorder.

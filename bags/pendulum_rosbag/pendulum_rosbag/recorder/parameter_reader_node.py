@@ -1,4 +1,4 @@
-"""Reading the parameters of all nodes, so that a bag says with which values its data came about."""
+"""Reading the parameters of all nodes, so that a bag has the values behind its data."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 __all__ = ["ParameterReader"]
 
-_PATIENCE = 50  # looks at the graph before a node that does not answer is given up
+_PATIENCE = 50  # polls of the graph before a node that does not respond is given up
 
 
 class ParameterReader:
-    """Asks each node that appears for its parameters, and follows their changes.
+    """Requests the parameters of each node that appears, and follows their changes.
 
     Args:
-        node: The node that asks; its executor delivers the answers.
+        node: The node that sends requests; its executor delivers the responses.
         on_values: Called with all values so far (node -> parameter -> value) and the name of a node whose parameters
             have changed after they were first read (else empty).
     """
@@ -42,10 +42,10 @@ class ParameterReader:
         node.create_subscription(ParameterEvent, "/parameter_events", self._on_event, qos_profile_parameter_events)
 
     def look(self, *, forget: bool = False) -> None:
-        """Look for new nodes, and ask those whose services have appeared.
+        """Poll for new nodes, and send requests to those whose services have appeared.
 
         Args:
-            forget: Whether nodes that are gone lose their values; one of the same name is then asked anew.
+            forget: Whether nodes that are gone lose their values; one of the same name is then read again.
         """
         for client in self._finished:
             self._node.destroy_client(client)
@@ -68,7 +68,7 @@ class ParameterReader:
         return self._node.create_client(kind, f"{full}/{service}")
 
     def _offers(self, full: str) -> bool:
-        """Return whether the graph says that a node offers its parameters: a client made in vain bothers everybody."""
+        """Return whether a node offers its parameters on the graph: each needless client loads discovery."""
         space, _, name = full.rpartition("/")
         try:
             offered = self._node.get_service_names_and_types_by_node(name, space or "/")

@@ -37,7 +37,7 @@ __all__ = ["SPECS", "Recorder"]
 POLL_PERIOD = 0.02
 """Time between two visits to the middleware [s]; the time of arrival is the middleware's, not that of the visit."""
 DISCOVERY_PERIOD = 0.2
-"""Time between two looks at the graph [s]."""
+"""Period of graph polls [s]."""
 
 SPECS = (
     ParameterSpec(
@@ -58,7 +58,7 @@ class Recorder(PollingNode):
 
     Args:
         options: What to record, and how.
-        stop: Asks the runner to end the process.
+        stop: Requests the runner to end the process.
 
     Raises:
         BagError: The output folder exists or cannot be created.
@@ -92,14 +92,14 @@ class Recorder(PollingNode):
         self.create_service(Trigger, "~/annotate", self._on_annotate)
         self.create_service(Trigger, "~/status", self._on_status)
         self._discover()
-        # Steady time: topics are looked for also where the system clock is set back, or simulated time stands still.
+        # Steady time: topics are discovered also where the system clock is set back, or simulated time stands still.
         create_wall_timer(self, DISCOVERY_PERIOD, self._discover)
         self._leave = threading.Event()
         self._poller = threading.Thread(target=self._poll, name="bag intake", daemon=True)
         self._poller.start()
 
     def close(self) -> None:
-        """Take what has arrived, close the bag and say what it holds."""
+        """Take what has arrived, close the bag and log its contents."""
         self._leave.set()
         self._poller.join()
         self._end()
@@ -170,7 +170,7 @@ class Recorder(PollingNode):
     def _poll(self) -> None:
         try:
             self._poll_until_told()
-        except Exception as error:  # noqa: BLE001  # a recorder that hears nothing any more must not look alive
+        except Exception as error:  # noqa: BLE001  # a recorder that receives nothing any more must not seem alive
             self.exit_code = 1
             with self._lock:
                 if self._session is not None:
@@ -315,7 +315,7 @@ class Recorder(PollingNode):
         if tap is not None:
             if tap.suits(publishers):
                 return
-            # A publisher has come that offers less than we ask for: ask for less, or it would never match.
+            # A new publisher offers less than the subscription requests: request less, or it would never match.
             with self._lock:
                 self._take(tap, self._session)
                 del self._taps[topic]

@@ -22,12 +22,12 @@ from pendulum_rosbag.storage.stamps import stamp_reader
 __all__ = ["Tap", "wanted_qos"]
 
 DEPTH = 4000
-"""Messages that the middleware holds for us between two visits: four seconds at 1 kHz."""
+"""Queue depth of the middleware between two polls: four seconds at 1 kHz."""
 SETTLING = 5.0
-"""Time after which a publisher and its subscription know of each other [s].
+"""Time after which a publisher and its subscription are matched at both ends [s].
 
-A publisher that serves others already may be heard as soon as we know it. It sends again what was missed only once it
-knows us, too, which took up to 2 s where recorders had been killed before.
+A matched publisher may deliver at once. It resends missed messages only once it has matched the subscription too,
+which took up to 2 s where recorders had been killed before.
 """
 
 
@@ -40,20 +40,20 @@ def wanted_qos(publishers: Sequence[TopicEndpointInfo]) -> tuple[bool, bool]:
 
 
 class Tap:
-    """A subscription that is visited, and what is needed to record from it.
+    """A polled subscription, and what is needed to record from it.
 
     Args:
         node: The node that subscribes.
         topic: Full name.
-        publishers: Who offers the topic, with their QoS.
-        before: The subscription that this one takes the place of; what is missed between them is counted, too.
+        publishers: The topic's publishers, with their QoS.
+        before: The subscription that this one replaces; what is missed between them is counted, too.
 
     Raises:
         ImportError: The type of the messages is not installed.
 
     Attributes:
         source: Where its messages come from; the node that made it destroys it after ``close``.
-        announced: The session that knows the topic.
+        announced: The session that has the topic.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Tap:
         self._opened = self._first_opened = time.monotonic()
         self._told_unmet = 0
         self.source = node.create_polled_input(class_of(name), topic, profile)
-        # Taken when it is asked for, not delivered by the executor: it must be as new as the messages.
+        # Taken on demand, not delivered by the executor: it must be as new as the messages.
         handle = self.source.subscription.handle
         with handle:
             self._matched = rclpy_implementation.EventHandle(handle, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED)
@@ -89,12 +89,12 @@ class Tap:
 
     @property
     def is_new(self) -> bool:
-        """Whether the topic is so new to us that nobody expects to hear its publishers from their first message on."""
+        """Whether the topic is so new here that its publishers' first messages may be missing."""
         return time.monotonic() - self._first_opened < SETTLING
 
     @property
     def is_settling(self) -> bool:
-        """Whether some publisher may not know of us yet."""
+        """Whether some publisher may not have matched the subscription yet."""
         return time.monotonic() - self._opened < SETTLING
 
     def suits(self, publishers: Sequence[TopicEndpointInfo]) -> bool:
@@ -106,7 +106,7 @@ class Tap:
         return (reliable or not self.reliable) and (latched or not self.latched)
 
     def announce(self, session: RecordingSession) -> None:
-        """See that a session knows the topic, before anything of it is told or offered."""
+        """Announce the topic to a session, before anything of it is reported or offered."""
         if self.announced is not session:
             session.add_topic(self.topic, self.type, self.qos)
             self.announced = session
@@ -119,23 +119,23 @@ class Tap:
             yield info["received_timestamp"], trim(data), see(sequence) if sequence else 0
 
     def repeats(self, session: RecordingSession | None, data: bytes) -> bool:
-        """Return whether a stamped message is the one before it in a recording once more, and take note of it.
+        """Return whether a stamped message repeats the one before it in a recording, and store it.
 
-        A plant in lockstep publishes a state again that nobody answers in time, and who has answered it already answers
-        the same.
+        A plant in lockstep publishes a state again without a reply in time, and a node that has replied repeats its
+        reply.
         """
         before, self._newest = self._newest, (session, data)
         again = before[0] is session and before[1] == data
         return again and self.stamp is not None and (self.stamp(data) or 0) > 0
 
     def unheard(self) -> int:
-        """Return how many messages publishers had sent before the first that was heard of them, since the last call."""
+        """Return how many messages publishers had sent before the first that was received, since the last call."""
         unheard = self._gaps.unmet - self._told_unmet
         self._told_unmet = self._gaps.unmet
         return unheard
 
     def close(self) -> None:
-        """Let go of the middleware before the source is destroyed."""
+        """Release the middleware before the source is destroyed."""
         self._matched.destroy_when_not_in_use()
 
     def _count_publishers(self) -> tuple[int, int]:

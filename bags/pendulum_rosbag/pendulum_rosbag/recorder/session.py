@@ -1,4 +1,4 @@
-"""A recording as a bounded queue and threads that write: nobody who delivers messages ever waits for the disk."""
+"""A recording as a bounded queue and threads that write: delivery of messages never waits for the disk."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class TopicCount:
 
     @property
     def lost(self) -> int:
-        """Messages that were published to us and are not in the bag."""
+        """Messages that were published to the recorder and are not in the bag."""
         return self.missing + self.received - self.written
 
 
@@ -57,11 +57,11 @@ class SessionReport:
     topics: dict[str, TopicCount] = field(default_factory=dict)
     error: str = ""
     unrecorded: dict[str, str] = field(default_factory=dict)
-    """What was asked for and is not in the bag, and why: a topic or a pattern of topics, and a reason."""
+    """What was requested and is not in the bag, and why: a topic or a pattern of topics, and a reason."""
 
     @property
     def failed(self) -> bool:
-        """Whether the bag holds less than what was asked for."""
+        """Whether the bag holds less than what was requested."""
         return bool(self.lost or self.error or self.unrecorded)
 
     @property
@@ -206,7 +206,7 @@ class RecordingSession:
                     self._write_queue()
                     self._store_counts()
                     self.writer.close()
-                except Exception as error:  # noqa: BLE001  # whatever it is, the report must say it
+                except Exception as error:  # noqa: BLE001  # whatever it is, the report must have it
                     self.fail(error)
         return SessionReport(self.writer.path, self.counts(), self.failure)
 
@@ -240,7 +240,7 @@ class RecordingSession:
         if items:
             self.writer.write_many(items)
         self.writer.seal()
-        # A recorder that is killed has told what is missing, too.
+        # A killed recorder's bag reports missing messages, too.
         gaps = {
             name: {"lost": count.missing + count.refused, "early": count.early, "before": count.before}
             for name, count in self._counts.copy().items()
@@ -257,13 +257,13 @@ class RecordingSession:
         self.writer.update_metadata({_COUNTS: counts})
 
     def fail(self, error: Exception) -> None:
-        """Keep what is in the bag, give back the room that it does not need, and say why; the first reason counts."""
+        """Keep what is in the bag, return unused disk space, and store the reason; the first one counts."""
         if self.failure:
             return
         self.failure = _reason(error)
         try:
             self.writer.close()
-        except Exception:  # noqa: BLE001  # out of room, out of memory: it does not matter any more
+        except Exception:  # noqa: BLE001  # out of disk or memory: it does not matter any more
             # Not even the summary fits: the file as it was sealed last is complete without it.
             self.writer.abandon()
         if self._on_failure is not None:
