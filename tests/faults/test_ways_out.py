@@ -18,12 +18,15 @@ from tests.tools.faults.motor import driving_torque
 from tests.tools.faults.ways_out import (
     ANGLE,
     BENCHES,
+    FADES,
     FATES,
     PER_DUTY,
     PHASES,
+    STOP_TIME,
     STRATEGIES,
     WAYS,
     Exit,
+    fade_out,
     is_possible,
     take_way_out,
 )
@@ -102,6 +105,20 @@ def test_a_controller_that_ends_releases_at_once_while_its_zero_drove_the_torque
     assert held > 1.25
     assert max(torque for _, torque in torques[before:]) < held + 0.05
     assert max(time_ns for time_ns, torque in torques if torque > 0.01) - ended_ns < 0.015 * NANOSECONDS
+
+
+@pytest.mark.parametrize("kind", tuple(EffortStrategy)[:2])
+@pytest.mark.parametrize("way", FADES)
+def test_a_stop_that_fades_drives_no_harder_and_ends_in_its_time(way: str, kind: EffortStrategy) -> None:
+    for cycles in range(20, 26):
+        left = fade_out(kind, way, cycles)
+        assert left.torque_before > 1.0
+        assert left.torque_after < left.torque_before + 0.05, left
+        # Compensated, a duty follows the speed of the link, which falls while the torque fades.
+        assert kind is EffortStrategy.DIRECT_PWM_COMPENSATED or not left.exceeds, left
+        # A period to hear of it, and at worst one attempt to switch off that was lost.
+        shortest, longest = (STOP_TIME - 0.02, STOP_TIME + 0.03) if way in {"e-stop", "disarm"} else (0.0, 0.02)
+        assert shortest <= left.lasting < longest, left
 
 
 def test_a_way_out_that_drives_harder_is_found() -> None:

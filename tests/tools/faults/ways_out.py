@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Protocol
 from unittest import mock
@@ -29,6 +30,7 @@ from pendulum_hw_bridge.backends.hebi_discovery import ModuleSelection
 from pendulum_hw_bridge.backends.hebi_emulated import EmulatedGroup, EmulatedLookup
 from pendulum_hw_bridge.backends.hebi_group import GroupDrive, HebiGroup
 from pendulum_hw_bridge.backends.hebi_log import import_hebi
+from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.emulation import wire
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.server import EmulatorIdentity, EmulatorServer
@@ -37,12 +39,24 @@ from pendulum_hw_bridge.port.actuator import ActuatorError, ActuatorPort, Comman
 from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_msgs_py.contract.timing import SteadyWallClock
-from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+from tests.tools.faults.bridge_rig import Rig
 from tests.tools.faults.motor import driving_torque
 
-__all__ = ["BENCHES", "FATES", "PHASES", "STRATEGIES", "WAYS", "Exit", "is_possible", "take_way_out"]
+__all__ = [
+    "BENCHES",
+    "FADES",
+    "FATES",
+    "PHASES",
+    "STRATEGIES",
+    "WAYS",
+    "Exit",
+    "fade_out",
+    "is_possible",
+    "take_way_out",
+]
 
 STRATEGIES = tuple(Strategy)[1:]
 PHASES = ("hold", "ramp", "regulation")
@@ -476,6 +490,16 @@ WAYS: dict[str, Callable[[Bench, Strategy], int]] = {
     "killed": _killed,
 }
 """Ways out; each returns when it was requested [ns]."""
+FADING = "bridge with stop_time"
+STOP_TIME = 0.2
+"""[s]"""
+FADES: dict[str, Callable[[Rig], None]] = {
+    "e-stop": Rig.e_stop,
+    "disarm": Rig.disarm,
+    "close": Rig.close,
+    "fault": lambda rig: rig.bridge.fail("host_stalled", "did not run"),
+}
+"""Stops of a bridge whose torque fades; its end and a fault cut it."""
 _PAUSED = {"stop after a pause", "killed"}
 """Ways that begin when the command lifetime has ended all torque: packets may bring none back."""
 
@@ -509,19 +533,49 @@ def take_way_out(backend: str, strategy: Strategy, phase: str, way: str, fate: F
         record = list(bench.record)
     if way not in _PAUSED:
         begin_ns = min(packets.arrived_ns for packets in bench.packets[:1])
-    parts: tuple[list[LinkState], list[LinkState]] = ([], [])
-    for link in record:
-        if link.time_ns > begin_ns - bench.before * NANOSECONDS:
-            parts[link.time_ns > begin_ns].append(link)
-    (torque_before, duty_before), (torque_after, duty_after) = (_largest(part) for part in parts)
-    last_ns = max((link.time_ns for link in parts[1] if link.pwm != 0.0), default=begin_ns)
+    return _exit_of([(link.time_ns, link.pwm, link.motor_torque) for link in record], begin_ns, bench.before)
+
+
+def fade_out(kind: EffortStrategy, way: str, cycles: int = 25) -> Exit:
+    """Hold the weight through a bridge whose stops fade, stop, and return what the motor did.
+
+    Args:
+        kind: How a torque is made; by the torque loop no stop fades.
+        way: One of :data:`FADES`.
+        cycles: How long to drive before [10 ms].
+    """
+    rig = Rig(kind=kind, start=ANGLE)
+    rig.supervisor.limits = replace(rig.supervisor.limits, stop_time=STOP_TIME)
+    rig.controlling = rig.disturbing = False
+
+    def command() -> None:
+        assert rig.bridge.sample is not None
+        weight = _PARAMETERS.plant.gravity * math.sin(ANGLE)
+        rig.send(JointCommand.of_one(rig.bridge.sample.stamp_ns, weight, "controller"))
+
+    rig.break_cycle = command
+    rig.run(cycles * _PERIOD)
+    begin_ns = rig.clock.now_ns()
+    FADES[way](rig)
+    rig.run(STOP_TIME + _AFTER)
+    return _exit_of(rig.duties, begin_ns, 2.0 * _PERIOD)
+
+
+def _exit_of(record: Sequence[tuple[int, float, float]], begin_ns: float, before: float) -> Exit:
+    """Return what a motor did before and after an instant, from its times [ns], duties [-] and torques [N m]."""
+    parts: tuple[list[tuple[int, float, float]], ...] = ([], [])
+    for each in record:
+        if each[0] > begin_ns - before * NANOSECONDS:
+            parts[each[0] > begin_ns].append(each)
+    (torque_before, duty_before), (torque_after, duty_after) = (
+        (
+            max(abs(driving_torque(pwm, torque, PER_DUTY)) for _, pwm, torque in part),
+            max(abs(pwm) for _, pwm, _ in part),
+        )
+        for part in parts
+    )
+    last_ns = max((time_ns for time_ns, pwm, _ in parts[1] if pwm != 0.0), default=begin_ns)
     return Exit(torque_before, torque_after, duty_before, duty_after, (last_ns - begin_ns) / NANOSECONDS)
-
-
-def _largest(links: Sequence[LinkState]) -> tuple[float, float]:
-    """Return the largest driving torque [N m] and duty [-]."""
-    torques = (driving_torque(link.pwm, link.motor_torque, PER_DUTY) for link in links)
-    return max(map(abs, torques)), max(abs(link.pwm) for link in links)
 
 
 # --- table ---------------------------------------------------------------------------------------------------------
@@ -536,7 +590,7 @@ def ways_out(
     out: Annotated[Path, typer.Option(help="Where the rows go.")] = Path("build", "ways_out.json"),
 ) -> int:
     """Leave in every way and print what the motors did; exit code 1 where torque exceeds that before the request."""
-    rows = [
+    rows: list[tuple[str, str, Strategy | EffortStrategy, str]] = [
         (backend, way, strategy, phase)
         for backend in backends.split(",")
         for way in WAYS
@@ -544,6 +598,7 @@ def ways_out(
         for strategy in STRATEGIES
         for phase in PHASES
     ]
+    rows += [(FADING, way, EffortStrategy.DIRECT_PWM, "hold") for way in FADES]
     names = (
         "backend",
         "way out",
@@ -565,7 +620,9 @@ def ways_out(
         track(rows, "ways out", transient=True, disable=not sys.stdout.isatty())
     ):
         exits = [
-            take_way_out(backend, strategy, phase, way, fates[(number + repetition) % len(fates)], 20 + repetition)
+            fade_out(strategy, way, 20 + repetition)
+            if isinstance(strategy, EffortStrategy)
+            else take_way_out(backend, strategy, phase, way, fates[(number + repetition) % len(fates)], 20 + repetition)
             for repetition in range(repetitions)
         ]
         worst = max(exits, key=lambda one: one.torque_after - one.torque_before)
