@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
+from pendulum_msgs_py.contract.joints import Coordinates, Joint
 from pendulum_msgs_py.contract.supervisor import DriveKind, Input, Mode, PlantLimits, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.errors import ParameterError
@@ -202,6 +203,27 @@ def test_a_clock_that_steps_lengthens_no_stop() -> None:
     plant.supervisor.e_stop(plant.now_ns)
     plant.now_ns -= 10 * NANOSECONDS
     assert plant.fade(12)[-1] == 0.0
+
+
+def test_a_clock_that_was_ahead_when_the_stop_was_asked_for_does_not_put_it_off() -> None:
+    plant = Plant(0.1)
+    plant.drive()
+    plant.supervisor.e_stop(plant.now_ns + 100 * NANOSECONDS)
+    assert plant.fade(11) == pytest.approx([9.0 * left / 10 for left in range(10, -1, -1)])
+
+
+def test_of_several_joints_one_without_torque_does_not_keep_another_from_fading() -> None:
+    joints = tuple(Joint(name) for name in ("hip", "knee"))
+    limits = PlantLimits(effort=(9.0, 9.0), stop_time=0.1)
+    supervisor = PlantSupervisor(limits, coordinates=Coordinates(joints, (0, 1)))
+    now_ns = 1000 * NANOSECONDS
+    sample = JointSample(now_ns, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+    assert supervisor.arm(now_ns, sample) == ""
+    supervisor.offer(Input.EFFORT_COMMAND, JointCommand(now_ns, (0.0, 4.0), "lqr", ("hip", "knee")), now_ns)
+    supervisor.report_applied(supervisor.decide(now_ns, sample).effort)
+    supervisor.e_stop(now_ns)
+    drive = supervisor.decide(now_ns + 5 * _PERIOD_NS, sample)
+    assert (drive.kind, drive.effort) == (DriveKind.EFFORT, pytest.approx((0.0, 2.0)))
 
 
 @pytest.mark.parametrize("step", [-_PERIOD_NS // 2, -3 * _PERIOD_NS, -10 * NANOSECONDS])

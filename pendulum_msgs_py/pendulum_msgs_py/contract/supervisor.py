@@ -367,7 +367,7 @@ class PlantSupervisor:
             return self._off(push)
         # Taken here: a request may come while a torque that was decided before it is not reported as applied yet.
         stop.effort = stop.effort or self._applied
-        # A plant that catches up decides as of before the request.
+        # A plant that catches up decides as of before the request, and a clock may be set back behind it.
         stop.start_ns = min(stop.start_ns, now_ns)
         remaining = stop.remaining(now_ns, self.limits.stop_time)
         if remaining == 0.0 or not any(stop.effort) or self._measurement_fault(now_ns, sample):
@@ -543,7 +543,6 @@ class PlantSupervisor:
     def _release(self, mode: Mode, reason: str, now_ns: int) -> None:
         self._trajectory = None
         self._handover = None
-        self._stop = None
         self._applied = self._last_effort = self._nothing
         self._enter(mode, reason, now_ns)
 
