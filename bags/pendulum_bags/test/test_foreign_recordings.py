@@ -282,3 +282,14 @@ def test_two_machines_in_one_table_are_refused(tmp_path):
     path = save(tmp_path / "two.csv", "time,position,torque\n" + rows(TIME, angle, TORQUE))
     with pytest.raises(DataError, match=r"two\.csv holds two motions .* jump by 0\.29 rad and back"):
         read_recording(path)
+
+
+@pytest.mark.parametrize("drop", [False, True])
+def test_a_column_without_any_number_is_not_told_to_drop_rows(tmp_path, drop):
+    table = rows(TIME, ANGLE, SPEED, np.full(TIME.size, np.nan))
+    path = save(tmp_path / "run.csv", "time,position,velocity,torque\n" + table)
+    with pytest.raises(DataError, match=r"column 'torque' holds no number at all; .*: name another one$"):
+        read_recording(path, {**MAPPINGS["pendulum"], "drop_nan": drop})
+    with pytest.raises(DataError, match=r"`--mapping free_swing` reads a pendulum that nothing drives$"):
+        read_recording(path)
+    assert read_recording(path, "free_swing").time.size == TIME.size

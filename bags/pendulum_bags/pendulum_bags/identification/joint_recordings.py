@@ -181,7 +181,8 @@ def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
             raise DataError(f"topic {push_topic} of bag {source} pushes links from outside; expected none of that")
     if sorted(states.names) != sorted(coordinates.names):
         raise DataError(
-            f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(coordinates.names)}"
+            f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(coordinates.names)} "
+            "(`pendulum export` makes a CSV file of it, in which a mapping file names the joints)"
         )
     columns = [states.names.index(name) for name in coordinates.names]
     # A plant in lockstep sends a state again when its answer was missed: the same stamp is the same state.

@@ -422,8 +422,12 @@ def _column(
     if sign not in (1, -1):
         raise DataError(f"{origin}: sign of {name} is {sign!r}; expected 1 or -1")
     raw = table[:, names.index(found)]
-    if section.get("optional") and raw.size and np.isnan(raw).all():
-        return None
+    if raw.size and np.isnan(raw).all():
+        if section.get("optional"):
+            return None
+        free = name == "input" and origin.startswith("built-in")
+        way = "`--mapping free_swing` reads a pendulum that nothing drives" if free else "name another one"
+        raise DataError(f"{source}: column {found!r} holds no number at all; expected those of {name}: {way}")
     bad = np.flatnonzero(~np.isfinite(raw))
     if bad.size:
         raise DataError(
