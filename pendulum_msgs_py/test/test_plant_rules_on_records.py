@@ -154,6 +154,17 @@ def test_who_has_been_silent_for_too_long_begins_anew() -> None:
     assert decide(record, _NOW + NANOSECONDS)
 
 
+@pytest.mark.parametrize(
+    ("position", "velocity"), [(math.inf, 0.0), (-math.inf, 0.0), (1.0, math.inf), (1.0, -math.inf)]
+)
+def test_an_infinite_measurement_is_no_ordinary_one_though_it_is_within_limits_that_are_none(
+    position: float, velocity: float
+) -> None:
+    supervisor = _armed(PlantLimits((2.0,)))
+    record = _lent(supervisor, JointSample.of_one(_NOW, position, velocity))
+    assert not decide(record, _NOW + _MS)
+
+
 def test_what_is_lent_again_counts_from_nothing() -> None:
     supervisor = _armed(PlantLimits((0.1,)))
     record = _lent(supervisor, JointSample.of_one(_NOW, 1.0, 0.0))
