@@ -17,6 +17,7 @@ from pendulum_bags.comparison.compare_cli import main as compare_main
 from pendulum_bags.identification.identify_cli import main as identify_main
 from pendulum_bags.replay.replay_cli import main as replay_main
 from pendulum_bags.report.report_cli import main as report_main
+from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.convert.convert_cli import convert_main, cut_main, filter_main, merge_main
 from pendulum_rosbag.reader import read_bag
@@ -165,3 +166,16 @@ def test_a_report_of_one_bag_says_what_it_is_and_what_shows_it(
 ) -> None:
     assert report_main([str(EXAMPLES / "regulation_hw")]) == 2
     assert "regulation_hw is one bag; expected run folders, or two bags" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_bag_of_two_plants_says_how_to_keep_one_and_that_works(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    both, one = tmp_path / "both", tmp_path / "one"
+    parts = [str(EXAMPLES / name) for name in ("regulation_sim", "regulation_hw")]
+    assert merge_main([*parts, "-o", str(both)]) == 0
+    assert identify_main([str(both), "--no-page"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"`pendulum filter {both} --regex '^/hw/' -o FOLDER`" in said
+    assert filter_main([str(both), "--regex", "^/hw/", "-o", str(one)]) == 0
+    assert read_recording(one).time.size == 501

@@ -142,7 +142,7 @@ def replay_controller(
         ParameterError: No such controller or plant, or a value out of domain.
     """
     with read_bag(path) as bag:
-        space = find_prefix(bag) if prefix is None else prefix.rstrip("/")
+        space = find_prefix(bag, prefix)
         states = bag.array(f"{space}/{names.JOINT_STATES}")
         commands = bag.array(f"{space}/{names.EFFORT_COMMAND}")
         metadata = dict(bag.metadata)

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.runs.datasets import Recording, gap_length
+from pendulum_bags.runs.run_data import find_prefix
+from pendulum_msgs_py.contract.names import APPLIED_EFFORT, JOINT_STATES
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader import Bag, read_bag
 
@@ -41,7 +43,7 @@ def read_bag_recording(
 
 
 def _recording(bag: Bag, path: str | Path, effort: str, namespace: str | None, swings_freely: bool) -> Recording:
-    states_topic = _find(bag, "joint_states", namespace)
+    states_topic = f"{find_prefix(bag, namespace)}/{JOINT_STATES}"
     states = bag.array(states_topic)
     # A plant in lockstep sends a state again when its answer was missed: the same stamp is the same state.
     states = states[np.append(True, np.diff(states["stamp_ns"]) != 0)] if states.size else states
@@ -57,7 +59,7 @@ def _recording(bag: Bag, path: str | Path, effort: str, namespace: str | None, s
         **{key: value for key, value in bag.metadata.items() if key.startswith("pendulum.")},
     }
     velocity = None if np.isnan(states["velocity"]).all() else states["velocity"]
-    applied_topic = states_topic.removesuffix("joint_states") + "applied_effort"
+    applied_topic = states_topic.removesuffix(JOINT_STATES) + APPLIED_EFFORT
     has_effort = not np.isnan(states["effort"]).all()
     if not swings_freely and effort == "applied" and applied_topic in bag.topics:
         applied = bag.array(applied_topic)
@@ -97,19 +99,6 @@ def cut_at_steps(bag: Bag, stamps: NDArray[np.int64], origin: int) -> NDArray[np
     for cut in bag.cuts_ns:
         times = np.where(stamps >= cut, times + gap, times)
     return times
-
-
-def _find(bag: Bag, name: str, namespace: str | None) -> str:
-    if namespace is not None:
-        topic = f"/{namespace.strip('/')}/{name}".replace("//", "/")
-        if topic not in bag.topics:
-            raise DataError(f"bag {bag.path} has no topic {topic}; it has {', '.join(sorted(bag.topics)) or 'none'}")
-        return topic
-    found = sorted(topic for topic in bag.topics if topic.rsplit("/", 1)[-1] == name)
-    if len(found) != 1:
-        listing = ", ".join(found or sorted(bag.topics)) or "none"
-        raise DataError(f"bag {bag.path} has {len(found)} topics called {name}; expected one (it has {listing})")
-    return found[0]
 
 
 def phases(bag: Bag, origin: int) -> list[tuple[float, str, dict[str, Any]]]:

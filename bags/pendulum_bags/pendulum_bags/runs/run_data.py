@@ -112,19 +112,24 @@ class RunData:
         return next((float(event["t"]) for event in self.events if event["name"] == name), None)
 
 
-def find_prefix(bag: Bag) -> str:
-    """Return the namespace of the one plant of a bag, such as ``/sim``; empty for plain ``/joint_states``.
+def find_prefix(bag: Bag, prefix: str | None = None) -> str:
+    """Return a namespace, by default that of the one plant of a bag, such as ``/sim``; empty for ``/joint_states``.
 
     Raises:
-        DataError: The bag has no plant, or several.
+        DataError: The bag has no plant, or several and no namespace is given.
     """
+    if prefix is not None:
+        return f"/{prefix.strip('/')}".rstrip("/")
     ending = f"/{names.JOINT_STATES}"
     found = sorted(topic[: -len(ending)] for topic in bag.topics if topic.endswith(ending))
     if len(found) == 1:
         return found[0]
     if not found:
         raise DataError(f"bag {bag.path} has no topic that ends in {ending}; it has {', '.join(bag.topics) or 'none'}")
-    raise DataError(f"bag {bag.path} holds several plants ({', '.join(found)}); choose one by its namespace")
+    raise DataError(
+        f"bag {bag.path} holds several plants ({', '.join(found)}); choose one by its namespace, or keep one with "
+        f"`pendulum filter {bag.path} --regex '^{found[0]}/' -o FOLDER`"
+    )
 
 
 def joints_of(
@@ -142,12 +147,8 @@ def joints_of(
         DataError: It lacks the states.
     """
     with open_bag(path) as bag:
-        found = bag.joint_names(f"{_space(bag, prefix)}/{names.JOINT_STATES}")
+        found = bag.joint_names(f"{find_prefix(bag, prefix)}/{names.JOINT_STATES}")
         return found if len(found) > 1 else ()
-
-
-def _space(bag: Bag, prefix: str | None) -> str:
-    return find_prefix(bag) if prefix is None else prefix.rstrip("/")
 
 
 def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
@@ -213,7 +214,7 @@ def read_run(
         DataError: It lacks the states or the window, or has other joints.
     """
     with open_bag(path) as bag:
-        space = _space(bag, prefix)
+        space = find_prefix(bag, prefix)
         topic = f"{space}/{names.JOINT_STATES}"
         states = _increasing(bag.array(topic) if joint is None else bag.joints(topic).of(joint))
         states = states[np.isfinite(states["position"])]
