@@ -61,7 +61,7 @@ def test_a_period_at_which_it_does_not_settle_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["lqr", "lqi"])
-@pytest.mark.parametrize(("period", "lag"), [(0.002, 0.0), (0.002, 0.02), (0.01, 0.0), (0.01, 0.02)])
+@pytest.mark.parametrize(("period", "lag"), [(0.01, 0.0), (0.002, 0.02)])
 def test_it_is_refused_where_the_sampled_loop_with_lag_and_delay_grows_and_nowhere_else(
     name: str, period: float, lag: float
 ) -> None:

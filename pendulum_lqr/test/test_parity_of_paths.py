@@ -143,7 +143,7 @@ def test_both_paths_refuse_from_the_same_delay_on_and_that_is_where_the_sampled_
 
     low, high = 0.0, 0.2
     assert (verdicts(low), verdicts(high)) == ([True, True], [False, False])
-    for _ in range(14):
+    for _ in range(9):
         middle = 0.5 * (low + high)
         first, second = verdicts(middle)
         assert first == second

@@ -26,8 +26,11 @@ _ENDS = {
     "crash": signal.SIGSEGV,
     "closed terminal": None,
 }
-_LIFTED = "import os, sys; os.open(sys.argv[1], os.O_RDWR); os.execv(sys.executable, [sys.executable, *sys.argv[2:]])"
-"""Opens a terminal, which becomes that of the session, then is the program named behind it."""
+_LIFTED = (
+    "import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_DFL); os.open(sys.argv[1], os.O_RDWR); "
+    "os.execv(sys.executable, [sys.executable, *sys.argv[2:]])"
+)
+"""Opens a terminal, which becomes that of the session, then is the program named behind it; also under ``nohup``."""
 _PROGRAM = """
 import contextlib, os, subprocess, sys, threading, time
 from pathlib import Path

@@ -28,7 +28,7 @@ def test_intervals_of_the_default_path_hold_the_truth():
     hits = {}
     for name in ("torque noise", "both offsets near one angle"):
         truth = TRUTHS[name]
-        for seed in range(3):
+        for seed in range(2):
             result = identify([truth.recording(seed, seconds=5.0, period=0.01)], profiles=0)
             for parameter, hit in covered(result, truth.plant).items():
                 hits.setdefault(parameter, []).append(hit)
