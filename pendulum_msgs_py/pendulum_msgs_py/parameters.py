@@ -40,7 +40,7 @@ __all__ = [
 ParameterValue: TypeAlias = bool | int | float | str | list[float] | list[str]
 
 TYPE_NAMES = {bool: "true or false", int: "an integer", float: "a number", str: "text", list: "a list"}
-"""What a parameter of a type must be, in words."""
+"""What a parameter of a type must be, as text."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class ParameterSpec:
 
     @property
     def domain(self) -> str:
-        """The values allowed, in words: ``> 0``, ``0 to 1``, ``one of a, b``, or empty for any."""
+        """The values allowed, as text: ``> 0``, ``0 to 1``, ``one of a, b``, or empty for any."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         above = ">" if self.exclusive_minimum else ">="
@@ -164,7 +164,7 @@ def reject_unknown(values: Mapping[str, object], known: Iterable[str], *, where:
 
 
 def suggestion(name: object, known: Iterable[str]) -> str:
-    """Return what may have been meant by a name that is not known, or else all that are, for the end of a message."""
+    """Return the nearest known name to an unknown one, or else all, for the end of a message."""
     known = list(known)
     near = get_close_matches(str(name), known, n=1)
     return f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
@@ -194,7 +194,7 @@ _NUMBERS = (
 def _read_numbers_as_yaml_1_2(kind: type[Any]) -> type[Any]:
     """Let a loader or dumper see numbers as YAML 1.2 does: ``1e-5`` is one, ``1:30`` and ``1_0`` are text.
 
-    YAML 1.1 reads 1:30 as 90, 010 as 8 and 1e-5 as text, none of which anybody means in a parameter file.
+    YAML 1.1 reads 1:30 as 90, 010 as 8 and 1e-5 as text, none of which is meant in a parameter file.
     """
     numbers = {tag for tag, _, _ in _NUMBERS}
     kind.yaml_implicit_resolvers = {

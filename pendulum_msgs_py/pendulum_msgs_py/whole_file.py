@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, whatever ends the writing; and the sentence for those that cannot."""
+"""Atomic writing of files, and the error message where it fails."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _may_be_replaced(target: Path, status: os.stat_result) -> bool:
     if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:
         return False
     for descriptor in range(3):
-        # A shell goes on to write to what a program has as its standard output.
+        # A shell continues to write to a program's standard output.
         with suppress(OSError):
             if os.path.samestat(status, os.fstat(descriptor)):
                 return False

@@ -60,19 +60,19 @@ def normal_probability(x: float) -> float:
 
 
 def student_quantile(probability: float, freedom: ArrayLike) -> Array:
-    """Return x with P(T <= x) = probability for Student's T with so many degrees of freedom, elementwise."""
+    """Return x with P(T <= x) = probability for Student's T with these degrees of freedom, elementwise."""
     found: Array = scipy.special.stdtrit(freedom, probability)
     return found
 
 
 def student_tail(x: ArrayLike, freedom: ArrayLike) -> Array:
-    """Return P(T > x) for Student's T with so many degrees of freedom, elementwise."""
+    """Return P(T > x) for Student's T with these degrees of freedom, elementwise."""
     found: Array = scipy.special.stdtr(freedom, -np.asarray(x))
     return found
 
 
 def chi_square_tail(x: float, freedom: int) -> float:
-    """Return P(X > x) for a chi-square X with so many degrees of freedom."""
+    """Return P(X > x) for a chi-square X with these degrees of freedom."""
     return float(scipy.special.chdtrc(freedom, x))
 
 

@@ -64,7 +64,7 @@ class JointController:
         Args:
             plant: The plant.
             p: Checked values of :meth:`parameters`.
-            period: Period at which states come, or as long as it is not known one that is assumed [s].
+            period: Period of states, or an assumed one while it is unknown [s].
 
         Raises:
             ParameterError: The values do not make a controller for this plant at this period.

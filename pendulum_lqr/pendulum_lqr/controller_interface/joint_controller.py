@@ -67,7 +67,7 @@ def make_joint_controller(
         name: One of ``JOINT_CONTROLLERS``.
         plant: The plant.
         values: Parameters of its ``parameters`` by name; others at their default.
-        period: Period at which states come [s]; None where it is not known yet.
+        period: Period of states [s]; None while it is unknown.
 
     Raises:
         ParameterError: No such controller for several joints, a value out of domain, a design that does not exist, or

@@ -23,11 +23,11 @@ Law = Callable[[float, float, float, MutableSequence[float], Sequence[float]], f
 
 The time since the first state [s], the angle from upright [rad] and the velocity [rad/s] are those of a state, all
 finite; ``numbers`` are what was designed, ``memory`` is what the law stores from state to state and changes in place.
-It is compiled as it stands, so it uses numbers, ``math``, indices and functions of this project that do likewise.
+It is compiled unchanged, so it uses numbers, ``math``, indices and functions of this project that do likewise.
 """
 
 EFFORT_LIMIT, SET_POINT, OWN = range(3)
-"""Where the limit [N m] and the set-point [rad, from upright] stand among a law's numbers, and where its own begin."""
+"""Indices of the limit [N m] and the set-point [rad, from upright] in a law's numbers, and of its first own one."""
 MOST_NUMBERS, MOST_MEMORY = 320, 128
 """Of a law that is compiled."""
 

@@ -1,4 +1,4 @@
-"""The rate at which states come, measured, and whether a controller bears it."""
+"""The measured rate of states, and whether a controller is stable at it."""
 
 from __future__ import annotations
 

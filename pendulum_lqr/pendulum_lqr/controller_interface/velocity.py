@@ -1,4 +1,4 @@
-"""Where the velocity comes from: measured, or estimated from positions.
+"""The velocity: measured, or estimated from positions.
 
 Positions come in [-pi, pi) and may jump from one end to the other; every estimator takes differences the short way.
 """

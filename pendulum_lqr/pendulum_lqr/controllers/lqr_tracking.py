@@ -32,7 +32,7 @@ class LqrTracking(BaseController):
     """u = u_r(t) - K(theta_r) (x - x_r(t)), where u_r moves the plant along the reference without feedback.
 
     The reference is joined from where the pendulum is, at the first state, after a gap and after an error beyond
-    ``max_error``; a change of parameters goes on from the reference before it. The time of the reference is that of
+    ``max_error``; a change of parameters continues from the reference before it. The time of the reference is that of
     the states' stamps.
 
     Attributes:
@@ -147,7 +147,7 @@ class LqrTracking(BaseController):
         return self._motion_by(self._way, t)
 
     def take_over(self, previous: Controller) -> None:
-        """Go on from the reference before this one, so that neither it nor the torque jumps."""
+        """Continue from the reference before this one, so that neither it nor the torque jumps."""
         if not isinstance(previous, LqrTracking) or previous._newest is None:
             return
         self._newest, self._lost, self.notice = previous._newest, previous._lost, previous.notice
@@ -175,7 +175,7 @@ class LqrTracking(BaseController):
         return self.clamp(fed - k0 * error - k1 * (velocity - now.velocity))
 
     def _join(self, t: float, angle: float, velocity: float) -> None:
-        """Find a way onto the reference that begins where the pendulum is, with as little torque as may be."""
+        """Find a way onto the reference that begins where the pendulum is, with as little torque as possible."""
         # At its own velocity, or at rest: sustaining a speed that damping stops within milliseconds would take torque.
         starts = [Motion(angle, velocity, 0.0), Motion(angle, 0.0, 0.0)]
         starts.sort(key=lambda start: abs(self.schedule.feedforward(start)))

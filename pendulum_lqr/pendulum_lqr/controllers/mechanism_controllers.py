@@ -27,7 +27,7 @@ _CATCH_SUFFIX = "+lqr"
 
 
 class DifferencedVelocity:
-    """Gives a controller velocities from the last two positions in the place of the measured ones.
+    """Gives a controller velocities from the last two positions in place of the measured ones.
 
     The slope between two positions is the velocity in their middle; half a period of the model's acceleration brings
     it to the end. That is exact to the period's square, and as good as the positions are: an encoder's steps over the

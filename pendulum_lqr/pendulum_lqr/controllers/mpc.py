@@ -19,7 +19,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["LinearMpc"]
 
 _SLACK_WEIGHT = 1e4
-"""So dear that angle and velocity keep their limits wherever a torque can keep them."""
+"""Cost high enough that angle and velocity stay within their limits wherever a torque can achieve that."""
 _NOISE = {"angle_noise": 2e-4, "velocity_noise": 1e-2, "torque_noise": 1.0}
 """What the filter expects of encoder, velocity and unknown torque [rad, rad/s, N m]."""
 

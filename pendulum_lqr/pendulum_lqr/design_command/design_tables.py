@@ -1,4 +1,4 @@
-"""Tables of ``design``: one row a combination; the loop in time, the worst case over what is not known of the plant."""
+"""Tables of ``design``: one row a combination; the loop in time, the worst case over the plant's uncertainty."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class TimeFigures:
     friction_band: float = math.nan
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; what is not known as None."""
+        """Return plain values for JSON; unknown ones as None."""
         return without_nan(asdict(self))
 
 

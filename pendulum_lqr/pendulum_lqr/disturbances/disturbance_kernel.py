@@ -23,7 +23,7 @@ def uniform_loop() -> Any:
 
     @compiled
     def middle_interval(own: Any, known: Any) -> Any:
-        """Return the lower median of so many intervals, as ``statistics.median_low`` does."""
+        """Return the lower median of a number of intervals, as ``statistics.median_low`` does."""
         for index in range(known):
             value, place = own.interval_ns[index], index
             while place > 0 and own.ordered_ns[place - 1] > value:

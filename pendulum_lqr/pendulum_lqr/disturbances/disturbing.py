@@ -63,7 +63,7 @@ class DisturbanceLoop:
         return self._armed or self.start_ns is not None
 
     def start(self) -> bool:
-        """Begin with the next state; return False if it runs already."""
+        """Start with the next state; return False if it runs already."""
         if self.running:
             return False
         self._armed = True
@@ -120,7 +120,7 @@ class DisturbanceLoop:
 
     @property
     def goes_on(self) -> bool:
-        """Whether the next state, if it is an ordinary one, begins and ends nothing."""
+        """Whether the next state, if it is a nominal one, starts and ends nothing."""
         return self.newest_stamp_ns is not None and not self._armed and not self._ending
 
     def count(self, stamps_ns: Sequence[int], torque: float) -> None:

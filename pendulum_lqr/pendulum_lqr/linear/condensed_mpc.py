@@ -143,7 +143,7 @@ class CondensedMpc:
         result = self._solver.solve(raise_error=False)
         plan = result.x
         if plan is None or not np.isfinite(plan[: self.inputs]).all() or result.info.status_val not in {1, 2}:
-            # It would begin the next one where it got lost.
+            # Its last iterate would be a bad start for the next one.
             self.reset()
             return None
         first: Matrix = self._scale * (plan[: self.inputs] - self._K @ state)

@@ -47,7 +47,7 @@ class DesignError(ParameterError):
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """State feedback u = -K x and the proof that came with it.
+    """State feedback u = -K x and its proof.
 
     Attributes:
         K: Gain, shape (n,) of one input, (m, n) of several [N m/rad, N m s/rad, ...].
@@ -113,7 +113,7 @@ def continuous_lqr(model: LinearModel, q: ArrayLike, r: ArrayLike) -> Gain:
     """Return the gain on the whole state that minimises the integral of x' Q x + u' R u.
 
     Args:
-        model: Linear model; its delay is not counted, the margins show how much of it the loop bears.
+        model: Linear model; its delay is ignored, the margins show how much of it the loop tolerates.
         q: Weights of the measured states, [theta, theta_dot] of one joint; the others cost nothing. See
             :func:`cost_matrices`.
         r: Weight of the efforts, > 0: one for all, or m.

@@ -41,7 +41,7 @@ class ParameterBox:
     Attributes:
         bounds: Lowest and highest value by parameter, in its unit.
         correlation: Of the errors, in the order of ``bounds``, shape (k, k); None takes every corner for possible.
-        source: Where this comes from, in words.
+        source: Where this comes from, as text.
     """
 
     bounds: Mapping[str, tuple[float, float]]
@@ -154,7 +154,7 @@ def parse_box(texts: Sequence[str], plant: PlantParameters, path: Path | None = 
     Args:
         texts: One a parameter: a share in percent to either side, or lowest and highest value in the parameter's unit;
             or ``identified`` alone, for the intervals of the plant file.
-        plant: The plant that is believed in.
+        plant: The nominal plant.
         path: Its file; None for a preset.
 
     Raises:

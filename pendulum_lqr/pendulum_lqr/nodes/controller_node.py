@@ -218,7 +218,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Send zero torque, whatever the state was."""
+        """Send zero torque in any state."""
         self._send_zero()
         return super().on_shutdown(state)
 
@@ -254,7 +254,7 @@ class ControllerNode(LifecycleNode, PollingNode):
             )
 
     def _swap(self, controller: Controller | JointController) -> None:
-        """Take over what was designed aside; a design that fails never comes here, and leaves the old gain in force."""
+        """Take over the new design; a failed design never gets here, and leaves the old gain in force."""
         if self._loop is None:
             self._pending = controller
             return
@@ -316,7 +316,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         return uses_period(self._settings["controller"], self._settings["velocity"])
 
     def _may_answer(self) -> bool:
-        """Return whether the rate of the states is one that the design is for, as far as it is known."""
+        """Return whether the design is for the rate of the states, as far as that is known."""
         if self._period_known:
             return True
         measured = self._watch.period
@@ -331,7 +331,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         return not waits or (self._loop is not None and self._loop.answered > 0)
 
     def _settle_period(self, measured: float) -> bool:
-        """Design for the measured period where none was given; return whether the controller bears it."""
+        """Design for the measured period where none was given; return whether the controller is stable at it."""
         values = self._settings.values
         self._refusal = ""
         plant = self._plant

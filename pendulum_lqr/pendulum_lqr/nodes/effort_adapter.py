@@ -1,6 +1,6 @@
 """Adds what commands of ros2_control's effort controllers lack: the stamp of the state that they reply to.
 
-ros2_control's commands bear no stamp that a plant could check, and its effort controllers hold the last one for ever.
+ros2_control's commands have no stamp that a plant could check, and its effort controllers hold the last one for ever.
 Here each command becomes one torque, as the reply to the newest state; none is ever repeated, so that a silent
 controller meets the plant's rule for stale commands.
 """
@@ -30,10 +30,10 @@ def effort_of_array(data: Sequence[float]) -> float:
 
 
 def effort_of_joint(joints: Sequence[str], efforts: Sequence[float]) -> float:
-    """Return the torque [N m] for our joint in a ``sensor_msgs/JointState`` that commands several.
+    """Return the torque [N m] for the pendulum's joint in a ``sensor_msgs/JointState`` that commands several.
 
     Raises:
-        DataError: Our joint is not among them, efforts are missing, or ours is not finite.
+        DataError: The joint is not among them, efforts are missing, or its own is not finite.
     """
     if JOINT not in joints:
         raise DataError(f"command is for {', '.join(joints) or 'no joint'}; expected {JOINT}")

@@ -55,7 +55,7 @@ SIGNALS = ("angle", "cos", "sin", "position", "velocity", "effort")
 """What a sample may hold of each joint, in this order: angle, cosine and sine of those that turn, the position of those
 that slide, the velocity of all, and of those that are driven the ``effort`` of the last command."""
 DEFAULT_SIGNALS = ("cos", "sin", "velocity", "effort")
-"""What policies of our own training see: an angle jumps where cosine and sine do not."""
+"""What policies of this project's training see: an angle jumps where cosine and sine do not."""
 ACTIVATIONS = ("tanh", "relu")
 OUTPUTS = ("clip", "tanh")
 _SAME = 1e-3
@@ -225,7 +225,7 @@ def model_of(plant: AnyPlant) -> str:
 
 
 def default_signals(coordinates: Coordinates) -> tuple[str, ...]:
-    """Return what policies of our own training see: ``DEFAULT_SIGNALS``, and positions where a joint slides."""
+    """Return what policies of this project's training see: ``DEFAULT_SIGNALS``, and positions where a joint slides."""
     if all(joint.turns for joint in coordinates.joints):
         return DEFAULT_SIGNALS
     return tuple(name for name in SIGNALS if name in {*DEFAULT_SIGNALS, "position"})

@@ -32,7 +32,7 @@ class Told:
         plant: The plant of its training.
         period: Time between two commands [s].
         observation: What it sees of a sample, in its order: words of ``SIGNALS``, with a minus where it sees the
-            negative (``-cos`` is the cosine of an angle from hanging); empty to know it by the spaces.
+            negative (``-cos`` is the cosine of an angle from hanging); empty to infer it from the spaces.
         history: Samples that it sees, the oldest first.
         velocity_scale: Velocity that it sees as 1 [rad/s].
         velocity_box: Largest speed that its training visited [rad/s]; 0 for the bound of its space.
@@ -49,7 +49,7 @@ class Told:
 
 
 class _Known(NamedTuple):
-    """An environment that is known by its spaces."""
+    """An environment that is identified by its spaces."""
 
     high: tuple[float, ...]
     action: float
@@ -58,7 +58,7 @@ class _Known(NamedTuple):
 
 _KNOWN = (
     _Known((1.0, 1.0, 8.0), 2.0, "cos,sin,velocity"),  # Gymnasium's Pendulum-v1
-    _Known((math.pi, math.nan), math.nan, "angle,velocity"),  # ours, PendulumX59-v0
+    _Known((math.pi, math.nan), math.nan, "angle,velocity"),  # this project's PendulumX59-v0
 )
 """Upper bounds of observation and action; NaN for any."""
 
@@ -125,7 +125,7 @@ def _plain(words: Sequence[str]) -> list[str]:
 
 
 def _columns(words: Sequence[str], history: int) -> NDArray[np.int64]:
-    """Return for each value that our networks see the place where the actor sees it, shape (history * n,)."""
+    """Return for each input of a policy its index in the actor's input, shape (history * n,)."""
     own = sorted(range(len(words)), key=lambda k: SIGNALS.index(_plain(words)[k]))
     return np.array([len(words) * sample + k for sample in range(history) for k in own])
 

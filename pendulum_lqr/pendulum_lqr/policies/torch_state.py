@@ -110,7 +110,7 @@ def _tensors(pickled: bytes) -> dict[str, _Tensor]:
 
 
 class _Reader:
-    """Reads the operations of a pickle into values of our own.
+    """Reads the operations of a pickle into plain values.
 
     Messages show no value of it: a small pickle can name one that takes forever to print.
     """

@@ -117,7 +117,7 @@ def _disc_distance(centre: Complex, discs: Array) -> Array:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What is known of one design on the machine.
+    """The certificate of one design on the machine.
 
     Attributes:
         stable_on_model: Whether it stabilises the model that it was designed on, sampled as the machine is.

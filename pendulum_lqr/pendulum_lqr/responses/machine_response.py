@@ -63,7 +63,7 @@ class Machine:
 
     @property
     def up_to_nyquist(self) -> bool:
-        """Whether the highest line lies so near the Nyquist frequency that little is left to happen beyond it."""
+        """Whether the highest line lies so near the Nyquist frequency that little can happen beyond it."""
         return 2.0 * self.period * float(self.frequency[-1]) >= _NEAR_NYQUIST
 
     @classmethod

@@ -1,4 +1,4 @@
-"""A measured frequency response as a value and as a file, with what is known of its errors."""
+"""A measured frequency response as a value and as a file, with its error estimate."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ _HANGING = 0.05
 _PUSH = 0.05
 """That push, as a share of the acceleration w_0^2 of the pendulum's own frequency."""
 _LEAST_COUPLING = 0.3
-"""Share of the coupling of hanging below which friction is not made up for: a level pole feels nothing of its cart."""
+"""Share of the coupling of hanging below which friction is not compensated: a cart does not act on a level pole."""
 _MOST_FRICTION = 0.015
 """Largest dry friction of the pendulum, by the torque of its level weight. The LQR's model has none, and with
 more it does not bring every mechanism to rest (pendubot: 5 of 5 at 0.015, none at 0.02)."""
@@ -199,7 +199,7 @@ class EnergyPump:
         pushed = self._forward(position, velocity, (1.0, 0.0) if a == 0 else (0.0, 1.0), self._packed)[a]
         effort = (wanted - still) / (pushed - still)
         if self._coulomb:
-            # In the way that it goes, or, as long as it stands, in the way that it should.
+            # In the direction of motion, or, at rest, in the desired direction.
             effort += math.copysign(self._coulomb, speed if abs(speed) > 1e-3 else wanted)
         return self.limit if effort > self.limit else max(effort, -self.limit)
 

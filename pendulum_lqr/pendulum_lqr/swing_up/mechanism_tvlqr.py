@@ -74,7 +74,7 @@ def whole_turns(plant: MechanismParameters, x: Vector) -> Array:
 class MechanismTvlqr:
     """u = u0(t) - K(t) (x - x0(t)) along a swing-up, then LQR; another controller where both are far.
 
-    It begins the trajectory at hanging. What is thrown off it, beyond ``tube`` in the tracking's own cost, is caught
+    It starts the trajectory at hanging. A state off it, beyond ``tube`` in the tracking's own cost, is caught
     by the LQR where that can, and else left to ``recover``.
 
     Args:

@@ -21,7 +21,7 @@ def wrap(angle: float) -> float: ...
 @overload
 def wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]: ...
 def wrap(angle: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
-    """Return the equivalent angle in [-pi, pi); what is no finite angle comes back as NaN.
+    """Return the equivalent angle in [-pi, pi); NaN where it is not finite.
 
     Angles that already lie there come back bit for bit, so that wrapping never adds rounding noise to a loop.
 

@@ -87,7 +87,7 @@ def encode_joints(
 
     Args:
         stamp_ns: Stamp, 0 to ``MAX_SECONDS`` seconds [ns].
-        frame_id: Header frame, by our contract the name of the sender.
+        frame_id: Header frame, by the contract the name of the sender.
         joints: Joint names.
         position: One for each joint, or none to leave them out [rad or m].
         velocity: Likewise [rad/s or m/s].
@@ -115,7 +115,7 @@ def encode_joint_state(
 
     Args:
         stamp_ns: Stamp, 0 to ``MAX_SECONDS`` seconds [ns].
-        frame_id: Header frame, by our contract the name of the sender.
+        frame_id: Header frame, by the contract the name of the sender.
         joint: Joint name.
         position: theta [rad], or None to leave it out.
         velocity: theta' [rad/s], or None.
@@ -216,7 +216,7 @@ def decode_joint_state(data: bytes) -> JointStateFields | None:
 
 
 def _decode_unknown(data: bytes) -> JointStateFields | None:
-    """Return the fields of a message whose layout is not known yet, believing none of its lengths."""
+    """Return the fields of a message of a new layout, checking all of its lengths."""
     size = len(data)
     try:
         sec, nanosec, frame_length = _PREFIX.unpack_from(data)
@@ -311,7 +311,7 @@ _layout_cache: dict[tuple[str, tuple[str, ...], int, int, int], tuple[struct.Str
 def _layout(
     frame_id: str, joints: tuple[str, ...], n_position: int, n_velocity: int, n_effort: int
 ) -> tuple[struct.Struct, tuple[object, ...]]:
-    """Return the layout of a message, and what stands in it between the stamp and the counts."""
+    """Return the layout of a message, and its bytes between the stamp and the counts."""
     key = (frame_id, joints, n_position, n_velocity, n_effort)
     cached = _layout_cache.get(key)
     if cached is not None:

@@ -31,7 +31,7 @@ _SEQUENCES = ("positions", "velocities", "accelerations", "effort")
 
 
 def decode_joint_trajectory(data: bytes) -> tuple[int, Trajectory]:
-    """Return stamp [ns] and trajectory of our joint.
+    """Return stamp [ns] and trajectory of the pendulum's joint.
 
     Args:
         data: A serialised message, encapsulation header included.

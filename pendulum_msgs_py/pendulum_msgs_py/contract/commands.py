@@ -46,7 +46,7 @@ _REFUSALS = {
 
 
 class CommandGate:
-    """Checks the commands of one input and keeps the newest that passed.
+    """Checks the commands of one input and stores the newest that passed.
 
     Args:
         timeout: Age beyond which a command is ignored [s], > 0.
@@ -108,7 +108,7 @@ class CommandGate:
         newest = self._newest
         if newest is None:
             return None
-        # What has grown old stays old, whatever the clock does then: a torque does not return without a command.
+        # An expired command stays expired, whatever the clock does: torque does not return without a command.
         self._expired = self._expired or has_expired(newest.stamp_ns, self._heard_ns, now_ns, self.timeout_ns)
         return None if self._expired or is_ahead(newest.stamp_ns, now_ns) else newest
 

@@ -91,7 +91,7 @@ class PlantLimits:
         arm_effort: Largest command that may be waiting when the plant is armed [N m].
         handover_effort: Largest distance of a command from the torque that holds, for it to take over [N m].
         handover_sum: The same for the sum with a disturbance that waits [N m].
-        start_effort: Largest torque with which a commander may begin where nobody commands [N m].
+        start_effort: Largest torque with which a commander may start where there is none [N m].
         start_sum: The same for the sum with a disturbance that waits [N m].
         stop_time: Time over which torque fades at an e-stop and at disarming, stop category 1; 0 for category 0 [s].
         starvation: Time without a command after which a plant that is armed for effort disarms [s].
@@ -152,7 +152,7 @@ class PlantLimits:
                 raise ParameterError(f"position window is [{low}, {high}] {of_position}; expected min < max")
 
     def for_joints(self, joints: int, driven: int) -> PlantLimits:
-        """Return the limits with one window for each of so many joints.
+        """Return the limits with one window for each of a number of joints.
 
         Raises:
             ParameterError: They are limits for another number of joints.

@@ -216,7 +216,7 @@ def limits_from_parameters(
         plant_effort_limits: Effort limit of each driven joint in the plant file [N m or N]; the parameter can only
             lower them.
         coordinates: Joints of the plant.
-        lockstep: Whether time is simulated: there noise begins with the controller, and its sum is not limited.
+        lockstep: Whether time is simulated: there noise starts with the controller, and its sum is not limited.
         feedback_timeout: Age of a measurement that faults an armed plant [s].
         least_command_timeout: The shortest that the plant's own period allows; a shorter one is raised to it [s].
 

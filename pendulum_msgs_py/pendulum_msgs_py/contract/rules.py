@@ -36,7 +36,7 @@ COMMANDER_HOLD = 1.0
 FUTURE_TOLERANCE_NS = 5_000_000
 """How far ahead of the plant's clock a stamp may lie [ns]."""
 NEVER = -(2**63)
-"""In the place of a stamp that there is none of."""
+"""In place of a missing stamp."""
 
 ACCEPTED, TOO_OLD, FROM_FUTURE, SECOND_COMMANDER, DUPLICATE, OUT_OF_ORDER = range(6)
 """Results of :func:`judge_stamp`."""
@@ -89,7 +89,7 @@ def has_lapsed(commanded_ns: int, now_ns: int) -> bool:
 
 
 def is_last(stamp_ns: int, newest_ns: int) -> bool:
-    """Return whether an effort of zero ends what its commander commands: it answers no state, but follows the answer.
+    """Return whether an effort of zero ends what its commander commands: it replies to no state, but follows the reply.
 
     Ended at once, a motor is released; an effort of zero would drive its torque loop until it is too old.
     """

@@ -88,7 +88,7 @@ class Throttle:
 
         Args:
             now: Time on a steady clock [s].
-            urgent: Let it through whatever was before.
+            urgent: Let it through regardless of the last line.
         """
         if now - self._last < self._interval and not urgent:
             self._left_out += 1

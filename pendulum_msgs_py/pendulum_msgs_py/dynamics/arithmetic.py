@@ -1,6 +1,6 @@
 """The scalar equations in another arithmetic: complex numbers, arrays, symbols.
 
-The equations of this package use ``math`` and the four operations alone. With ``cmath`` in the place of ``math`` they
+The equations of this package use ``math`` and the four operations alone. With ``cmath`` in place of ``math`` they
 give exact derivatives (complex step), with ``numpy`` they take whole grids, with ``casadi`` they become expressions.
 """
 
@@ -21,7 +21,7 @@ _STEP = 2.0**-64
 
 @lru_cache(maxsize=64)
 def in_arithmetic(function: Callable[..., Any], arithmetic: ModuleType) -> Callable[..., Any]:
-    """Return an equation of this package, and what it calls, with another module in the place of ``math``.
+    """Return an equation of this package, and what it calls, with another module in place of ``math``.
 
     Args:
         function: A plain function of :mod:`pendulum_msgs_py.dynamics` or :mod:`pendulum_msgs_py.mechanisms`.

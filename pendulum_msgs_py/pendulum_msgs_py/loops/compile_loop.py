@@ -22,8 +22,8 @@ COMMON = (
     ("pendulum_lqr.disturbances.disturbance_kernel:uniform_loop",),
     ("pendulum_hw_bridge.emulation.kernel_loop:actuator_loop",),
 )
-"""Those of the thesis's experiment: the plant by our integrator and by the thesis's, its controller, its noise, and the
-emulated actuator."""
+"""Those of the thesis's experiment: the plant by the default integrator and by the thesis's, its controller, its
+noise, and the emulated actuator."""
 
 
 def _keep_common() -> None:

@@ -58,7 +58,7 @@ def load_loop(builder: str, *choice: str, symbols: Mapping[str, int]) -> Loop:
         symbols: Addresses of the functions that it calls, by name.
 
     Raises:
-        NoMachineCodeError: It cannot be had here.
+        NoMachineCodeError: It cannot be compiled here.
     """
     return _load(builder, choice, tuple(sorted(symbols.items())))
 
@@ -184,7 +184,7 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes] | None:
 
 
 def _source(name: str) -> Path:
-    """Return a source file of the packages that are in use here, wherever the code that names it was compiled."""
+    """Return a source file of the imported packages, also for code that was compiled from another copy."""
     package, _, rest = name.partition("/")
     return _folder(package) / rest
 
@@ -256,7 +256,7 @@ def compile_loop(path: Path, builder: str, *choice: str) -> None:
 
 
 def _own_sources() -> list[str]:
-    """Return the files of our modules in this process, each from its package on: a copy elsewhere has its own."""
+    """Return the files of the project's modules in use, each from its package on: a copy elsewhere has its own."""
     found = []
     for name, module in sorted(sys.modules.items()):
         package = name.partition(".")[0]

@@ -112,7 +112,7 @@ def _link(code: bytes, known: Mapping[str, int]) -> LinkedCode:
 
 @contextlib.contextmanager
 def _damage_is_told() -> Iterator[None]:
-    """Turn whatever a file that is cut or damaged leads to into a ``ValueError``."""
+    """Turn any error of a truncated or damaged file into a ``ValueError``."""
     try:
         yield
     except (struct.error, LookupError, OverflowError, MemoryError) as error:

@@ -26,7 +26,7 @@ MOST_PERIODS = 256
 OWN_STAMPS = 128
 """Number of own stamps among which a command's stamp is searched."""
 EFFORT, DISTURBANCE, PUSH = range(3)
-"""Where each input stands."""
+"""Index of each input."""
 INPUTS = 3
 ENDED, UNUSUAL, MESSAGE_WAITS = range(3)
 """Why a slice ended: its time is over, the next period is not nominal, or a message is Python's to read.

@@ -1,7 +1,7 @@
 """Compiles the project's scalar functions with numba, from the very code that is also interpreted.
 
 Equations and rules stand once, in plain Python with ``math``. :func:`compile_tree` takes such a function with
-everything it calls and returns it compiled; on request with another module in the place of one that it uses.
+everything it calls and returns it compiled; on request with another module in place of one that it uses.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def compile_tree(
         function: A plain function of this project that uses scalars, tuples and ``math``.
         exact: Give the very bits that Python gives; else a fused multiply-add may change the last one.
         inline: Inline each function: machine code without function arguments can be cached on disk.
-        substitutes: Modules that are found in the place of those that the functions name.
+        substitutes: Modules that are found in place of those that the functions name.
         within: Compiled functions alone call it, as they do what it calls.
     """
     key = (function, exact, inline, within, *substitutes.items())

@@ -65,7 +65,7 @@ def chain(q: Any, p: Any) -> tuple[Point, ...]:
 
 
 def bodies(p: Any) -> tuple[Body, ...]:
-    """Return arm and pendulum; the arm's inertia is all about its axis, its mass is not known and counts nowhere."""
+    """Return arm and pendulum; the arm's inertia is all about its axis, its mass is unknown and has no effect."""
     arm_inertia, arm, m, length, centre, inertia, _, _, _ = p
     about_centre = inertia - m * centre * centre
     return (

@@ -29,7 +29,7 @@ def undetermined(
 
     A size (inertia, gravity, mass, centre of mass) has to be positive and known to an order of magnitude; only the
     inertia of a strongly overdamped pendulum may be anything from 0 up. A friction may be 0, but not more than ten
-    times what is believed, or than what stops the pendulum; a time has to be known to a second.
+    times the estimate, or than what stops the pendulum; a time has to be known to a second.
 
     Args:
         plant: The estimates.

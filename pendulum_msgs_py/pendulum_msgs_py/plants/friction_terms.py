@@ -100,7 +100,7 @@ def added_friction(
         # One that is absent is not called: interpreted plants would wait for it.
         calls.append(f"(term_{number}({', '.join(('speed', 'weight', *values))}) if {values[0]} != 0.0 else 0.0)")
     text = f"def added(speed, weight, values):\n    return {' + '.join(calls) or '0.0'}\n"
-    exec(compile(text, __file__, "exec"), scope)  # noqa: S102  (our own words: names and numbers of the table above)
+    exec(compile(text, __file__, "exec"), scope)  # noqa: S102  (own text: names and numbers of the table above)
     made: FunctionType = scope["added"]
     return made
 

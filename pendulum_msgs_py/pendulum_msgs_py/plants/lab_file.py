@@ -131,8 +131,8 @@ class LabFile:
     Attributes:
         values: Value by parameter of the bridge; what the file leaves out is not in it.
         name: Name of the bench.
-        notes: Remarks of a person.
-        proofs: What the guided procedures have shown, by procedure: date and result in words.
+        notes: Free text.
+        proofs: What the guided procedures have shown, by procedure: date and result as text.
         folder: Where relative paths start; the folder of the file.
     """
 

@@ -52,7 +52,7 @@ class PlantDifference:
     unit: str
 
     def __str__(self) -> str:
-        """Return the difference in words, the plant designed for first."""
+        """Return the difference as text, the plant designed for first."""
         first, second = (
             f"{value:.6g}" if isinstance(value, float) else value for value in (self.designed, self.running)
         )

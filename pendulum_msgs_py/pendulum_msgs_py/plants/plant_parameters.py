@@ -1,6 +1,6 @@
 """Physical parameters of a pendulum: one dataclass, one YAML format, shared by plant, design and identification.
 
-The file gives each value with its unit, so that a file in other units is refused rather than believed::
+The file gives each value with its unit, so that a file in other units is refused rather than misread::
 
     format: pendulum_plant/1
     name: thesis
@@ -139,7 +139,7 @@ if TYPE_CHECKING:
 
     @dataclass(frozen=True, kw_only=True)
     class _FrictionTerms:
-        """What type checkers see of the terms' parameters: those of our own table."""
+        """What type checkers see of the terms' parameters: those of the table of terms."""
 
         load_friction: float = 0.0
 

@@ -47,7 +47,7 @@ def specs_of(kind: type[Any]) -> tuple[ParameterSpec, ...]:
     """Return the table of a dataclass's quantities: name and default are the field's, the rest its annotation's."""
     found = []
     hints = get_type_hints(kind, include_extras=True)
-    # What is given by name alone, such as a friction term, stands last.
+    # What is given by name alone, such as a friction term, comes last.
     for entry in sorted(fields(kind), key=lambda entry: bool(entry.kw_only)):
         for quantity in getattr(hints[entry.name], "__metadata__", ()):
             default = entry.default if isinstance(entry.default, float) else quantity.example
@@ -124,7 +124,7 @@ def write_quantities(
         values: By name; None is left out.
         specs: The quantities to write.
         intervals: By name, with the prefix.
-        prefix: What stands before the names there, as ``elbow.``.
+        prefix: Prefix of the names there, as ``elbow.``.
     """
     quantities: dict[str, dict[str, Any]] = {}
     for spec in specs:

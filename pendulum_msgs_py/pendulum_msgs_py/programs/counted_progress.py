@@ -32,7 +32,7 @@ def counting_bar(console: Console, *columns: ProgressColumn) -> Progress:
 
     Args:
         console: Where to draw.
-        columns: What stands at its right end.
+        columns: Columns at its right end.
     """
     return Progress(
         TextColumn("{task.description}"),
@@ -81,7 +81,7 @@ def _call(job: Callable[[], _Result]) -> _Result:
 
 @contextmanager
 def resumable(console: Console, folder: Path) -> Iterator[None]:
-    """Turn Ctrl-C into a sentence that says how the work in a folder is gone on with.
+    """Turn Ctrl-C into a sentence on how to resume the work in a folder.
 
     Raises:
         typer.Exit: The user interrupted, after the sentence.
@@ -95,13 +95,13 @@ def resumable(console: Console, folder: Path) -> Iterator[None]:
 
 @contextmanager
 def counted_progress(console: Console, unit: str, total: int, folder: Path) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar with the remaining time while resumable work goes on.
+    """Show a bar with the remaining time during resumable work.
 
     Args:
         console: Where to draw.
         unit: What is counted, as a plural.
         total: How many there are.
-        folder: Where the work keeps what it has done.
+        folder: Where the work stores its results.
 
     Yields:
         What the work calls with pieces done and in all.

@@ -159,7 +159,7 @@ def split_ros_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]
 def cli_main(
     app: typer.Typer, argv: Sequence[str] | None = None, *, name: str | None = None, takes_ros_arguments: bool = False
 ) -> int:
-    """Run a typer application and return its exit code; our own errors end as one sentence.
+    """Run a typer application and return its exit code; a PendulumError ends as one sentence.
 
     Args:
         app: The application.

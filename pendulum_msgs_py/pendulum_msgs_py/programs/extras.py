@@ -1,4 +1,4 @@
-"""What to install where a library is missing: the extra of one of our packages that brings it, in a sentence."""
+"""What to install where a library is missing: the extra of a package that installs it, in a sentence."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def extra_of(module: str) -> str:
         module: What is imported; of ``a.b`` only ``a`` counts.
 
     Returns:
-        Empty where no installed package of ours needs it.
+        Empty where no installed package of this project needs it.
     """
     # Each program's start would pay for it, and few lack a library.
     from importlib.metadata import PackageNotFoundError, requires

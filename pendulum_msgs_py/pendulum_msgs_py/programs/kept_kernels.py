@@ -85,7 +85,7 @@ class KernelStore:
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the kernel for these types of arguments; None where none is cached, or it is damaged."""
         target.refresh()
-        # Whatever a damaged file holds, compiling again mends it.
+        # A damaged file is replaced by compiling again.
         with contextlib.suppress(OSError, ValueError, EOFError, pickle.UnpicklingError):
             head, _, content = self._path(signature, target.codegen()).read_bytes().partition(b"\n")
             # Of other source it is not even read: what it names may be gone.
@@ -137,7 +137,7 @@ def _digest(content: bytes) -> bytes:
 
 @cache
 def _source_of(package: str) -> str:
-    """Return what identifies all Python source of a package, or of a module that stands alone."""
+    """Return what identifies all Python source of a package, or of a single module."""
     module = sys.modules[package]
     folders = [Path(each) for each in getattr(module, "__path__", ())]
     files = [path for folder in folders for path in sorted(folder.rglob("*.py"))]

@@ -53,7 +53,7 @@ def run_in_real_time(priority: int) -> None:
     if not _is_known():
         raise ParameterError(f"realtime_priority is {priority}; this system has none: expected 0")
     promoted: set[int] = set()
-    # A thread that was begun meanwhile by one whose turn had not come is an ordinary one.
+    # A thread started meanwhile by one not yet promoted has normal priority.
     while waiting := thread_numbers() - promoted:
         for thread in waiting:
             _promote(thread, priority)

@@ -185,7 +185,7 @@ BESIDE_PLANTS = {"conductor": "/conductor", "console": "/console", "recorder": "
 
 _SIDE_NODES = ("controller", "effort_controller", "disturbance", "recorder", "viewer", "markers")
 _IN_PROCESS = {"simulator_e_stop": "simulator", "bridge_e_stop": "bridge", "bridge_e_stop_input": "bridge"}
-"""Nodes that run in the process of another, whose enclave is theirs too; they have no log of their own."""
+"""Nodes that run in the process of another, and share its enclave; they have no log of their own."""
 _WITH_PLANT = {
     "simulator": ("simulator_e_stop",),
     "bridge": ("procedure", "bridge_e_stop", "bridge_e_stop_input"),

@@ -35,7 +35,7 @@ def make_console(*, stderr: bool = False, highlight: bool = True) -> Console:
 
 
 class WholeTable(Table):
-    """A table that breaks its cells at spaces only, and goes on below, its first column repeated, when it is too wide.
+    """A table that breaks its cells at spaces only, and continues below with its first column if it is too wide.
 
     A single word that is wider than the console is folded; nothing is ever left out.
     """

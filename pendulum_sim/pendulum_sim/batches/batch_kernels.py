@@ -137,7 +137,7 @@ def _control(lanes: int) -> Any:
 
 @cache
 def smooth_kernel(method: str, coefficient_rows: int) -> Any:
-    """Return the loop for pendulums without dry friction, lag and delay, by an integrator with so many coefficients."""
+    """Return the loop for pendulums without dry friction, lag and delay, by an integrator with its coefficients."""
     integrator = get_integrator(method)
     step = compile_tree(integrator.step, vector=True)
     acceleration = compile_tree(acceleration_with_friction, vector=True)

@@ -171,7 +171,7 @@ def _table(name: str, values: ArrayLike, width: int) -> Array:
 
 
 def _vary(parameters: MechanismParameters, wide: dict[str, Array], name: str, values: Array) -> None:
-    """Put values in the place of one parameter, by its name."""
+    """Put values in place of one parameter, by its name."""
     if name not in parameters.specs:
         raise ParameterError(f"variation {name!r} is unknown; expected one of {', '.join(parameters.specs)}")
     for value in (float(values.min()), float(values.max())):

@@ -49,7 +49,7 @@ def check_weights(q: object, r: float, count: int, expected: str) -> None:
         q: Weights of the state.
         r: Weight of the efforts.
         count: How many the state has.
-        expected: That in words.
+        expected: That as text.
     """
     weights = np.asarray(q, dtype=np.float64)
     # Below zero they would pay for what they are to keep small.
@@ -118,7 +118,7 @@ class PlantVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         self._generators: list[np.random.Generator] | None = None
 
     def _take_seeds(self, seed: int | list[int | None] | None) -> None:
-        """Set the generators: one for all plants, or one for each; where one of a list is None, its plant goes on."""
+        """Set the generators: one for all plants, or one for each; None in a list leaves that generator as it is."""
         if isinstance(seed, (list, tuple, np.ndarray)):
             if len(seed) != self.num_envs:
                 raise ParameterError(f"seed has {len(seed)} entries; expected one for each of {self.num_envs} plants")

@@ -93,7 +93,7 @@ class PendulumVectorEnv(PlantVectorEnv):
 
         Args:
             seed: One seed for all, whose pendulums then share a generator, or one for each: pendulum i then starts and
-                is disturbed as a single environment reset with that seed; where one is None, it goes on drawing.
+                is disturbed as a single environment reset with that seed; where one is None, its generator stays.
             options: ``start``: one of ``STARTS``; ``state``: starts [x_1, x_2], shape (2,) or (N, 2), in the
                 observation's convention; ``reset_mask``: which to start, shape (N,).
 
@@ -157,7 +157,7 @@ class PendulumVectorEnv(PlantVectorEnv):
         if not np.isfinite(reward).all():
             raise ParameterError(f"action {int(np.argmin(np.isfinite(reward)))} is not a finite number of N m")
         if restart.size:
-            # By gymnasium's rule for NEXT_STEP this step starts their next episodes; its action counts for nothing.
+            # By gymnasium's rule for NEXT_STEP this step starts their next episodes; its action is ignored.
             self._restart(restart, self._start)
             result[restart] = self._observe()[restart]
             reward[restart] = 0.0

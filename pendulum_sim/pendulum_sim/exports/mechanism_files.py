@@ -29,7 +29,7 @@ _TIMESTEP = 0.002
 def mechanism_mjcf(parameters: MechanismParameters) -> str:
     """Return the MJCF of a plant for MuJoCo, with its rotors as armature of tendons.
 
-    What MuJoCo has no word for is left out: Stribeck's curve. Its dry friction is regularised: it creeps where ours
+    What MuJoCo lacks is left out: Stribeck's curve. Its dry friction is regularised: it creeps where this one
     sticks; its end stops are springs.
 
     Raises:

@@ -105,7 +105,7 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
     # The measured angle is angle_offset when the link hangs: the frame is turned back by as much.
     add(joint, "origin", xyz="0 0 0", rpy=f"0 {number(parameters.angle_offset)} 0")
     add(joint, "axis", xyz="0 -1 0")
-    # topic_based drives our plants, which take commands; anything else moves the joint itself.
+    # topic_based drives this project's plants, which take commands; anything else moves the joint itself.
     gain = 1.0 if ros2_control == "topic_based" else torque_gain(parameters)
     limit = gain * parameters.effort_limit
     friction = parameters.coulomb_friction + (drive.motor_coulomb_friction if drive is not None else 0.0)
@@ -119,7 +119,7 @@ def mjcf(parameters: PlantParameters) -> str:
     """Return the MJCF of the plant for MuJoCo.
 
     What MuJoCo has no word for is left out: Stribeck's curve, further friction terms, and the spring's hysteresis and
-    hardening. Its dry friction is regularised: it creeps where ours sticks.
+    hardening. Its dry friction is regularised: it creeps where this one sticks.
 
     Args:
         parameters: The plant; with a drivetrain there is a second joint, the motor's, coupled by a spring.

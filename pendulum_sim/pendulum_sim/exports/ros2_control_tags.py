@@ -10,7 +10,7 @@ from pendulum_msgs_py.errors import ParameterError
 __all__ = ["HARDWARE", "add_ros2_control"]
 
 HARDWARE = ("none", "gz", "topic_based")
-"""No hardware; Gazebo's simulation; one of our plants, through its topics."""
+"""No hardware; Gazebo's simulation; a plant of this project, through its topics."""
 
 _GZ_LIBRARY = "gz_ros2_control-system"
 _GZ_PLUGIN = "gz_ros2_control::GazeboSimROS2ControlPlugin"

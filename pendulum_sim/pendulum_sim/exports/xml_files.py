@@ -22,7 +22,7 @@ def number(value: float) -> str:
 
 
 def lateness(lag: float, delay: float, timestep: float) -> dict[str, str]:
-    """Return the attributes of a MuJoCo actuator whose effort comes late.
+    """Return the attributes of a MuJoCo actuator with a delayed effort.
 
     Args:
         lag: Time constant; 0 for none [s].

@@ -38,7 +38,7 @@ _SLIDE = 0.1
 _SMALL = 0.1
 """Small effort as a share of the limit."""
 _FLOOR = 0.02
-"""Share of the motion under full effort below which a difference counts for nothing: no controller would notice it."""
+"""Share of the motion under full effort below which a difference is ignored: it is too small for a controller."""
 _ABRUPT = 0.5
 """Error right behind a stop; of what grows with the angle it is less."""
 _OUTSIDE = 3.0
@@ -86,7 +86,7 @@ class Switches(NamedTuple):
     """What can be switched off in a copy of a plant.
 
     Attributes:
-        causes: Names of what can be, in words.
+        causes: The tested causes, as text.
         without: Returns a copy without some of them.
     """
 
@@ -102,8 +102,8 @@ class EquationCheck:
         joints: Names of the joints.
         errors: Largest error of each joint, as a share of the largest motion of the same kind [-].
         runs: Number of runs.
-        where: The run with the largest error, in words.
-        causes: What was tested to be the cause, in words; empty where nothing that was tested is.
+        where: The run with the largest error, as text.
+        causes: The confirmed causes, as text; empty where none was confirmed.
         left: Largest error without these causes; None where none was switched off [-].
     """
 
@@ -149,7 +149,7 @@ class _Probe(NamedTuple):
 
 @dataclass
 class _Trace:
-    """States of one run, shape (periods + 1, joints), as far as it came."""
+    """States of one run, shape (periods + 1, joints), as far as it got."""
 
     position: Array
     velocity: Array
@@ -559,7 +559,7 @@ def _late(case: _Case) -> str:
 
 
 def _unlike(theirs: Array, mine: Array) -> float:
-    """Return what one curve leaves over of another whatever their sizes [-]."""
+    """Return the relative residual of one curve after fitting another, independent of their sizes [-]."""
     power = float(np.dot(mine, mine))
     if power == 0.0:
         return 1.0

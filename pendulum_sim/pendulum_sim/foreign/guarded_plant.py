@@ -75,7 +75,7 @@ class PaceWatch:
         self._mean = 0.0
 
     def problem(self, duration: float, behind: float) -> str:
-        """Take note of a step; return in words why the simulation cannot keep the wall's time, or nothing.
+        """Record a step; return as text why the simulation cannot run in real time, or nothing.
 
         Args:
             duration: Wall time that the step took [s].
@@ -106,7 +106,7 @@ class StallWatch:
         threading.Thread(target=self._watch, daemon=True).start()
 
     def __enter__(self) -> StallWatch:
-        """Begin a step."""
+        """Start a step."""
         self._since = time.monotonic()
         return self
 

@@ -132,9 +132,9 @@ class GymnasiumPlant:
     """An environment as a plant; see :func:`load_gymnasium_plant`. A push adds to the action: it has no other input.
 
     Attributes:
-        parameters: The equation of a pendulum that comes closest.
+        parameters: The nearest equation of a pendulum.
         dt: Time between two states [s].
-        remarks: What was chosen, in words.
+        remarks: What was chosen, as text.
     """
 
     description = "gymnasium"
@@ -325,7 +325,7 @@ class GymnasiumPlant:
                 "holds both"
             ) from error
         if not fresh and math.isfinite(theta):
-            # Observations are wrapped; our angles are not.
+            # Observations are wrapped; the plant's angles are not.
             theta = self._theta + wrap(theta - self._theta)
         self._theta, self._theta_dot = theta, theta_dot
 

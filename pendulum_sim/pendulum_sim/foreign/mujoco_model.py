@@ -14,7 +14,7 @@ _PACKAGE = "package://"
 
 
 def read_model(mujoco: Any, path: Path) -> tuple[Any, list[str]]:
-    """Return the compiled model, and in words what was left out of it.
+    """Return the compiled model, and as text what was left out of it.
 
     Raises:
         ParameterError: MuJoCo refuses it, or it is a source of a model.

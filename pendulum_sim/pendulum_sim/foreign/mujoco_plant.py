@@ -74,9 +74,9 @@ class MujocoPlant:
     """A hinge of a MuJoCo model as a plant; see :func:`load_mujoco_plant`.
 
     Attributes:
-        parameters: The equation of a pendulum that comes closest, read off the model in commanded torque.
+        parameters: The nearest equation of a pendulum, read off the model in commanded torque.
         dt: Time between two states [s].
-        remarks: What was chosen, in words.
+        remarks: What was chosen, as text.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class MujocoPlant:
 
     @property
     def description(self) -> str:
-        """Engine and integrator, in words."""
+        """Engine and integrator, as text."""
         integrator = self._mujoco.mjtIntegrator(self._model.opt.integrator).name.removeprefix("mjINT_").lower()
         return f"mujoco {self._mujoco.__version__}, {integrator}"
 
@@ -262,7 +262,7 @@ class MujocoPlant:
             if model.actuator_trntype[i] in joints and model.actuator_trnid[i, 0] == joint
         ]
         if not on_joint and self._name("joint", joint) == JOINT and CONTRACT_ACTUATOR in names:
-            # Our own export of a motor behind a spring.
+            # This project's export of a motor behind a spring.
             return names[CONTRACT_ACTUATOR]
         if len(on_joint) == 1 or not names:
             return on_joint[0] if on_joint else None

@@ -31,7 +31,7 @@ _STIFFER = 100.0
 _FLUID, _JOINTS, _ACTUATORS = "the fluid around it", "other joints that move", "other actuators"
 _FLAG, _TIMESTEP = "a flag that disables a part of MuJoCo", "a timestep too long for the integrator"
 CAUSES = (*_DISABLED, *_CLEARED, _DRIVE, _FLUID, _JOINTS, _ACTUATORS, _FLAG, _TIMESTEP)
-"""What can be switched off, in words."""
+"""What can be switched off, as text."""
 
 
 def switch_off(mujoco: Any, model: Any, cause: str, dofs: Collection[int], actuator: int | None) -> int:

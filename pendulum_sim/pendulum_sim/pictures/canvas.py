@@ -114,7 +114,7 @@ class Picture:
 
         Args:
             origin: Where the joint is [px].
-            right: Where the arc begins, from the origin [px].
+            right: Start of the arc, from the origin [px].
             up: Where it is after a quarter of a turn, from the origin [px].
             share: Torque, as a share of the one that is shown by three eighths of a turn.
             length: Size of the plant in the picture [px].
@@ -152,7 +152,7 @@ class Picture:
         """Draw a torque or a force as an arrow whose length is its share of the largest one.
 
         Args:
-            begin: Where it begins [px].
+            begin: Its start [px].
             along: Direction of a positive one [px].
             share: Torque or force, as a share of the one that is shown by half of ``length``.
             length: Size of the plant in the picture [px].

@@ -59,7 +59,7 @@ _ARCS = {
 def arc_points(effort: float, effort_scale: float, radius: float) -> list[tuple[float, float, float]]:
     """Return the polyline of a torque: an arc that starts above the joint, with an arrow's head at its end.
 
-    Positive torque turns from +z towards -x, the way that the joint of our URDF turns (about -y).
+    Positive torque turns from +z towards -x, the direction of the joint of the exported URDF (about -y).
 
     Args:
         effort: Torque [N m].

@@ -31,7 +31,7 @@ class ShownPlant:
 
     @property
     def missing(self) -> str:
-        """What is not known yet of the plant whose states come, in words; empty where it can be drawn."""
+        """What is not known yet of the plant whose states come, as text; empty where it can be drawn."""
         if len(self.joints) == 1 or self.parameters is not None:
             return ""
         return f"waiting for the parameters of {', '.join(self.joints)}"

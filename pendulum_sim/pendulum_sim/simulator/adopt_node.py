@@ -168,7 +168,7 @@ class AdoptNode(PollingNode):
         self._commands.publish(Float64MultiArray(data=self._efforts))
 
     def _sample(self, message: JointState, now_ns: int) -> JointSample | None:
-        """Return our state of theirs, or None for one that has no such joint or no numbers."""
+        """Return the contract's state for an adopted one, or None without such a joint or numbers."""
         if self._joint not in message.name:
             self._refuse(f"a state of {', '.join(message.name) or 'no joint'}; expected {self._joint!r}")
             return None
@@ -179,7 +179,7 @@ class AdoptNode(PollingNode):
         effort = message.effort[i] if len(message.effort) > i else math.nan
         theta = self._sign * (message.position[i] - self._zero)
         if self._interface.sample is not None and math.isfinite(theta):
-            # Theirs may wrap; ours go on.
+            # Adopted angles may wrap; the contract's do not.
             before = self._interface.sample.position[0]
             theta = before + wrap(theta - before)
         if math.isnan(effort) and self._interface.sample is None:

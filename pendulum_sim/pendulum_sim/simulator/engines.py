@@ -89,7 +89,7 @@ _OF_EQUATION = (
 )
 """What an importer finds of a plant's parameters."""
 _EXACT_STEP = 1e-3
-"""Longest step of the equation that a simulation of others is checked against [s]."""
+"""Longest step of the equation that a third-party simulation is checked against [s]."""
 _FOREIGN_SPECS = (
     ParameterSpec(
         "step_timeout",
@@ -266,7 +266,7 @@ def find_engine(simulation: str) -> tuple[Engine, dict[str, str]]:
 
 
 def open_simulation(simulation: str, mapping: str = "") -> Simulation:
-    """Return a simulation of others in this process, as its node would run it.
+    """Return a third-party simulation in this process, as its node would run it.
 
     Args:
         simulation: As in :func:`find_engine`.

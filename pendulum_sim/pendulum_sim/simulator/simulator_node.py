@@ -92,7 +92,7 @@ class SimulatorNode(PollingNode):
         self._settings = NodeParameters(self, self._specs(engine), self._check_start)
         values = self._settings.values
         self._simulation = engine.make(values)
-        # Before the first reset, which ends what it has begun.
+        # Before the first reset, which undoes the steps of the check.
         self._checked = None if self._simulation.check is None else self._simulation.check()
         self._plant = joint_plant(self._simulation.plant)
         self._coordinates = self._plant.coordinates
@@ -236,7 +236,7 @@ class SimulatorNode(PollingNode):
         return self._measure(), effort
 
     def _step(self, effort: Vector, push: Vector, stamp_ns: int) -> str:
-        """Step the plant; return why it cannot go on though it came back, or nothing."""
+        """Step the plant; return why it cannot continue although the step returned, or nothing."""
         pace = self._pace
         if pace is None:
             with self._stall:

@@ -27,7 +27,7 @@ class SlowClock:
     A plant that is sampled at 100 Hz under noise that changes every 10 ms is sampled at one phase of it only; its
     velocity at that phase spreads by up to a quarter more or less than over all phases. No filter undoes that, for
     what was not sampled is lost. So the faster motion is taken at the very same phases, where it has the same images,
-    and both are filtered alike after that.
+    and both are then filtered in the same way.
 
     Args:
         stamps: Of the slower motion, strictly increasing, shape (n,) [s].

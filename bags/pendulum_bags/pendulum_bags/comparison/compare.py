@@ -80,12 +80,12 @@ class Comparison:
 
     @property
     def is_emulated(self) -> bool:
-        """Whether an emulator stood in for the hardware, in all runs."""
+        """Whether the hardware was emulated, in all runs."""
         return all(is_emulated(pair.hardware) for pair in self.pairs)
 
     @property
     def hardware_name(self) -> str:
-        """What the simulation was compared with, in words."""
+        """What the simulation was compared with, as text."""
         return "emulated hardware" if self.is_emulated else "hardware"
 
     @property
@@ -120,7 +120,7 @@ class Comparison:
 
     @property
     def seen(self) -> str:
-        """Of what the spreads and distances of the tests are, in words: not of all samples, as those of a plant."""
+        """Of what the spreads and distances of the tests are, as text: not of all samples, as those of a plant."""
         times = "at the slower plant's sampling times and " if self.is_tested_in_pairs else ""
         return f"{times}below {self.band:.3g} Hz"
 
@@ -377,7 +377,7 @@ _ROOTS_OF_SQUARES = ("rms_u", "rms_tracking_error")
 
 
 def _pool(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the figures that all runs would have as one: each sample counts once, whichever run it is of."""
+    """Return the figures of all runs as one: each sample has the same weight."""
     if len(rows) == 1:
         return dict(rows[0])
     counts = [row["samples"] for row in rows]

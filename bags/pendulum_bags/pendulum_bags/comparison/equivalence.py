@@ -1,4 +1,4 @@
-"""Equivalence tests against a stated margin: two one-sided tests, and what they mean in words.
+"""Equivalence tests against a stated margin: two one-sided tests, and their result as text.
 
 A test of "no difference" rewards little data. Two one-sided tests (Schuirmann, J. Pharmacokinet. Biopharm. 15, 1987)
 turn that round: equivalence is shown when the 90 % interval lies inside the margin, difference when it lies outside,
@@ -38,7 +38,7 @@ class EquivalenceTest:
     """One quantity against its margin.
 
     Args:
-        quantity: What was tested, in words.
+        quantity: What was tested, as text.
         unit: Unit of the figures.
         interval: Estimate with its interval; one of 90 % is two one-sided tests at 5 % each.
         low: Lower margin; minus infinity for a one-sided test.
@@ -80,7 +80,7 @@ class EquivalenceTest:
         return f"margin {self.low:.3g} to {self.high:.3g}"
 
     def sentence(self) -> str:
-        """Return the result in words."""
+        """Return the result as text."""
         if math.isnan(self.interval.estimate):
             return f"{self.quantity}: {_UNTOLD}"
         unit = _behind_a_number(self.unit)
@@ -117,7 +117,7 @@ def equivalence_test(
     """Test one quantity.
 
     Args:
-        quantity: Name in words.
+        quantity: Name as text.
         unit: Unit.
         interval: Estimate and interval.
         low: Lower margin; minus infinity for one-sided.

@@ -213,7 +213,7 @@ def covariance(products: Array, sizes: Array, moment: Moments) -> tuple[Array, A
     transposed = np.swapaxes(weights, -1, -2)
     rest = means[..., p:, p:] - transposed @ means[..., :p, p:]
     if not moment.known:
-        # About the window's own mean, which is known from so many samples only.
+        # About the window's own mean, which is estimated from these samples only.
         short = np.sqrt(1.0 / np.maximum(1.0 - 1.0 / np.maximum(moment.samples, 2.0), 0.5))
         rest = rest * short[:, None] * short[None, :]
     return transposed @ moment.gram @ weights + rest, weights[..., 0, :]

@@ -1,4 +1,4 @@
-"""What difference does not matter: stated by the user in words of the task, in one file."""
+"""What difference does not matter: stated by the user in units of the task, in one file."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ class Margins:
 
     @property
     def whose(self) -> str:
-        """Whose margins these are, in words."""
+        """The source of these margins, as text."""
         if not self.stated:
             return "the default margins (none were stated)"
         if all(name in self.stated for name in _UNITS):

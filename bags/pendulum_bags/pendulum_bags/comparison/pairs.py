@@ -202,7 +202,7 @@ class Pair:
 
 
 def _turned(hardware: RunData, simulation: RunData) -> RunData:
-    """Return the hardware's run moved by whole turns to where the simulation is: an angle is known but for those."""
+    """Return the hardware's run moved by whole turns to where the simulation is: an angle is ambiguous by those."""
     if hardware.window.slides:
         return hardware
     turn = 2.0 * np.pi

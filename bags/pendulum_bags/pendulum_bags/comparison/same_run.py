@@ -75,7 +75,7 @@ class Looks:
         return 1.0 - 2.0 * self.alpha * 0.5**self.number
 
     def level_of_each(self, tests: int) -> float:
-        """Return the probability of the interval that shows a difference, where any of so many tests may."""
+        """Return the probability of the interval that shows a difference, where any of all tests may."""
         return 1.0 - (1.0 - self.level) / tests
 
 
@@ -183,7 +183,7 @@ def unpaired_tests(
         hardware: Motions of the hardware.
         margins: The margins.
         noises: The disturbances of both, each on its motion's clock, where they are white and known.
-        looks: How often these data have been looked at.
+        looks: Number of interim analyses of these data.
         runs_differ: Whether runs may differ by more than their seeds.
     """
     band = common_band(margins.band.si, *simulations, *hardware)

@@ -46,7 +46,7 @@ class SharedSignal:
 
     @property
     def reason(self) -> str:
-        """Why they do not, in words; empty where they do."""
+        """Why they do not, as text; empty where they do."""
         found = self.alignment.correlation
         if found <= self.threshold:
             return (

@@ -69,7 +69,7 @@ class Interval(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What it is, in words."""
+        """What it is, as text."""
         return f"{100.0 * self.level:.4g} % interval"
 
     def as_dict(self) -> dict[str, float]:

@@ -147,7 +147,7 @@ class Hub:
     # --- requests of the operator --------------------------------------------------------------------------
 
     async def e_stop(self, nodes: Sequence[str] = ()) -> dict[str, Any] | None:
-        """Order these plants, or all, to stop until a person has seen that they have; return the order's state."""
+        """Order these plants, or all, to stop until the operator acknowledges it; return the order's state."""
         with self._order_lock:
             for node in nodes:
                 self._order.press_one(node, time.monotonic())
@@ -448,7 +448,7 @@ def console(
     token = "" if is_loopback(host) else secrets.token_urlsafe(16)
     if runs.exists() and not runs.is_dir():
         raise ParameterError(f"runs is {runs}, a file; expected a folder")
-    # An address that cannot be had is refused before anything starts.
+    # An address that is not available is refused before anything starts.
     listen(host, port).close()
     hub, jobs = Hub(), Jobs(runs.resolve())
     address = f"http://{'localhost' if is_loopback(host) else host}:{port}/" + (f"?token={token}" if token else "")

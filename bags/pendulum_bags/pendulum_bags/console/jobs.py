@@ -44,7 +44,7 @@ class Job:
         return self.process.poll() is None
 
     def describe(self) -> str:
-        """Return how it stands: state, time, size of what it wrote, its last words."""
+        """Return its status: state, time, size of its output, its last lines."""
         running = self.running
         if not running and self.ended is None:
             self.ended = time.monotonic()
@@ -80,7 +80,7 @@ class Jobs:
         return self._jobs.get(kind)
 
     def newest(self, page: str) -> Path | None:
-        """Return the run folder, of all those here, whose page of a name was written last; None where none has one."""
+        """Return the run folder with the newest page of a name; None where none has one."""
         found = [path for path in self.runs.glob(f"*/{page}") if path.is_file()]
         return max(found, key=lambda path: path.stat().st_mtime).parent if found else None
 
@@ -95,7 +95,7 @@ class Jobs:
         Args:
             seed: Seed of the noise.
         """
-        # Not in our domain: its plants have the names of those that are shown here.
+        # Not in this domain: its plants have the names of those that are shown here.
         environment = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
         return self._start("experiment", ["experiment", "thesis", "--seed", str(seed)], "--out", environment)
 

@@ -30,7 +30,7 @@ REFRESH_PERIOD = 0.5
 
 
 class _Card(NamedTuple):
-    """What stands on the page for one plant."""
+    """The elements of the page for one plant."""
 
     node: str
     section: ui.element

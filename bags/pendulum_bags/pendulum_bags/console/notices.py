@@ -11,7 +11,7 @@ __all__ = ["Notices"]
 _NEWEST = 3
 """Notices that stand at once."""
 _STAYS = {"bad": 15.0, "good": 4.0}
-"""How long a notice stands [s]: a refusal long enough to be read, acted on and read again."""
+"""How long a notice stays [s]: a refusal long enough to be read, acted on and read again."""
 
 _LONG_WORD = re.compile(r"(\S{60})\S{61,}(\S{60})")
 """What was typed may be of any length; the words of a refusal, and the remedy in it, are shown whole."""

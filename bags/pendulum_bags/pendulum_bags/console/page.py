@@ -45,7 +45,7 @@ def serve(
         jobs: Programs that the page may start.
         host: Address to listen on.
         port: Port to listen on.
-        token: Token that every request must bear; empty on loopback.
+        token: Token that every request needs; empty on loopback.
         ready: Called when the page can be opened.
     """
 

@@ -22,7 +22,7 @@ _UNIT = re.compile(r"\[[^]]+\]$")
 
 
 def show_value(value: Any) -> str:
-    """Return a value as a person types it: ``0.1``, ``100, 0.01``, ``true``."""
+    """Return a value in its input format: ``0.1``, ``100, 0.01``, ``true``."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, (list, tuple)):
@@ -31,7 +31,7 @@ def show_value(value: Any) -> str:
 
 
 def parse_value(text: str, like: Any) -> Any:
-    """Return what a person typed, as the type of the value in force.
+    """Return the input, as the type of the value in force.
 
     Raises:
         FaultError: It is none of that type.

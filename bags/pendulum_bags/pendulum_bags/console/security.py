@@ -36,7 +36,7 @@ def listen(host: str, port: int, backlog: int = 1) -> socket.socket:
         backlog: How many may wait to be accepted.
 
     Raises:
-        ParameterError: The address or the port cannot be had.
+        ParameterError: The address or the port is not available.
     """
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -62,7 +62,7 @@ def refusal(headers: dict[str, str], query: str, token: str) -> str:
     Args:
         headers: Headers by their names in lower case.
         query: Query of the address.
-        token: What a request from another machine must bear; empty where only loopback is served.
+        token: Token of a request from another machine; empty where only loopback is served.
     """
     host = headers.get("host", "")
     name = urlsplit(f"//{host}").hostname or ""
@@ -108,7 +108,7 @@ class Guard:
             await send({"type": "http.response.body", "body": reason.encode()})
 
     def _keep(self, send: Send) -> Send:
-        """Give the token back as a cookie, so that the page's own requests bear it."""
+        """Return the token as a cookie, so that the page's own requests carry it."""
         if not self._token:
             return send
 

@@ -109,7 +109,7 @@ class StopOrder:
             row.text = text
 
     def release(self, plant: str) -> None:
-        """Leave a plant alone, because a person resets its e-stop, or gives it up."""
+        """End the requests to a plant, because the operator resets its e-stop, or gives it up."""
         self._rows.pop(plant, None)
         self._left_alone.add(plant)
         self._end_without_rows()

@@ -49,7 +49,7 @@ _RATIO_TOLERANCE = 0.2
 _STOPPED_WITHIN = 0.06
 """Time from the bridge's fault to zero torque [s], as its README promises."""
 _WATCHED = 0.5
-"""How long the recording must go on after the fault, to show that the torque stays away [s]."""
+"""How long the recording must continue after the fault, to show that the torque stays zero [s]."""
 _LONGEST_GAP = 0.12
 """Longest time without a torque in the recording around the fault [s].
 
@@ -72,7 +72,7 @@ class Judgement:
     reason: str
 
     def __str__(self) -> str:
-        """Return the judgement in words."""
+        """Return the judgement as text."""
         return f"{'right' if self.right else 'wrong'}: {self.reason}"
 
 
@@ -252,7 +252,7 @@ def time_constant(q: tuple[float, float], r: float) -> float:
 def critical_delay(tasks: Tasks) -> float:
     """Return the delay at which the sampled loop at 100 Hz becomes unstable [s]."""
     model, gain = _thesis_model(), _gain(tasks.delay_weight)
-    # Continuous control bears a little more; every step costs the eigenvalues of a loop with that many delays.
+    # Continuous control tolerates a little more; every step costs the eigenvalues of a loop with that many delays.
     low, high = 0.5 * (margin := loop_margins(model, gain).delay), 1.1 * margin
     for _ in range(10):
         middle = 0.5 * (low + high)

@@ -429,7 +429,7 @@ class RecorderClient:
         self._status = conductor.node.create_client(Trigger, f"{namespace}/recorder/status")
 
     def heard(self) -> set[str]:
-        """Return the topics whose publishers the recorder is connected with."""
+        """Return the topics whose publishers the recorder is matched with."""
         return set(self._ask().get("matched", []))
 
     def wait_until_heard(self, topics: Collection[str], timeout: float) -> None:

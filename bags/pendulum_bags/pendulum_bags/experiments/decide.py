@@ -17,7 +17,7 @@ __all__ = ["Budget", "decide"]
 
 @dataclass(frozen=True)
 class Budget:
-    """How long an experiment may go on.
+    """How long an experiment may last.
 
     Args:
         seconds: Wall time for repeats beyond the first analysis; 0 for one analysis of one run [s].

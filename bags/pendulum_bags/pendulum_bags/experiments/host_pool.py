@@ -39,7 +39,7 @@ class _Host:
 
 
 class HostedProgram:
-    """One program in a host; it looks like a ``subprocess.Popen``.
+    """One program in a host; it has the interface of ``subprocess.Popen``.
 
     Args:
         host: The host, which runs nothing else.
@@ -136,7 +136,7 @@ class HostPool:
         """Start a program in a host of its kind, one that waits or a new one.
 
         Args:
-            command: ``[sys.executable, "-m", PACKAGE, EXECUTABLE, ...]`` of a package of ours.
+            command: ``[sys.executable, "-m", PACKAGE, EXECUTABLE, ...]`` of a package of this project.
             environment: All of its variables.
             log: File that gets what it prints, behind what is there.
             niceness: Scheduling priority to give away, or to take where it is negative and permitted.

@@ -1,4 +1,4 @@
-"""A plant of several joints, held upright under noise, and another plant that stands in for its machine."""
+"""A plant of several joints, held upright under noise, and another plant as the surrogate of its machine."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class JointSettings:
     controller: str = "lqr"
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be run before anything starts; the first driven joint takes the place of none."""
+        """Refuse what cannot be run before anything starts; the joint defaults to the first driven one."""
         if not is_mechanism(self.plant):
             raise ParameterError(
                 f"plant is {self.plant!r}, which has one joint; expected one of several, such as cart_pole "
@@ -114,7 +114,7 @@ class JointRun:
 
     Attributes:
         settings: The settings.
-        side: ``sim``, or ``hw`` for the plant that stands in for the machine.
+        side: ``sim``, or ``hw`` for the surrogate of the machine.
         plant: Preset or file of what runs on this side.
         design: Preset or file on which the controller is designed; empty for the simulated plant.
         excitation: Parameters of the disturbance that differ from those of the noise.
@@ -155,7 +155,7 @@ class JointRun:
         return self.settings.storage
 
     def plant_program(self, listeners: int) -> NodeProgram:
-        """Return the simulator, paused, or the bridge; either waits for so many subscriptions to its states."""
+        """Return the simulator, paused, or the bridge; either waits for a number of subscriptions to its states."""
         rate = 1.0 / self.settings.period
         lockstep: dict[str, Any] = lockstep_parameters(listeners, self.duration)
         if self.has_bridge:
@@ -231,7 +231,7 @@ def identified_names(plant: MechanismParameters) -> list[str]:
 
 
 def stand_in_for(plant: MechanismParameters, *, share: float, delay: float, seed: int) -> MechanismParameters:
-    """Return another plant in the place of a machine: values as far off as an identification may leave them.
+    """Return another plant in place of a machine: values as far off as an identification may leave them.
 
     Args:
         plant: The plant that is simulated.
@@ -362,7 +362,7 @@ def fall_time(plant: MechanismParameters, stamps_ns: Array, position: Array) -> 
 
 
 def _end_of(bag: Path, namespace: str, plant: MechanismParameters, stopped: str) -> str:
-    """Return how a side failed, in words, or an empty string."""
+    """Return how a side failed, as text, or an empty string."""
     with read_bag(bag) as opened:
         states = opened.joints(f"{namespace}/{JOINT_STATES}")
     fell = fall_time(plant, states.stamp_ns, states.position) if len(states.stamp_ns) else None

@@ -139,7 +139,7 @@ class GraphRun(Protocol):
         """Return the bag's metadata of its run."""
 
     def plant_program(self, listeners: int) -> NodeProgram:
-        """Return the plant, which waits for so many subscriptions to its states."""
+        """Return the plant, which waits for a number of subscriptions to its states."""
 
     def controller_program(self) -> NodeProgram:
         """Return the controller."""
@@ -223,7 +223,7 @@ def _has_reached(plant: PlantClient, end_ns: int) -> bool:
 
 
 def _wait_for_end(conductor: Conductor, plant: PlantClient, duration: float) -> None:
-    """Wait for the end of a run in lockstep, however slow a busy machine makes it, as long as it goes on."""
+    """Wait for the end of a run in lockstep, however slow a busy machine makes it, as long as it proceeds."""
     conductor.wait_for("the first state", lambda: plant.is_heard or _is_finished(plant), START_TIMEOUT)
     plant.look_away()
     recorder, received = RecorderClient(conductor, plant.namespace), 0

@@ -70,7 +70,7 @@ class RealMachine:
 
     @property
     def effort_limit(self) -> str:
-        """Largest torque, in words."""
+        """Largest torque, as text."""
         limit = self.lab.values.get("effort_limit")
         return f"{limit:g} N m (lab file)" if limit else "that of the plant file, up to 13 N m"
 

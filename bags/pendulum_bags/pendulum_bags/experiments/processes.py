@@ -40,7 +40,7 @@ _TOO_LATE = re.compile(r"\bwithin \d|did not (?:answer|run)")
 
 
 def _busy_note(words: str) -> str:
-    """Return a remark for last words whose cause may be other programs, else nothing."""
+    """Return a remark for last lines whose cause may be other programs, else nothing."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     if load <= 2.0 * cores or not _TOO_LATE.search(words):
         return ""
@@ -80,7 +80,7 @@ class ProcessSet:
     Args:
         log_folder: One log file per program goes here.
         environment: Variables to add, such as the ROS domain.
-        hosts: Processes that run programs of ours one after the other; without them each has its own.
+        hosts: Processes that run programs one after the other; without them each has its own.
     """
 
     log_folder: Path
@@ -188,7 +188,7 @@ class ProcessSet:
         """End all programs, recorders last: plants publish a last zero torque that should be recorded.
 
         Args:
-            keep: Those that go on.
+            keep: Those that continue.
         """
         for wave in (False, True):
             children = [child for child in self.children if child.ends_last is wave and child not in keep]
@@ -254,7 +254,7 @@ def start_recorder(
     command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
     command += ["--metadata", str(metadata), "--log-time", "header" if simulated else "receive"]
     if simulated:
-        # What is stamped with wall time has no place in a bag whose time is simulated.
+        # Stamps of wall time do not belong in a bag of simulated time.
         command += ["--exclude", "^/diagnostics$|/transition_event$"]
     command += ["--ros-args", "-r", f"__ns:={namespace}"]
     if priority:

@@ -151,7 +151,7 @@ class RunSpec:
 
     @property
     def foreign(self) -> ForeignSimulation | None:
-        """The simulation of others, in the place of either; None where ours or the emulated hardware runs."""
+        """The third-party simulation, in place of either; None where the built-in one or the emulated hardware runs."""
         return ForeignSimulation(self.simulation, self.mapping) if self.simulation else None
 
     @property

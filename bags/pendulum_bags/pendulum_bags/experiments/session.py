@@ -112,11 +112,11 @@ class Session:
         self.close(recorder)
 
     def drives(self, *plants: PlantClient) -> None:
-        """Let whatever breaks the session off disarm these plants at once, before their programs are ended."""
+        """Disarm these plants at once on any abort of the session, before their programs are ended."""
         self._driven += plants
 
     def leaves(self, plant: PlantClient) -> None:
-        """Leave a plant as it is from now on, whatever breaks the session off."""
+        """Leave a plant as it is from now on, also on an abort of the session."""
         self._driven = [one for one in self._driven if one is not plant]
 
     def let_go(self) -> None:
@@ -157,7 +157,7 @@ def conduct(
 ) -> Iterator[Session]:
     """Join the graph to carry out one run; leaving it ends all its programs, recorders last.
 
-    The phases of the run are its caller's. Whatever breaks them off disarms what the session drives, at once.
+    The phases of the run are its caller's. An abort disarms what the session drives, at once.
 
     Args:
         logs: Folder of the programs' logs.

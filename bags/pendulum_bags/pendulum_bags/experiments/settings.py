@@ -99,7 +99,7 @@ class RegulationSettings:
 
     Attributes:
         plant: Preset or file of the simulated plant; the controller is designed on it too.
-        hardware: ``emulator``, or ``hebi`` for the machine of a lab file; or a second simulation of others (a model
+        hardware: ``emulator``, or ``hebi`` for the machine of a lab file; or a second third-party simulation (a model
             file or ``gymnasium:ID``), or a plant that runs already, ``ros:/namespace``.
         lab: The lab file, for ``hebi``.
         effort_strategy: How the actuator turns wanted torque into PWM; it changes the plant that a controller sees.
@@ -110,8 +110,8 @@ class RegulationSettings:
         noise: The disturbance.
         storage: Storage of the bags.
         method: Integrator of the simulator; Euler as in the thesis, which a plant with motor and spring has not.
-        simulation: A simulation of others in our simulator's place, a model file, ``gymnasium:ID``, or
-            ``ros:/namespace`` for one that runs already; empty for ours.
+        simulation: A third-party simulation in place of the simulator, a model file, ``gymnasium:ID``, or
+            ``ros:/namespace`` for one that runs already; empty for the simulator.
         mapping: Its mapping file; empty for none.
         hardware_mapping: Mapping file of a simulation in the hardware's place; empty for none.
         ramp_speed: Mean speed of the ramps up and down; the largest is half as much again [rad/s].
@@ -194,11 +194,11 @@ class RegulationSettings:
 
     @property
     def foreign(self) -> ForeignSimulation | None:
-        """The simulation of others in the simulator's place; None for ours and for one that runs already."""
+        """The third-party simulation of the side sim; None for the built-in one and for one that runs already."""
         return self.foreign_of("sim")
 
     def foreign_of(self, side: str) -> ForeignSimulation | None:
-        """Return the simulation of others that is one side, ``sim`` or ``hw``; None where something else is."""
+        """Return the third-party simulation that is one side, ``sim`` or ``hw``; None where something else is."""
         name, mapping = (self.simulation, self.mapping) if side == "sim" else (self.hardware, self.hardware_mapping)
         if not name or (side == "hw" and name in HARDWARE) or name.startswith(PREFIX):
             return None
@@ -234,7 +234,7 @@ class RegulationSettings:
         return TIME_BESIDE_NOISE + self.noise.duration + 2.0 * (self.ramp_time - UPRIGHT / RAMP_SPEED)
 
     def ramp(self, start: float, goal: float) -> Trajectory:
-        """Return the thesis's ramp between two positions [rad], as fast as these settings say."""
+        """Return the thesis's ramp between two positions [rad], at the speed of these settings."""
         faster = self.ramp_speed / RAMP_SPEED
         return thesis_ramp(start, goal, increment=RAMP_INCREMENT * faster, max_velocity=MAX_RAMP_VELOCITY * faster)
 
@@ -270,7 +270,7 @@ class RegulationSettings:
         return self.simulator_program() if side == "sim" else self.bridge_program(bag)
 
     def simulator_program(self) -> NodeProgram:
-        """Return the simulation, ours or that of others, in real time."""
+        """Return the simulation, built-in or third-party, in real time."""
         if (foreign := self.foreign) is not None:
             return foreign.program("/sim", clock="realtime")
         return graph.simulator("/sim", plant=self.plant, method=self.method, clock="realtime")

@@ -48,7 +48,7 @@ def _facts(name: str, mapping: str) -> _Facts:
 
 @dataclass(frozen=True)
 class ForeignSimulation:
-    """A simulation in our simulator's place.
+    """A simulation in place of the simulator.
 
     Attributes:
         name: Path of a model file, or ``gymnasium:ID``.
@@ -60,12 +60,12 @@ class ForeignSimulation:
 
     @property
     def label(self) -> str:
-        """Name of the file or environment, without the place where it lies."""
+        """Name of the file or environment, without its folder."""
         return Path(self.name).name
 
     @property
     def parameters(self) -> PlantParameters:
-        """The equation that comes closest.
+        """The nearest equation.
 
         Raises:
             ParameterError: The simulation is refused.
@@ -78,7 +78,7 @@ class ForeignSimulation:
         return _facts(self.name, self.mapping).period
 
     def check(self, hold_time: float) -> None:
-        """Refuse a simulation that cannot take part in regulation upright.
+        """Refuse a simulation that cannot be regulated upright.
 
         Args:
             hold_time: Time for which a sample of the noise is held [s].
@@ -121,7 +121,7 @@ class ForeignSimulation:
         return open_simulation(self.name, self.mapping).pendulum
 
     def program(self, namespace: str, **parameters: ParameterArgument) -> NodeProgram:
-        """Return its node, which has the name of ours."""
+        """Return its node, which has the simulator's name."""
         engine, named = find_engine(self.name)
         mapping = {"mapping": str(Path(self.mapping).expanduser().resolve())} if self.mapping else {}
         return NodeProgram("pendulum_sim", engine.program, namespace, "simulator", {**named, **mapping, **parameters})

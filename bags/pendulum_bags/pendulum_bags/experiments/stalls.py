@@ -26,7 +26,7 @@ _LOGS = "logs"
 
 
 def is_stall(error: FaultError) -> bool:
-    """Return whether a plant that is no real machine stopped since this machine stood still."""
+    """Return whether a plant that is no real machine stopped because this machine stalled."""
     if not isinstance(error, PlantStoppedError):
         return False
     name = error.reason.split(":", maxsplit=1)[0]
@@ -72,7 +72,7 @@ def run_undisturbed(
 
 
 def _clear(folder: Path, attempt: int) -> None:
-    """Remove the bags of a run that broke off; its logs stay, under the run's number."""
+    """Remove the bags of an aborted run; its logs stay, under the run's number."""
     for bag in ("sim", "hw", "sim_500hz", REPEATS):
         shutil.rmtree(folder / bag, ignore_errors=True)
     logs = folder / _LOGS

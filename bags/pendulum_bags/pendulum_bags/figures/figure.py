@@ -16,7 +16,7 @@ Kind = Literal["line", "step", "points", "interval", "band"]
 
 @dataclass(frozen=True)
 class Style:
-    """How a role looks. Dash and marker differ too, so that a greyscale print can be read.
+    """Style of a role. Dash and marker differ too, so that a greyscale print can be read.
 
     Args:
         colour: From the colour-blind safe set of Okabe and Ito.

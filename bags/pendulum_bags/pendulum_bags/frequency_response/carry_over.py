@@ -20,7 +20,7 @@ __all__ = ["carry_over", "layers_of"]
 def carry_over(
     comparison: Comparison, folders: Sequence[Path], machine: Path | None = None, designs: Sequence[str] = ()
 ) -> Analysis | None:
-    """Return what is known of designs on the machine of a comparison, made on the plant that was simulated.
+    """Return the certificates of designs for the machine of a comparison, made on the simulated plant.
 
     Args:
         comparison: The comparison.

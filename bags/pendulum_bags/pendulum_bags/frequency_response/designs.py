@@ -1,4 +1,4 @@
-"""Designs to be certified: as a person writes them, and what was found of each."""
+"""Designs to be certified: as text, and the result of each."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class DesignResult:
         name: As in tables.
         K: Gain on [theta, theta_dot] [N m/rad, N m s/rad], or on those of k joints; None for a controller that is no
             gain.
-        certificate: What is known of it.
-        unknown: Why nothing is known of it, as text; empty where there is a certificate.
+        certificate: Its certificate.
+        unknown: Why it has no certificate, as text; empty where there is a certificate.
         text: What :func:`certify_designs` reads for it, where that is not the name.
     """
 
@@ -156,7 +156,7 @@ def policies_of(record: Mapping[str, Any]) -> list[str]:
 
 
 def _policy(path: str, plant: PlantParameters, certifier: Certifier, *, recorded: bool) -> DesignResult:
-    """Return what is known of a learned policy around upright, by its responses to disturbances of two sizes."""
+    """Return the certificate of a learned policy around upright, by its responses to disturbances of two sizes."""
     machine = certifier.machine
     name, text = f"policy {Path(path).name}", str(Path(path).expanduser().resolve())
     nothing = certifier.feedback(np.zeros((2, machine.frequency.size), dtype=np.complex128), stable=False)

@@ -1,4 +1,4 @@
-"""Designs of a plant of several joints to be certified: LQR weights or gains, as a person writes them."""
+"""Designs of a plant of several joints to be certified: LQR weights or gains, as text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measure a plant of several joints and what stands in for its machine, by one multisine at the driven joint."""
+"""Measure a plant of several joints and the surrogate of its machine, by one multisine at the driven joint."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LINES = 48
 
 @dataclass(frozen=True)
 class JointMultisine:
-    """A multisine in the place of the noise, whole periods of it.
+    """A multisine in place of the noise, whole periods of it.
 
     Attributes:
         settings: The run.

@@ -41,7 +41,7 @@ class Record:
         outputs: Angle [rad] and velocity [rad/s] at each sample, shape (2, n); of k joints all positions, then all
             velocities, shape (2 k, n).
         disturbance: Parameters of the excitation; empty where they are not known.
-        facts: What else is known of the run.
+        facts: Further facts on the run.
         joints: Names of the k joints; none for a plant of one.
         driven: Which of them has the excitation.
     """

@@ -43,7 +43,7 @@ class Analysis:
 
     @property
     def is_emulated(self) -> bool:
-        """Whether an emulator, or a second simulation, took the place of the hardware."""
+        """Whether an emulator, or a second simulation, replaced the hardware."""
         return any(response.facts.get("emulated") for response in self.responses)
 
     def to_json(self) -> dict[str, Any]:

@@ -36,8 +36,8 @@ _ENDS = 0.5
 """Of one joint, the share of parameters that lie at an end of their range: drawn evenly, plants of which several are
 extreme are too rare for a policy to learn to brake them."""
 _SPUN, _FASTEST_SPIN = 0.1, 3.0
-"""Of one joint, the share of episodes that begin with any speed up to so many scales: else no policy meets what goes
-round and round with its torque."""
+"""Of one joint, the share of episodes that begin with any speed up to so many scales: else no training has plants that
+spin with its torque."""
 _HELD, _FULL = 0.1, 1.5
 """Of one joint, the share of episodes that begin where gravity and effort balance, which dry friction and a constant
 command would hold for ever; efforts are drawn up to so many limits and clipped: most get stuck at the limit."""
@@ -257,7 +257,7 @@ class SwingUp:
         }  # fmt: skip
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from a checkpoint."""
+        """Resume from a checkpoint."""
         for name, array in self.state().items():
             array[...] = kept[name]
 

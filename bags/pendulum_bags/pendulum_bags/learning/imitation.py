@@ -116,7 +116,7 @@ class Imitation:
         return kept | {f"adam_{key}": each for key, each in self._adam.state().items()}
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from a checkpoint."""
+        """Resume from a checkpoint."""
         for k, each in enumerate(self.actor.parameters):
             each[...] = kept[f"actor_{k}"]
         self._adam.restore({key.removeprefix("adam_"): each for key, each in kept.items() if key.startswith("adam_")})

@@ -116,7 +116,7 @@ class Adam:
         return kept
 
     def restore(self, kept: Mapping[str, NDArray[np.generic]]) -> None:
-        """Go on from a checkpoint."""
+        """Resume from a checkpoint."""
         self.count = int(kept["count"])
         for k in range(len(self.parameters)):
             self.first[k][...] = kept[f"first_{k}"]

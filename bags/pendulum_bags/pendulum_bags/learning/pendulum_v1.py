@@ -55,7 +55,7 @@ class PendulumV1:
         return seen.astype(np.float32), np.empty((self.count, 0), dtype=np.float32)
 
     def step(self, actions: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Take a step; return rewards and whose time is over."""
+        """Take a step; return rewards and which episodes are over."""
         torque = _MOST_TORQUE * actions[:, 0].astype(np.float64)
         cost = wrap(self.angle) ** 2 + 0.1 * self.velocity**2 + 0.001 * torque**2
         acceleration = 3.0 * _G / (2.0 * _L) * np.sin(self.angle) + 3.0 / (_M * _L**2) * torque
@@ -76,6 +76,6 @@ class PendulumV1:
         return {"angle": self.angle, "velocity": self.velocity, "left": self._left}
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from a checkpoint."""
+        """Resume from a checkpoint."""
         self.angle, self.velocity = kept["angle"].copy(), kept["velocity"].copy()
         self._left = kept["left"].copy()

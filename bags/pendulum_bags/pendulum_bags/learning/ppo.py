@@ -37,7 +37,7 @@ class BatchEnvironment(Protocol):
         """Return the policy's observations, shape (N, observations), and the critic's further ones, (N, privileged)."""
 
     def step(self, actions: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Take actions of shape (N, actions), within [-1, 1] after a clip; return rewards and whose time is over."""
+        """Take actions of shape (N, actions), within [-1, 1] after a clip; return rewards and finished episodes."""
 
     def restart(self, which: NDArray[np.bool_]) -> None:
         """Start new episodes in some of them."""
@@ -46,7 +46,7 @@ class BatchEnvironment(Protocol):
         """Return everything that a checkpoint has to keep."""
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from a checkpoint."""
+        """Resume from a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ class Ppo:
         return kept
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from a checkpoint."""
+        """Resume from a checkpoint."""
         self.rate = float(kept["rate"])
         self.log_spread[...] = kept["log_spread"]
         for name, network in (("actor", self.actor), ("critic", self.critic)):

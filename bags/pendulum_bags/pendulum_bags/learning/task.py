@@ -16,7 +16,7 @@ VARIED = ("inertia", "damping", "gravity", "coulomb_friction")
 """Parameters that differ from episode to episode; static friction keeps its ratio to Coulomb friction."""
 _OF_JOINTS = ("damping", "coulomb_friction")
 _FIXED = ("gravity", "pole_length", "gear_ratio")
-"""What is known of a mechanism, or moves nothing."""
+"""Parameters that are known exactly, or have no effect."""
 _POSITIVE = ("period", "rate_time", "episode", "travel")
 
 

@@ -1,4 +1,4 @@
-"""A training from its settings to a policy file: one seed, one file; what is interrupted goes on where it stopped."""
+"""A training from its settings to a policy file: one seed, one file; it resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def _told(settings: Training) -> str:
 
 
 def checkpoint_path(out: Path) -> Path:
-    """Return where the checkpoint of a training lies."""
+    """Return the path of a training's checkpoint."""
     return out.with_name(f"{out.stem}.checkpoint.npz")
 
 
@@ -127,7 +127,7 @@ def train(
     on_update: Callable[[int, Mapping[str, float]], None] | None = None,
     on_trial: Callable[[int, int], None] | None = None,
 ) -> tuple[Policy, NDArray[np.float64]]:
-    """Train, or go on where a checkpoint stopped, and write the policy file.
+    """Train, or resume from a checkpoint, and write the policy file.
 
     Args:
         settings: What is trained.
@@ -281,7 +281,7 @@ def _check_arrays(
 def _restore(
     path: Path, settings: Training, learner: Ppo | Imitation, generator: np.random.Generator
 ) -> tuple[list[list[float]], NDArray[np.float64]]:
-    """Go on from a checkpoint; return the curves so far and the fastest motion of each joint [rad/s or m/s]."""
+    """Resume from a checkpoint; return the curves so far and the fastest motion of each joint [rad/s or m/s]."""
     try:
         if path.stat().st_size > _LARGEST_CHECKPOINT:
             raise DataError(f"checkpoint {path} has more than {_LARGEST_CHECKPOINT} bytes; expected one of ours")

@@ -19,7 +19,7 @@ from pendulum_msgs_py.errors import FaultError
 __all__ = ["Gate"]
 
 _PAUSE = 0.004
-"""Rest after each delivery to a client [s]: what comes in between goes in one piece, for a tenth of the processor."""
+"""Rest after each delivery to a client [s]: what arrives in between goes in one piece, for a tenth of the processor."""
 _PIECE = 1 << 18
 _LONGEST_HEAD = 16384
 _HANDSHAKE_TIME = 5.0
@@ -150,7 +150,7 @@ class Gate:
 
 
 def _read_head(source: socket.socket) -> tuple[bytes, bytes]:
-    """Return a head with its empty line, and what came behind it; raise an OSError where none comes."""
+    """Return a head with its empty line, and the bytes after it; raise an OSError where none arrives."""
     data = b""
     while _END not in data:
         piece = source.recv(4096)

@@ -69,7 +69,7 @@ def refusal(request: Request, token: str, origins: Collection[str] = ()) -> str:
 
     Args:
         request: The request.
-        token: What it must bear; empty where only loopback is served.
+        token: The expected token; empty where only loopback is served.
         origins: Origins of pages that may connect without a token, besides the known viewers.
     """
     if token:

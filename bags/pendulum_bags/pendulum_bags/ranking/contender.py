@@ -25,7 +25,7 @@ class Contender:
         sim, hw: Parts of the cost, one row for each run (by seed), shape (runs, 3); no rows for a side that failed.
         sim_failed, hw_failed: How many runs failed on each side.
         sim_seeds, hw_seeds: Seeds of the rows; none where they are not known.
-        emulated: Whether an emulator stood in for the hardware, in all runs.
+        emulated: Whether the hardware was emulated, in all runs.
     """
 
     name: str

@@ -44,7 +44,7 @@ class WrongPair:
         sim: By how much ``picked`` is better in simulation (cost); infinity where ``better`` fails there.
         hw: By how much it is worse on the hardware (cost); infinity where it fails there.
         sure: Whether the difference on the hardware is larger than its runs scatter (95 %).
-        reason: In words.
+        reason: As text.
     """
 
     picked: str

@@ -74,7 +74,7 @@ class ControllerReplay:
         }
 
     def sentence(self) -> str:
-        """Return the result in words."""
+        """Return the result as text."""
         figures = self.as_dict()
         if figures["equal_share"] == 1.0:
             return f"{self.controller} answers all {self.t.size} recorded states with the torque that was commanded."

@@ -68,7 +68,7 @@ class JointReplay:
         )
 
     def sentence(self) -> str:
-        """Return the result in words."""
+        """Return the result as text."""
         errors = ", ".join(
             f"{joint.name} {1e3 * rms:.3g} m{joint.unit}"
             for joint, rms in zip(self.joints, self.score.rms, strict=True)

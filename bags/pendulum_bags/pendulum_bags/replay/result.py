@@ -125,7 +125,7 @@ class InputReplay:
         )
 
     def sentence(self) -> str:
-        """Return the result in words."""
+        """Return the result as text."""
         where = "never" if self.diverges_at is None else f"after {self.diverges_at:.2f} s"
         best, worst = self.by_window.min(), self.by_window.max()
         return (

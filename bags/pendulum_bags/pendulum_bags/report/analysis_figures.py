@@ -156,7 +156,7 @@ def spectrum_panels(result: Spectra, unit: str = "rad", of: str = "") -> list[Pa
 
 
 def coherent_up_to(result: Spectra) -> str:
-    """Return up to where both velocities are coherent, in words."""
+    """Return up to where both velocities are coherent, as text."""
     reach = result.coherent_up_to
     return f"up to {reach:.0f} Hz" if reach > result.frequency[1] else "at no frequency"
 

@@ -78,7 +78,7 @@ FIGURES: tuple[tuple[str, Maker], ...] = (
     ("Overdamped phase plot", model_figures.overdamped_phase),
     ("Replay of a real pendulum", model_figures.replay),
 )
-"""Title and maker, in the order of the report; a maker returns the reason in words where the data do not allow it."""
+"""Title and maker, in the order of the report; a maker returns the reason as text where the data do not allow it."""
 
 
 def make_figures(data: ReportData) -> tuple[list[Figure], list[tuple[str, str]]]:

@@ -183,7 +183,7 @@ _RANDOM = ("uniform", "gaussian", "multisine", "prbs", "from_bag")
 
 
 def _metric_name(metric: str, *, noisy: bool) -> str:
-    """Return a metric's name in words; under noise nothing settles, so nothing is called steady."""
+    """Return a metric's name as text; under noise nothing settles, so nothing is called steady."""
     return "mean error at the end" if noisy and metric == "steady_state_error" else metric.replace("_", " ")
 
 

@@ -1,4 +1,4 @@
-"""Closed-loop runs of a plant of several joints over what is not known of it: parameters, noise and start.
+"""Closed-loop runs of a plant of several joints over its uncertainty: parameters, noise and start.
 
 The plant is held upright by its own LQR, as in ``experiment joints``. Chunks, seeds and files are those of
 :mod:`pendulum_bags.studies.random_runs`.
@@ -38,7 +38,7 @@ class JointMonteCarlo(RandomRuns):
     shares: Mapping[str, float] = field(default_factory=dict)
 
     def load(self) -> MechanismParameters:
-        """Return the plant that is believed in."""
+        """Return the nominal plant."""
         return load_mechanism(self.plant)
 
     def numbers_of_plant(self) -> Any:
@@ -46,7 +46,7 @@ class JointMonteCarlo(RandomRuns):
         return self.load().numbers
 
     def draw(self, plant: MechanismParameters, count: int, generator: np.random.Generator) -> Columns:
-        """Return parameters and starts of so many runs."""
+        """Return parameters and starts of a number of runs."""
         drawn: Columns = {**scatter(plant, self.shares, count, generator)}
         for name, goal in zip(plant.coordinates.names, plant.coordinates.goal, strict=True):
             drawn[f"start_{name}"] = goal + self.start * generator.uniform(-1.0, 1.0, count)
@@ -97,7 +97,7 @@ class JointMonteCarlo(RandomRuns):
 
 
 def joint_shares(text: str, plant: str) -> dict[str, float]:
-    """Return how far the parameters of a plant of several joints are known, by name.
+    """Return the uncertainty of the parameters of a plant of several joints, by name.
 
     Args:
         text: ``identified`` for the intervals of the plant file, one share for all that an identification finds, such
@@ -142,7 +142,7 @@ def scatter(
     """Return values of uncertain parameters, shape (count,) each: log-normal and independent, for no mass is negative.
 
     Args:
-        plant: The plant that is believed in.
+        plant: The nominal plant.
         shares: Standard deviation of each value, as a share of it.
         count: How many plants.
         generator: Of the draw.

@@ -1,7 +1,7 @@
-"""From which starts is a plant of several joints brought to rest upright, over all that is not known of it?
+"""From which starts is a plant of several joints brought to rest upright, over its uncertainty?
 
 A grid over two of its positions or velocities, the others as upright at rest, run for many plants through the batch
-engine; chunks and files are those of :mod:`pendulum_bags.studies.start_grid`. Plant 0 is the one that is believed in.
+engine; chunks and files are those of :mod:`pendulum_bags.studies.start_grid`. Plant 0 is the nominal one.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class JointRegion(StartGrid):
-    """What to map of a plant of several joints; its own LQR is designed on the plant that is believed in.
+    """What to map of a plant of several joints; its own LQR is designed on the nominal plant.
 
     Attributes:
         axes: Names of the two axes, joints or ``JOINT_dot``; empty for the positions of the first two joints.
@@ -112,7 +112,7 @@ class JointRegion(StartGrid):
         return load_mechanism(self.plant).numbers
 
     def job(self) -> MechanismParameters:
-        """Return the plant that is believed in."""
+        """Return the nominal plant."""
         return load_mechanism(self.plant)
 
     def gain(self, plant: MechanismParameters) -> Gain:
@@ -182,7 +182,7 @@ class JointRegionResult:
     Attributes:
         settings: What was mapped.
         share: Share of the plants that come to rest upright, shape (second axis, first axis).
-        believed: Whether the plant that is believed in does, same shape.
+        believed: Whether the nominal plant does, same shape.
         caught: States that the LQR catches, by sampling the model without dry friction; None where none were found.
         section: Edge of these states in the plane of the map, shape (k, 2); empty without them.
         share_in_section: Share of all runs from inside that come to rest upright; NaN without such a start.

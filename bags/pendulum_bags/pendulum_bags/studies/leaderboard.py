@@ -246,7 +246,7 @@ def evaluate(
     Args:
         plant: Preset or file of a rigid plant.
         controller: Kind.
-        parameters: Of the controller; by default those that it comes with.
+        parameters: Of the controller; by default its own.
         duration: Length of each run [s].
         robustness: Whether to try the perturbations.
     """

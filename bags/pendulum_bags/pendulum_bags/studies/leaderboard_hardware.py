@@ -90,7 +90,7 @@ def evaluate_hardware(
 
     Args:
         controller: Kind.
-        parameters: Of the controller; by default those that it comes with.
+        parameters: Of the controller; by default its own.
         duration: Length of each run [s].
         robustness: Whether to try the perturbations.
         hosts: Run the programs; without them others do, which end with the line.

@@ -345,7 +345,7 @@ class _KnockDowns:
         self._count = 0
         self._active = False
         self._timer = self._last = 0.0
-        # Sums and last errors go on from one knock-down to the next: the first derivative of a later one is a jump.
+        # Sums and last errors persist from one knock-down to the next: the first derivative of a later one is a jump.
         self._sums = [0.0, 0.0]
         self._errors: list[tuple[float, float]] = []
 

@@ -97,7 +97,7 @@ def prepare(bench: Bench) -> _Prepared:
 
 
 def run_job(bench: Bench, job: Job) -> Any:
-    """Run one job and return what came of it."""
+    """Run one job and return its result."""
     ready = prepare(bench)
     kind, name, number = job
     controller = ready.controllers[name]

@@ -1,4 +1,4 @@
-"""A million closed-loop runs over what is not known: parameters, noise and start; chunked, restartable, distributed.
+"""A million closed-loop runs over uncertain parameters, noise and starts; chunked, restartable, distributed.
 
 Chunk c draws its plants from the stream (seed, c) and its noise from seeds of its own, so a result depends neither on
 the number of workers nor on the order in which they finish, bit for bit.
@@ -34,7 +34,7 @@ class MonteCarlo(RandomRuns):
     """What to draw and to run, of a pendulum; see :class:`RandomRuns`.
 
     Attributes:
-        uncertainty: How far its parameters are known.
+        uncertainty: Of its parameters.
         q: Diagonal of Q.
         r: R.
         amplitude: Largest noise torque [N m].
@@ -60,11 +60,11 @@ class MonteCarlo(RandomRuns):
             raise ParameterError(f"start is {self.start} rad; expected 0 to pi")
 
     def load(self) -> PlantParameters:
-        """Return the plant that is believed in."""
+        """Return the nominal plant."""
         return load_plant(self.plant)
 
     def draw(self, plant: PlantParameters, count: int, generator: np.random.Generator) -> Columns:
-        """Return parameters and starts of so many runs."""
+        """Return parameters and starts of a number of runs."""
         values = self.uncertainty.draw(plant, count, generator)
         return {**values, "theta_0": UPRIGHT + self.start * generator.uniform(-1.0, 1.0, count)}
 

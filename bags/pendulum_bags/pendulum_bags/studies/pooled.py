@@ -48,7 +48,7 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
 
 
 def _number(value: float | None) -> float:
-    """Return a number of a result file, where null stands for one that is none."""
+    """Return a number of a result file, where null is NaN."""
     return math.nan if value is None else float(value)
 
 

@@ -46,7 +46,7 @@ class RandomRuns(ABC):
     """What to draw and to run.
 
     Attributes:
-        plant: Preset or file of the plant that is believed in; the controller is designed on it.
+        plant: Preset or file of the nominal plant; the controller is designed on it.
         runs: Number of closed-loop runs.
         seed: Seed of everything.
         amplitude: Largest noise on each driven joint [N m or N]; None where the plant decides.
@@ -92,7 +92,7 @@ class RandomRuns(ABC):
 
     @abstractmethod
     def load(self) -> Any:
-        """Return the plant that is believed in."""
+        """Return the nominal plant."""
 
     def numbers_of_plant(self) -> Any:
         """Return all numbers of the plant, for a fingerprint."""
@@ -100,7 +100,7 @@ class RandomRuns(ABC):
 
     @abstractmethod
     def draw(self, plant: Any, count: int, generator: np.random.Generator) -> Columns:
-        """Return parameters and starts of so many runs."""
+        """Return parameters and starts of a number of runs."""
 
     @abstractmethod
     def simulate(
@@ -137,7 +137,7 @@ def draw_chunk(settings: RandomRuns, index: int, plant: Any = None) -> Columns:
     Args:
         settings: Of the Monte Carlo.
         index: Of the chunk.
-        plant: The plant that is believed in; by default the one that the settings name.
+        plant: The nominal plant; by default the one that the settings name.
     """
     first = index * settings.chunk
     count = min(settings.chunk, settings.runs - first)

@@ -1,7 +1,7 @@
-"""From which starts is upright reached under the torque limit, over all that is not known of the plant?
+"""From which starts is upright reached under the torque limit, over the plant's uncertainty?
 
 A grid of starts (theta, theta'), run for many plants through the batch engine; chunk by chunk as the Monte Carlo is,
-so that neither the number of workers nor an interruption changes a bit. Plant 0 is the one that is believed in. The
+so that neither the number of workers nor an interruption changes a bit. Plant 0 is the nominal one. The
 ellipse of the linear analysis, proven for that plant, belongs inside.
 """
 
@@ -42,7 +42,7 @@ class RegionMap(StartGrid):
     """What to map of a plant of one joint.
 
     Attributes:
-        uncertainty: How far its parameters are known.
+        uncertainty: Of its parameters.
         q: Diagonal of Q.
         r: R.
         effort_limit: Torque limit [N m]; 0 for the plant's own.
@@ -98,7 +98,7 @@ class RegionMap(StartGrid):
         return asdict(self.believed())
 
     def job(self) -> tuple[PlantParameters, tuple[float, ...]]:
-        """Return the plant that is believed in, and the gain."""
+        """Return the nominal plant, and the gain."""
         return self.believed(), tuple(float(value) for value in self.gain().K)
 
     def run_chunk(self, job: tuple[PlantParameters, tuple[float, ...]], index: int, threads: int | None) -> Columns:
@@ -187,12 +187,12 @@ class RegionResult:
         theta: Start angles, shape (n,) [rad].
         theta_dot: Start velocities, shape (n,) [rad/s].
         share: Share of the plants that reach upright, shape (n velocities, n angles).
-        believed: Whether the plant that is believed in does, same shape.
+        believed: Whether the nominal plant does, same shape.
         turned: Share of the plants that reach it after going round, same shape.
         moving: Share of all runs that neither reached upright nor rest: a longer duration may decide them.
-        level: c of the ellipse x' S x <= c, proven for the believed plant without dry friction.
+        level: c of the ellipse x' S x <= c, proven for the nominal plant without dry friction.
         ellipse: Its boundary: angle from upright [rad], velocity [rad/s], shape (k, 2).
-        counterexamples: Starts inside the ellipse from which the believed plant does not reach upright; 0 is right.
+        counterexamples: Starts inside the ellipse from which the nominal plant does not reach upright; 0 is right.
         share_in_ellipse: Share of all runs from inside the ellipse that reach upright; NaN without such a start.
     """
 

@@ -122,7 +122,7 @@ def run_metrics(place: Path, spec: RunSpec) -> dict[str, float | None]:
 
 
 def read_record(folder: Path, run: StudyRun) -> dict[str, Any] | None:
-    """Return what is known about a run that has ended, well or not; None for one that has not."""
+    """Return the result of a run that has ended, well or not; None for one that has not."""
     path = folder / "runs" / run.name / "run.json"
     if not path.is_file():
         return None

@@ -130,7 +130,7 @@ def run_study(
         workers: Runs at once.
         retry_failed: Carry out again those that failed; else they stay failed.
         on_progress: Called several times a second.
-        before_machine: Called before each run that moves a real machine; what it raises ends the study, which goes on
+        before_machine: Called before each run that moves a real machine; what it raises ends the study, which resumes
             from there when it is started again.
 
     Returns:
@@ -228,7 +228,7 @@ def _start(folder: Path, run: StudyRun, processes: ProcessSet, threads: ThreadPo
         command += ["--yes"] if run.lab else []
     else:
         command += ["run", str(place / "spec.json"), "--bag", str(place / "bag")]
-    # Each finds a free domain: one that is set in our environment would be the same for all.
+    # Each finds a free domain: one in this process's environment would be the same for all.
     environment = {"ROS_DOMAIN_ID": ""}
     # What is hosted once must go well a hundred times; a machine, or an experiment of several runs, starts afresh.
     alone = run.spec is None or not run.spec.simulated_time

@@ -26,11 +26,11 @@ __all__ = ["StartGrid", "inside_ellipse", "run_map", "share_inside"]
 
 @dataclass(frozen=True)
 class StartGrid(ABC):
-    """What to map; plant 0 is the one that is believed in.
+    """What to map; plant 0 is the nominal one.
 
     Attributes:
-        plant: Preset or file of the plant that is believed in; the controller is designed on it.
-        plants: Plants at each start, the believed one first; 1 leaves the uncertainty out.
+        plant: Preset or file of the nominal plant; the controller is designed on it.
+        plants: Plants at each start, the nominal one first; 1 leaves the uncertainty out.
         points: Points along each axis of the grid; an odd number has upright at rest among them.
         duration: Of each run [s].
         dt: Period of the loop [s].
@@ -120,7 +120,7 @@ def run_map(
     """Run what is not on disk yet, one Parquet file for each chunk, and write the map and its figures.
 
     Args:
-        folder: Where the files go; a folder of the same settings is gone on with.
+        folder: Where the files go; a folder of the same settings is continued.
         settings: What to map.
         connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
         on_progress: Called with chunks done and in all.

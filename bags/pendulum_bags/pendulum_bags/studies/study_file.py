@@ -348,7 +348,7 @@ def _named_runs(
         if experiment == "thesis":
             if "strategy" in settings or not settings.get("lab"):
                 arguments += ["--strategy", str(settings.get("strategy", "direct_pwm"))]
-            # A study has its seeds: none of its runs is repeated by itself.
+            # A study has its seeds: none of its runs is repeated automatically.
             arguments += ["--budget", "0"]
             arguments += _thesis_arguments(controllers[controller], controller, disturbances[disturbance])
             duration = _duration(file)

@@ -1,4 +1,4 @@
-"""What is not known about a plant: shares of its parameters, given or identified, and plants drawn from them."""
+"""The uncertainty of a plant: shares of its parameters, given or identified, and plants drawn from them."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ _NORMAL_95 = 1.959963984540054
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How far the parameters of a plant are known.
+    """The uncertainty of a plant's parameters.
 
     Attributes:
         shares: Standard deviation of each parameter as a share of its value, 0 to 1; others are known.
         correlation: Of the parameters in the order of ``shares``; empty where they are independent.
-        source: Where this comes from, in words.
+        source: Where this comes from, as text.
     """
 
     shares: Mapping[str, float] = field(default_factory=dict)
@@ -66,7 +66,7 @@ class Uncertainty:
         A plant of negative inertia is no plant. Mean and deviation are those of the value, not of its logarithm.
 
         Args:
-            plant: The plant that is believed in.
+            plant: The nominal plant.
             normals: One row for each of ``VARIED``.
             correlated: False takes the parameters for independent.
         """
@@ -109,7 +109,7 @@ class Uncertainty:
 
 
 THESIS_UNCERTAINTY = Uncertainty({"inertia": 0.3, "damping": 0.05, "gravity": 0.05})
-"""What is not known of the plant of the thesis, about."""
+"""Approximate uncertainty of the plant of the thesis."""
 
 
 def batch_variations(plant: PlantParameters, drawn: Mapping[str, NDArray[Any]]) -> dict[str, Array]:

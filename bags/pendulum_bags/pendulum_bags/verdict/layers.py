@@ -51,7 +51,7 @@ class Layer(Enum):
     Attributes:
         key: Name in JSON and of files.
         title: Name in tables.
-        question: What it answers.
+        question: The question.
     """
 
     key: str
@@ -255,7 +255,7 @@ def sum_up(
     if mark is Mark.YES and by_mark[Mark.NOT_MEASURED]:
         missing = _listed([f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED]])
         text += f" Not measured: {missing}."
-    # What mends a no comes before what decides, and that before what was left out.
+    # Steps that mend a no come first, then those that decide, then those for missing layers.
     order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES])
     steps = dict.fromkeys(step for result in order for step in result.next_steps)
     for command in dict.fromkeys(result.reason for result in by_mark[Mark.NOT_MEASURED] if result.reason):

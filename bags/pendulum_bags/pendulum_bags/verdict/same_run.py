@@ -187,7 +187,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
                 f"designs are safe all the same ({how_to_measure(comparison)[Layer.WHICH_CONTROLLERS]})."
             )
     elif late is not None and foreign:
-        # No plant file of ours reaches into it.
+        # A plant file has no effect on it.
         steps.append(f"Give {foreign} {_late(late)}; measure again.")
     elif late is not None:
         steps.append(
@@ -237,13 +237,13 @@ def _test_of_the_plant(comparison: Comparison, plant: str) -> str:
 
 
 def _late(test: EquivalenceTest) -> str:
-    """Return by how much the simulation's delay is to change, in words."""
+    """Return the change of the simulation's delay, as text."""
     value = test.interval.estimate
     return f"{abs(value):.3g} {test.unit} {'more' if value >= 0.0 else 'less'} delay than now"
 
 
 def _foreign_simulation(comparison: Comparison) -> str:
-    """Return the name of the simulation where it is not ours, else nothing."""
+    """Return the name of a third-party simulation, else nothing."""
     simulation = run_record(comparison.pairs[0].simulation.metadata).get("simulation")
     return str(simulation.get("name", "")) if isinstance(simulation, Mapping) else ""
 

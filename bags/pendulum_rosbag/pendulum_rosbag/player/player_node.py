@@ -56,9 +56,9 @@ class PlayOptions:
         remaps: Recorded name -> name to publish under.
         start: Time after the beginning of the bag to start at [s].
         duration: Time of the recording to play [s]; 0 for all.
-        loop: Begin again at the end.
+        loop: Restart at the end.
         wait: Longest time to wait for a subscriber on every topic before the first message [s].
-        paused: Begin when the service ``~/pause`` is called with false.
+        paused: Start when the service ``~/pause`` is called with false.
     """
 
     bag: Path
@@ -94,7 +94,7 @@ class _Timeline:
         return _LONGEST_WAIT if self._paused else (recorded_ns - self.now()) / self._rate * 1e-9
 
     def change(self, *, rate: float | None = None, paused: bool | None = None, jump_to: int | None = None) -> None:
-        """Go on from here at another rate, pause, or go on from another recorded time."""
+        """Continue at another rate, pause, or continue from another recorded time."""
         self._anchor = (time.monotonic_ns(), self.now() if jump_to is None else jump_to)
         self._rate = self._rate if rate is None else rate
         self._paused = self._paused if paused is None else paused

@@ -25,7 +25,7 @@ _Source = TypeVar("_Source")
 
 
 class BlackBox(Generic[_Source]):
-    """Messages of the last seconds, whatever their sources are.
+    """Messages of the last seconds, of any sources.
 
     Args:
         seconds: How long messages are kept [s].

@@ -10,7 +10,7 @@ __all__ = ["GapCounter"]
 _LARGEST_GAP = 1_000_000  # beyond this a number is taken for that of another publisher
 _MOST_STREAMS = 64
 _PATIENCE = 200
-"""Messages of a topic after which a publisher that did not go on is taken for one that never paused."""
+"""Messages of a topic after which an open sample counts as the silent publisher's next one, after a gap."""
 
 
 @dataclass
@@ -35,7 +35,7 @@ class GapCounter:
     So every publisher seen so far is remembered by its last number, and a sample belongs to the one that it
     continues. A sample that continues none is the first of a new publisher (which may have published before it was
     matched), or there is a gap before it. If more publishers were matched than received from, both are possible, and
-    later samples decide: the publisher whose number it could have continued goes on, or has left, or the gap was real.
+    later samples decide: the publisher that it could have continued sends more, or has left, or the gap was real.
 
     Args:
         matched: Returns how many publishers were matched since the beginning, and how many are now.
@@ -98,7 +98,7 @@ class GapCounter:
         return gap
 
     def _judge_doubts(self, continued: int) -> int:
-        """Settle the open case of a publisher that goes on; return the gaps of those that were silent for long."""
+        """Settle the open case of a publisher that sends more; return the gaps of those that were silent for long."""
         if continued in self._doubts:
             self.unmet += self._doubts.pop(continued).unmet
         found = 0

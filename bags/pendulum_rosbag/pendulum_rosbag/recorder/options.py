@@ -29,12 +29,12 @@ class RecorderOptions:
         exclude: Pattern of topics to leave out.
         storage: ``mcap`` or ``sqlite3``.
         compression: ``None`` or ``zstd``.
-        max_size: Begin a new file before this one is larger [bytes]; 0 for never.
-        max_duration: Begin a new file before this one is longer [s]; 0 for never.
+        max_size: Start a new file before this one is larger [bytes]; 0 for never.
+        max_duration: Start a new file before this one is longer [s]; 0 for never.
         duration: Stop after this time [s]; 0 for never.
         metadata: Run metadata to store.
         log_time: ``receive`` or ``header``.
-        wait: Begin only when the service ``~/start`` is called.
+        wait: Start only when the service ``~/start`` is called.
         black_box: Keep the last messages for so long, and write them each time that a plant faults or is stopped [s]; 0
             to record all.
     """

@@ -51,7 +51,7 @@ class TopicCount:
 
 @dataclass(slots=True)
 class SessionReport:
-    """What a recording came to."""
+    """Result of a recording."""
 
     path: Path
     topics: dict[str, TopicCount] = field(default_factory=dict)
