@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -14,20 +13,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_msgs_py.json_values import without_nan
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_msgs_py.whole_file import writing
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.decode import store_for
+from pendulum_rosbag.reader.joint_table import joint_table
 from pendulum_rosbag.reader.topic_info import TopicInfo
 
 if TYPE_CHECKING:
     import pandas as pd
     from rosbags.typesys.store import Typestore
 
-    from pendulum_rosbag.reader.topic_info import StoredMessage
 
 __all__ = ["FORMATS", "LEROBOT", "export_bag", "require_pyarrow", "to_pandas"]
 
@@ -56,30 +54,24 @@ def to_pandas(bag: Bag, topic: str) -> pd.DataFrame:
         return pd.DataFrame({name: values[name] for name in values.dtype.names or ()})
     if not values:
         return pd.DataFrame({"log_time_ns": np.empty(0, np.int64)})
-    if bag.topics[topic].type == _JOINT_STATE and (columns := _joint_columns(values)):
+    if bag.topics[topic].type == _JOINT_STATE and (columns := _joint_columns(bag, topic)):
         return pd.DataFrame(columns)
     return pd.DataFrame([{"log_time_ns": stored.log_time_ns, **_flat(stored.message)} for stored in values])
 
 
-def _joint_columns(values: Sequence[StoredMessage]) -> dict[str, Any]:
+def _joint_columns(bag: Bag, topic: str) -> dict[str, Any]:
     """Return the columns of states of several joints; none where messages are not all of the same joints."""
-    messages = [stored.message for stored in values]
-    joints = [str(name) for name in messages[0].name]
-    if len(joints) < 2 or len(set(joints)) < len(joints) or any({*one.name} != {*joints} for one in messages):
+    try:
+        table = joint_table(bag.raw(topic), topic)
+    except DataError:
         return {}
-    orders = [[[*one.name].index(joint) for joint in joints] for one in messages]
-    stamps = [int(one.header.stamp.sec) * NANOSECONDS + int(one.header.stamp.nanosec) for one in messages]
-    columns: dict[str, Any] = {"log_time_ns": [stored.log_time_ns for stored in values], "stamp_ns": stamps}
-    absent = (math.nan,) * len(joints)
+    if len(set(table.names)) < max(2, len(table.names)):
+        return {}
+    columns: dict[str, Any] = {"log_time_ns": table.log_time_ns, "stamp_ns": table.stamp_ns}
     for quantity in ("position", "velocity", "effort"):
-        rows = [tuple(getattr(one, quantity)) or absent for one in messages]
-        if any(len(row) != len(joints) for row in rows):
-            return {}
-        columns |= {
-            f"{name}.{quantity}": [row[order[index]] for row, order in zip(rows, orders, strict=True)]
-            for index, name in enumerate(joints)
-        }
-    return {**columns, "frame_id": [one.header.frame_id for one in messages]}
+        values = getattr(table, quantity)
+        columns |= {f"{name}.{quantity}": values[:, index] for index, name in enumerate(table.names)}
+    return {**columns, "frame_id": [stored.message.header.frame_id for stored in bag[topic]]}
 
 
 def export_bag(
