@@ -190,8 +190,6 @@ def read_run(
     prefix: str | None = None,
     label: str | None = None,
     joint: str | None = None,
-    start_ns: int | None = None,
-    stop_ns: int | None = None,
     or_all: bool = False,
     open_bag: OpenBag = read_bag,
 ) -> RunData:
@@ -203,10 +201,8 @@ def read_run(
         label: Name for tables; by default that of the bag's folder.
         joint: Joint of a plant of several, see :func:`joints_of`. Its disturbance is the joint's own,
             else that of the first joint that has one.
-        start_ns: Start of the window by the plant's stamps [ns]; by default the event ``noise_start``, or without
-            one the first sample of the disturbance.
-        stop_ns: End of the window [ns]; by default ``noise_end``, or the last sample of the disturbance.
-        or_all: Whether the window is the whole recording where it has neither events nor a disturbance.
+        or_all: Whether the window is the whole recording where it has neither events nor a disturbance. Else it goes
+            from the event ``noise_start`` to ``noise_end``, or from the first to the last sample of the disturbance.
         open_bag: How the bag is opened.
 
     Raises:
@@ -225,7 +221,7 @@ def read_run(
         applied = _optional(bag, f"{space}/{names.APPLIED_EFFORT}", joint)
         events = [event for event in bag.events() if event["topic"].startswith(f"{space}/")]
         metadata, damage = dict(bag.metadata), [*bag.damage, *bag.clock_notes]
-    start, stop = _window(events, disturbance, str(path), start_ns, stop_ns, states["stamp_ns"] if or_all else None)
+    start, stop = _window(events, disturbance, str(path), states["stamp_ns"] if or_all else None)
     name = label or Path(path).stem
     stamps = states["stamp_ns"]
     times = (stamps - start) / NANOSECONDS
@@ -375,8 +371,6 @@ def _window(
     events: Sequence[Mapping[str, Any]],
     disturbance: NDArray[Any] | None,
     path: str,
-    start_ns: int | None,
-    stop_ns: int | None,
     stamps: NDArray[np.int64] | None,
 ) -> tuple[int, int]:
     found = {
@@ -388,13 +382,14 @@ def _window(
         live = disturbance["stamp_ns"][disturbance["effort"] != 0.0]
         if len(live):
             active = int(live[0]), int(live[-1])
-    if stamps is not None and active is None and not starts:
+    if starts or active is not None:
+        start = starts[-1] if active is None or starts else active[0]
+    elif stamps is not None:
         return int(stamps[0]), int(stamps[-1]) + 1
-    start = start_ns if start_ns is not None else (starts[-1] if starts else active[0] if active else None)
-    if start is None:
+    else:
         raise DataError(f"bag {path} has neither an event {START_EVENT!r} nor a disturbance; expected one of them")
     after = [stop for stop in stops if stop > start]
-    stop = stop_ns if stop_ns is not None else (after[0] if after else active[1] if active else None)
+    stop = after[0] if after else active[1] if active else None
     if stop is None or stop <= start:
         raise DataError(f"bag {path}: the noise starts at {start} ns and has no end; expected an event {END_EVENT!r}")
     return start, stop
