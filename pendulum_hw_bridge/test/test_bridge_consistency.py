@@ -256,3 +256,10 @@ def test_a_plant_without_a_drivetrain_has_no_mapping_of_efforts() -> None:
     limits = PlantLimits(**LIMITS)  # type: ignore[arg-type]
     with pytest.raises(ParameterError, match="plant 'thesis' has no drivetrain; expected one for the effort mapping"):
         effort_mapping(validate(BRIDGE_SPECS, {}), load_plant("thesis"), DEFAULT_GAINS, limits)
+
+
+def test_a_motor_keeps_the_limit_of_its_own_joint() -> None:
+    limits = PlantLimits(effort=(3.0, 1.5))
+    values, plant = validate(BRIDGE_SPECS, {}), load_emulator("thesis").plant
+    mappings = [effort_mapping(values, plant, DEFAULT_GAINS[3], limits, joint=joint) for joint in (0, 1)]
+    assert [mapping.effort_limit for mapping in mappings] == [3.0, 1.5]

@@ -120,6 +120,19 @@ def test_records_within_half_a_period_make_a_state_that_is_as_old_as_the_older()
 # --- driving ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("ahead", [0, 1])
+def test_the_older_record_of_two_waits_for_its_next_whichever_joint_it_is_of(ahead: int) -> None:
+    rig = Rig()
+    rig.bridge.connect()
+    rig.ports[1 - ahead].records.append(rig.record())
+    rig.wait()
+    rig.ports[ahead].records.append(rig.record())
+    assert rig.bridge.observe(0.0) is None
+    # Only the older one is asked for again.
+    rig.ports[1 - ahead].records.append(rig.record())
+    assert rig.bridge.observe(0.0) is not None
+
+
 def test_each_driven_joint_gets_its_own_torque_and_its_own_push() -> None:
     rig = Rig().armed()
     drive = Drive(DriveKind.EFFORT, effort=(1.0, -0.5), push=(0.25, -0.75))
