@@ -159,6 +159,9 @@ def test_two_bags_without_noise_are_compared_as_a_whole(
     assert compare_main([str(one), str(other)]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "The hardware has neither a disturbance nor events: all of its recording is compared." in shown
+    # What needs a disturbance is not asked of bags without one.
+    assert f"frequency_response {one}" not in shown
+    assert "record both plants under a disturbance" in shown
 
 
 def test_a_report_of_one_bag_says_what_it_is_and_what_shows_it(

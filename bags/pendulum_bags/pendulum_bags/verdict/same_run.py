@@ -69,6 +69,8 @@ def how_to_measure(comparison: Comparison) -> dict[Layer, str]:
     bags = [one.source or name for one, name in ((first.simulation, "SIM"), (first.hardware, "HW"))]
     in_frequency = measurement_of(_records(comparison), "frequency_response") or (
         f"python -m pendulum_bags frequency_response {' '.join(map(shlex.quote, bags))} --out FOLDER"
+        if not (first.simulation.is_whole or first.hardware.is_whole)
+        else "record both plants under a disturbance (python -m pendulum_bags frequency_response SIM HW --out FOLDER)"
     )
     choice = measurement_of(_records(comparison), "ranking") or (
         "record several controllers on both plants (python -m pendulum_bags ranking FOLDER)"
