@@ -27,7 +27,7 @@ from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.policies.convert_policy_cli import main
 from pendulum_lqr.policies.onnx_file import dumps_onnx, observation_names
 from pendulum_lqr.policies.policy_file import header_of, load_policy, write_policy
-from pendulum_lqr.policies.policy_import import Told, policy_of_actor
+from pendulum_lqr.policies.policy_import import ActorSpec, policy_of_actor
 from pendulum_lqr.policies.sb3_archive import LARGEST_ARCHIVE, load_actor
 from pendulum_lqr.policies.torch_state import read_state
 from pendulum_msgs_py.errors import DataError, ParameterError
@@ -41,7 +41,7 @@ PLANTS = {"ppo": load_plant("dfki"), "sac": PENDULUM_V1, "tqc": PENDULUM_V1}
 
 def imported(name, **changes):
     told = {"plant": PLANTS[name], "period": 0.05, **changes}
-    return policy_of_actor(load_actor(IMPORTED / f"{name}.zip"), Told(**told), name=name, provenance={})
+    return policy_of_actor(load_actor(IMPORTED / f"{name}.zip"), ActorSpec(**told), name=name, provenance={})
 
 
 def members(name="sac"):
@@ -95,10 +95,12 @@ def test_a_converted_policy_answers_as_the_library_that_trained_it(tmp_path, nam
 
 def test_a_cosine_from_hanging_another_order_and_stacked_samples_come_out_the_same():
     actor = load_actor(IMPORTED / "sac.zip")
-    told = Told(PENDULUM_V1, 0.05, observation="velocity,-cos,-sin", history=1, velocity_scale=8.0, velocity_box=8.0)
+    told = ActorSpec(
+        PENDULUM_V1, 0.05, observation="velocity,-cos,-sin", history=1, velocity_scale=8.0, velocity_box=8.0
+    )
     # The bounds say where the velocity is.
     with pytest.raises(ParameterError, match="observation says cos and its value lies in -8 to 8") as caught:
-        policy_of_actor(actor, Told(PENDULUM_V1, 0.05, observation="sin,velocity,cos"), name="x", provenance={})
+        policy_of_actor(actor, ActorSpec(PENDULUM_V1, 0.05, observation="sin,velocity,cos"), name="x", provenance={})
     assert "expected -1 to 1" in str(caught.value)
     free = type(actor.observations)(np.full(3, -np.inf), np.full(3, np.inf))
     unbound = type(actor)(actor.network, free, actor.actions, actor.algorithm, "", None, "")
@@ -107,7 +109,10 @@ def test_a_cosine_from_hanging_another_order_and_stacked_samples_come_out_the_sa
     ours = np.stack([-theirs[:, 1], -theirs[:, 2], theirs[:, 0]], axis=1)
     np.testing.assert_allclose(policy.network.answer(ours), actor.network.answer(theirs), atol=1e-6)
     stacked = policy_of_actor(
-        unbound, Told(PENDULUM_V1, 0.05, observation="velocity", history=3, velocity_box=8.0), name="x", provenance={}
+        unbound,
+        ActorSpec(PENDULUM_V1, 0.05, observation="velocity", history=3, velocity_box=8.0),
+        name="x",
+        provenance={},
     )
     np.testing.assert_array_equal(stacked.network.answer(theirs), actor.network.answer(theirs))
 
@@ -145,11 +150,11 @@ def test_spaces_of_no_known_environment_want_to_be_told(tmp_path):
     path.write_bytes(content)
     actor = load_actor(path)
     with pytest.raises(ParameterError, match=r"sees 3 values up to 1, 1, inf.*expected --observation"):
-        policy_of_actor(actor, Told(PENDULUM_V1, 0.05), name="x", provenance={})
+        policy_of_actor(actor, ActorSpec(PENDULUM_V1, 0.05), name="x", provenance={})
     with pytest.raises(ParameterError, match="expected --velocity-box"):
-        policy_of_actor(actor, Told(PENDULUM_V1, 0.05, "cos,sin,velocity"), name="x", provenance={})
+        policy_of_actor(actor, ActorSpec(PENDULUM_V1, 0.05, "cos,sin,velocity"), name="x", provenance={})
     policy = policy_of_actor(
-        actor, Told(PENDULUM_V1, 0.05, "cos,sin,velocity", velocity_box=9.0), name="x", provenance={}
+        actor, ActorSpec(PENDULUM_V1, 0.05, "cos,sin,velocity", velocity_box=9.0), name="x", provenance={}
     )
     assert policy.velocity_box == (9.0,)
 

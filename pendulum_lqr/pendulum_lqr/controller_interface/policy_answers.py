@@ -156,8 +156,8 @@ class PolicyAnswers:
         """Return which policy it is, and whether it gave up; ``after`` names what commands then."""
         policy = self.policy
         sizes = "-".join(str(size) for size in policy.network.sizes)
-        told = f"{policy.name} ({policy.task}, {sizes}) every {policy.period:g} s, fallback {after}"
-        return f"{told}; {self.notice}" if self.notice else told
+        text = f"{policy.name} ({policy.task}, {sizes}) every {policy.period:g} s, fallback {after}"
+        return f"{text}; {self.notice}" if self.notice else text
 
     def take_over(self, previous: PolicyAnswers) -> None:
         """Take over samples and efforts from another run of the same kind of policy, and whether it gave up."""

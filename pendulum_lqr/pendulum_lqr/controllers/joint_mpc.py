@@ -62,15 +62,15 @@ class JointMpc(JointDiscreteLqr):
     @property
     def notice(self) -> str:
         """That the horizon is too short, and how often the solver found no plan."""
-        told = []
+        notices = []
         if self._program.horizon < self._enough:
-            told.append(
+            notices.append(
                 f"it looks {self._program.horizon * self.period:g} s ahead, and to keep clear of a limit it may let "
                 f"fall what falls later; expected a horizon of {self._enough} samples or more, or a slower plant"
             )
         if self.failures:
-            told.append(f"no plan for {self.failures} states: the LQR answered")
-        return "; ".join(told)
+            notices.append(f"no plan for {self.failures} states: the LQR answered")
+        return "; ".join(notices)
 
     def reset(self) -> None:
         """Forget the plan and what was sent."""

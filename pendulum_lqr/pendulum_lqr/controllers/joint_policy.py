@@ -131,8 +131,8 @@ class JointPolicy(JointController):
 
     def describe(self) -> str:
         """Return which policy it is, what catches, and whether it gave up."""
-        told = self._answers.describe("no effort" if self.fallback is None else self.fallback.describe())
-        return told if self.catch is None else f"{told}; LQR within {self.catch.region.describe()}"
+        text = self._answers.describe("no effort" if self.fallback is None else self.fallback.describe())
+        return text if self.catch is None else f"{text}; LQR within {self.catch.region.describe()}"
 
     def carry_over(self, previous: Controller | JointController) -> None:
         """Take over samples and efforts from the same kind of policy, and that it gave up."""

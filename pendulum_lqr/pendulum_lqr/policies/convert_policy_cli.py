@@ -14,7 +14,7 @@ from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
-    from pendulum_lqr.policies.policy_import import Told
+    from pendulum_lqr.policies.policy_import import ActorSpec
 
 __all__ = ["app", "main"]
 
@@ -71,7 +71,7 @@ def convert_policy(
             "the archive does not say on which plant and at which period it was trained; expected --plant, and "
             "a finite --period > 0"
         )
-    from pendulum_lqr.policies.policy_import import Told
+    from pendulum_lqr.policies.policy_import import ActorSpec
     from pendulum_msgs_py.plants.plant_parameters import load_plant
 
     for name, value in (("velocity_box", velocity_box), ("effort_limit", effort_limit)):
@@ -79,8 +79,8 @@ def convert_policy(
             raise ParameterError(f"{name} is {value}; expected a finite number >= 0")
     if not 0.0 < velocity_scale < float("inf"):
         raise ParameterError(f"velocity_scale is {velocity_scale} rad/s; expected a finite number > 0")
-    told = Told(load_plant(plant), period, observation, history, velocity_scale, velocity_box, effort_limit)
-    console.print(_import(source, out, told), soft_wrap=True, markup=False)
+    spec = ActorSpec(load_plant(plant), period, observation, history, velocity_scale, velocity_box, effort_limit)
+    console.print(_import(source, out, spec), soft_wrap=True, markup=False)
 
 
 def _export(source: Path, out: Path) -> str:
@@ -92,7 +92,7 @@ def _export(source: Path, out: Path) -> str:
     return f"{policy.name}: observation ({policy.observation_size}) to action in -1 to 1, opset {OPSET}\nmodel   {out}"
 
 
-def _import(source: Path, out: Path, told: Told) -> str:
+def _import(source: Path, out: Path, spec: ActorSpec) -> str:
     from pendulum_lqr.policies.policy_file import write_policy
     from pendulum_lqr.policies.policy_import import policy_of_actor
     from pendulum_lqr.policies.sb3_archive import load_actor
@@ -105,8 +105,8 @@ def _import(source: Path, out: Path, told: Told) -> str:
         "stable_baselines3": actor.version,
         "steps": actor.steps,
     }
-    name = f"{told.plant.name} {actor.algorithm}"
-    policy = policy_of_actor(actor, told, name=name, provenance=provenance)
+    name = f"{spec.plant.name} {actor.algorithm}"
+    policy = policy_of_actor(actor, spec, name=name, provenance=provenance)
     write_policy(out, policy)
     sizes = "-".join(str(size) for size in policy.network.sizes)
     return (

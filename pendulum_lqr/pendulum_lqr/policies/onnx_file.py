@@ -45,7 +45,7 @@ def write_onnx(path: str | Path, policy: Policy) -> Path:
 
 def dumps_onnx(policy: Policy) -> bytes:
     """Return the ONNX model of a policy; equal policies give equal bytes."""
-    told: dict[str, Any] = {**header_of(policy), "observation": observation_names(policy)}
+    metadata: dict[str, Any] = {**header_of(policy), "observation": observation_names(policy)}
     return b"".join(
         (
             _number(1, _IR_VERSION),
@@ -53,8 +53,8 @@ def dumps_onnx(policy: Policy) -> bytes:
             _field(7, _graph(policy.network)),
             _field(8, _text(1, "") + _number(2, OPSET)),
             *(
-                _field(14, _text(1, key) + _text(2, json.dumps(told[key], sort_keys=True, allow_nan=False)))
-                for key in sorted(told)
+                _field(14, _text(1, key) + _text(2, json.dumps(metadata[key], sort_keys=True, allow_nan=False)))
+                for key in sorted(metadata)
             ),
         )
     )

@@ -16,7 +16,7 @@ from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["Told", "policy_of_actor"]
+__all__ = ["ActorSpec", "policy_of_actor"]
 
 _WORDS = (*SIGNALS, "-cos", "-sin")
 _SAME = 1e-3
@@ -25,7 +25,7 @@ _BOX_MARGIN = 1.001
 
 
 @dataclass(frozen=True)
-class Told:
+class ActorSpec:
     """What an archive does not define of its actor.
 
     Attributes:
@@ -63,7 +63,7 @@ _KNOWN = (
 """Upper bounds of observation and action; NaN for any."""
 
 
-def policy_of_actor(actor: Actor, told: Told, *, name: str, provenance: Mapping[str, Any]) -> Policy:
+def policy_of_actor(actor: Actor, spec: ActorSpec, *, name: str, provenance: Mapping[str, Any]) -> Policy:
     """Return the policy with the outputs of an actor.
 
     Raises:
@@ -72,26 +72,26 @@ def policy_of_actor(actor: Actor, told: Told, *, name: str, provenance: Mapping[
     """
     if actor.actions.high.size != 1:
         raise ParameterError(f"the actor answers with {actor.actions.high.size} values; expected 1, the torque")
-    words = _words(actor, told)
+    words = _words(actor, spec)
     network = actor.network
-    first = network.weights[0][:, _columns(words, told.history)] * np.float32(_signs(words, told.history))
-    box = _boxes(actor.observations, words, told)
-    limit = _effort_limit(float(actor.actions.high[0]), told)
+    first = network.weights[0][:, _columns(words, spec.history)] * np.float32(_signs(words, spec.history))
+    box = _boxes(actor.observations, words, spec)
+    limit = _effort_limit(float(actor.actions.high[0]), spec)
     return Policy(
         network=Network((np.ascontiguousarray(first), *network.weights[1:]), network.biases, network.activation,
                         network.output),
-        name=name, task="imported", joints=(JOINT,), period=told.period, plant=told.plant, ranges={},
-        effort_limit=(limit,), effort_rate=(math.inf,), velocity_scale=(told.velocity_scale,), angle_box=(box[0],),
+        name=name, task="imported", joints=(JOINT,), period=spec.period, plant=spec.plant, ranges={},
+        effort_limit=(limit,), effort_rate=(math.inf,), velocity_scale=(spec.velocity_scale,), angle_box=(box[0],),
         velocity_box=(box[1],), signals=tuple(name for name in SIGNALS if name in _plain(words)),
-        history=told.history, provenance={**provenance, "observation": ",".join(words)},
+        history=spec.history, provenance={**provenance, "observation": ",".join(words)},
     )  # fmt: skip
 
 
-def _words(actor: Actor, told: Told) -> list[str]:
+def _words(actor: Actor, spec: ActorSpec) -> list[str]:
     high = actor.observations.high
-    text = told.observation
+    text = spec.observation
     if not text:
-        text = next((known.observation for known in _KNOWN if _is_known(known, actor)), "") if told.history == 1 else ""
+        text = next((known.observation for known in _KNOWN if _is_known(known, actor)), "") if spec.history == 1 else ""
         if not text:
             raise ParameterError(
                 f"the actor sees {high.size} values up to {', '.join(f'{value:g}' for value in high[:8])}, which is no "
@@ -103,9 +103,9 @@ def _words(actor: Actor, told: Told) -> list[str]:
         raise ParameterError(
             f"observation is {text!r}; expected some of {', '.join(_WORDS)}, separated by commas, each signal once"
         )
-    if len(words) * told.history != high.size:
+    if len(words) * spec.history != high.size:
         raise ParameterError(
-            f"observation {text} in {told.history} sample(s) has {len(words) * told.history} values and the actor sees "
+            f"observation {text} in {spec.history} sample(s) has {len(words) * spec.history} values and the actor sees "
             f"{high.size}; expected as many"
         )
     return words
@@ -135,11 +135,11 @@ def _signs(words: Sequence[str], history: int) -> NDArray[np.float64]:
     return signs[_columns(words, history)]
 
 
-def _boxes(space: Space, words: Sequence[str], told: Told) -> tuple[float, float]:
+def _boxes(space: Space, words: Sequence[str], spec: ActorSpec) -> tuple[float, float]:
     """Return the largest angle [rad] and velocity [rad/s], after a check of the bounds of each value."""
-    angle, velocity = math.pi, told.velocity_box
+    angle, velocity = math.pi, spec.velocity_box
     # Stacked samples: the bounds lie in another order than the values (VecFrameStack repeats each bound).
-    bounds = dict(zip(_plain(words), zip(space.low, space.high, strict=True), strict=True)) if told.history == 1 else {}
+    bounds = dict(zip(_plain(words), zip(space.low, space.high, strict=True), strict=True)) if spec.history == 1 else {}
     for word, (low, high) in bounds.items():
         expected = 1.0 if word in {"cos", "sin"} else high
         if low != -high or (math.isfinite(high) and not math.isclose(high, expected, rel_tol=1e-6)):
@@ -150,7 +150,7 @@ def _boxes(space: Space, words: Sequence[str], told: Told) -> tuple[float, float
         if word == "angle":
             angle = min(angle, float(high))
         if word == "velocity" and math.isfinite(high):
-            largest = _BOX_MARGIN * float(high) * told.velocity_scale
+            largest = _BOX_MARGIN * float(high) * spec.velocity_scale
             if velocity > largest:
                 raise ParameterError(
                     f"velocity_box is {velocity:g} rad/s and the actor's space ends at "
@@ -165,18 +165,18 @@ def _boxes(space: Space, words: Sequence[str], told: Told) -> tuple[float, float
     return angle, velocity
 
 
-def _effort_limit(largest: float, told: Told) -> float:
-    limit = told.plant.effort_limit
-    if not told.effort_limit:
+def _effort_limit(largest: float, spec: ActorSpec) -> float:
+    limit = spec.plant.effort_limit
+    if not spec.effort_limit:
         if abs(largest - limit) > _SAME * limit:
             raise ParameterError(
-                f"the largest action is {largest:g} and plant {told.plant.name!r} has {limit:g} N m; expected "
+                f"the largest action is {largest:g} and plant {spec.plant.name!r} has {limit:g} N m; expected "
                 "--effort-limit, the torque of the largest action [N m]"
             )
         return limit
-    if told.effort_limit > (1.0 + _SAME) * limit:
+    if spec.effort_limit > (1.0 + _SAME) * limit:
         raise ParameterError(
-            f"effort_limit is {told.effort_limit:g} N m and plant {told.plant.name!r} has {limit:g} N m; expected at "
+            f"effort_limit is {spec.effort_limit:g} N m and plant {spec.plant.name!r} has {limit:g} N m; expected at "
             "most that"
         )
-    return told.effort_limit
+    return spec.effort_limit

@@ -141,13 +141,13 @@ def _read(content: bytes) -> Actor:
         return wanted
 
     data, weights, *rest = read_parts(content, "Stable-Baselines3", check)
-    told = _json(data)
-    kind = _kind(told)
-    settings = told.get("policy_kwargs", {})
+    saved = _json(data)
+    kind = _kind(saved)
+    settings = saved.get("policy_kwargs", {})
     if not isinstance(settings, dict):
         raise DataError(f"policy_kwargs is {shown(settings)}; expected a mapping")
-    activation, output = _settings(kind, settings, sde=told.get("use_sde") is True)
-    observations, actions = (_space(told, name) for name in ("observation_space", "action_space"))
+    activation, output = _settings(kind, settings, sde=saved.get("use_sde") is True)
+    observations, actions = (_space(saved, name) for name in ("observation_space", "action_space"))
     if not actions.is_symmetric or not np.all(np.isfinite(actions.high) & (actions.high > 0.0)):
         raise DataError(
             f"its actions go from {shown(actions.low.tolist())} to {shown(actions.high.tolist())}; expected a finite "
@@ -165,7 +165,7 @@ def _read(content: bytes) -> Actor:
             f"{observations.low.size} and {actions.low.size}; expected the same"
         )
     version = rest[0].decode("ascii", "replace").strip() if rest else ""
-    steps = told.get("num_timesteps")
+    steps = saved.get("num_timesteps")
     return Actor(
         network,
         observations,
@@ -179,16 +179,16 @@ def _read(content: bytes) -> Actor:
 
 def _json(data: bytes) -> dict[str, Any]:
     try:
-        told = json.loads(data.decode())
+        content = json.loads(data.decode())
     except (ValueError, RecursionError) as error:
         raise DataError(f"its data is no JSON ({sentence_of(error)})") from error
-    if not isinstance(told, dict):
-        raise DataError(f"its data is a {type(told).__name__}; expected a mapping")
-    return told
+    if not isinstance(content, dict):
+        raise DataError(f"its data is a {type(content).__name__}; expected a mapping")
+    return content
 
 
-def _kind(told: Mapping[str, Any]) -> _Kind:
-    policy = told.get("policy_class")
+def _kind(content: Mapping[str, Any]) -> _Kind:
+    policy = content.get("policy_class")
     module = policy.get("__module__") if isinstance(policy, dict) else None
     kind = _KINDS.get(module) if isinstance(module, str) else None
     if kind is None:
@@ -217,8 +217,8 @@ def _settings(kind: _Kind, settings: Mapping[str, Any], *, sde: bool) -> tuple[s
     return activation, "tanh" if squashed else kind.output
 
 
-def _space(told: Mapping[str, Any], name: str) -> Space:
-    given = told.get(name)
+def _space(content: Mapping[str, Any], name: str) -> Space:
+    given = content.get(name)
     kind = given.get(":type:") if isinstance(given, dict) else None
     if not isinstance(given, dict) or kind not in _BOXES:
         raise DataError(f"its {name} is {shown(kind)}; expected a Box of Gymnasium")

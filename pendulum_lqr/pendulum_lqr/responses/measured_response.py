@@ -130,8 +130,8 @@ class MeasuredResponse:
             DataError: They describe none.
         """
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
-            told = content.get("format") if isinstance(content, Mapping) else type(content).__name__
-            raise DataError(f"format is {told!r}; expected {FORMAT!r}")
+            found = content.get("format") if isinstance(content, Mapping) else type(content).__name__
+            raise DataError(f"format is {found!r}; expected {FORMAT!r}")
         try:
             first, second = content["distortion"]
             return cls(

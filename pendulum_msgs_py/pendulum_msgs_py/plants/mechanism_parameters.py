@@ -297,9 +297,9 @@ def mechanism_from_pendulum(parameters: PlantParameters) -> MechanismParameters:
         joint["static_friction"] = None
     for spec in PLANT_SPECS:
         if given.get(spec.name, spec.default) != spec.default:
-            told = f"{given[spec.name]} {spec.unit}".removesuffix(" -")
+            value = f"{given[spec.name]} {spec.unit}".removesuffix(" -")
             raise ParameterError(
-                f"{spec.name} of plant {name!r} is {told}; expected {spec.default:g} to be read as a mechanism"
+                f"{spec.name} of plant {name!r} is {value}; expected {spec.default:g} to be read as a mechanism"
             )
     return MechanismParameters(MECHANISMS["pendulum"], values, (JointParameters(**joint, actuator=actuator),), name)
 

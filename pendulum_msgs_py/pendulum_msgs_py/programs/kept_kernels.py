@@ -126,8 +126,8 @@ def _words(choice: object) -> str:
     if isinstance(choice, FunctionType):
         code = choice.__code__
         kept = [_words(cell.cell_contents) for cell in choice.__closure__ or ()]
-        told = repr((code.co_code, code.co_consts, code.co_names, choice.__defaults__, kept))
-        return f"{choice.__module__}.{choice.__qualname__} {_digest(told.encode()).decode()}"
+        text = repr((code.co_code, code.co_consts, code.co_names, choice.__defaults__, kept))
+        return f"{choice.__module__}.{choice.__qualname__} {_digest(text.encode()).decode()}"
     return repr(choice)
 
 

@@ -488,9 +488,9 @@ def _period(case: _Case) -> str:
     for _, theirs, _ in case.whole(_MOVING):
         moved, speeds = float(np.diff(theirs.position[1:3, j])[0]), theirs.velocity[1:3, j]
         # By the integrator, a step goes at any velocity between its first and its last.
-        told = moved if speeds.min() <= moved / dt <= speeds.max() else dt * float(speeds.mean())
-        if told:
-            ratios.append(moved / told)
+        period = moved if speeds.min() <= moved / dt <= speeds.max() else dt * float(speeds.mean())
+        if period:
+            ratios.append(moved / period)
     if len(ratios) <= _FEW:
         return ""
     low, ratio, high = (float(value) for value in np.quantile(ratios, (0.25, 0.5, 0.75)))

@@ -120,12 +120,12 @@ def load_gymnasium_plant(
         raise ParameterError(how_to_install(error) or f"Gymnasium cannot be imported: {error}") from error
     if env_id == "PendulumX59-v0":
         import pendulum_sim.environments.environment  # noqa: F401  # registers it
-    told = {**KNOWN.get(env_id.rpartition(":")[2], {}), **(adapter or {})}
+    entries = {**KNOWN.get(env_id.rpartition(":")[2], {}), **(adapter or {})}
     try:
-        env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **told.get("make", {}))
+        env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **entries.get("make", {}))
     except (Exception, SystemExit) as error:
         raise ParameterError(f"Gymnasium refuses environment {env_id!r}: {' '.join(str(error).split())}") from error
-    return GymnasiumPlant(env, env_id, told, seed, effort_limit)
+    return GymnasiumPlant(env, env_id, entries, seed, effort_limit)
 
 
 class GymnasiumPlant:
@@ -253,15 +253,15 @@ class GymnasiumPlant:
         return value
 
     def _quantity(self, name: str, attribute: str = "") -> float:
-        told = self._adapter.get(name, attribute)
-        if isinstance(told, str):
-            value = getattr(self._env.unwrapped, told, None)
+        entry = self._adapter.get(name, attribute)
+        if isinstance(entry, str):
+            value = getattr(self._env.unwrapped, entry, None)
             if value is None:
                 raise self._error(
-                    f"it has no attribute {told!r}; expected {name}: {{value: ..., unit: {_QUANTITIES[name]}}}"
+                    f"it has no attribute {entry!r}; expected {name}: {{value: ..., unit: {_QUANTITIES[name]}}}"
                 )
         else:
-            mapping = require_mapping(told, f"environment {self._id}: {name}")
+            mapping = require_mapping(entry, f"environment {self._id}: {name}")
             if mapping.get("unit") != _QUANTITIES[name]:
                 raise self._error(f"{name}: unit is {mapping.get('unit')!r}; expected {_QUANTITIES[name]!r}")
             value = mapping.get("value")

@@ -130,9 +130,9 @@ class MarkersNode(Node):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         space = self.get_namespace()
         self._torques.mode = plant_mode(message, space) or self._torques.mode
-        told = plant_value(message, space, PLANT_PARAMETERS)
-        if told and told != self._told:
-            self._told, self._mechanism = told, told_mechanism(told)
+        description = plant_value(message, space, PLANT_PARAMETERS)
+        if description and description != self._told:
+            self._told, self._mechanism = description, told_mechanism(description)
 
     def _publish(self) -> None:
         newest = self._torques.newest_ns

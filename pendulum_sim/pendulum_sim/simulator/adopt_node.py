@@ -213,8 +213,8 @@ class AdoptNode(PollingNode):
 
     def _diagnostics(self) -> Mapping[str, object]:
         values = self._settings.values
-        told = {f"refused_state.{i}": f"{problem} ({count})" for i, (problem, count) in enumerate(self._odd.items())}
-        return {"states": values["states"], "commands": values["commands"], "joint": self._joint, **told}
+        refused = {f"refused_state.{i}": f"{problem} ({count})" for i, (problem, count) in enumerate(self._odd.items())}
+        return {"states": values["states"], "commands": values["commands"], "joint": self._joint, **refused}
 
 
 def _check(values: Mapping[str, object]) -> None:

@@ -353,11 +353,11 @@ class SimulatorNode(PollingNode):
             self._interface.publish_event("reset", theta=position[0], theta_dot=velocity[0])
         else:
             names = self._coordinates.names
-            told = {
+            details = {
                 "position": dict(zip(names, position, strict=True)),
                 "velocity": dict(zip(names, velocity, strict=True)),
             }
-            self._interface.publish_event("reset", **told)
+            self._interface.publish_event("reset", **details)
         return ""
 
     def _where(self, *, speed: bool = True) -> str:
