@@ -180,9 +180,10 @@ def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
         if push_topic in bag.topics and np.any(bag.joints(push_topic).effort):
             raise DataError(f"topic {push_topic} of bag {source} pushes links from outside; expected none of that")
     if sorted(states.names) != sorted(coordinates.names):
+        way = " (`pendulum export` makes a CSV file of it, in which a mapping file names the joints)"
         raise DataError(
-            f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(coordinates.names)} "
-            "(`pendulum export` makes a CSV file of it, in which a mapping file names the joints)"
+            f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(coordinates.names)}"
+            f"{way * (len(states.names) == len(coordinates.names))}"
         )
     columns = [states.names.index(name) for name in coordinates.names]
     # A plant in lockstep sends a state again when its answer was missed: the same stamp is the same state.
