@@ -173,7 +173,7 @@ def test_swapped_columns_are_refused_by_name(both_driven):
     ("name", "position", "effort", "words"),
     [
         ("double_pendulum", [[1, 0], [0, 1]], (-1, -1), "with every effort negated"),
-        ("acrobot", [[1, 0], [0, 1]], (1, -1), "with the effort of elbow negated"),
+        ("double_pendulum", [[1, 0], [0, 1]], (1, -1), "with the effort of elbow negated"),
         ("acrobot", [[1, 0], [1, 1]], (1, 1), "with the angle of elbow less that of shoulder"),
         ("cart_pole", [[1, 0], [0, 1]], (-1, 1), "with the effort of cart negated"),
     ],
