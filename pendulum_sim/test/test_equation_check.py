@@ -167,10 +167,10 @@ class Odd(gymnasium.Env[Any, Any]):
 
     action_space = gymnasium.spaces.Box(-5.0, 5.0, (1,), np.float64)
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    dt = 0.01
 
     def __init__(self, **odd: float) -> None:
         self.odd = odd
+        self.dt = odd.get("dt", 0.01)
         self.x = np.zeros(2)
         self.waiting: list[float] = []
         self.torque = 0.0
@@ -194,8 +194,11 @@ class Odd(gymnasium.Env[Any, Any]):
         odd, dt = self.odd, 0.001
         self.waiting.append(float(np.clip(action[0], -odd.get("clip", 5.0), odd.get("clip", 5.0))))
         wanted = self.waiting.pop(0)
+        if abs(wanted) < odd.get("threshold", 0.0):
+            wanted = 0.0
+        wanted = math.copysign(max(abs(wanted) - odd.get("dead", 0.0), 0.0), wanted)
         theta, speed = self.x
-        for _ in range(10 * int(odd.get("skip", 1))):
+        for _ in range(round(self.dt / dt) * int(odd.get("skip", 1))):
             lag = odd.get("lag", 0.0)
             self.torque += (wanted - self.torque) * (dt / lag if lag else 1.0)
             force = self.torque - 0.02 * speed - 1.5 * math.sin(theta - odd.get("zero", 0.0))
@@ -218,6 +221,12 @@ gymnasium.register("Odd-v0", entry_point=Odd)
     [
         ({}, ""),
         ({"noise": 1e-4}, ""),
+        ({"dt": 0.05}, ""),
+        # Under its largest torque it turns by more than half a turn within a period.
+        ({"dt": 0.1}, ""),
+        ({"dead": 0.05}, "a dead zone of the action (below about 0.05"),
+        ({"dead": 0.2, "dt": 0.05}, "a dead zone of the action (below about 0.2 N m"),
+        ({"threshold": 0.3}, "a dead zone of the action (below about 0.3"),
         ({"wrap": 2.0 * math.pi}, ""),
         ({"noise": 0.1}, "noise (with another seed"),
         ({"wrap": math.pi}, "an angle that jumps by"),

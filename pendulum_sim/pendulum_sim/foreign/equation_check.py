@@ -37,6 +37,8 @@ _SLIDE = 0.1
 """Distance from the middle at which a joint that slides starts [m]."""
 _SMALL = 0.1
 """Small effort as a share of the limit."""
+_FINE = (0.02, 0.005)
+"""Efforts of a controller near its goal, as shares of the limit: a dead zone shows there alone."""
 _FLOOR = 0.02
 """Share of the motion under full effort below which a difference is ignored: it is too small for a controller."""
 _ABRUPT = 0.5
@@ -53,6 +55,10 @@ _WORST = 16
 _JUMP = 4.0
 """Times its velocity that an angle may move in a period before it jumps."""
 _LAGS = 40
+_LEAST = 1e-3
+"""Share of the limit below which a dead zone is none."""
+_DEAD = 0.02
+"""Share of the equation's response below which there is none."""
 _CLOSE = 0.05
 """What a response may leave over of another that is taken for the same."""
 _LOST = 0.3
@@ -63,7 +69,7 @@ _LEAST_JUMP = 0.5
 """Least jump [rad or m]."""
 _OTHER_PERIOD = 0.2
 """Share by which a period is another; integrators of first order differ by less."""
-_FREE, _SMALL_STEP, _FULL, _MOVING = "free swing", "small step", "full step", "moving"
+_FREE, _FINE_STEP, _SMALL_STEP, _FULL, _MOVING = "free swing", "fine step", "small step", "full step", "moving"
 _OWN = ("another scale of the effort", "another damping", "another weight")
 _FEW = 4
 """Runs that are too few to conclude from."""
@@ -250,6 +256,11 @@ def _plan(equation: JointPlant, coarse: JointPlant | None, count: int) -> _Runs:
             for i in range(len(limits)):
                 effort = tuple(sign * share * limit if j == i else 0.0 for j, limit in enumerate(limits))
                 rest += [_Probe(kind, q, still, effort) for q in some]
+    for share in _FINE:
+        for i, limit in enumerate(limits):
+            effort = tuple(share * limit if j == i else 0.0 for j in range(len(limits)))
+            # Where nothing else moves it: beside its weight, so little is no motion.
+            rest += [_Probe(_FINE_STEP, still, still, tuple(sign * u for u in effort)) for sign in (1.0, -1.0)]
     _add(runs, equation, coarse, rest, count)
     fastest = np.max([runs.scales[kind][1] for kind in (_FREE, _SMALL_STEP)], axis=0)
     moving = []
@@ -376,7 +387,7 @@ def _causes(
             return causes, left
     if faults := [case.traces[i].fault for i in worst if case.traces[i].fault]:
         return (faults[0],), None
-    for test in (_clipped, _late, _stop, _shape):
+    for test in (_dead, _clipped, _late, _stop, _shape):
         if cause := test(case):
             return (cause,), None
     return (), None
@@ -502,17 +513,42 @@ def _period(case: _Case) -> str:
     )
 
 
-def _response(case: _Case, plant: JointPlant, driven: int, effort: float) -> Array | None:
-    """Return what a step of effort from rest at the first start that is free adds to the velocity of its joint."""
+def _response(case: _Case, plant: JointPlant, driven: int, effort: float, speed: float = 0.0) -> Array | None:
+    """Return what a step of effort adds to the velocity of its joint, from 0 at rest or at a velocity of that joint."""
     coordinates = plant.coordinates
     still, none = (0.0,) * len(coordinates.joints), (0.0,) * len(coordinates.driven)
+    moving = tuple(speed if i == coordinates.driven[driven] else 0.0 for i in range(len(still)))
     with_it = tuple(effort if i == driven else 0.0 for i in range(len(none)))
-    one, other = (_run(plant, _Probe(_FULL, still, still, u), case.count) for u in (with_it, none))
+    one, other = (_run(plant, _Probe(_FULL, still, moving, u), case.count) for u in (with_it, none))
     if one.fault or other.fault:
         return None
     j = coordinates.driven[driven]
     added: Array = one.velocity[:, j] - other.velocity[:, j]
     return added
+
+
+def _dead(case: _Case) -> str:
+    """Name an effort below which a joint that moves anyhow, so that no friction holds it, does not answer."""
+    for i, limit in enumerate(case.plant.effort_limits):
+        speed = float(case.runs.scales[_FREE][1][case.plant.coordinates.driven[i]])
+        speed = speed or float(case.runs.scales[_SMALL_STEP][1][case.plant.coordinates.driven[i]])
+
+        def answers(effort: float, i: int = i, speed: float = speed) -> bool:
+            theirs, mine = (_response(case, plant, i, effort, speed) for plant in (case.plant, case.equation))
+            return theirs is None or mine is None or bool(np.ptp(theirs) > _DEAD * np.ptp(mine))
+
+        low, high = _LEAST * limit, limit
+        if answers(low) or not answers(high):
+            continue
+        while high - low > 0.02 * high:
+            middle = math.sqrt(low * high)
+            low, high = (low, middle) if answers(middle) else (middle, high)
+        unit = case.plant.coordinates.joints[case.plant.coordinates.driven[i]].effort_unit
+        return (
+            f"a dead zone of the action (below about {high:.2g} {unit} it does nothing; the limit is {limit:.3g} "
+            f"{unit})"
+        )
+    return ""
 
 
 def _clipped(case: _Case) -> str:
@@ -590,7 +626,8 @@ def _shape(case: _Case) -> str:
     driven = case.plant.coordinates.driven
     rows, left = [], []
     for i, (probe, theirs, mine) in enumerate(zip(case.runs.probes, case.traces, case.runs.traces, strict=True)):
-        if theirs.fault:
+        if theirs.fault or probe.kind == _FINE_STEP:
+            # In a joint that friction holds, its torque has no sign of the velocity.
             continue
         scale = _scales(case.runs, i)[1][j]
         q, v = float(np.mean(theirs.position[: w + 1, j])), float(np.mean(theirs.velocity[: w + 1, j]))

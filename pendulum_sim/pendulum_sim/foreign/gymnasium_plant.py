@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import FaultError, ParameterError
@@ -38,6 +39,7 @@ from pendulum_sim.stepping.plant import PlantState, check_start, command_within
 __all__ = ["KNOWN", "GymnasiumPlant", "load_adapter", "load_gymnasium_plant"]
 
 Adapter = Mapping[str, Any]
+Array = NDArray[np.float64]
 
 KNOWN: dict[str, Adapter] = {
     "Pendulum-v1": {
@@ -73,6 +75,12 @@ _AS_GOOD = 0.1
 """Share of a usual change that a step may be off and still counts."""
 _LITTLE = 0.1
 """Share of the largest torque that no limit of speed or torque cuts."""
+_SUBSTEPS, _ROUNDS = 20, 8
+"""Steps within a period by which the equation is solved, and rounds of its fit."""
+_BETTER = 0.5
+"""Share of what one step of first order misses below which the solved equation is taken."""
+_AHEAD = 0.5
+"""Distance from where its velocities lead up to which an angle is there [rad]."""
 _STEPS = 3
 """Steps of a probe at least, of which the last counts."""
 
@@ -325,8 +333,12 @@ class GymnasiumPlant:
                 "holds both"
             ) from error
         if not fresh and math.isfinite(theta):
-            # Observations are wrapped; the plant's angles are not.
-            theta = self._theta + wrap(theta - self._theta)
+            # Observations are wrapped; the plant's angles are not. Within a long period the joint may turn by more than
+            # half a turn, which the velocities report.
+            ahead = 0.5 * self.dt * (self._theta_dot + theta_dot)
+            if not (abs(ahead) > math.pi and abs(wrap(theta - self._theta - ahead)) < _AHEAD):
+                ahead = 0.0
+            theta = self._theta + ahead + wrap(theta - self._theta - ahead)
         self._theta, self._theta_dot = theta, theta_dot
 
     def _find_equation(self) -> PlantParameters:
@@ -336,11 +348,12 @@ class GymnasiumPlant:
         # A step here and there: v' = a v + c u - d sin(theta), of which a and c give inertia and damping. The first
         # steps are skipped, so that neither a reset nor a short delay of the effort biases the fit.
         generator = np.random.default_rng(0)
-        rows, after = np.empty((_PROBES, 3)), np.empty(_PROBES)
+        rows, angles, after = np.empty((_PROBES, 3)), np.empty(_PROBES), np.empty(_PROBES)
         for i in range(_PROBES):
             self.reset(generator.uniform(-math.pi, math.pi), generator.uniform(-1.0, 1.0))
             effort = generator.uniform(-self._limit, self._limit)
             for _ in range(_STEPS + i % _STEPS):
+                angles[i] = self._theta
                 rows[i] = self._theta_dot, effort, -math.sin(self._theta)
                 self._advance(effort)
             after[i] = self._theta_dot
@@ -353,9 +366,10 @@ class GymnasiumPlant:
             few = generator.choice(_PROBES, _FEW, replace=False)
             found, *_ = np.linalg.lstsq(rows[few], after[few], rcond=None)
             left = np.abs(after - rows @ found)
-            fits.append((float(np.sort(left)[_PROBES // 3]), left))
+            fits.append((_third(left), left))
         best, left = min(fits, key=lambda fit: fit[0])
-        kept = left <= max(_AS_WELL * best, _AS_GOOD * float(np.median(np.abs(after - rows[:, 0]))))
+        least = _AS_GOOD * float(np.median(np.abs(after - rows[:, 0])))
+        kept = left <= max(_AS_WELL * best, least)
         (a, c, d), *_ = np.linalg.lstsq(rows[kept], after[kept], rcond=None)
         if not c > 0.0:
             self.reset()
@@ -374,9 +388,58 @@ class GymnasiumPlant:
             inertia = -damping * self.dt / math.log(float(a)) if a > 0.0 else self.dt / float(c)
         else:
             damping, inertia = 0.0, self.dt / float(c)
+        # One step of first order is not what a better integrator makes of a long period: what meets the probes better
+        # is the equation.
+        rates = np.array([max(damping, 0.0), 1.0, max(0.0, float(d / c))]) / inertia
+        for _ in range(2):
+            rates = _fit_rates(rates, rows[kept], angles[kept], after[kept], self.dt)
+            left = np.abs(after - _moved(rates, rows, angles, self.dt))
+            kept = left <= max(_AS_WELL * _third(left), least)
+        if rates[1] > 0.0 and _third(left) < _BETTER * best:
+            inertia, damping, d = 1.0 / float(rates[1]), max(0.0, float(rates[0] / rates[1])), rates[2] / rates[1] * c
         return PlantParameters(
             inertia=inertia, damping=damping, gravity=max(0.0, float(d / c)), effort_limit=self._limit, name=self._id
         )
+
+
+def _third(left: Array) -> float:
+    """Return what a third of all probes meet at least."""
+    return float(np.sort(left)[_PROBES // 3])
+
+
+def _moved(rates: Array, rows: Array, angles: Array, dt: float) -> Array:
+    """Return velocities after a period of v' = (v, u, -sin theta) . (-b/J, 1/J, G/J), by Runge-Kutta [rad/s]."""
+    theta, speed, effort = angles, rows[:, 0], rows[:, 1]
+
+    def slope(q: Array, v: Array) -> Array:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(rates[1] * effort - rates[0] * v - rates[2] * np.sin(q))
+
+    h = dt / _SUBSTEPS
+    for _ in range(_SUBSTEPS):
+        v1, a1 = speed, slope(theta, speed)
+        v2 = speed + 0.5 * h * a1
+        a2 = slope(theta + 0.5 * h * v1, v2)
+        v3 = speed + 0.5 * h * a2
+        a3 = slope(theta + 0.5 * h * v2, v3)
+        v4 = speed + h * a3
+        a4 = slope(theta + h * v3, v4)
+        theta = theta + h * (v1 + 2.0 * v2 + 2.0 * v3 + v4) / 6.0
+        speed = speed + h * (a1 + 2.0 * a2 + 2.0 * a3 + a4) / 6.0
+    return np.asarray(speed)
+
+
+def _fit_rates(rates: Array, rows: Array, angles: Array, after: Array, dt: float) -> Array:
+    """Return the rates that meet the velocities after a period, by Gauss-Newton from others."""
+    for _ in range(_ROUNDS):
+        here = _moved(rates, rows, angles, dt)
+        steps = 1e-6 * np.maximum(np.abs(rates), 1e-3 * float(np.max(rates)))
+        slopes = [(_moved(rates + step, rows, angles, dt) - here) / step.sum() for step in np.diag(steps)]
+        change = np.linalg.lstsq(np.stack(slopes, axis=1), after - here, rcond=None)[0]
+        if not np.all(np.isfinite(change)):
+            break
+        rates = rates + change
+    return rates
 
 
 def _count(answer: object) -> str:
