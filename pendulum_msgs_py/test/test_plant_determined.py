@@ -1,5 +1,7 @@
 """A plant file whose intervals leave open what a design needs is refused by name."""
 
+import math
+
 import pytest
 
 from pendulum_msgs_py.errors import ParameterError
@@ -8,6 +10,7 @@ from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_m
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
 
 ARM = PlantParameters(inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05)
+FLAT = PlantParameters(inertia=0.05, damping=0.03, gravity=0.0, effort_limit=2.0)
 SLOW = PlantParameters(inertia=0.12, damping=12.0, gravity=2.3)
 
 
@@ -26,6 +29,9 @@ SLOW = PlantParameters(inertia=0.12, damping=12.0, gravity=2.3)
         # Behind a strong damping the inertia is a fast lag: it may be anything from 0 up to a known end.
         (SLOW, {"inertia": (0.0, 0.2)}, []),
         (SLOW, {"inertia": (0.0, 20.0)}, ["inertia"]),
+        # A gravity of 0 is known where it may be next to nothing only, and no damping is strong beside none.
+        (FLAT, {"inertia": (0.04, 0.06), "gravity": (0.0, 0.01)}, []),
+        (FLAT, {"inertia": (0.0, 0.1), "gravity": (0.0, math.inf)}, ["inertia", "gravity"]),
     ],
 )
 def test_what_leaves_a_design_open_is_named(plant, intervals, names):

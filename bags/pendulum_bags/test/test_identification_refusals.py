@@ -347,6 +347,13 @@ def test_recordings_of_one_zero_keep_it_and_another_one_to_score_is_said_to_be_e
     assert any("its zero lies +0.0" in sentence for sentence in result.sentences())
 
 
+@pytest.mark.parametrize(("gravity", "excluding"), [(1.05, True), (1.5, False)])
+def test_recordings_of_two_machines_in_one_fit_are_said_to_exclude_each_other(gravity, excluding):
+    pair = [run(1, seconds=4.0), run(2, seconds=4.0, plant=replace(TRUTH, gravity=gravity))]
+    said = identify(pair, QUICK, profiles=0).sentences()
+    assert any(one.startswith("The recordings exclude each other: fitted alone, natural") for one in said) == excluding
+
+
 def test_a_file_without_a_torque_says_how_a_free_swing_is_read(tmp_path):
     swing = run(8, amplitude=0.0, start=(1.5, 0.0))
     path = tmp_path / "swing.csv"

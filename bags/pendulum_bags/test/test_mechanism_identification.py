@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -17,54 +16,7 @@ from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, load_mechanism_file, write_mechanism
 from pendulum_rosbag.storage import BagWriter
-
-PERIOD = 0.01
-NOISE = 2e-4
-DRIVE = {"double_pendulum": (1.0, 0.6), "acrobot": (0.0, 0.8), "cart_pole": (4.0, 0.0), "furuta": (0.01, 0.0)}
-OFF = {
-    "double_pendulum": {"inertia_1": 0.026, "centre_1": 0.17, "inertia_2": 0.055, "centre_2": 0.24},
-    "acrobot": {"inertia_1": 0.029, "inertia_2": 0.055},
-    "cart_pole": {"cart_mass": 1.3, "pole_inertia": 0.04, "cart.damping": 0.3},
-    "furuta": {"pendulum_inertia": 1.6e-4, "arm_inertia": 1.8e-4},
-}
-
-
-def truth(name):
-    plant = load_mechanism(name)
-    if name == "cart_pole":
-        return plant.with_values({"cart.damping": 0.5, "pole.damping": 0.003, "cart.coulomb_friction": 0.2})
-    return plant
-
-
-@cache
-def motion(plant, seed, seconds=6.0, period=PERIOD, swing=0.3):
-    """Return a noisy recording of a plant under slow multisines, by an integrator of its own with small steps."""
-    rng = np.random.default_rng(seed)
-    time = np.cumsum(period * (1.0 + rng.uniform(-0.1, 0.1, round(seconds / period))))
-    drives = DRIVE[plant.name]
-    count = len(plant.joints)
-    effort = np.zeros((time.size, count))
-    for i, size in enumerate(drives):
-        for rate in rng.uniform(0.4, 2.0, 4):
-            effort[:, i] += 0.5 * size * np.sin(2.0 * np.pi * rate * time + rng.uniform(0.0, 6.3))
-    friction = np.array([joint.coulomb_friction for joint in plant.joints])
-    q, v = swing * rng.normal(0.0, 1.0, count), np.zeros(count)
-    path = np.empty((time.size, count))
-    path[0] = q
-    for k in range(time.size - 1):
-        h = (time[k + 1] - time[k]) / 8
-        for step in range(8):
-            torque = effort[k] + (step + 0.5) / 8 * (effort[k + 1] - effort[k])
-            a = np.array(plant.acceleration(tuple(q), tuple(v), tuple(torque - friction * np.tanh(v / 0.02))))
-            middle = v + 0.5 * h * a
-            half = q + 0.5 * h * v
-            a = np.array(
-                plant.acceleration(tuple(half), tuple(middle), tuple(torque - friction * np.tanh(middle / 0.02)))
-            )
-            q, v = q + h * middle, v + h * a
-        path[k + 1] = q
-    noisy = path + rng.normal(0.0, NOISE, path.shape)
-    return JointRecording(f"{plant.name}_{seed}.csv", time, noisy, effort, ("linear",) * count, f"{plant.name}_{seed}")
+from pendulum_testing.mechanism_recordings import NOISE, OFF, PERIOD, motion, truth
 
 
 def save(path, recording, names, driven, order=None):

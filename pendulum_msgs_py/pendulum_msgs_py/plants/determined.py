@@ -18,6 +18,9 @@ SPAN = 10.0
 _LONGEST = 1.0
 """Width of the interval of a time from which on it does not determine a drive [s]."""
 
+_NONE = 0.02
+"""Share of the largest torque up to which a gravity of 0 may be more: that of a pendulum that lies flat."""
+
 _OVERDAMPED = 2.0
 """Damping ratio beyond which the inertia of a pendulum is a fast lag behind its damping, which decides instead."""
 
@@ -51,9 +54,9 @@ def undetermined(
             continue
         kind = name.rsplit(".", 1)[-1]
         if name in sizes:
-            lost = value > 0.0 and (low <= 0.0 or high > SPAN * low)
+            lost = (low <= 0.0 or high > SPAN * low) if value > 0.0 else high > _NONE * largest
             if lost and name == "inertia" and isinstance(plant, PlantParameters) and high <= SPAN * value:
-                lost = plant.damping < 2.0 * _OVERDAMPED * math.sqrt(high * plant.gravity) or plant.damping == 0.0
+                lost = not plant.damping >= 2.0 * _OVERDAMPED * math.sqrt(high * plant.gravity) > 0.0
         elif kind in {"transport_delay", "actuator_time_constant"}:
             lost = high - low > _LONGEST
         elif kind == "angle_offset":

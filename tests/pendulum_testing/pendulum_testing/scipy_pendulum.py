@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
+from scipy.integrate import odeint, solve_ivp
 
-__all__ = ["coulomb_pendulum", "tones"]
+__all__ = ["coulomb_pendulum", "sampled_pendulum", "tones"]
 
 Array = NDArray[np.float64]
 
@@ -67,3 +67,43 @@ def coulomb_pendulum(
         now = float(found.t[-1])
         state = np.array([found.y[0, -1], 0.0])
     return angle
+
+
+def sampled_pendulum(
+    command: Callable[[float, float, float], float],
+    time: Array,
+    noise: Array,
+    *,
+    inertia: float,
+    damping: float,
+    gravity: float,
+    coulomb: float,
+    start: tuple[float, float],
+    push: Callable[[float], float] | None = None,
+) -> tuple[Array, Array]:
+    """Return the read angle [rad] and the torque held from each sample on [N m].
+
+    Args:
+        command: Torque by time [s], read angle [rad] and speed [rad/s].
+        time: Of the samples [s].
+        noise: Of the read angle, one value for each time [rad].
+        inertia: [kg m^2].
+        damping: [N m s/rad].
+        gravity: [N m].
+        coulomb: Dry friction, which turns round within 2 mrad/s [N m].
+        start: Angle and speed [rad], [rad/s].
+        push: Torque by time that no recording has [N m].
+    """
+    state, read, torque = np.array(start, dtype=float), np.empty(time.size), np.empty(time.size)
+
+    def rate(x: Array, t: float, u: float) -> list[float]:
+        pushed = push(t) if push is not None else 0.0
+        dry = coulomb * np.tanh(x[1] / 2e-3)
+        return [x[1], (u + pushed - gravity * np.sin(x[0]) - damping * x[1] - dry) / inertia]
+
+    for k, now in enumerate(time):
+        read[k] = state[0] + noise[k]
+        torque[k] = u = command(float(now), float(read[k]), float(state[1]))
+        if k + 1 < time.size:
+            state = odeint(rate, state, (now, time[k + 1]), args=(u,), rtol=1e-7, atol=1e-9)[1]
+    return read, torque

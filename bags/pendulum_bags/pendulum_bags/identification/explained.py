@@ -104,7 +104,9 @@ def undetermined_fit(fit: OutputErrorFit, uncertainty: Uncertainty) -> str | Non
     lost: dict[str, str] = {}
     # Of a free swing or a voltage only ratios to the inertia are fitted: it has no interval.
     intervals = {name: (found.low, found.high) for name, found in uncertainty.intervals.items()}
-    for name, (_, high) in undetermined(to_plant(model), intervals).items():
+    drive = model["input_gain"] * np.concatenate([piece.recording.input for piece in fit.pieces])
+    largest = float(np.max(np.abs(drive)))
+    for name, (_, high) in undetermined(to_plant(model, effort_limit=largest or 1.0), intervals).items():
         # Where the estimate's neighbourhood alone was asked, that it reaches 0 says little of 0.
         if name in uncertainty.profiles or not 0.0 < high <= SPAN * model[name]:
             lost[name] = uncertainty.intervals[name].text
@@ -112,9 +114,11 @@ def undetermined_fit(fit: OutputErrorFit, uncertainty: Uncertainty) -> str | Non
     if gain is not None and gain.low <= 0.0 <= gain.high:
         lost["input_gain"] = gain.text
     offset = uncertainty.intervals.get("torque_offset")
-    largest = max(float(np.max(np.abs(piece.recording.input))) for piece in fit.pieces) * abs(model["input_gain"])
     if offset is not None and not free and offset.high - offset.low > 2.0 * largest:
         lost["torque_offset"] = f"{offset.text}, more than all of the recorded torque"
+    level, spread = float(np.mean(drive)), float(np.std(drive))
+    if not free and abs(level + model["torque_offset"]) < 0.1 * abs(level) > model["gravity"] and abs(level) > spread:
+        lost["gravity"] = "torque_offset takes away the recorded torque, which may be what holds the weight"
     for name in at_bounds(fit.chosen):
         # A strength of 0 is an answer; the end of a range that was never meant to be reached is none.
         if name in {"inertia", "gravity", "torque_offset", "angle_offset", "input_gain"} and model[name] != 0.0:

@@ -9,7 +9,8 @@ from datetime import datetime, timezone
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pendulum_bags.identification.explained import explained, undetermined_fit
+from pendulum_bags.identification.covariance import FREQUENCY, candidate_errors
+from pendulum_bags.identification.explained import REFUSED, explained, undetermined_fit
 from pendulum_bags.identification.geometry import check_geometry
 from pendulum_bags.identification.options import DEFAULTS, Options
 from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
@@ -24,6 +25,12 @@ from pendulum_bags.runs.datasets import Recording, distinct_names
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["identify"]
+
+_SURE = 3.0
+"""Standard errors to each side within which the natural frequency of a recording lies."""
+
+_ONE_MACHINE = {FREQUENCY: 1.1, "inertia": 1.35, "gravity": 1.35}
+"""Ratios up to which what differs from recording to recording may be one machine's: what the model lacks moves them."""
 
 
 # BLAS splits long sums by the cores that it finds, and a fit magnifies the last digits: on one core, a recording has
@@ -49,6 +56,13 @@ def identify(
         # A column of zeros is no drive: a gain or a delay of it could be anything.
         recordings = [replace(r, input_kind="none", meta={**r.meta, "no_torque": True}) for r in recordings]
         held_out = [replace(r, input_kind="none") if not np.any(r.input) else r for r in held_out]
+    levels = {(r.input_kind, float(r.input[0])) if np.ptp(r.input) == 0.0 else None for r in recordings}
+    if len(levels) == 1 and (one := levels.pop()) is not None and one[0] == "effort":
+        raise DataError(
+            f"{recordings[0].name}: the torque is {one[1]:.4g} N m throughout, which no fit can tell from a zero error "
+            "of the torque; expected a torque that varies, or none (`--mapping free_swing`, where this column is no "
+            "torque)"
+        )
     fit = fit_output_error(recordings, options)
     tests = residual_tests(fit)
     account = explained(fit, tests.outliers)
@@ -56,6 +70,10 @@ def identify(
     uncertainty = assess(fit, tests, profiles=0 if account.refusal is not None else profiles, explains=explains)
     if account.refusal is None and (lost := undetermined_fit(fit, uncertainty)) is not None:
         account = replace(account, refusal=lost)
+    excluding = _excluding(fit)
+    if account.refusal is not None and excluding is not None:
+        # What one fit to two machines lacks is no fault of either recording.
+        account = replace(account, refusal=f"{REFUSED}: {excluding[0].lower()}{excluding[1:]}")
     geometry = check_geometry(fit.model, uncertainty, options.geometry)
     scores = {}
     for name, recording in zip(distinct_names(held_out), held_out, strict=True):
@@ -69,7 +87,36 @@ def identify(
         for name, recording in zip(scores, held_out, strict=True)
         if (found := _moved_zero(fit, recording, scores[name].rms)) is not None
     }
-    return IdentificationResult(fit, uncertainty, tests, geometry, scores, created, account, moved)
+    return IdentificationResult(fit, uncertainty, tests, geometry, scores, created, account, moved, excluding)
+
+
+def _excluding(fit: OutputErrorFit) -> str | None:
+    """Return that two recordings of a fit exclude each other: they are of two machines, or of one with two loads."""
+    if len(fit.pieces) < 2 or fit.reading is not None:
+        return None
+    chosen = fit.chosen
+    found: dict[str, list[tuple[float, float, float, str]]] = {name: [] for name in _ONE_MACHINE}
+    names = distinct_names([piece.recording for piece in fit.pieces])
+    for label, piece, state in zip(names, fit.pieces, chosen.solution.states, strict=True):
+        alone = solve(fit.model, [piece], chosen.free, states=[state], scale=fit.scale, tolerance=1e-5)
+        errors = candidate_errors(replace(chosen, solution=alone, validation=None), [piece], fit.scale, white=False)
+        for name, rows in found.items():
+            if name in errors.deviation:
+                value = alone.model.natural_frequency if name == FREQUENCY else alone.model[name]
+                reach = _SURE * errors.deviation[name]
+                rows.append((value - reach, value, value + reach, label))
+    for name, rows in found.items():
+        if len(rows) < 2:
+            continue
+        small, large = min(rows, key=lambda one: one[2]), max(rows)
+        if small[2] < large[0] and large[1] > _ONE_MACHINE[name] * small[1]:
+            listing = " and ".join(f"{low:.4g} to {high:.4g} ({label})" for low, _, high, label in (small, large))
+            unit = fit.model.units.get(name, "rad/s")
+            return (
+                f"The recordings exclude each other: fitted alone, {name} is {listing} {unit}; a common fit describes "
+                "neither. Expected recordings of one machine with one load: fit them one by one."
+            )
+    return None
 
 
 def _moved_zero(fit: OutputErrorFit, recording: Recording, rms: float) -> tuple[float, float] | None:

@@ -84,9 +84,9 @@ def misfit_cause(
             )
     if static or (share > DOUBTFUL_SHARE and _torque_of_angle(found.model, pieces)):
         return (
-            "the recorded torque is a function of the angle alone, as of gravity compensation or a spring, and the "
-            "motion does not come from it (a hand?). Excite the pendulum by a torque that does not follow from its "
-            "angle."
+            "the recorded torque is a function of the angle alone, as of gravity compensation or a spring, which "
+            "nothing tells from the weight, and what else moves the pendulum (a hand?) is not recorded. Excite it by a "
+            "torque that does not follow from its angle."
         )
     return None
 

@@ -57,6 +57,7 @@ class IdentificationResult:
         created: Date, ISO 8601.
         explained: How much of the motion the fit explains.
         moved_zeros: Held-out recordings whose zero lies elsewhere: by how much [rad], and their rms with it [rad].
+        excluding: That the recordings are of two machines, in a sentence; None where they may be of one.
     """
 
     fit: OutputErrorFit
@@ -67,6 +68,7 @@ class IdentificationResult:
     created: str
     explained: Explained
     moved_zeros: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    excluding: str | None = None
 
     @property
     def model(self) -> FitModel:
@@ -118,7 +120,8 @@ class IdentificationResult:
         """Return what there is to say about the fit, most important first."""
         if self.explained.refusal is not None:
             return [self.explained.refusal, *self._of_the_data()]
-        said = list(self.geometry.sentences) if self.geometry is not None else []
+        said = [self.excluding] if self.excluding is not None else []
+        said += self.geometry.sentences if self.geometry is not None else []
         tests = list(self.tests.sentences)
         if self.explained.doubt is not None:
             said.append(self.explained.doubt)

@@ -6,6 +6,7 @@ recorded: irregular sampling is kept, nothing is resampled.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -183,9 +184,12 @@ def data_notes(recording: Recording) -> list[str]:
         )
     if recording.meta.get("no_torque"):
         notes.append("the recorded torque is 0 throughout: it is taken for a free swing.")
+    # Behind a clock that stepped back the recording goes on after a gap that nothing lasted.
+    made = gap_length(recording.time) if recording.meta.get("clock_notes") else -1.0
     notes.extend(
         f"no samples for {stop - start:.2f} s from {start:.2f} s after its start: no window reaches across."
         for start, stop in gaps(recording)
+        if not 0.0 <= round(stop - start - made, 6) < 1.5 * recording.period
     )
     return notes
 
@@ -325,28 +329,49 @@ def check_consistency(recording: Recording) -> Recording:
         )
     if np.ptp(recording.position) < 0.2:
         return recording
-    step = np.diff(recording.time)
-    travel = 0.5 * (recording.velocity[1:] + recording.velocity[:-1]) * step
-    integrated = np.concatenate(([0.0], np.cumsum(travel)))
-    # Over stretches of about 0.1 s the quantisation of the angle and the noise of the velocity average out.
-    stride = max(1, round(0.1 / recording.period))
-    taken = slice(None, None, stride)
-    moved = np.diff(recording.position[taken])
-    expected = np.diff(integrated[taken])
-    passed = np.concatenate(([0], np.cumsum(step > _longest_step(recording.time))))
-    whole = np.diff(passed[taken]) == 0
-    moved, expected = moved[whole], expected[whole]
-    power = float(moved @ moved)
-    slope = float(expected @ moved) / power if power > 0.0 else 0.0
+    position, velocity = recording.position, recording.velocity
+    slope, alike = _slope(recording, position, velocity)
     if 0.5 <= slope <= 2.0:
         return recording
+    drive = np.interp(recording.time, recording.input_stamps, recording.input)
+    orders = (("position and velocity", velocity, position), ("position and input", drive, velocity))
+    for words, angle, rate in (*orders, ("velocity and input", position, drive)):
+        other, fits = _slope(recording, angle, rate)
+        if 0.5 <= other <= 2.0 and fits > _ALIKE > abs(alike):
+            raise DataError(
+                f"{recording.name}: the columns of {words} seem to be exchanged: so read, the velocity is {other:.2g} "
+                f"times the derivative of the position, and as given {slope:.3g} times; correct them in a mapping file"
+            )
     likely = ""
     for text, factor in _CONSISTENCY_FACTORS:
         if abs(slope / factor - 1.0) < 0.3:
             likely = f"; this looks like {text} in the velocity"
         elif factor > 0.0 and abs(slope * factor - 1.0) < 0.3:
             likely = f"; this looks like {text.split('/s')[0]} instead of rad in the position"
+    mend = "correct `unit` or `sign` in the mapping file"
+    if abs(alike) < _ALIKE:
+        likely, mend = "", "name another column in a mapping file, or none: no unit or sign makes it the derivative"
     raise DataError(
         f"{recording.name}: the velocity is {slope:.3g} times the derivative of the position; "
-        f"expected 0.5 to 2{likely}: correct `unit` or `sign` in the mapping file"
+        f"expected 0.5 to 2{likely}: {mend}"
     )
+
+
+_ALIKE = 0.9
+"""Correlation from which on one column is the derivative of another, whatever its unit."""
+
+
+def _slope(recording: Recording, position: Array, velocity: Array) -> tuple[float, float]:
+    """Return the slope of integrated velocity against travelled angle, and their correlation."""
+    step = np.diff(recording.time)
+    integrated = np.concatenate(([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * step)))
+    # Over stretches of about 0.1 s the quantisation of the angle and the noise of the velocity average out.
+    taken = slice(None, None, max(1, round(0.1 / recording.period)))
+    passed = np.concatenate(([0], np.cumsum(step > _longest_step(recording.time))))
+    whole = np.diff(passed[taken]) == 0
+    moved, expected = np.diff(position[taken])[whole], np.diff(integrated[taken])[whole]
+    power = float(moved @ moved)
+    if not power > 0.0:
+        return 0.0, 0.0
+    product = float(expected @ moved)
+    return product / power, product / max(math.sqrt(power * float(expected @ expected)), 1e-300)
