@@ -5,7 +5,8 @@ feedback objects are used, only the way to the module is ours.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -332,3 +333,19 @@ def test_a_group_of_several_modules_is_refused() -> None:
     backend = HebiBackend(make_group=lambda: hebi.util.create_imitation_group(2), imitation=True)
     with pytest.raises(ActuatorError, match="HEBI group has 2 modules; expected 1"):
         backend.connect()
+
+
+def test_the_librarys_group_is_released_under_a_guard_since_its_thread_may_never_end(
+    port: HebiBackend, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: list[bool] = []
+
+    @contextmanager
+    def guard() -> Iterator[None]:
+        held.append(port._group is not None)
+        yield
+        held.append(port._group is not None)
+
+    monkeypatch.setattr("pendulum_hw_bridge.backends.hebi.hang_guard", guard)
+    port.close()
+    assert held == [True, False]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import math
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -787,3 +789,18 @@ def test_closing_switches_all_off_and_lets_the_group_go_when_the_last_has_closed
     rig.shared._log = None
     rig.bridge.connect()
     assert rig.shared.group is rig.network
+
+
+def test_the_last_port_releases_the_librarys_group_under_a_guard(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig().connected()
+    held: list[bool] = []
+
+    @contextmanager
+    def guard() -> Iterator[None]:
+        held.append(rig.shared.group is not None)
+        yield
+        held.append(rig.shared.group is not None)
+
+    monkeypatch.setattr("pendulum_hw_bridge.backends.hebi_group.hang_guard", guard)
+    rig.bridge.close()
+    assert held == [True, False]

@@ -5,6 +5,7 @@ What a real graph tells is tested with real nodes in ``tests/faults``; here time
 
 from __future__ import annotations
 
+import threading
 from types import SimpleNamespace
 from typing import Any
 
@@ -93,6 +94,32 @@ def test_two_commanders_of_one_name_are_a_conflict_that_is_told_once_and_passes(
     watched.commanders("controller", "other")
     assert watched.conflict() == ""
     assert len(watched.graph.errors) == 1
+
+
+def test_what_was_seen_earlier_is_not_told_later(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    looking, may_go_on = threading.Event(), threading.Event()
+    count = watched.graph.count_publishers
+
+    def count_slowly(topic: str) -> int:
+        found = count(topic)
+        if not looking.is_set():
+            looking.set()
+            may_go_on.wait(10.0)
+        return found
+
+    watched.commanders("controller")
+    monkeypatch.setattr(watched.graph, "count_publishers", count_slowly)
+    early, late = (threading.Thread(target=watched.watch.check) for _ in range(2))
+    early.start()
+    assert looking.wait(10.0)
+    watched.commanders("controller", "controller")
+    late.start()
+    # It waits for the earlier one; one that did not would be done by now.
+    late.join(0.3)
+    may_go_on.set()
+    for thread in (early, late):
+        thread.join(10.0)
+    assert "2 commanders" in watched.supervisor.commander_conflict
 
 
 def test_names_in_the_root_namespace_have_one_slash(watched: Watched) -> None:

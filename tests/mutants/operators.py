@@ -138,12 +138,14 @@ def _changes(tree: ast.Module) -> Iterator[Callable[[], tuple[int, str]]]:
 
 
 def _walk(node: ast.AST) -> Iterator[ast.AST]:
-    """Walk a tree, but not into what only words or checks of types are made of: assertions and texts."""
+    """Walk a tree, but not into what only words or checks of types are made of: assertions, texts and annotations."""
     if isinstance(node, (ast.Assert, ast.JoinedStr)):
         return
     yield node
+    annotation = getattr(node, "annotation", None)
     for child in ast.iter_child_nodes(node):
-        yield from _walk(child)
+        if child is not annotation:
+            yield from _walk(child)
 
 
 def _of_expression(node: ast.AST) -> Iterator[Callable[[], tuple[int, str]]]:

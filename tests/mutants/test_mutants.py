@@ -42,7 +42,7 @@ def _found(target: Target) -> list[Mutant]:
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.module)
 def test_each_function_and_test_file_of_the_list_exists_and_can_be_broken(target: Target) -> None:
-    assert len(_found(target)) > 5
+    assert len(_found(target)) >= 5
     assert all((_PROJECT / name).is_file() for name in target.tests)
 
 
