@@ -202,14 +202,14 @@ def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: 
     try:
         with read_bag(piece.path) as bag:
             plants = _plants(bag)
-            told = _told(bag)
+            facts = _told(bag)
     except Exception as error:  # noqa: BLE001  # one bag must not cost the table of a thousand others
         return [{"bag": piece.name, "plant": "", "error": _sentence(error)}]
     if not plants:
         return [{"bag": piece.name, "plant": "", "error": f"the bag has no topic that ends in {names.JOINT_STATES}"}]
     rows = []
     for plant in plants:
-        row = {"bag": piece.name, "plant": plant, "error": "", **told}
+        row = {"bag": piece.name, "plant": plant, "error": "", **facts}
         _answer(row, chosen, Path(piece.path), plant)
         rows.append(row)
     return rows

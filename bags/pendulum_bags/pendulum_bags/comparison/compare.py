@@ -172,12 +172,12 @@ class Comparison:
 
     def to_json(self) -> dict[str, Any]:
         """Return everything for other programs; undefined numbers are None."""
-        told = run_record(self.pairs[0].hardware.metadata)
+        record = run_record(self.pairs[0].hardware.metadata)
         content = {
-            "seed": told.get("seed"),
-            "strategy": told.get("strategy"),
-            "versions": told.get("versions", {}),
-            "git_revision": told.get("git_revision"),
+            "seed": record.get("seed"),
+            "strategy": record.get("strategy"),
+            "versions": record.get("versions", {}),
+            "git_revision": record.get("git_revision"),
             "runs": len(self.pairs),
             "emulated": self.is_emulated,
             "looks": self.looks.number,
@@ -350,11 +350,11 @@ _PHASE = (
 
 def _in_words(stalls: Sequence[Mapping[str, str]]) -> str:
     """Return that runs were aborted, and why: a fault of the bridge's own may look the same."""
-    told = "; ".join(stall["reason"] + (f" (logs: {stall['logs']})" if stall["logs"] else "") for stall in stalls)
+    reasons = "; ".join(stall["reason"] + (f" (logs: {stall['logs']})" if stall["logs"] else "") for stall in stalls)
     runs, does, what = ("run", "does", "a standstill") if len(stalls) == 1 else ("runs", "do", "standstills")
     return (
         f"{len(stalls)} {runs} broke off before this one and {does} not count, taken for {what} of this machine: "
-        f"{told}."
+        f"{reasons}."
     )
 
 

@@ -83,7 +83,7 @@ def _check_two(one: RunData, other: RunData) -> None:
     for key, words in _MUST_AGREE:
         if key in first and key in second and _value(key, first[key]) != _value(key, second[key]):
             _refuse(words, first[key], second[key], one, other)
-    noises = [told.get("disturbance") for told in (first, second)]
+    noises = [record.get("disturbance") for record in (first, second)]
     if all(isinstance(noise, Mapping) for noise in noises):
         for key in _OF_THE_NOISE:
             before, after = (noise.get(key) if noise else None for noise in noises)
@@ -102,8 +102,8 @@ def _refuse(words: str, first: Any, second: Any, one: RunData, other: RunData) -
 def _check_seeds(runs: Sequence[RunData]) -> None:
     seen: dict[str, RunData] = {}
     for run in runs:
-        told = run_record(run.metadata)
-        seed = told.get("seed")
+        record = run_record(run.metadata)
+        seed = record.get("seed")
         if seed is None:
             continue
         # One seed is one signal, whatever its length.

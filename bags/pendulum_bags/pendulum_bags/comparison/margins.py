@@ -176,9 +176,9 @@ class Margins:
 
     def as_dict(self) -> dict[str, Any]:
         """Return value and unit of each for JSON, and which were stated."""
-        told = {name: getattr(self, name) for name in _UNITS}
+        values = {name: getattr(self, name) for name in _UNITS}
         return {
-            **{name: {"value": one.value, "unit": one.unit} for name, one in told.items()},
+            **{name: {"value": one.value, "unit": one.unit} for name, one in values.items()},
             "stated": sorted(self.stated),
         }
 

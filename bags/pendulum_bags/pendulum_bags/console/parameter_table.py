@@ -116,32 +116,32 @@ class ParameterTable:
     def _row(
         self, name: str, known: dict[str, dict[str, Any]], descriptions: dict[str, dict[str, Description]]
     ) -> None:
-        told = next(found[name] for found in descriptions.values() if name in found)
+        description = next(found[name] for found in descriptions.values() if name in found)
         with ui.element("tr"):
             with ui.element("th").props('scope="row"'):
-                unit = _UNIT.search(told.text)
+                unit = _UNIT.search(description.text)
                 with ui.label(f"{name} {unit.group() if unit else ''}").classes("name"):
-                    ui.tooltip(told.text)
+                    ui.tooltip(description.text)
             for space, values in known.items():
                 with ui.element("td"):
                     if name not in values:
                         ui.label("–").props('aria-label="has none"')
-                    elif told.read_only:
+                    elif description.read_only:
                         ui.label(show_value(values[name]))
                     else:
-                        self._field(name, space, told)
+                        self._field(name, space, description)
             if len(known) > 1:
                 with ui.element("td"):
-                    if not told.read_only:
-                        self._field(name, _ALL, told, list(known))
+                    if not description.read_only:
+                        self._field(name, _ALL, description, list(known))
                     self._marks[name] = ui.label("≠ differ").classes("differ")
                     self._marks[name].set_visibility(False)
 
-    def _field(self, name: str, space: str, told: Description, spaces: Sequence[str] = ()) -> None:
+    def _field(self, name: str, space: str, description: Description, spaces: Sequence[str] = ()) -> None:
         label = f"{name} of {space}"
         field = ui.input().props(f'dense outlined aria-label="{label}" data-name="{name}" data-plant-field="{space}"')
-        if told.domain:
-            field.tooltip(told.domain)
+        if description.domain:
+            field.tooltip(description.domain)
 
         async def take() -> None:
             for where in spaces or [space]:

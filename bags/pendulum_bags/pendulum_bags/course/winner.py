@@ -42,11 +42,11 @@ def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], 
             on_run(letter)
             spreads[letter] = spread_on_machine(folder / letter, r, tasks.noise_seed, hosts)
     best = min(spreads, key=spreads.__getitem__)
-    told = ", ".join(
+    deviations = ", ".join(
         f"{letter.upper()} {f'leaves {value:.3g} rad' if math.isfinite(value) else 'drives the bridge into a fault'}"
         for letter, value in spreads.items()
     )
-    return Judgement(name == best, f"on the emulated machine {told} (standard deviation of theta)")
+    return Judgement(name == best, f"on the emulated machine {deviations} (standard deviation of theta)")
 
 
 def spread_on_machine(bag: Path, r: float, seed: int, hosts: HostPool | None = None) -> float:

@@ -85,9 +85,9 @@ def _simulate(spec: RunSpec, plant: Plant, sensors: Sensors) -> RunArrays:
     controller = AnswerLoop(
         make_controller(spec.controller, design, spec.period, values), float("inf"), simulated_time=True
     )
-    told = spec.disturbance_parameters()
-    length = told.pop("duration", 0.0)
-    signal = make_disturbance(validate(DISTURBANCE_SPECS, told))
+    chosen = spec.disturbance_parameters()
+    length = chosen.pop("duration", 0.0)
+    signal = make_disturbance(validate(DISTURBANCE_SPECS, chosen))
     disturbance = DisturbanceLoop(signal, length, simulated_time=True)
     disturbance.start()
 

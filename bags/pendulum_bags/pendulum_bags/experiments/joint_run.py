@@ -269,11 +269,11 @@ def design_for(plant: MechanismParameters) -> MechanismParameters:
 
 def design_file(folder: Path, plant: MechanismParameters) -> str:
     """Return the file of the plant on which the LQR is designed, stored in a folder; empty where that is the plant."""
-    told = design_for(plant)
-    if told is plant:
+    designed = design_for(plant)
+    if designed is plant:
         return ""
     meaning = f"{plant.name}, dry friction of its passive joints as viscous friction at {_SLIDING:g} rad/s or m/s"
-    return str(write_mechanism(folder / "design.yaml", told, provenance={"design_of": meaning}))
+    return str(write_mechanism(folder / "design.yaml", designed, provenance={"design_of": meaning}))
 
 
 def load_stand_in(path: str | Path, plant: MechanismParameters) -> MechanismParameters:

@@ -48,9 +48,9 @@ class RealMachine:
             bag: A real actuator's own log is written next to it.
         """
         patience = EMULATOR_PATIENCE if self.patient else {}
-        told = {name: value for name, value in patience.items() if name not in self.lab.values}
-        told |= self.log_parameters(bag)
-        return graph.bridge("/hw", lab_file=str(self.path), effort_strategy=strategy, **told)
+        parameters = {name: value for name, value in patience.items() if name not in self.lab.values}
+        parameters |= self.log_parameters(bag)
+        return graph.bridge("/hw", lab_file=str(self.path), effort_strategy=strategy, **parameters)
 
     def log_parameters(self, bag: Path | None) -> dict[str, ParameterArgument]:
         """Return the parameters for hebi-py's own log next to a bag; empty for an emulator, which has none."""

@@ -73,10 +73,10 @@ class Session:
             storage: ``mcap`` or ``sqlite3``.
             simulated: Whether time is the plant's and not wall time.
         """
-        told = self.logs / f"{bag.name}_metadata.json"
-        write_json(told, dict(metadata))
+        file = self.logs / f"{bag.name}_metadata.json"
+        write_json(file, dict(metadata))
         priority = 0 if simulated else permitted(RECORDER_PRIORITY)
-        return start_recorder(self.processes, bag, namespace, told, storage, simulated=simulated, priority=priority)
+        return start_recorder(self.processes, bag, namespace, file, storage, simulated=simulated, priority=priority)
 
     def close(self, recorder: Child) -> None:
         """End a recorder now.

@@ -70,8 +70,8 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, 
         plant = _design_plant(path, facts) or plant
         policies |= dict.fromkeys(policies_of(facts))
         measured = estimate(record)
-        told = {"emulated": label == "hw" and stands_in(facts), IDENTITY: facts.get(IDENTITY, "")}
-        found.append(replace(measured, label=label, facts={**measured.facts, **told}))
+        added = {"emulated": label == "hw" and stands_in(facts), IDENTITY: facts.get(IDENTITY, "")}
+        found.append(replace(measured, label=label, facts={**measured.facts, **added}))
     if len(found) == 2 and found[0].label == found[1].label:
         # Two of one kind: their order decides which is the reference.
         found = [replace(one, label=label) for one, label in zip(found, ("sim", "hw"), strict=True)]
@@ -92,8 +92,8 @@ def _read(path: Path) -> tuple[Record, Mapping[str, Any]]:
     facts = run_record(runs[joints[0]].metadata)
     disturbed = (facts.get("disturbance") or {}).get("joints") or []
     if len(disturbed) != 1:
-        told = ", ".join(disturbed) or "nobody says which joint"
-        raise DataError(f"{path} has {told} disturbed; expected one joint, so that excitation and response are known")
+        found = ", ".join(disturbed) or "nobody says which joint"
+        raise DataError(f"{path} has {found} disturbed; expected one joint, so that excitation and response are known")
     return record_of_joints(runs, disturbed[0]), facts
 
 

@@ -38,9 +38,9 @@ def carry_over(
     place = machine or find_machine(folders)
     if place is None:
         if designs:
-            told = ", ".join(map(str, folders)) or "no folder"
+            places = ", ".join(map(str, folders)) or "no folder"
             raise DataError(
-                f"--design needs the measured response of the machine, and {told} keeps none; expected --machine or "
+                f"--design needs the measured response of the machine, and {places} keeps none; expected --machine or "
                 "--layers with the folder of python -m pendulum_bags experiment frequency_response"
             )
         return None

@@ -151,8 +151,8 @@ def policies_of(record: Mapping[str, Any]) -> list[str]:
         record: A bag's metadata of its run.
     """
     controller = record.get("controller")
-    told = controller.get("policy") if isinstance(controller, Mapping) else None
-    return [told] if isinstance(told, str) and told.endswith(POLICY_SUFFIX) else []
+    file = controller.get("policy") if isinstance(controller, Mapping) else None
+    return [file] if isinstance(file, str) and file.endswith(POLICY_SUFFIX) else []
 
 
 def _policy(path: str, plant: PlantParameters, certifier: Certifier, *, recorded: bool) -> DesignResult:

@@ -232,8 +232,8 @@ def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output
 def _extent(facts: Mapping[str, Any]) -> str:
     """Return a plant's largest motion and torque during the measurement, as text."""
     if "largest_deviation" in facts:
-        told = ", ".join(f"{joint} {value:.3g}" for joint, value in facts["largest_deviation"].items())
-        return f"largest deviations {told} rad or m, largest effort {facts['largest_effort']:.3g} N m or N"
+        deviations = ", ".join(f"{joint} {value:.3g}" for joint, value in facts["largest_deviation"].items())
+        return f"largest deviations {deviations} rad or m, largest effort {facts['largest_effort']:.3g} N m or N"
     return f"largest angle {facts['largest_angle_rad']:.3f} rad, largest torque {facts['largest_torque_nm']:.2f} N m"
 
 

@@ -55,30 +55,30 @@ def same_plant(
     }
     sentence = f"{heads[mark]}, {where}; {found}."
     delay, gain = difference.delay, difference.gain
-    told = Mark.YES if mark is Mark.YES else Mark.UNDECIDED
+    shown = Mark.YES if mark is Mark.YES else Mark.UNDECIDED
     evidence = [
         Evidence("nu-gap", "", gap.value, gap.low, gap.high, f"below {margin:g}", mark, difference.scaling.sentence()),
         Evidence(
-            "extra delay of the hardware", "ms", 1e3 * delay.value, 1e3 * delay.low, 1e3 * delay.high, "", told,
+            "extra delay of the hardware", "ms", 1e3 * delay.value, 1e3 * delay.low, 1e3 * delay.high, "", shown,
             "slope of the phase over all frequencies; lag and spring count too",
         ),
-        Evidence("gain of the hardware beside the simulation", "", gain.value, gain.low, gain.high, "", told),
+        Evidence("gain of the hardware beside the simulation", "", gain.value, gain.low, gain.high, "", shown),
         Evidence(
             f"frequencies that differ by more than {100.0 * SMALLEST:g} %", "", float(difference.lines_that_differ),
-            None, None, "", told, f"of {total}; error 5 % over all",
+            None, None, "", shown, f"of {total}; error 5 % over all",
         ),
     ]  # fmt: skip
     for measured, name in ((first, "simulation"), (second, "hardware")):
         weakest = float(measured.coherence[measured.driven].min())
         note = "" if weakest > _WEAK_COHERENCE else "weak: a larger amplitude or more periods would tell more"
-        evidence.append(Evidence(f"lowest coherence, {name}", "", weakest, mark=told, note=note))
+        evidence.append(Evidence(f"lowest coherence, {name}", "", weakest, mark=shown, note=note))
         if measured.distortion[1] == measured.distortion[1]:
             evidence.append(
                 Evidence(
                     f"distortion, {name}",
                     "%",
                     100.0 * measured.distortion[1],
-                    mark=told,
+                    mark=shown,
                     note="velocity on lines that were not excited: friction and other nonlinearity",
                 )
             )

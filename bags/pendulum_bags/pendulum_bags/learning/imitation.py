@@ -63,7 +63,7 @@ class Imitation:
         Raises:
             FaultError: A parameter is no longer finite.
         """
-        seen, told, reward = self._gather(max(0.0, 1.0 - (1.0 - remaining) / _LED))
+        seen, taught, reward = self._gather(max(0.0, 1.0 - (1.0 - remaining) / _LED))
         rate = _LAST_RATE + (_FIRST_RATE - _LAST_RATE) * remaining
         size = len(seen) // _PARTS
         losses = []
@@ -71,7 +71,7 @@ class Imitation:
             order = self.generator.permutation(len(seen))
             for part in range(_PARTS):
                 rows = order[part * size : (part + 1) * size]
-                answers, right = self.actor.forward(seen[rows]), told[rows]
+                answers, right = self.actor.forward(seen[rows]), taught[rows]
                 # What is beyond the limit is clipped to it.
                 enough = (np.abs(right) >= 1.0) & (answers * right >= 1.0)
                 error = np.where(enough, np.float32(0.0), answers - right)
@@ -84,20 +84,20 @@ class Imitation:
         """Return observations and the teacher's commands, shapes (N, k) and (N, m), and the mean reward."""
         env, draw = self.environment, self.generator
         follows = draw.random(env.count) < led
-        seen, told, rewards = [], [], []
+        seen, taught, rewards = [], [], []
         for _ in range(self.settings.horizon):
             observed, _ = env.observe()
             efforts, cost = self.teacher.answer(env.states)
             right = (efforts / env.limit).astype(np.float32)
             near = cost < _LOST
             seen.append(observed[near])
-            told.append(right[near])
+            taught.append(right[near])
             noise = _NOISE * draw.standard_normal(right.shape, dtype=np.float32)
             answers = np.where(follows[:, None], right, self.actor.forward(observed)) + noise
             reward, over = env.step(np.clip(answers, -1.0, 1.0).astype(np.float32))
             rewards.append(float(reward.mean()))
             self._restart(over | ~near)
-        return np.concatenate(seen), np.concatenate(told), float(np.mean(rewards))
+        return np.concatenate(seen), np.concatenate(taught), float(np.mean(rewards))
 
     def _restart(self, which: NDArray[np.bool_]) -> None:
         rows = np.flatnonzero(which)

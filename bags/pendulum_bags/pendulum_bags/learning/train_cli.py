@@ -184,10 +184,10 @@ def _sentence(measured: Mapping[str, Any]) -> str:
         )
     time_up = measured["median_time"]
     start = " from hanging at rest" if measured.get("start") == "hanging" else ""
-    told = f"{measured['up']} of {measured['trials']} trials{start} end upright"
-    told += f", after {time_up:.2f} s in the median" if time_up is not None else ""
+    text = f"{measured['up']} of {measured['trials']} trials{start} end upright"
+    text += f", after {time_up:.2f} s in the median" if time_up is not None else ""
     gave_up = measured["gave_up"]
-    return f"{told}; {gave_up} left the states that training visited" if gave_up else told
+    return f"{text}; {gave_up} left the states that training visited" if gave_up else text
 
 
 main = partial(cli_main, app, name="python -m pendulum_bags train")

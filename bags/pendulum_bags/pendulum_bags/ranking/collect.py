@@ -78,8 +78,8 @@ def collect_contenders(folders: Sequence[Path], weights: Sequence[float] = WEIGH
             "BAG), or move them out of the folder"
         )
     if not runs:
-        told = ", ".join(map(str, folders))
-        raise DataError(f"{told} holds no runs; expected a study, or bags that say which controller ran on which side")
+        where = ", ".join(map(str, folders))
+        raise DataError(f"{where} holds no runs; expected a study, or bags that say which controller ran on which side")
     costs: dict[str, dict[str, list[tuple[int, Array | None]]]] = {}
     for run in runs:
         costs.setdefault(run.name, {"sim": [], "hw": []})[run.side].append((run.seed, run.parts))
@@ -127,11 +127,11 @@ def _why(error: Exception) -> str:
 
 
 def _studied_run(record: Path, weights: Sequence[float]) -> _Run:
-    told, spec = (json.loads(path.read_text(encoding="utf-8")) for path in (record, record.with_name("spec.json")))
-    name, side, seed = str(told["labels"]["controller"]), str(spec["side"]), int(spec["seed"])
+    result, spec = (json.loads(path.read_text(encoding="utf-8")) for path in (record, record.with_name("spec.json")))
+    name, side, seed = str(result["labels"]["controller"]), str(spec["side"]), int(spec["seed"])
     parts = None
-    if told.get("status") == "done" and told.get("metrics", {}).get("success"):
-        parts = _parts(told["metrics"], float(spec["duration"]), weights, f"{name} on {side} under seed {seed}")
+    if result.get("status") == "done" and result.get("metrics", {}).get("success"):
+        parts = _parts(result["metrics"], float(spec["duration"]), weights, f"{name} on {side} under seed {seed}")
     return _Run(name, side, seed, parts, True, RunSpec.from_json(spec).identity)
 
 
@@ -152,28 +152,28 @@ def _recorded_run(bag: Path, weights: Sequence[float]) -> _Run | None:
         DataError: It is damaged, or its run is not whole.
     """
     with read_bag(bag) as opened:
-        told, damage = run_record(opened.metadata), list(opened.damage)
+        facts, damage = run_record(opened.metadata), list(opened.damage)
     if damage:
         # What is lost may be the record of the run, or the moment in which it fell.
         raise DataError(f"bag {bag} is damaged: {', '.join(damage)}")
-    side = str(told.get("side") or str(told.get("namespace", "")).strip("/"))
-    if not isinstance(told.get("controller"), Mapping) or side not in {"sim", "hw"}:
+    side = str(facts.get("side") or str(facts.get("namespace", "")).strip("/"))
+    if not isinstance(facts.get("controller"), Mapping) or side not in {"sim", "hw"}:
         return None
     run = read_run(bag)
-    name, seed = _name(told), int(told.get("seed") or 0)
+    name, seed = _name(facts), int(facts.get("seed") or 0)
     episode = episode_of(run.window)
     parts = None
     # (no comparison with a number is true of NaN)
     if not np.max(np.abs(episode.error)) > _FALLEN:
         who = f"{name} on {side} under seed {seed}"
         parts = _parts(metrics_of(episode), float(episode.t[-1]), weights, who)
-    return _Run(name, side, seed, parts, side == "sim" or is_emulated(run), str(told.get(IDENTITY, "")))
+    return _Run(name, side, seed, parts, side == "sim" or is_emulated(run), str(facts.get(IDENTITY, "")))
 
 
-def _name(told: Mapping[str, Any]) -> str:
+def _name(facts: Mapping[str, Any]) -> str:
     """Return the name of a run's controller; two policies of one file name are two."""
-    controller = told["controller"]
-    digest, file = told.get("policy_sha256"), controller.get("policy")
+    controller = facts["controller"]
+    digest, file = facts.get("policy_sha256"), controller.get("policy")
     if isinstance(digest, str) and isinstance(file, str):
         rest = {key: value for key, value in controller.items() if key not in {"kind", "policy"}}
         controller = {"kind": f"policy {Path(file).stem}", "file": digest[:8], **rest}

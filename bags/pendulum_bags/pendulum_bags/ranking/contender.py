@@ -90,8 +90,8 @@ def refuse_no_number(contenders: Sequence[Contender]) -> None:
             for i, row in enumerate(rows):
                 if not np.all(np.isfinite(row)):
                     run = f"under seed {seeds[i]}" if seeds else f"in run {i + 1} of {len(rows)}"
-                    told = ", ".join(f"{part} {value:g}" for part, value in zip(PARTS, row, strict=True))
-                    raise DataError(f"the cost of {one.name} on {side} {run} is {told}; expected finite numbers")
+                    costs = ", ".join(f"{part} {value:g}" for part, value in zip(PARTS, row, strict=True))
+                    raise DataError(f"the cost of {one.name} on {side} {run} is {costs}; expected finite numbers")
 
 
 def compared_runs(one: Contender, other: Contender) -> tuple[Array, Array, bool]:

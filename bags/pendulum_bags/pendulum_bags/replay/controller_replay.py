@@ -110,12 +110,12 @@ def recorded_controller(metadata: Mapping[str, Any]) -> tuple[str, dict[str, Any
         DataError: The bag lacks it.
     """
     run = run_record(metadata)
-    told = run.get("controller")
-    if not isinstance(told, Mapping) or "kind" not in told:
+    recorded = run.get("controller")
+    if not isinstance(recorded, Mapping) or "kind" not in recorded:
         raise DataError("the bag does not say which controller made it; expected pendulum.run.controller, or name one")
-    name = str(told["kind"])
+    name = str(recorded["kind"])
     known = {spec.name for spec in controller_parameters(name)}
-    values = {key: value for key, value in told.items() if key in known}
+    values = {key: value for key, value in recorded.items() if key in known}
     design = run.get("design_plant", run.get("plant", "thesis"))
     return name, values, str(design)
 

@@ -44,22 +44,22 @@ def _relative(test: EquivalenceTest) -> tuple[float, float, float]:
 def equivalence(verdict: Verdict) -> Figure:
     """Return every test of a verdict against its margin."""
     tests = list(verdict.tests)[::-1]
-    told = [test for test in tests if math.isfinite(test.interval.estimate)]
+    measured = [test for test in tests if math.isfinite(test.interval.estimate)]
     traces = []
     for outcome in ("equivalent", "not equivalent", "undecided"):
-        rows = [i for i, test in enumerate(tests) if test.outcome.value == outcome and test in told]
+        rows = [i for i, test in enumerate(tests) if test.outcome.value == outcome and test in measured]
         if rows:
             middle, low, high = (np.array(v) for v in zip(*(_relative(tests[i]) for i in rows), strict=True))
             traces.append(Trace(middle, np.array(rows, dtype=float), outcome, outcome, "interval", low, high))
-    closest = max(told, key=lambda test: abs(_relative(test)[0]))
+    closest = max(measured, key=lambda test: abs(_relative(test)[0]))
     sentence = (
         f"{verdict.sentence} The quantity nearest to (or farthest beyond) its margin is the {closest.quantity}: "
         f"{quantity(closest.interval.estimate, closest.unit.replace('-', ''))}, {closest.interval.title} "
         f"{quantity(closest.interval.low)} to {quantity(closest.interval.high)}, resting on "
         f"{closest.interval.blocks} independent blocks."
     )
-    names = [test.quantity if test in told else f"{test.quantity}: not told" for test in tests]
-    reach = max(1.3, *(abs(value) * 1.08 for test in told for value in _relative(test)))
+    names = [test.quantity if test in measured else f"{test.quantity}: not told" for test in tests]
+    reach = max(1.3, *(abs(value) * 1.08 for test in measured for value in _relative(test)))
     panel = Panel(
         "difference [margins]",
         "",
@@ -110,8 +110,8 @@ def alignment(data: ReportData) -> Figure:
     )
     if data.comparison.is_paired:
         delay = 1e3 * data.comparison.delay
-        told = f"is {delay:.2f} ms" if math.isfinite(delay) else "cannot be determined: there is no peak"
-        sentence += f" The tested delay, at one phase of the noise samples and so without their hold, {told}."
+        result = f"is {delay:.2f} ms" if math.isfinite(delay) else "cannot be determined: there is no peak"
+        sentence += f" The tested delay, at one phase of the noise samples and so without their hold, {result}."
     return Figure(
         "alignment",
         "Alignment of clocks and delay",

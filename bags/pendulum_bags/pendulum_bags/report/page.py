@@ -177,8 +177,8 @@ def facts_of_tests(comparison: Comparison, of: str = "") -> list[tuple[str, str]
             continue
         unit = "" if test.unit == "-" else f" {test.unit}"
         value = test.interval.estimate
-        told = f"{quantity(value)}{unit}" if math.isfinite(value) else "–"
-        found.append((f"{test.quantity}{of}", f"{told} ({test.margin_text().removeprefix('margin ')}{unit})"))
+        value_text = f"{quantity(value)}{unit}" if math.isfinite(value) else "–"
+        found.append((f"{test.quantity}{of}", f"{value_text} ({test.margin_text().removeprefix('margin ')}{unit})"))
     return found
 
 

@@ -78,9 +78,9 @@ def _runs(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
             rows.append((f"{of}bag of the {one.label}", f"{_short_path(one.source)} (plant {name})"))
             rows += [(f"{of}damage of the {one.label}'s bag", text) for text in one.damage]
         if of:
-            told = [str(run_record(one.metadata).get("command", "")) for one in sides]
-            rows += [(f"{of}command", command) for command in dict.fromkeys(told) if command not in commands]
-            commands.update(told)
+            found = [str(run_record(one.metadata).get("command", "")) for one in sides]
+            rows += [(f"{of}command", command) for command in dict.fromkeys(found) if command not in commands]
+            commands.update(found)
             made = _made_with(pair)
             first = number > 1 and made == _made_with(pairs[0])
             rows.append((f"{of}revision and versions", "as run 1" if first else made))
@@ -89,15 +89,15 @@ def _runs(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
 
 def _made_with(pair: Pair) -> str:
     """Return with which software a run was recorded, for each side where they differ."""
-    told = {}
+    by_side = {}
     for one in (pair.simulation, pair.hardware):
         record = run_record(one.metadata)
         versions = record.get("versions")
         software = [("git", record.get("git_revision", "unknown"))]
         software += versions.items() if isinstance(versions, Mapping) else ()
-        told[one.label] = ", ".join(f"{name} {version}" for name, version in software)
-    texts = set(told.values())
-    return texts.pop() if len(texts) == 1 else "; ".join(f"{label}: {text}" for label, text in told.items())
+        by_side[one.label] = ", ".join(f"{name} {version}" for name, version in software)
+    texts = set(by_side.values())
+    return texts.pop() if len(texts) == 1 else "; ".join(f"{label}: {text}" for label, text in by_side.items())
 
 
 def seed_of(run: RunData) -> str:
@@ -113,7 +113,7 @@ def _occasion(data: ReportData) -> list[tuple[str, str]]:
     if "command" in data.run:
         rows.append(("command", str(data.run["command"])))
     computers = (
-        " · ".join(str(told[key]) for key in ("host", "system", "rmw") if key in told) for told in _recorders(data)
+        " · ".join(str(facts[key]) for key in ("host", "system", "rmw") if key in facts) for facts in _recorders(data)
     )
     return [*rows, *(("computer", text) for text in dict.fromkeys(computers) if text)]
 
@@ -124,7 +124,7 @@ def _recorders(data: ReportData) -> list[Mapping[str, Any]]:
 
 
 def _began(data: ReportData) -> datetime | None:
-    begun = [began for told in _recorders(data) if isinstance(began := told.get("started_ns"), int)]
+    begun = [began for facts in _recorders(data) if isinstance(began := facts.get("started_ns"), int)]
     return datetime.fromtimestamp(min(begun) * 1e-9, timezone.utc) if begun else None
 
 
@@ -152,10 +152,10 @@ def _emulated_plant(run: RunData, open_bag: OpenBag) -> PlantParameters | None:
     space = str(run_record(run.metadata).get("namespace", "")).rstrip("/") + "/"
     try:
         with open_bag(run.source) as bag:
-            told = bag.messages(names.DIAGNOSTICS) if names.DIAGNOSTICS in bag.topics else []
+            messages = bag.messages(names.DIAGNOSTICS) if names.DIAGNOSTICS in bag.topics else []
         texts = (
             pair.value
-            for stored in told
+            for stored in messages
             for status in stored.message.status
             for pair in status.values
             if status.name.startswith(space) and pair.key == PLANT_PARAMETERS
@@ -202,18 +202,18 @@ def citation(version: str, revision: str, year: str = "n.d.") -> str:
         revision: Of its source code.
         year: In which the run was recorded.
     """
-    told = f" (version {version})" if version else ""
-    return f"{_AUTHORS} ({year}). {_TITLE}{told} [Computer software]. Git revision {revision}. No DOI is assigned."
+    release = f" (version {version})" if version else ""
+    return f"{_AUTHORS} ({year}). {_TITLE}{release} [Computer software]. Git revision {revision}. No DOI is assigned."
 
 
 def _plant_in_words(plant: PlantParameters) -> str:
     """Return the parameters of a plant that are not zero, with units."""
-    told = [
+    constants = [
         f"{spec.name} {quantity(float(value), '' if spec.unit == '-' else typeset(spec.unit), 5)}"
         for spec in PLANT_SPECS
         if (value := getattr(plant, spec.name)) != 0.0
     ]
-    return f"{plant.name}: {', '.join(told)}"
+    return f"{plant.name}: {', '.join(constants)}"
 
 
 def _short_path(path: str) -> str:

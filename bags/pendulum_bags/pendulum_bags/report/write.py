@@ -163,8 +163,8 @@ def find_real_recording() -> Path | None:
     ``PENDULUM_SHARED_DATA`` names the folder of recordings; by default it is ``shared/data`` next to
     the folder that holds this checkout.
     """
-    told = os.environ.get("PENDULUM_SHARED_DATA")
-    places = [Path(told)] if told else [parent / "shared" / "data" for parent in Path(__file__).resolve().parents[4:6]]
+    path = os.environ.get("PENDULUM_SHARED_DATA")
+    places = [Path(path)] if path else [parent / "shared" / "data" for parent in Path(__file__).resolve().parents[4:6]]
     return next((place / REAL_RECORDING for place in places if (place / REAL_RECORDING).is_file()), None)
 
 

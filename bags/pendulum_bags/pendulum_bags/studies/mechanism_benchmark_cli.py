@@ -73,10 +73,10 @@ def benchmark(
     rows = score_rows(names, jobs, results, trials)
     out.mkdir(parents=True, exist_ok=True)
     picture = write_swing_up_figure(out / f"{plant}.png", model, rows)
-    told = document(plant, seed, rows)
-    write_json(out / f"{plant}.json", told)
+    content = document(plant, seed, rows)
+    write_json(out / f"{plant}.json", content)
     if json_output:
-        print(json_text(told))
+        print(json_text(content))
         return
     _print(console, plant, rows, [row for row in PUBLISHED if row.plant == plant])
     console.print(f"figure  {picture}\nresults {out / f'{plant}.json'}", soft_wrap=True)

@@ -143,8 +143,8 @@ def options_of_several(
         raise ParameterError(
             f"{typed[0]} is for a plant of one joint, and {given['plant']} has several: its own LQR holds it"
         )
-    told = given["uncertainty"] if typed_options(context, {"uncertainty"}) else "0.05"
-    return told, {name: given[name] for name in shared if typed_options(context, {name})}
+    uncertainty = given["uncertainty"] if typed_options(context, {"uncertainty"}) else "0.05"
+    return uncertainty, {name: given[name] for name in shared if typed_options(context, {name})}
 
 
 def _joints(context: typer.Context) -> JointMonteCarlo:
@@ -153,8 +153,8 @@ def _joints(context: typer.Context) -> JointMonteCarlo:
 
     plant = context.params["plant"]
     shared = ("runs", "seed", "bound", "start", "amplitude", "hold_time", "duration")
-    told, chosen = options_of_several(context, _OF_ONE_JOINT, shared)
-    return JointMonteCarlo(plant=plant, shares=joint_shares(told, plant), **chosen)
+    uncertainty, chosen = options_of_several(context, _OF_ONE_JOINT, shared)
+    return JointMonteCarlo(plant=plant, shares=joint_shares(uncertainty, plant), **chosen)
 
 
 def _replay(console: Console, settings: MonteCarlo | JointMonteCarlo, number: int, folder: Path) -> None:
@@ -195,8 +195,8 @@ def _print_result(
         f"{result['runs']} runs: {stays} of upright with probability {result['probability_inside']:.5f} "
         f"(95 % interval {low:.5f} to {high:.5f})"
     )
-    told = ", ".join(f"{name} {100.0 * share:.2g} %" for name, share in shares.items()) or "nothing"
-    console.print(f"uncertain: {told}{source}")
+    uncertain = ", ".join(f"{name} {100.0 * share:.2g} %" for name, share in shares.items()) or "nothing"
+    console.print(f"uncertain: {uncertain}{source}")
     quantiles = result["quantiles"]
     table = number_table("Quantiles", "", *next(iter(quantiles.values())), left=0)
     for name, values in quantiles.items():

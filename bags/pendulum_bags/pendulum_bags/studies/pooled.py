@@ -69,8 +69,8 @@ def print_table(console: Console, result: Mapping[str, Any]) -> None:
     if "comparisons" in result:
         for content in result["comparisons"]:
             pooled = "1 run" if content["runs"] == 1 else f"{content['runs']} runs pooled"
-            told = ", ".join(content["of"])
-            console.print(f"{told}: {pooled}: {content['verdict']['sentence']}", markup=False, highlight=False)
+            sources = ", ".join(content["of"])
+            console.print(f"{sources}: {pooled}: {content['verdict']['sentence']}", markup=False, highlight=False)
         return
     names = (f"{name} \\[{UNITS.get(name, '')}]" for name in result["pooled"])
     table = number_table("Identified, 95 % interval over trials", "seed", *names, left=0)

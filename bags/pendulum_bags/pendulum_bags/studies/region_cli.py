@@ -109,6 +109,6 @@ def _joints(context: typer.Context, axes: str, spans: tuple[float, float]) -> Jo
     from pendulum_bags.studies.joint_region import JointRegion
 
     plant = context.params["plant"]
-    told, chosen = options_of_several(context, _OF_ONE_JOINT, ("plants", "points", "duration", "seed"))
+    uncertainty, chosen = options_of_several(context, _OF_ONE_JOINT, ("plants", "points", "duration", "seed"))
     both = tuple(part.strip() for part in axes.split(",") if part.strip())
-    return JointRegion(plant=plant, axes=both, spans=spans, shares=joint_shares(told, plant), **chosen)
+    return JointRegion(plant=plant, axes=both, spans=spans, shares=joint_shares(uncertainty, plant), **chosen)

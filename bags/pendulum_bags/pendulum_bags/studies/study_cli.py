@@ -219,13 +219,13 @@ def _study(
     found = open_study_folder(folder, found)
     for sentence in found.left_out:
         console.print(f"left out: {as_typed(sentence)}", markup=False)
-    told = -1
+    printed = -1
 
     def show(progress: StudyProgress) -> None:
-        nonlocal told
+        nonlocal printed
         bar.update(task, completed=progress.done, remaining=_duration(progress.remaining))
-        if not console.is_terminal and progress.done != told:
-            told = progress.done
+        if not console.is_terminal and progress.done != printed:
+            printed = progress.done
             failed = f", {progress.failed} failed" if progress.failed else ""
             console.print(f"{progress.done} of {progress.total} runs{failed}, {_duration(progress.remaining)} left")
 

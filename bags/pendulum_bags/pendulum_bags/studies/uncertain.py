@@ -171,8 +171,8 @@ def uncertainty_of(plant_file: str) -> Uncertainty:
     if not beside.is_file():
         return Uncertainty(shares, source=f"intervals of {plant_file}, taken for independent")
     try:
-        told = json.loads(beside.read_text(encoding="utf-8"))["covariance"]
-        names, matrix = list(told["names"]), np.array(told["matrix"], dtype=np.float64)
+        covariance = json.loads(beside.read_text(encoding="utf-8"))["covariance"]
+        names, matrix = list(covariance["names"]), np.array(covariance["matrix"], dtype=np.float64)
         rows = [names.index(name) for name in shares]
         found = matrix[np.ix_(rows, rows)]
         values = np.array([float(entries[name]["value"]) for name in shares])

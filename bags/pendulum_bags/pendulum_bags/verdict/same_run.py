@@ -39,15 +39,15 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
     whose = verdict.margins.whose
     if mark is Mark.YES:
         reason = f"in {runs} simulation and the hardware move alike within {whose}, in all {len(tests)} tests"
-        told = [test for test in tests if math.isfinite(test.interval.estimate)]
-        reason += f"; nearest to its margin, {in_words(max(told, key=_beyond))}" if told else ""
+        finite = [test for test in tests if math.isfinite(test.interval.estimate)]
+        reason += f"; nearest to its margin, {in_words(max(finite, key=_beyond))}" if finite else ""
         steps: Sequence[str] = ()
     elif mark is Mark.NO:
         failed = sorted((test for test in tests if test.outcome is Outcome.DIFFERENT), key=_beyond, reverse=True)
-        told = _each_once(failed)
-        beside = ", ".join(test.quantity for test in told[_MOST_REASONS:])
-        reason = "; ".join(in_words(test) for test in told[:_MOST_REASONS])
-        reason += f"; also beyond its margin: {beside}" if beside else ""
+        once = _each_once(failed)
+        further = ", ".join(test.quantity for test in once[_MOST_REASONS:])
+        reason = "; ".join(in_words(test) for test in once[:_MOST_REASONS])
+        reason += f"; also beyond its margin: {further}" if further else ""
         steps = _remedies(comparison, failed)
     else:
         reason = verdict.sentence.removeprefix("Undecided: ").rstrip(".")
