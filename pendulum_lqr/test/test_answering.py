@@ -43,6 +43,23 @@ def test_an_answer_leaves_before_it_is_counted_and_what_is_refused_never_does():
     assert len(sent) == 1
 
 
+def test_a_state_without_a_command_is_not_the_one_that_was_answered_last():
+    class Fails(BaseController):
+        def command(self, t, x):
+            return math.nan if t else 1.0
+
+    answering = AnswerLoop(Fails(2.0), 0.05)
+    assert answering.answered_ns is None
+    assert answering.answer(sample(START), START) == (1.0,)
+    assert answering.answer(sample(START + MS), START + MS) is None
+    assert (answering.newest_stamp_ns, answering.answered_ns) == (START + MS, START)
+    last = sample(START + 2 * MS)
+    answering.count(last, (1.0,), answered=1, saturated=0, ages_ns=[0], compute_times_ns=[0])
+    assert answering.answered_ns == START + 2 * MS
+    answering.restart()
+    assert answering.answered_ns is None
+
+
 def test_in_lockstep_a_repeated_state_is_sent_the_same_answer_again():
     sent = []
     answering = loop(simulated_time=True, send=lambda state, effort: sent.append((state.stamp_ns, effort)))

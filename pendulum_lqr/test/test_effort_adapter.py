@@ -48,6 +48,18 @@ def test_a_plant_that_begins_anew_is_answered() -> None:
     assert adapter.command(2.0, 0) == (10, 2.0)
 
 
+def test_the_state_that_got_a_command_last_is_not_the_newest() -> None:
+    adapter = EffortAdapter(0.05)
+    adapter.state(100, 0)
+    assert adapter.answered_ns is None
+    adapter.command(1.0, 0)
+    adapter.state(200, 0)
+    assert adapter.answered_ns == 100
+    # A plant that begins anew.
+    adapter.state(10, 0)
+    assert adapter.answered_ns is None
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [([], "0 values"), ([1.0, 2.0], "2 values"), ([math.nan], "finite"), ([-math.inf], "finite")],

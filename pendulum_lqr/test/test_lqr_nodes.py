@@ -183,6 +183,27 @@ def test_the_controller_answers_each_state_once_by_its_stamp_and_ends_with_zero(
     assert plant.commands[-1].stamp_ns == plant.commands[-2].stamp_ns + 1
 
 
+def test_an_adapter_ends_its_last_command_and_commands_no_newer_state(plant, processes):
+    adapter = processes.start("pendulum_lqr", "effort_adapter", *ros(), alone=True)
+    arrays = plant.node.create_publisher(Float64MultiArray, "effort_controller/commands", 10)
+    plant.connect()
+    plant.until(arrays.get_subscription_count, "the adapter")
+
+    def answered() -> bool:
+        arrays.publish(Float64MultiArray(data=[1.5]))
+        return bool(plant.commands)
+
+    plant.run_until(answered, "a command")
+    plant.run(5)
+    count, newest = len(plant.commands), plant.commands[-1].stamp_ns
+    assert newest < plant.published[-1]
+    adapter.send_signal(signal.SIGTERM)
+    assert adapter.wait(15) == 0
+    plant.until(lambda: len(plant.commands) > count, "the last zero")
+    # Stamped as an answer to a newer state, it would wake the torque loop of a plant that has been at rest since.
+    assert (plant.commands[-1].effort, plant.commands[-1].stamp_ns) == ((0.0,), newest + 1)
+
+
 def test_the_period_is_taken_from_the_states_or_refused_where_the_loop_would_be_unstable(plant, processes):
     # They go on from each other, however long a busy machine waits between two: after a second, a plant has begun anew.
     stamps = itertools.count(time.time_ns(), 2_000_000)

@@ -62,6 +62,7 @@ class AnswerLoop:
         controller: The controller.
         simulated_time: Whether stamps are those of a simulator.
         newest: The newest state that got a command, or could not; None before the first.
+        answered_ns: Stamp of the newest state that got a command [ns]; None before the first.
         kept_answer: The efforts in reply to it [N m or N], or None.
         start_ns: Stamp of the first state since a restart [ns]; None before it.
         timeout_ns: Age beyond which a state gets no command [ns].
@@ -90,6 +91,7 @@ class AnswerLoop:
         self.age = RingOfTimes()
         self.compute_time = RingOfTimes()
         self.newest: JointSample | None = None
+        self.answered_ns: int | None = None
         self.kept_answer: Vector | None = None
         self._send = send
         self._monotonic = monotonic
@@ -107,7 +109,7 @@ class AnswerLoop:
     def restart(self) -> None:
         """Forget the past: the next state is the first one."""
         self.controller.reset()
-        self.newest = None
+        self.newest = self.answered_ns = None
         self.start_ns = None
         self.last_effort = self._nothing
 
@@ -171,6 +173,7 @@ class AnswerLoop:
         self.last_effort = self.kept_answer = effort
         # Before counting: the plant waits for it, and counting is slow in a process that has just woken up.
         self._send(sample, effort)
+        self.answered_ns = sample.stamp_ns
         self.compute_time.add(ended - began)
         if not self.simulated_time:
             self.age.add(now_ns - sample.stamp_ns)
@@ -202,6 +205,7 @@ class AnswerLoop:
             compute_times_ns: Times that they took [ns].
         """
         self.newest, self.kept_answer, self.last_effort = sample, effort, effort
+        self.answered_ns = sample.stamp_ns
         self.answered += answered
         self.saturated += saturated
         self.compute_time.extend(compute_times_ns)

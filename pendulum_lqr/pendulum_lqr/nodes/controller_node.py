@@ -397,10 +397,11 @@ class ControllerNode(LifecycleNode, PollingNode):
         if self._multi_array:
             self._command_publisher.publish(Float64MultiArray(data=[0.0] * len(self._driven)))
             return
-        # Just after the last command: with the same stamp it would be refused as a duplicate.
-        if (newest := self._loop.newest_stamp_ns) is not None:
+        # Just after the last command: with the same stamp it would be refused as a duplicate. After a state without a
+        # command it would be a command of its own, which wakes the torque loop of a plant that is at rest.
+        if (answered := self._loop.answered_ns) is not None:
             nothing = (0.0,) * len(self._driven)
-            self._command_publisher.publish(encode_joints(newest + 1, self._full_name, self._driven, (), (), nothing))
+            self._command_publisher.publish(encode_joints(answered + 1, self._full_name, self._driven, (), (), nothing))
 
     def _publish_diagnostics(self) -> None:
         values: dict[str, object] = {"controller": self._settings["controller"], "plant": self._plant.name}

@@ -70,6 +70,11 @@ class EffortAdapter:
         """Stamp of the newest state [ns]."""
         return self._newest_ns
 
+    @property
+    def answered_ns(self) -> int | None:
+        """Stamp of the newest state that got a command [ns]; None before the first of this plant."""
+        return None if self._answered_ns < 0 else self._answered_ns
+
     def command(self, effort: float, now_ns: int) -> tuple[int, float] | None:
         """Take a command and return stamp [ns] and torque [N m] to publish, or None where it has to wait.
 

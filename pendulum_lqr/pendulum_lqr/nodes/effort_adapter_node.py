@@ -19,6 +19,7 @@ from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import sample_from_bytes
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
+from pendulum_msgs_py.ros.leaving import wait_until_heard
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.ros.simulated_time import live_by_stamps
@@ -82,10 +83,11 @@ class EffortAdapterNode(Node):
         live_by_stamps(self, lambda: self._adapter.newest_stamp_ns)
 
     def close(self) -> None:
-        """End with zero torque while the context is still valid."""
-        newest = self._adapter.newest_stamp_ns
-        if newest is not None and self._adapter.counts["answers"]:
-            self._publisher.publish(encode_joint_state(newest + 1, frame_id=self._full_name, effort=0.0))
+        """End with zero torque while the context is still valid, and give it time to arrive."""
+        # After a newer state it would be a command of its own, which wakes the torque loop of a plant that is at rest.
+        if (answered := self._adapter.answered_ns) is not None:
+            self._publisher.publish(encode_joint_state(answered + 1, frame_id=self._full_name, effort=0.0))
+            wait_until_heard(self._publisher)
         self._publish_diagnostics()
 
     def _on_state(self, data: bytes) -> None:
