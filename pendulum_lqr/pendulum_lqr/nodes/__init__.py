@@ -1,1 +1,1 @@
-"""The programs on the graph but the disturbance, which has a room of its own, and what they do without ROS."""
+"""The programs on the graph except the disturbance, and their logic without ROS."""

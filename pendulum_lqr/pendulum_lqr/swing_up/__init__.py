@@ -1,1 +1,1 @@
-"""Far from upright: planned and stored swing-ups of one joint and of several, who follows them and who catches."""
+"""Far from upright: planned and stored swing-ups of one joint and of several, tracking, and handover to an LQR."""

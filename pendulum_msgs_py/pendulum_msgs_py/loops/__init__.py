@@ -1,1 +1,1 @@
-"""Loops that run compiled: what they are made of, and how they are compiled, kept and loaded."""
+"""Loops that run compiled: what they are made of, and how they are compiled, cached and loaded."""

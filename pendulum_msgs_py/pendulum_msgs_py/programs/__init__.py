@@ -1,1 +1,1 @@
-"""Programs: their table, their ends, terminal, completion, and who may speak on the graph."""
+"""Programs: their table, their ends, terminal, completion, and permissions on the graph."""

@@ -1,1 +1,1 @@
-"""Simulations that somebody else wrote, as plants."""
+"""Third-party simulations as plants."""

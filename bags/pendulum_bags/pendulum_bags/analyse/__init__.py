@@ -1,1 +1,1 @@
-"""The same questions asked of every bag below a folder."""
+"""The same questions to every bag below a folder."""

@@ -1,1 +1,1 @@
-"""A course in six exercises: hidden plants from a seed, and checks that say right or wrong."""
+"""A course in six exercises: hidden plants from a seed, and checks of the answers."""

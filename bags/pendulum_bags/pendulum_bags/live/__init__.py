@@ -1,1 +1,1 @@
-"""Live in the viewers that people have: topics, parameters and services over the Foxglove WebSocket protocol."""
+"""Live data for viewers: topics, parameters and services over the Foxglove WebSocket protocol."""

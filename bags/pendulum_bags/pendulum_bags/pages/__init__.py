@@ -1,1 +1,1 @@
-"""Pages that need nothing beside them: templates, style, terms, and the page of single layers of the verdict."""
+"""Self-contained pages: templates, style, terms, and the page of single layers of the verdict."""

@@ -1,1 +1,1 @@
-"""Studies: many runs from one file, resumed where they stopped, and what they say together."""
+"""Studies: many runs from one file, resumed where they stopped, and their pooled results."""
