@@ -249,9 +249,17 @@ class Switch:
         self.publisher.publish(Bool(data=held))
         assert select.select([self.plant.interface._enable.descriptor], [], [], 30.0)[0]  # type: ignore[union-attr]
 
-    def say(self, monkeypatch: pytest.MonkeyPatch, late: int = 0, *, held: bool = True, known: bool = True) -> None:
-        """Let what it sends next be heard so much later than usual [ns]."""
-        self.sent_ns += 100 * _MS
+    def say(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        late: int = 0,
+        *,
+        held: bool = True,
+        known: bool = True,
+        after: int = 100 * _MS,
+    ) -> None:
+        """Let what it sends after some time be heard so much later than usual [ns]."""
+        self.sent_ns += after
         monkeypatch.setattr(time, "time_ns", lambda: self.sent_ns + late)
         stamps = {"source_timestamp": (self.sent_ns + self.ahead_ns) * known, "received_timestamp": self.sent_ns}
         self.plant.interface._on_enable(serialize_message(Bool(data=held)), stamps)
@@ -304,6 +312,35 @@ def test_a_switch_whose_clock_drifts_is_heard_for_hours_and_one_whose_clock_is_s
     for late, old in ((3000, 500), (3001, 500), (3002, 500)):
         switch.say(monkeypatch, late * _MS)
         assert plant.supervisor._held_ns == NOW - old * _MS
+
+
+@pytest.mark.parametrize("after", [_MS, 10 * _MS])
+def test_a_fast_switch_hides_no_delay_that_grows(switch: Switch, monkeypatch: pytest.MonkeyPatch, after: int) -> None:
+    plant = switch.plant
+    switch.say(monkeypatch)
+    assert plant.arm() == ""
+    # A link that passes half of what it is given; several messages are heard at each decision.
+    for late in range(0, 1000, 10):
+        for each in range(10):
+            switch.say(monkeypatch, (late + each) * _MS, after=after)
+        plant.interface.decide()
+    assert plant.supervisor.mode is Mode.DISARMED
+    assert plant.supervisor.reason.startswith("disarmed: enable switch is silent for 50")
+
+
+def test_a_switch_that_was_silent_for_long_may_not_be_late(switch: Switch, monkeypatch: pytest.MonkeyPatch) -> None:
+    switch.say(monkeypatch)
+    switch.say(monkeypatch, 900 * _MS, after=100 * NANOSECONDS)
+    assert switch.plant.arm().startswith("enable switch is silent for 895 ms")
+
+
+@pytest.mark.parametrize("data", [b"\x00\x01\x00\x00\x02", b"\x00\x01\x00\x00\xff", b"\x00\x01\x00\x00", b""])
+def test_a_message_that_is_not_true_holds_nothing(switch: Switch, data: bytes) -> None:
+    plant, stamps = switch.plant, {"source_timestamp": time.time_ns(), "received_timestamp": 0}
+    plant.interface._on_enable(serialize_message(Bool(data=True)), stamps)
+    assert plant.arm() == ""
+    plant.interface._on_enable(data, stamps)
+    assert plant.supervisor.mode is Mode.DISARMED
 
 
 def test_two_switches_hold_nothing(switch: Switch, monkeypatch: pytest.MonkeyPatch) -> None:

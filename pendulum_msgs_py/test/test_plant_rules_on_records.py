@@ -198,6 +198,7 @@ def test_a_loop_that_decided_nothing_changes_nothing() -> None:
 @example(stamp=-2 * _MS, later=2 * _MS, effort=1.0)
 @example(stamp=1, later=2 * _MS, effort=0.0)
 @example(stamp=1, later=2 * _MS, effort=1e-9)
+@example(stamp=1, later=2 * _MS, effort=-1e-9)
 @example(stamp=2, later=2 * _MS, effort=0.0)
 @example(stamp=2 * _MS, later=2 * _MS, effort=math.nan)
 @example(stamp=2 * _MS, later=2 * _MS, effort=math.inf)

@@ -47,8 +47,9 @@ __all__ = ["PlantInterface"]
 
 _LEAST_BETWEEN_LINES = 1.0
 """Time between two lines of the log about one mode [s]."""
-_DRIFT_NS = NANOSECONDS // 1000
-"""Most by which a message of the hold-to-run switch is later than the one before because two clocks differ [ns]."""
+_DRIFT = 0.01
+"""Largest share of the time between two messages of the hold-to-run switch by which the second is later because two
+clocks differ."""
 _LOOK = 0.02
 """Time between two looks for a press or a trajectory [s]; of trajectories without pause the newest is read then."""
 TRAJECTORY_AGE_LIMIT = 1.0
@@ -151,7 +152,7 @@ class PlantInterface:
         self._e_stop = EStopServer(node, self.e_stop)
         supervisor.watch_for_presses(self._unread_press)
         self._enable: PolledInput | None = None
-        self._enable_lag, self._enable_waited = math.inf, 0.0
+        self._enable_spoke_ns, self._enable_lag, self._enable_waited = 0, math.inf, 0.0
         if math.isfinite(supervisor.limits.enable_timeout):
             self._enable = node.create_polled_input(Bool, names.ENABLE_INPUT, qos.COMMAND_INPUT)
             self._enable.watch()
@@ -409,11 +410,15 @@ class PlantInterface:
         A message has no stamp, and hosts have clocks of their own; but what waited is later than those before it were.
         """
         assert self._enable is not None
-        lag = time.time_ns() - (info["source_timestamp"] or info["received_timestamp"])
-        later, self._enable_lag = lag - self._enable_lag, lag
-        # Of messages that waited each is less late than the one before; where none is, a clock was set.
-        was_set = later >= 0 and self._enable_waited > NANOSECONDS * self.supervisor.limits.enable_timeout
-        self._enable_waited = 0.0 if was_set else max(0.0, self._enable_waited + later - _DRIFT_NS)
+        timeout_ns = NANOSECONDS * self.supervisor.limits.enable_timeout
+        spoke_ns = info["source_timestamp"] or info["received_timestamp"]
+        apart, lag = spoke_ns - self._enable_spoke_ns, time.time_ns() - spoke_ns
+        later = lag - self._enable_lag - _DRIFT * min(apart, timeout_ns)
+        # Of messages that waited each is less late than the one before; where none is, a clock was set. While armed it
+        # is not assumed: a link that delays more and more would count as one in time.
+        was_set = lag >= self._enable_lag and self._enable_waited > timeout_ns and not self.supervisor.mode.armed
+        self._enable_spoke_ns, self._enable_lag = spoke_ns, lag
+        self._enable_waited = 0.0 if was_set else max(0.0, self._enable_waited + later)
         # Of two switches one would hide that the other is released or silent.
         alone = self._enable.subscription.get_publisher_count() == 1
         held = data[4:5] == b"\x01"
