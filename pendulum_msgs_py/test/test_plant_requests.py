@@ -192,6 +192,21 @@ def test_a_request_counts_for_nothing_that_waited_while_the_e_stop_was_pressed_f
     assert plant.arm() == ""
 
 
+def test_requests_are_outdated_before_the_e_stop_is_latched_and_could_be_reset(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant.node.request_ns = time.time_ns()
+    latch, outdated = plant.supervisor.e_stop, []
+
+    def press(now_ns: int, reason: str) -> None:
+        outdated.append(plant.interface._is_outdated())
+        latch(now_ns, reason)
+
+    monkeypatch.setattr(plant.supervisor, "e_stop", press)
+    plant.interface.e_stop("pressed")
+    assert outdated == [True]
+
+
 def test_a_press_that_was_counted_is_read_once_and_makes_earlier_requests_outdated(plant: Plant) -> None:
     plant.node.request_ns = time.time_ns()
     assert plant.interface._unread_press() is None
