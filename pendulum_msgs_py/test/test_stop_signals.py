@@ -11,14 +11,20 @@ from pendulum_msgs_py.ros import runner
 
 
 def _watched(monkeypatch: pytest.MonkeyPatch, *numbers: int) -> tuple[int, list[int]]:
-    """Return how often a node was asked to stop, and the codes with which its process was ended, after signals."""
+    """Return how often a node was asked to stop, and the codes with which its process was ended, after signals.
+
+    The first is noted, so that the death of the starter does not count as a second.
+    """
     reader, writer = socket.socketpair()
     writer.send(bytes(numbers))
     writer.close()
     stops, codes = [], []
+    noted: list[int] = []
     monkeypatch.setattr(runner.os, "_exit", codes.append)
+    monkeypatch.setattr(runner, "stops", noted)
     runner._watch_signals(reader, lambda: stops.append(1))
     reader.close()
+    assert noted == [number for number in numbers if number in runner._STOP_SIGNALS][:1]
     return len(stops), codes
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 from pendulum_msgs_py.contract.values import NANOSECONDS
 
 __all__ = ["EStopInput"]
@@ -18,15 +16,13 @@ class EStopInput:
 
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout
-        self._lock = threading.Lock()
-        self._pressed = False
-        self._heard_ns: int | None = None
+        # One value, so that the other thread never reads what was pressed with the time of another message.
+        self._heard: tuple[bool, int] | None = None
         self._publishers = 1
 
     def count(self, publishers: int) -> None:
         """Take note of how many publish on the topic: of two, one would hide that the other is silent."""
-        with self._lock:
-            self._publishers = publishers
+        self._publishers = publishers
 
     def hear(self, *, pressed: bool, now_ns: int) -> None:
         """Take note of a message.
@@ -35,8 +31,7 @@ class EStopInput:
             pressed: What it says.
             now_ns: When it came, by a clock that does not jump [ns].
         """
-        with self._lock:
-            self._pressed, self._heard_ns = pressed, now_ns
+        self._heard = pressed, now_ns
 
     def reason(self, now_ns: int) -> str:
         """Return why the plant must be stopped, or an empty string.
@@ -44,12 +39,13 @@ class EStopInput:
         Args:
             now_ns: The same clock [ns].
         """
-        with self._lock:
-            if self._heard_ns is None:
-                return "e-stop button was never heard"
-            if self._pressed:
-                return "e-stop button is pressed"
-            if self._publishers > 1:
-                return f"{self._publishers} publish for the e-stop button; expected one, whose silence can be told"
-            silent = (now_ns - self._heard_ns) / NANOSECONDS
-            return f"e-stop button is silent for {1e3 * silent:.0f} ms" if silent > self.timeout else ""
+        heard, publishers = self._heard, self._publishers
+        if heard is None:
+            return "e-stop button was never heard"
+        pressed, heard_ns = heard
+        if pressed:
+            return "e-stop button is pressed"
+        if publishers > 1:
+            return f"{publishers} publish for the e-stop button; expected one, whose silence can be told"
+        silent = (now_ns - heard_ns) / NANOSECONDS
+        return f"e-stop button is silent for {1e3 * silent:.0f} ms" if silent > self.timeout else ""
