@@ -97,6 +97,16 @@ def test_an_input_that_has_nothing_to_do_with_the_motion_is_refused():
     assert result.sentences()[0].startswith("REFUSED: the model explains next to nothing. It misses the angle by")
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-4])
+def test_a_constant_torque_that_lifts_a_pendulum_determines_it(scale):
+    plant = PlantParameters(inertia=0.02 * scale, damping=0.01 * scale, gravity=0.6 * scale)
+    effort = np.full(1200, 0.3 * scale)
+    result = identify([synthetic_recording(plant, effort, 0.005, np.random.default_rng(5))], QUICK, profiles=0)
+    assert not result.refused, result.sentences()[0]
+    for name in ("inertia", "damping", "gravity"):
+        assert result.fit.model[name] == pytest.approx(getattr(plant, name), rel=0.05)
+
+
 def test_a_good_fit_is_not_refused_however_its_windows_are_cut(known):
     for window in (0.5, 3.0):
         result = identify([known], replace(QUICK, window=window), profiles=0)

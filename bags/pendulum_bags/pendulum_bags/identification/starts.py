@@ -21,6 +21,9 @@ from pendulum_msgs_py.errors import DataError
 
 __all__ = ["bumps", "equation_error", "equation_residual", "first_models", "rank"]
 
+_CONSTANT = 0.1
+"""Spread of an input, as a share of its mean, below which it is taken as constant."""
+
 
 def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
     """Return least-squares (J, b, c, G, offset) of J th'' + b th' + c sgn th' + G sin th - offset = u, shape (5,).
@@ -43,6 +46,9 @@ def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
         # Nothing drives it: the equation holds per unit of inertia.
         rest = np.linalg.lstsq(columns[:, 1:], -columns[:, 0], rcond=None)[0]
         return np.concatenate(([1.0], rest))
+    if np.std(drive) < _CONSTANT * abs(np.mean(drive)):
+        # The offset would explain such an input alone, with neither inertia nor weight.
+        return np.append(np.linalg.lstsq(columns[:, :4], drive, rcond=None)[0], 0.0)
     return np.linalg.lstsq(columns, drive, rcond=None)[0]
 
 
@@ -135,7 +141,7 @@ def _around(
     inertia, damping, coulomb, gravity, _ = map(float, estimate)
     sign = -1.0 if gravity < 0.0 and inertia < 0.0 else 1.0
     # At standstill or in noise the estimate may be nonsense: the input's torque gives the order of magnitude.
-    torque = float(np.std(recording.input)) or 1.0
+    torque = float(np.std(recording.input) or np.max(np.abs(recording.input))) or 1.0
     inertia = max(abs(inertia), 1e-3 * torque)
     gravity = max(abs(gravity), 1e-2 * torque)
     damping, coulomb = max(sign * damping, 0.0), max(sign * coulomb, 0.0)
