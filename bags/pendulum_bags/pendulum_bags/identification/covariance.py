@@ -150,7 +150,7 @@ def _white_covariance(
     _, singular, right = np.linalg.svd(stacked * size, full_matrices=False)
     condition = float(min(singular[0] / max(singular[-1], 1e-300), 1e150)) ** 2 if singular.size else 1.0
     inverse = (
-        (right.T / np.maximum(singular, 1e-12 * max(singular[0], 1e-300)) ** 2) @ right if singular.size else stacked
+        (right.T / np.maximum(singular, 1e-12 * max(singular[0], 1e-300)) ** 2) @ right if names else np.zeros((0, 0))
     )
     return variance * inverse * np.outer(size, size), right[-1] if len(names) else np.zeros(0), condition
 

@@ -47,8 +47,9 @@ def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
         rest = np.linalg.lstsq(columns[:, 1:], -columns[:, 0], rcond=None)[0]
         return np.concatenate(([1.0], rest))
     if np.std(drive) < _CONSTANT * abs(np.mean(drive)):
-        # The offset would explain such an input alone, with neither inertia nor weight.
-        return np.append(np.linalg.lstsq(columns[:, :4], drive, rcond=None)[0], 0.0)
+        # An offset, or a dry friction in one direction, would explain such an input without inertia and weight.
+        inertia, damping, gravity = np.linalg.lstsq(columns[:, (0, 1, 3)], drive, rcond=None)[0]
+        return np.array([inertia, damping, 0.0, gravity, 0.0])
     return np.linalg.lstsq(columns, drive, rcond=None)[0]
 
 
