@@ -269,6 +269,23 @@ def test_a_table_without_names_is_not_told_to_skip_lines(tmp_path, before, way):
         read_recording(save(tmp_path / "run.csv", f"1.0,2.0\n{before}{names}{table}"))
 
 
+@pytest.mark.parametrize("before", ["Messung;Pendel 3\nDatum;27.11.2026\n", "mass_A;;\n"])
+def test_lines_above_the_names_are_told_to_be_skipped(tmp_path, before):
+    table = rows(TIME, ANGLE, SPEED, TORQUE).replace(",", ";")
+    path = save(tmp_path / "run.csv", f"{before}time;position;velocity;torque\n{table}")
+    with pytest.raises(DataError, match=r"`skip: N` in a mapping file leaves out N lines"):
+        read_recording(path)
+    skipped = {**MAPPINGS["pendulum"], "skip": before.count("\n")}
+    np.testing.assert_allclose(read_recording(path, skipped).position, ANGLE, atol=1e-6)
+
+
+def test_a_file_in_the_letters_of_windows_says_how_it_is_made_readable(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_bytes("time,Winkel [\N{DEGREE SIGN}]\n0.0,0.1\n".encode("cp1252"))
+    with pytest.raises(DataError, match=r"no text in UTF-8 \(.* at byte 13\).*`iconv -f WINDOWS-1252 -t UTF-8 FILE`"):
+        read_recording(path)
+
+
 def test_a_sparse_table_of_other_names_says_which_it_has(tmp_path):
     path = save(tmp_path / "run.csv", "__time,/joint0/position,/u\n0.0,0.1,\n0.1,,0.2\n0.2,0.1,\n")
     with pytest.raises(

@@ -267,7 +267,12 @@ def _read_table(
     """
     try:
         text = source.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise DataError(
+            f"{source} is no text in UTF-8 ({error.reason} at byte {error.start}); expected such: of one that Excel or "
+            "LabVIEW wrote, `iconv -f WINDOWS-1252 -t UTF-8 FILE` makes it"
+        ) from error
+    except OSError as error:
         raise DataError(f"{source} cannot be read as text: {error}") from error
     lines = text.split("\n", skip)
     if len(lines) <= skip:
@@ -356,7 +361,8 @@ def _first_bad_cell(body: str, names: list[str], delimiter: str, skip: int, used
         if not _is_row(row):
             continue
         if len(row) != len(names):
-            return f"line {number} has {len(row)} cells; expected {len(names)} ({', '.join(names)})"
+            way = "; `skip: N` in a mapping file leaves out N lines before the names of the columns" if not used else ""
+            return f"line {number} has {len(row)} cells; expected {len(names)} ({', '.join(names)}){way}"
         for index in used:
             if row[index].strip() and not _is_number(row[index]):
                 return f"line {number}, column {names[index]!r} holds {row[index].strip()!r}; expected a number"
