@@ -349,6 +349,22 @@ def test_a_switch_that_was_silent_for_long_may_not_be_late(switch: Switch, monke
     assert switch.plant.arm().startswith("enable switch is silent for 895 ms")
 
 
+def test_a_flood_on_the_switch_keeps_no_decision_waiting(switch: Switch, monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = switch.plant
+    heard: list[int] = []
+
+    def flood() -> Iterator[tuple[bytes, dict[str, int]]]:
+        while len(heard) < 1000:
+            heard.append(time.time_ns())
+            yield serialize_message(Bool(data=True)), {"source_timestamp": heard[-1]}
+
+    monkeypatch.setattr(plant.interface._enable, "messages", flood)
+    switch.send(held=True)
+    plant.interface.decide()
+    # As many as the input keeps.
+    assert len(heard) == 10
+
+
 @pytest.mark.parametrize("data", [b"\x00\x01\x00\x00\x02", b"\x00\x01\x00\x00\xff", b"\x00\x01\x00\x00", b""])
 def test_a_message_that_is_not_true_holds_nothing(switch: Switch, data: bytes) -> None:
     plant, stamps = switch.plant, {"source_timestamp": time.time_ns(), "received_timestamp": 0}

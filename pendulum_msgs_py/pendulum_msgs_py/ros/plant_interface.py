@@ -11,6 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from itertools import islice
 from typing import Protocol
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -401,7 +402,8 @@ class PlantInterface:
     def _hear_enable(self) -> None:
         if self._enable is not None:
             with self.supervisor.alone():
-                for data, info in self._enable.messages():
+                # No more than it keeps: e-stop and actuator wait meanwhile, however fast others publish.
+                for data, info in islice(self._enable.messages(), self._enable.depth):
                     self._on_enable(data, info)
 
     def _on_enable(self, data: bytes, info: Mapping[str, int]) -> None:
