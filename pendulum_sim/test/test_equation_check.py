@@ -11,8 +11,9 @@ import gymnasium
 import numpy as np
 import pytest
 
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, write_plant
 from pendulum_sim.exports.model_files import mjcf
 from pendulum_sim.foreign.equation_check import TOLERANCE, EquationCheck, check_equation
 from pendulum_sim.simulator.engines import open_simulation
@@ -267,6 +268,27 @@ def test_an_environment_that_is_odd_is_named_by_what_it_does(tmp_path: Path, odd
     found = made.check()
     assert found.agrees == (not cause), str(found)
     assert cause in str(found)
+
+
+@pytest.mark.parametrize(
+    ("delay", "cause"), [(6, "a delay (an effort acts 60 ms later)"), (30, "an effort that does nothing within 200 ms")]
+)
+def test_a_delay_that_the_search_for_an_equation_cannot_see_is_told_and_then_named(
+    tmp_path: Path, delay: int, cause: str
+) -> None:
+    adapter = tmp_path / "adapter.yaml"
+    text = "format: pendulum_simulation/1\nangle: {index: 0}\nvelocity: {index: 1}\ntorque: {index: 0}\n"
+    text += f"start: {{options: state}}\nperiod: dt\nmake: {{delay: {delay}}}\n"
+    adapter.write_text(text, encoding="utf-8")
+    with pytest.raises(
+        ParameterError, match=rf"moves it only in step {delay + 1} \(a delay\); expected equation: FILE"
+    ):
+        open_simulation("gymnasium:Odd-v0", str(adapter))
+    plant = PlantParameters(inertia=0.05, damping=0.02, gravity=1.5, effort_limit=5.0)
+    adapter.write_text(f"{text}equation: {write_plant(tmp_path / 'plant.yaml', plant)}\n", encoding="utf-8")
+    made = open_simulation("gymnasium:Odd-v0", str(adapter))
+    assert made.check is not None
+    assert cause in str(made.check())
 
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "PendulumX59-v0"])

@@ -17,7 +17,7 @@ from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.repeats import record_repeat, record_simulation, repeat_folder
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
-from pendulum_bags.experiments.simulation import recorded_difference
+from pendulum_bags.experiments.simulation import ForeignSimulation, recorded_difference
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import plant_differences
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
@@ -94,6 +94,14 @@ def test_a_model_that_cannot_take_part_is_refused_before_anything_starts(
     model.write_text(text.replace(*model_text), encoding="utf-8")
     with pytest.raises(ParameterError, match=sentence):
         RegulationSettings(simulation=str(model))
+
+
+def test_a_weak_environment_is_told_what_its_adapter_file_takes() -> None:
+    pytest.importorskip("gymnasium")
+    with pytest.raises(
+        ParameterError, match=r"expected more torque, as set, on the attribute that limits it, in a map"
+    ):
+        ForeignSimulation("gymnasium:Pendulum-v1").check(0.05)
 
 
 @pytest.fixture

@@ -578,8 +578,10 @@ def _late(case: _Case) -> str:
     dt = case.plant.dt
     for i, limit in enumerate(case.plant.effort_limits):
         theirs, mine = (_response(case, plant, i, _SMALL * limit) for plant in (case.plant, case.equation))
-        if theirs is None or mine is None or not np.any(theirs) or not np.any(mine):
+        if theirs is None or mine is None or not np.any(mine):
             continue
+        if not np.any(theirs):
+            return f"an effort that does nothing within {1e3 * dt * case.count:.3g} ms (a longer delay?)"
         tried = [(_unlike(theirs, mine), "")]
         for k in range(2, case.count // 2):
             late = np.concatenate([np.zeros(k), mine[:-k]])

@@ -83,6 +83,8 @@ _AHEAD = 0.5
 """Distance from where its velocities lead up to which an angle is there [rad]."""
 _STEPS = 3
 """Steps of a probe at least, of which the last counts."""
+_LATEST = 50
+"""Steps in which a torque moves an environment at the latest."""
 
 
 def load_adapter(path: str | Path) -> Adapter:
@@ -341,6 +343,13 @@ class GymnasiumPlant:
             theta = self._theta + ahead + wrap(theta - self._theta - ahead)
         self._theta, self._theta_dot = theta, theta_dot
 
+    def _speed(self, effort: float, steps: int) -> float:
+        """Return the velocity some steps after a start at rest [rad/s]."""
+        self.reset()
+        for _ in range(steps):
+            self._advance(effort)
+        return self._theta_dot
+
     def _find_equation(self) -> PlantParameters:
         if "equation" in self._adapter:
             found = load_plant(self._adapter["equation"])
@@ -372,13 +381,14 @@ class GymnasiumPlant:
         kept = left <= max(_AS_WELL * best, least)
         (a, c, d), *_ = np.linalg.lstsq(rows[kept], after[kept], rcond=None)
         if not c > 0.0:
-            self.reset()
-            for _ in range(_STEPS):
-                self._advance(_LITTLE * self._limit)
-            if self._theta_dot < 0.0:
+            answers = (self._speed(_LITTLE * self._limit, n) - self._speed(0.0, n) for n in range(_STEPS, _LATEST))
+            steps, answer = next(((n, v) for n, v in enumerate(answers, _STEPS) if v), (0, 0.0))
+            if answer < 0.0:
                 why = "a positive torque speeds it up backwards; expected torque.sign or angle.sign the other way"
-            elif self._theta_dot == 0.0:
+            elif answer == 0.0:
                 why = "a torque does not move it; expected another torque.index"
+            elif steps > _STEPS:
+                why = f"a torque moves it only in step {steps} (a delay); expected equation: FILE"
             else:
                 why = f"it moves as no pendulum does in single steps from {_PROBES} states; expected equation: FILE"
             raise self._error(why)

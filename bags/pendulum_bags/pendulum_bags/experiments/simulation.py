@@ -88,10 +88,11 @@ class ForeignSimulation:
         """
         found = self.parameters
         if found.gravity >= found.effort_limit:
+            environment = find_engine(self.name)[0].program == "gymnasium"
+            way = "set, on the attribute that limits it," if environment else "effort_limit with actuator: none"
             raise ParameterError(
                 f"simulation {self.name} gives at most {found.effort_limit:g} N m, its weight takes up to "
-                f"{found.gravity:.4g} N m: nobody brings it upright on a ramp; expected more torque, as effort_limit "
-                "with actuator: none in a mapping file"
+                f"{found.gravity:.4g} N m: no ramp brings it upright; expected more torque, as {way} in a mapping file"
             )
         if self.period > hold_time * (1.0 + 1e-9):
             raise ParameterError(
