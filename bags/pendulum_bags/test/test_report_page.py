@@ -398,6 +398,9 @@ def test_every_pooled_run_is_listed_with_seed_bags_and_versions(tmp_path: Path) 
     assert told["run 1, revision and versions"] == "git 0123456789ab, pendulum_bags 0.1.0, python 3.11.0"
     assert told["run 2, revision and versions"] == "as run 1"
     assert "run 2, command" not in told
+    # An experiment that ended before it simulated the repeat's other side leaves a run that can be reported.
+    shutil.rmtree(repeat / "sim")
+    assert len(compare_folders([run]).pairs) == 1
     assert not any("private" in value for value in told.values())
     head = page.split("<nav")[0]
     assert "<dt>seeds</dt><dd>1, 10000001</dd>" in head

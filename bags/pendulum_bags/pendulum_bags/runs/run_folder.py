@@ -94,8 +94,11 @@ def discard_if_empty(folder: Path) -> bool:
 
 
 def pair_folders(folder: Path) -> list[Path]:
-    """Return the folders with the bags ``sim`` and ``hw`` of a run: its own, and those of its repeats in order."""
-    repeats = [place for place in (folder / REPEATS).glob("*") if place.name.isdigit()]
+    """Return the folders with the bags ``sim`` and ``hw`` of a run: its own, and those of its repeats in order.
+
+    Of a repeat whose simulation had not begun when the experiment ended, the hardware alone is there: it is no pair.
+    """
+    repeats = [place for place in (folder / REPEATS).glob("*") if place.name.isdigit() and (place / "sim").is_dir()]
     return [folder, *sorted(repeats, key=lambda place: int(place.name))]
 
 
