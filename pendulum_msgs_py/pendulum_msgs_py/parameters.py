@@ -312,7 +312,7 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
         ParameterError: The file is missing, not text, not YAML (with line and column), or holds no mapping.
     """
     text = read_text(path, what)
-    if text.lstrip().startswith("<"):
+    if text.lstrip().startswith(("<?xml", "<!--", "<robot", "<mujoco")):
         way = xacro_hint(path, text) or "`pendulum experiment --simulation FILE` takes a URDF or MJCF model"
         raise ParameterError(f"{what} {path} is XML; expected YAML ({way})")
     try:

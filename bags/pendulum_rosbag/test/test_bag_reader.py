@@ -289,9 +289,19 @@ def test_a_bag_whose_files_were_renamed_or_lost_is_read_as_far_as_it_goes(tmp_pa
         read_bag(path)
 
 
+def test_joints_are_read_by_their_names_in_whatever_order_a_message_has_them(tmp_path: Path) -> None:
+    path = tmp_path / "bag"
+    with BagWriter(path) as writer:
+        writer.add_topic("/many", "sensor_msgs/msg/JointState")
+        for stamp, names, values in ((2, ("p", "q"), (1.0, 2.0)), (3, ("q", "p"), (4.0, 3.0))):
+            writer.write("/many", stamp, encode_joints(stamp, "", names, values))
+    with read_bag(path) as bag:
+        assert bag.joints("/many").position.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+
+
 @pytest.mark.parametrize(
     ("names", "problem"),
-    [(["q", "p"], "message 1 is of q, p; expected p, q"), (["p"], "message 1 is of p; expected p, q")],
+    [(["q", "r"], "message 1 is of q, r; expected p, q"), (["p"], "message 1 is of p; expected p, q")],
 )
 def test_joints_that_change_from_message_to_message_are_no_arrays(
     tmp_path: Path, names: list[str], problem: str
