@@ -169,10 +169,9 @@ def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel,
         free = ["damping", "inertia", "input_gain"]
     else:
         free.append("inertia")
-    # A constant input has no delay to be seen, and an offset of one input is another scale.
+    # A constant input has no delay to be seen, and a gain of its own is an offset.
     varies = kind != "none" and any(np.ptp(recording.input) > 0.0 for recording in recordings)
-    levels = {float(level) for r in recordings for level in (np.min(r.input), np.max(r.input))}
-    if options.torque_offset and kind in {"effort", "voltage"} and len(levels) > 1:
+    if options.torque_offset and kind in {"effort", "voltage"} and (varies or "input_gain" not in free):
         free.append("torque_offset")
     if options.angle_offset:
         free.append("angle_offset")
