@@ -190,8 +190,8 @@ def hinted(spoiled: Spoiled, said: str) -> tuple[Options, dict[str, Any]] | None
         rules["velocity"]["sign"] = -1
     if "another column in a mapping file, or none" in text and "velocity" in rules:
         del rules["velocity"]
-    found = options, rules
-    return None if said and found == (spoiled.options, (hinted(spoiled, "") or found)[1]) else found
+    written = options, rules
+    return None if said and written == (spoiled.options, (hinted(spoiled, "") or written)[1]) else written
 
 
 def verdict(spoiled: Spoiled, path: Path, mapping: dict[str, Any] | None = None) -> tuple[set[str], bool, list[str]]:
