@@ -179,7 +179,7 @@ class Odd(gymnasium.Env[Any, Any]):
     def _observe(self) -> Any:
         theta, speed = self.x + self.odd.get("noise", 0.0) * self.np_random.normal(size=2)
         theta = theta + self.odd.get("shown", 0.0)
-        theta = 1.0 - theta if "mirrored" in self.odd else theta
+        theta = 1.0 - theta if "mirrored" in self.odd else theta * self.odd.get("angle_unit", 1.0)
         if wrap := self.odd.get("wrap"):
             theta = (theta + 0.5 * wrap) % wrap - 0.5 * wrap
         return np.array([theta, speed * self.odd.get("speed_unit", 1.0)])
@@ -238,6 +238,10 @@ gymnasium.register("Odd-v0", entry_point=Odd)
             "another zero of the angle that is read than of the start (put at -3.14 rad, it is read as -2.64 rad)",
         ),
         ({"mirrored": 1}, "another sign, or swapped sine and cosine, of the angle that is read than of the start"),
+        (
+            {"angle_unit": 1.0 / math.pi},
+            "another unit of the angle that is read than of the start (put at -3.14 rad, it is read as -1.00 rad)",
+        ),
         ({"speed_unit": 0.1}, "or a unit of velocity: its angle moves 10 times as far"),
         ({"lag": 0.05, "kept": 1}, "a reset that leaves something behind (with the same seed a run differs by"),
         ({"delay": 3}, "a delay (an effort acts 30 ms later)"),

@@ -461,6 +461,12 @@ def _reset(case: _Case) -> str:
                     f"{what} of the angle that is read than of the start (put at {asked[0]:.2f} {unit}, it is read as "
                     f"{wrap(float(came[0])):.2f} {unit})"
                 )
+        scale = float(np.dot(came, there) / np.dot(there, there))
+        if np.std(came - scale * there) < 0.1 * np.std(came):
+            return (
+                f"another unit of the angle that is read than of the start (put at {asked[0]:.2f} {unit}, it is read "
+                f"as {came[0]:.2f} {unit})"
+            )
         i = int(np.argmax(far))
         at = wrap(float(came[i])) if case.plant.coordinates.joints[j].turns else float(came[i])
         return f"a reset that is ignored (put at {asked[i]:.2f} {unit}, it is at {at:.2f} {unit} a period later)"
