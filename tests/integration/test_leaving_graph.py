@@ -58,7 +58,7 @@ try:
 except ValueError:
     with hang_guard():
         pass
-time.sleep(7.0)  # longer than what is guarded may take
+time.sleep(17.0)  # longer than what is guarded may take
 """
 _GROUP = """
 import ctypes

@@ -11,8 +11,8 @@ from functools import cache
 
 __all__ = ["guard_exit", "hang_guard"]
 
-_LONGEST = 5.0
-"""Time that what is guarded may take [s]."""
+_LONGEST = 15.0
+"""Time that what is guarded may take, also on a busy computer [s]."""
 _STANDARD_ERROR = 2
 """Its descriptor: what stands for it in Python may have none, as in a notebook."""
 _lock = threading.Lock()
@@ -21,7 +21,7 @@ _under_way = 0
 
 @contextmanager
 def hang_guard() -> Iterator[None]:
-    """End the process with exit code 1 and print its stacks if this context is not left within 5 s.
+    """End the process with exit code 1 and print its stacks if this context is not left within 15 s.
 
     No signal does that while a library holds the GIL. Make the plant safe and write files before.
     """
