@@ -60,8 +60,7 @@ def identify(
     if len(levels) == 1 and (one := levels.pop()) is not None and one[0] == "effort":
         raise DataError(
             f"{recordings[0].name}: the torque is {one[1]:.4g} N m throughout, which no fit can tell from a zero error "
-            "of the torque; expected a torque that varies, or none (`--mapping free_swing`, where this column is no "
-            "torque)"
+            "of the torque; expected a torque that varies"
         )
     fit = fit_output_error(recordings, options)
     tests = residual_tests(fit)
