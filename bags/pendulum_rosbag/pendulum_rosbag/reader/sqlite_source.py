@@ -235,7 +235,8 @@ class SqliteSource:
                 for row in self._salvaged
                 if row[1] in channels and (start is None or row[2] >= start) and (stop is None or row[2] < stop)
             ]
-            yield from _batches([_columns(rows)] if rows else [])
+            if rows:
+                yield from _batches([_columns(rows)])
             return
         expected = sum(stream.count for stream in self.streams if stream.channel in channels)
         for _ in range(_TRIES):
