@@ -165,9 +165,9 @@ def test_a_cycle_waits_for_an_answer_only_in_its_window_and_no_longer_once_it_ha
     waits.clear()
     running.take_inputs = lambda wait: (waits.append(wait), time.sleep(wait))
     count = len(running.outcomes)
-    running.until(lambda: len(running.outcomes) > count + 3, "outcomes")
+    # A cycle that begins late on a busy computer has no time left to wait.
+    running.until(lambda: len(running.outcomes) > count + 3 and any(waits), "a wait for a late answer")
     asked = [wait for wait in waits if wait]
-    assert asked, "an answer that is late was not waited for"
     assert max(asked) <= 0.3 * 0.01
 
 
