@@ -51,6 +51,7 @@ QUICK = Options(friction="viscous", folds=2, multi_start=False)
             f"{THESIS} --simulation my.xml --mapping my.map --design-plant x",
             f"{THESIS} --design-plant x --plant my.yaml --seed 2",
         ),
+        ("python /lab/.venv/bin/pendulum experiment thesis --seed 7", f"{THESIS} --plant my.yaml --seed 8"),
         ("python -m pendulum_bags experiment lockstep --side hw --seed 7", ""),
         ("python -m pendulum_bags experiment", ""),
         ("python -m pendulum_sim experiment thesis", ""),
@@ -72,6 +73,7 @@ def test_a_plant_file_is_tested_by_the_recorded_experiment_under_other_noise(com
         ),
         (f"{THESIS} --simulation 'my robot.xml' --mapping m.yaml", "--simulation 'my robot.xml' --mapping m.yaml"),
         (f"{THESIS} --hardware emulator --q 1 1", ""),
+        ("python '/my lab/.venv/bin/pendulum' experiment thesis --plant my.yaml", "--plant my.yaml"),
     ],
 )
 @pytest.mark.parametrize("experiment", ["frequency_response", "ranking"])
