@@ -18,14 +18,7 @@ from pendulum_bags.comparison.margins import MarginArgument, Margins
 from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
 from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
-from pendulum_bags.runs.run_data import (
-    OpenBag,
-    RunData,
-    is_emulated,
-    noise_hold_time,
-    plant_summary,
-    read_run,
-)
+from pendulum_bags.runs.run_data import OpenBag, RunData, is_emulated, noise_hold_time, plant_summary, read_run
 from pendulum_bags.runs.run_folder import pair_folders, read_looks, read_stalls
 from pendulum_bags.runs.run_record import DIFFERENCE, STAND_IN, run_record
 from pendulum_msgs_py.errors import BagError, DataError

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -188,7 +187,7 @@ def joints(
                 words = Words("--rank-seeds 10", f"experiment joints --plant {plant} --periods 40", COST)
                 case = Case(*map(plant_identity, (simulated, drawn)))
                 write_ranking(folder / RANKING, found, words=words, emulated=True, case=case)
-                write_layer(folder, replace(same_choice(found, words=words), case=case))
+                write_layer(folder, same_choice(found, words, case))
     if analysis is not None and not json_output:
         console.print(designs_table(analysis.designs))
     compare([folder], margin=margin, margins_file=margins_file, out=folder, json_output=json_output)

@@ -11,7 +11,7 @@ from pendulum_bags.frequency_response.designs import policies_of
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Layer, LayerResult
-from pendulum_bags.verdict.same_run import same_run_layer
+from pendulum_bags.verdict.same_run import case_of
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["carry_over", "layers_of"]
@@ -46,8 +46,9 @@ def carry_over(
         return None
     facts = run_record(comparison.pairs[0].simulation.metadata)
     found = analyse_machine(place, str(facts.get("plant") or "thesis"), designs, policies_of(facts))
+    case = case_of(comparison)
     for layer in found.layers:
-        same_run_layer(comparison).case.require_same(layer.case, f"the response in {place}")
+        case.require_same(layer.case, f"the response in {place}")
     return found
 
 

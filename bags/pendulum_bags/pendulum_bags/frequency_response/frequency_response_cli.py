@@ -132,7 +132,6 @@ def experiment(
     from pendulum_bags.experiments.new_run import new_run
     from pendulum_bags.experiments.progress import PhaseProgress
     from pendulum_bags.experiments.run_spec import RunSpec
-    from pendulum_bags.experiments.simulation import ForeignSimulation
     from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
     from pendulum_lqr.policies.policy_file import named_controller
     from pendulum_lqr.responses.controller_response import require_time_invariant
@@ -155,11 +154,6 @@ def experiment(
         "hold_time": 0.01,
     }
     console = make_console(stderr=json_output, highlight=False)
-    foreign = ForeignSimulation(simulation, str(mapping or "")) if simulation else None
-    if foreign is not None:
-        foreign.check(disturbance["hold_time"])
-        if plant is None and not accept_differences:
-            foreign.require_equation()
     # Both hold each sample for the slower plant's period: the same torque as a function of time.
     specs = [
         RunSpec(
@@ -179,6 +173,10 @@ def experiment(
         )
         for side in ("sim", "hw")
     ]
+    if (foreign := specs[0].foreign) is not None:
+        foreign.check(disturbance["hold_time"])
+        if plant is None and not accept_differences:
+            foreign.require_equation()
     started = time.monotonic()
     shares = (1.0, 1.0) if realtime else (0.35, 0.15)
     expected = [6.0 + share * spec.duration for spec, share in zip(specs, shares, strict=True)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +41,7 @@ class Words:
     cost: str = "Cost: mean of q11 e² + q22 v² + r u², that of the thesis's LQR unless other weights were asked for."
 
 
-def same_choice(ranking: Ranking, words: Words = Words()) -> LayerResult:
+def same_choice(ranking: Ranking, words: Words = Words(), case: Case = UNKNOWN) -> LayerResult:
     """Return layer 4: yes where the regret is small, no where large, undecided where its runs scatter or are few.
 
     A pick that fails on the hardware in any run is a no, whatever it costs.
@@ -49,6 +49,7 @@ def same_choice(ranking: Ranking, words: Words = Words()) -> LayerResult:
     Args:
         ranking: The ranking.
         words: How its runs were made.
+        case: The plants that ran.
     """
     regret = ranking.regret_share
     share = [regret.value, regret.low, regret.high]
@@ -107,7 +108,7 @@ def same_choice(ranking: Ranking, words: Words = Words()) -> LayerResult:
         else f"the regret of the simulation's pick, {percent[1]:.0f} to {percent[2]:.0f} %, is not measured well "
         "enough",
     }[mark]
-    return LayerResult(Layer.SAME_CHOICE, mark, sentence, evidence, steps, reason)
+    return LayerResult(Layer.SAME_CHOICE, mark, sentence, evidence, steps, reason, case=case)
 
 
 def _regret_words(ranking: Ranking) -> str:
@@ -206,7 +207,7 @@ def write_ranking(
         case: The plants that ran.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    layer = name_in(replace(same_choice(ranking, words=words), case=case), emulated=emulated)
+    layer = name_in(same_choice(ranking, words, case), emulated=emulated)
     write_json(folder / "ranking.json", ranking.to_json())
     write_layer(folder, layer)
     figures = [name_in(ranking_figure(ranking), emulated=emulated)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -54,7 +53,7 @@ def ranking(
     narrowed = narrow_all(contenders) if use else {}
     page = write_ranking(out, found, emulated=emulated, case=case) if out is not None else None
     if json_output:
-        content = {**found.to_json(), "layer": replace(same_choice(found), case=case).to_json()}
+        content = {**found.to_json(), "layer": same_choice(found, case=case).to_json()}
         if use:
             content["narrowed"] = {name: one.to_json() for name, one in narrowed.items()}
         print(json_text(content))

@@ -20,12 +20,12 @@ IDENTITY = "identity"
 
 def identity_of(name: str, *content: Any) -> str:
     """Return a name with a short hash of content: JSON values, and paths of files, which count by their bytes."""
-    told = [
+    parts = [
         hashlib.sha256(one.read_bytes()).hexdigest() if isinstance(one, Path) else one
         for one in content
         if not isinstance(one, Path) or one.is_file()
     ]
-    return f"{name} ({hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:8]})"
+    return f"{name} ({hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:8]})"
 
 
 def plant_identity(plant: AnyPlant) -> str:

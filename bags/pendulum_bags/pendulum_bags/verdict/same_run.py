@@ -15,7 +15,7 @@ from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 
-__all__ = ["design_plant", "how_to_measure", "in_words", "same_run_layer", "seen_note"]
+__all__ = ["case_of", "design_plant", "how_to_measure", "in_words", "same_run_layer", "seen_note"]
 
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
@@ -56,23 +56,33 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
             reason = f"{runs} cannot tell yet in {', '.join(test.quantity for test in open_tests)}"
         steps = (_what_it_takes(comparison, more),)
     sentence = f"{reason[0].upper()}{reason[1:]}."
-    case = Case.of(
+    evidence = tuple(map(_evidence, tests))
+    return LayerResult(Layer.SAME_RUN, mark, sentence, evidence, steps, reason=reason, case=case_of(comparison))
+
+
+def case_of(comparison: Comparison) -> Case:
+    """Return the plants of a comparison.
+
+    Raises:
+        DataError: The runs of one side are of two plants.
+    """
+    return Case.of(
         [run_record(pair.simulation.metadata) for pair in comparison.pairs],
         [run_record(pair.hardware.metadata) for pair in comparison.pairs],
     )
-    return LayerResult(Layer.SAME_RUN, mark, sentence, tuple(map(_evidence, tests)), steps, reason=reason, case=case)
 
 
 def how_to_measure(comparison: Comparison) -> dict[Layer, str]:
     """Return the commands that measure the other layers of a comparison's own plants."""
     first = comparison.pairs[0]
     bags = [one.source or name for one, name in ((first.simulation, "SIM"), (first.hardware, "HW"))]
-    in_frequency = measurement_of(_records(comparison), "frequency_response") or (
+    records = _records(comparison)
+    in_frequency = measurement_of(records, "frequency_response") or (
         f"python -m pendulum_bags frequency_response {' '.join(map(shlex.quote, bags))} --out FOLDER"
         if not (first.simulation.is_whole or first.hardware.is_whole)
         else "record both plants under a disturbance (python -m pendulum_bags frequency_response SIM HW --out FOLDER)"
     )
-    choice = measurement_of(_records(comparison), "ranking") or (
+    choice = measurement_of(records, "ranking") or (
         "record several controllers on both plants (python -m pendulum_bags ranking FOLDER)"
     )
     return {

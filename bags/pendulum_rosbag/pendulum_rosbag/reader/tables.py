@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from rosbags.typesys.store import Typestore
 
+    from pendulum_rosbag.reader.topic_info import StoredMessage
+
 
 __all__ = ["FORMATS", "LEROBOT", "export_bag", "require_pyarrow", "to_pandas"]
 
@@ -54,12 +56,12 @@ def to_pandas(bag: Bag, topic: str) -> pd.DataFrame:
         return pd.DataFrame({name: values[name] for name in values.dtype.names or ()})
     if not values:
         return pd.DataFrame({"log_time_ns": np.empty(0, np.int64)})
-    if bag.topics[topic].type == _JOINT_STATE and (columns := _joint_columns(bag, topic)):
+    if bag.topics[topic].type == _JOINT_STATE and (columns := _joint_columns(bag, topic, values)):
         return pd.DataFrame(columns)
     return pd.DataFrame([{"log_time_ns": stored.log_time_ns, **_flat(stored.message)} for stored in values])
 
 
-def _joint_columns(bag: Bag, topic: str) -> dict[str, Any]:
+def _joint_columns(bag: Bag, topic: str, messages: Sequence[StoredMessage]) -> dict[str, Any]:
     """Return the columns of states of several joints; none where messages are not all of the same joints."""
     try:
         table = joint_table(bag.raw(topic), topic)
@@ -71,7 +73,7 @@ def _joint_columns(bag: Bag, topic: str) -> dict[str, Any]:
     for quantity in ("position", "velocity", "effort"):
         values = getattr(table, quantity)
         columns |= {f"{name}.{quantity}": values[:, index] for index, name in enumerate(table.names)}
-    return {**columns, "frame_id": [stored.message.header.frame_id for stored in bag[topic]]}
+    return {**columns, "frame_id": [stored.message.header.frame_id for stored in messages]}
 
 
 def export_bag(
