@@ -1,4 +1,4 @@
-"""The page that tells of a first day in a lab: its commands and what they said."""
+"""The section of a page that shows a first day in a lab: its commands and their output."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 __all__ = ["PAGE", "Step", "skeleton", "steps_of", "text_of", "write_page"]
 
-PAGE = Path(__file__).resolve().parents[2] / "pendulum_hw_bridge" / "docs" / "first_day.md"
+PAGE = Path(__file__).resolve().parents[2] / "pendulum_hw_bridge" / "docs" / "run_on_hardware.md"
 _BEGIN, _END = "<!-- the day -->\n", "<!-- end of the day -->\n"
 
 
@@ -35,7 +35,7 @@ def text_of(steps: list[Step]) -> str:
     """Return the day in Markdown."""
     text = ""
     for step in steps:
-        text += f"\n## {step.heading}\n" if step.heading else ""
+        text += f"\n### {step.heading}\n" if step.heading else ""
         text += f"\n{step.words}\n" if step.words else ""
         text += f"\n```console\n$ {step.command}\n{step.output}```\n"
     return text

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pendulum_testing.fixtures import PROJECT
 
-PAGE = PROJECT / "bags" / "pendulum_bags" / "docs" / "course.md"
+PAGE = PROJECT / "bags" / "pendulum_bags" / "docs" / "tutorial.md"
 
 
 def _run(line: str, folder: Path) -> subprocess.CompletedProcess[str]:

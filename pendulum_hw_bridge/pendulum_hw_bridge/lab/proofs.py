@@ -1,5 +1,9 @@
 """Proofs of a lab: that a motor's torque ends with the command lifetime, and with the motion stop. Both turn it gently.
 
+Commands continue until the end of the torque has been seen, and live for 250 ms meanwhile: with the usual lifetime of
+50 ms, expiry would end the duty within the 60 ms allowed, and a button that only sets its flag would be proved. Each
+proof counts from the last record (or command) that certainly had the duty.
+
 Pure: the actuator is a port, the person a dialogue, time the port's clock.
 """
 

@@ -1,4 +1,8 @@
-"""Moving references of the angle: periodic ones, and the way onto them without a jump."""
+"""Moving references of the angle: periodic ones, and the way onto them without a jump.
+
+A reference is computed from parameters and stamps, not received on a topic, whose delay and losses would differ between
+simulator and machine. Where no way onto it is within the torque, the controller gives none.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Change of control without a jump: what was there before fades out."""
+"""Change of control without a jump: what was there before fades out.
+
+A command takes over from position control only within ``handover_effort_limit`` of the holding torque: otherwise an
+upright controller that is still active after the ramp down would command 100 N m at a hanging pendulum.
+"""
 
 from __future__ import annotations
 

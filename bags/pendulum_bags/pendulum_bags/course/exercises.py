@@ -13,7 +13,7 @@ _TEXT = """\
 
 Work in the project's folder. Run `make extras` once, and activate the environment in each terminal:
 `. .venv/bin/activate`. Each exercise ends with a command that says *right* or *wrong*; the answer in it is a
-placeholder for yours. Background and hints: `bags/pendulum_bags/docs/course.md`.
+placeholder for yours. Background and hints: `bags/pendulum_bags/docs/tutorial.md`.
 
 ## 1. Choose Q and R
 The plant is `thesis`. Choose Q and R of an LQR so that the time constant of the closed loop is

@@ -7,6 +7,9 @@ reader skips::
     magic  header | settled chunks | room to grow | staged chunks | summary A | summary B | data end, footer, magic
                                    ^ settled_end  ^ area.start    ^ area.stop
 
+Messages stay in the order of arrival, so chunks may overlap in log time where that is a plant's stamp: a recorder that
+sorted would hold back messages that a killed recording should contain.
+
 A chunk is written into room that no reader sees, and the summary that lists it into whichever of the two places the
 footer does not point to, each with a data end right before it, where Foxglove's reader looks for one, and a private
 record with its checksum at its end (that of the footer would have to cover the place that is written next). Two small
