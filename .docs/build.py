@@ -10,7 +10,14 @@ import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from pendulum_msgs_py.parameters import ParameterSpec
 
 PROJECT = Path(__file__).resolve().parents[1]
 GATHERED = PROJECT / "build" / "docs"
@@ -93,44 +100,96 @@ def for_the_site(text: str, page: str, gathered: set[str]) -> str:
     return "".join(parts)
 
 
+def _rows(specs: Iterable[ParameterSpec]) -> list[str]:
+    """Return the rows of a table of parameters, those that are read-only marked by a star."""
+    from pendulum_msgs_py.parameters import markdown_table
+
+    rows = markdown_table(specs).splitlines()[2:]
+    return [re.sub(r"^(\| `[^`]*`)(.*?) Read-only\. \|$", r"\1*\2 |", row) for row in rows]
+
+
+def _tables(tables: Mapping[str, tuple[str, list[str]]], shared: str) -> list[str]:
+    """Return a section for each table; rows that several have stand once, in a section of their own.
+
+    Args:
+        tables: Heading, with a sentence and the rows.
+        shared: Heading of the rows that several tables have.
+
+    Returns:
+        Markdown, in parts.
+    """
+    head = "| parameter | default | unit | allowed | meaning |\n|---|---|---|---|---|\n"
+    count = Counter(row for _, rows in tables.values() for row in rows)
+    common = [row for row, tables_with_it in count.items() if tables_with_it > 1]
+    parts = [f"### {shared}\n\n{head}" + "\n".join(common) + "\n"] if common else []
+    link = re.sub(r"\W+", "-", shared.lower())
+    for heading, (sentence, rows) in tables.items():
+        own = [row for row in rows if count[row] == 1]
+        names = ", ".join(row.split(" ")[1].rstrip("*") for row in rows if count[row] > 1)
+        parts.append(f"### {heading}\n")
+        parts += [f"{sentence}.\n"] if sentence else []
+        parts += [head + "\n".join(own) + "\n"] if own else []
+        parts += [f"{'Also' if own else 'Parameters'} ([{shared}](#{link})): {names}.\n"] if names else []
+        parts += [] if rows else ["No parameters of its own.\n"]
+    return parts
+
+
+def _programs() -> list[str]:
+    """Return a line for each program; what a package offers of another is named only."""
+    from pendulum_msgs_py.programs.executables import summary
+
+    parts: list[str] = []
+    seen: dict[str, str] = {}
+    for package in PACKAGES:
+        module = importlib.import_module(f"{package}.executables")
+        table = {**module.EXECUTABLES, **getattr(module, "COMMANDS", {})}
+        said = {name: summary(name, target) for name, target in table.items()}
+        parts += [f"- `python -m {package} {name}`: {text}." for name, text in said.items() if seen.get(name) != text]
+        again = ", ".join(f"`{name}`" for name, text in said.items() if seen.get(name) == text)
+        parts += [f"- `python -m {package}` also has {again}."] if again else []
+        seen |= said
+    return parts
+
+
 def reference() -> str:
     """Return the reference page, from the tables that the programs themselves read."""
+    from pendulum_hw_bridge.drive.safety import FAULTS
     from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
     from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS, joint_controller_class
     from pendulum_lqr.nodes.bringup import ARGUMENTS
-    from pendulum_msgs_py.parameters import markdown_table
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
     from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS
-    from pendulum_msgs_py.programs.executables import summary
 
     parts = [
         "# Reference\n\nGenerated from the code by `python .docs/build.py --reference`; a test compares it.\n",
+        "Parameters with a star are read-only: they are set at the start.\n",
         "## Programs\n",
+        *_programs(),
+        "\n## Parameters of the nodes\n",
     ]
-    for package in PACKAGES:
-        tables = importlib.import_module(f"{package}.executables")
-        for name, target in {**tables.EXECUTABLES, **getattr(tables, "COMMANDS", {})}.items():
-            parts.append(f"- `python -m {package} {name}`: {summary(name, target)}.")
-    parts.append("\n## Parameters of the nodes\n")
+    nodes: dict[str, tuple[str, list[str]]] = {}
     for name, module, tables in NODES:
         found = [getattr(importlib.import_module(module), table) for table in tables]
-        specs = [spec for table in found for spec in getattr(table, "specs", table)]
-        parts.append(f"### {name}\n\n{markdown_table(specs)}\n")
+        nodes[name] = ("", _rows(spec for table in found for spec in getattr(table, "specs", table)))
     node = importlib.import_module("pendulum_lqr.nodes.controller_node").NODE_SPECS
-    parts.append(f"### controller\n\n{markdown_table([*node, *COMMON_PARAMETERS])}\n\n## Controllers\n")
-    for name in CONTROLLERS:
-        own = controller_class(name)
-        table = markdown_table(own.PARAMETERS) if own.PARAMETERS else "No parameters of its own."
-        parts.append(f"### {name}\n\n{own.SUMMARY}.\n\n{table}\n")
+    nodes["controller"] = ("", _rows([*node, *COMMON_PARAMETERS]))
+    parts += _tables(nodes, "several nodes")
+    classes = {name: controller_class(name) for name in CONTROLLERS}
+    parts.append("## Controllers\n")
+    parts += _tables(
+        {name: (own.SUMMARY, _rows(own.PARAMETERS)) for name, own in classes.items()}, "several controllers"
+    )
     parts.append("## Controllers of several joints\n\nParameters as for the preset `cart_pole`.\n")
     mechanism = load_mechanism("cart_pole")
-    for name in JOINT_CONTROLLERS:
-        own_joint = joint_controller_class(name, mechanism)
-        specs = own_joint.parameters(mechanism)
-        table = markdown_table(specs) if specs else "No parameters of its own."
-        parts.append(f"### {name}, several joints\n\n{own_joint.SUMMARY}.\n\n{table}\n")
-    parts.append(f"## Plant files\n\n{markdown_table(PLANT_SPECS)}\n")
-    parts.append(f"### Drivetrain\n\n{markdown_table(DRIVETRAIN_SPECS)}\n")
+    joint = {name: joint_controller_class(name, mechanism) for name in JOINT_CONTROLLERS}
+    tables_of_joints = {
+        f"{name}, several joints": (own.SUMMARY, _rows(own.parameters(mechanism))) for name, own in joint.items()
+    }
+    parts += _tables(tables_of_joints, "several controllers of joints")
+    parts.append("## Faults of the bridge\n\n| fault | meaning |\n|---|---|")
+    parts += [f"| `{name}` | {meaning} |" for name, meaning in FAULTS.items()]
+    parts += ["\n## Plant files\n", *_tables({"plant": ("", _rows(PLANT_SPECS))}, "")]
+    parts += _tables({"drivetrain": ("", _rows(DRIVETRAIN_SPECS))}, "")
     parts.append("## Arguments of `bringup.launch.py`\n\n| argument | default | choices | meaning |\n|---|---|---|---|")
     parts += [
         f"| `{it.name}` | `{it.default or chr(34) * 2}` | {', '.join(it.choices) or 'any'} | {it.description} |"

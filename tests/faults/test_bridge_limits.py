@@ -153,9 +153,10 @@ def test_the_motor_drives_with_the_limit_at_most_and_brakes_with_no_more_than_is
 
 def test_the_torque_that_is_stated_beside_the_limit_is_that_of_the_drivetrain() -> None:
     mapping = EffortMapping(EffortStrategy.EFFORT_LOOP, load_emulator("thesis").drivetrain, effort_limit=3.0)
-    readme = (Path(__file__).parents[2] / "pendulum_hw_bridge/README.md").read_text(encoding="utf-8")
-    assert f"{mapping.largest_effort(1.0) - 3.0:.1f} N m at 1 rad/s,\nwhatever its duty" in readme
-    assert f"{mapping.largest_effort(1.5):.1f} N m at a limit of\n3 N m and 1.5 rad/s" in readme
+    page = (Path(__file__).parents[2] / "pendulum_hw_bridge/docs/run_on_hardware.md").read_text(encoding="utf-8")
+    words = " ".join(page.split())
+    assert f"{mapping.largest_effort(1.0) - 3.0:.1f} N m at 1 rad/s, whatever its duty" in words
+    assert f"{mapping.largest_effort(1.5):.1f} N m at a limit of 3 N m and 1.5 rad/s" in words
     (limit,) = [spec for spec in SPECS if spec.name == "effort_limit"]
     assert f"{mapping.largest_effort(1.0) - 3.0:.1f} N m at 1 rad/s" in limit.description
     assert mapping.largest_effort(-1.0) == mapping.largest_effort(1.0) > mapping.largest_effort(0.0) == 3.0
