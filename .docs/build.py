@@ -154,8 +154,7 @@ def _programs() -> list[str]:
 def reference() -> str:
     """Return the reference page, from the tables that the programs themselves read."""
     from pendulum_hw_bridge.drive.safety import FAULTS
-    from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, CONTROLLERS, controller_class
-    from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS, joint_controller_class
+    from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, controller_class, controller_names
     from pendulum_lqr.nodes.bringup import ARGUMENTS
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
     from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS
@@ -174,14 +173,14 @@ def reference() -> str:
     node = importlib.import_module("pendulum_lqr.nodes.controller_node").NODE_SPECS
     nodes["controller"] = ("", _rows([*node, *COMMON_PARAMETERS]))
     parts += _tables(nodes, "several nodes")
-    classes = {name: controller_class(name) for name in CONTROLLERS}
+    classes = {name: controller_class(name) for name in controller_names()}
     parts.append("## Controllers\n")
     parts += _tables(
         {name: (own.SUMMARY, _rows(own.PARAMETERS)) for name, own in classes.items()}, "several controllers"
     )
     parts.append("## Controllers of several joints\n\nParameters as for the preset `cart_pole`.\n")
     mechanism = load_mechanism("cart_pole")
-    joint = {name: joint_controller_class(name, mechanism) for name in JOINT_CONTROLLERS}
+    joint = {name: controller_class(name, mechanism) for name in controller_names(several=True)}
     tables_of_joints = {
         f"{name}, several joints": (own.SUMMARY, _rows(own.parameters(mechanism))) for name, own in joint.items()
     }

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from pendulum_lqr.controller_interface.interface import JointController
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.joint_energy_swing_up import JointEnergySwingUp
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.swing_up.energy_margin import EnergyMargin
@@ -23,14 +23,14 @@ PERIOD = 0.01
 
 
 def _swing(
-    controller: JointController, plant: MechanismParameters, start: Vector, duration: float
+    controller: Controller, plant: MechanismParameters, start: Vector, duration: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions, deviations from upright, and efforts."""
     simulated = MechanismPlant(plant, dt=PERIOD)
     state = simulated.reset(start)
     positions, deviations, efforts = [], [], []
     for k in range(round(duration / PERIOD)):
-        efforts.append(controller.command(k * PERIOD, state.position, state.velocity)[0])
+        efforts.append(controller.efforts(k * PERIOD, state.position, state.velocity)[0])
         state = simulated.step((efforts[-1],))
         positions.append(state.position)
         deviations.append(plant.coordinates.deviation(state.position))
@@ -50,7 +50,7 @@ def test_it_swings_up_from_hanging_within_limit_and_reach(
     name: str, duration: float, limit: float, reach: float
 ) -> None:
     plant = load_mechanism(name)
-    controller = make_joint_controller("energy_swing_up", plant, {"effort_limit": limit}, PERIOD)
+    controller = make_controller("energy_swing_up", plant, PERIOD, {"effort_limit": limit})
     for start in ((0.0, 0.0), (0.1, -0.2)):
         controller.reset()
         positions, deviations, efforts = _swing(controller, plant, start, duration)
@@ -67,7 +67,7 @@ def test_it_swings_up_from_hanging_within_limit_and_reach(
 @pytest.mark.parametrize(("name", "seed"), [("furuta", 11), ("furuta", 19), ("cart_pole", 2)])
 def test_it_learns_to_aim_below_upright_where_the_model_has_more_friction_than_the_plant(name: str, seed: int) -> None:
     plant = load_mechanism(name)
-    controller = make_joint_controller("energy_swing_up", plant, {}, PERIOD)
+    controller = make_controller("energy_swing_up", plant, PERIOD)
     machines = pytest.importorskip("pendulum_bags.experiments.joint_run")
     lighter = machines.stand_in_for(plant, share=0.05, delay=0.0, seed=seed)
     start = tuple(float(value) for value in np.random.default_rng(seed - 1).uniform(-0.2, 0.2, 2))
@@ -127,7 +127,7 @@ def test_only_what_happens_near_upright_tells_how_to_aim(states: tuple[Vector, V
 
 def test_the_driven_joint_goes_no_farther_than_it_may() -> None:
     plant = load_mechanism("cart_pole")
-    wide, narrow = (make_joint_controller("energy_swing_up", plant, {"reach": reach}, PERIOD) for reach in (10.0, 0.8))
+    wide, narrow = (make_controller("energy_swing_up", plant, PERIOD, {"reach": reach}) for reach in (10.0, 0.8))
     # Nine tenths of the way to the stops bound what is asked for.
     assert wide.pump.reach == pytest.approx(1.62)
     positions, deviations, _ = _swing(narrow, plant, (0.0, 0.1), 15.0)
@@ -136,8 +136,8 @@ def test_the_driven_joint_goes_no_farther_than_it_may() -> None:
     # The LQR takes over only from where it stays within, too.
     assert narrow.catch.region.level < wide.catch.region.level
     # Beyond its reach it comes back, however it moves.
-    assert narrow.command(0.0, (1.2, 0.5), (0.0, 3.0))[0] < 0.0
-    assert narrow.command(0.0, (-1.2, 0.5), (-0.5, -3.0))[0] > 0.0
+    assert narrow.efforts(0.0, (1.2, 0.5), (0.0, 3.0))[0] < 0.0
+    assert narrow.efforts(0.0, (-1.2, 0.5), (-0.5, -3.0))[0] > 0.0
 
 
 def test_the_dry_friction_of_the_driven_joint_is_made_up_for_in_the_way_that_it_goes() -> None:
@@ -167,9 +167,9 @@ def test_what_cannot_be_swung_up_so_is_refused_with_what_to_take() -> None:
             JointEnergySwingUp.parameters(load_mechanism(name))
     stiff = load_mechanism("furuta").with_values({"arm.coulomb_friction": 0.02})
     with pytest.raises(DesignError, match=r"effort_limit is 0\.01 N m; .* the friction that holds arm, 0\.02 N m"):
-        make_joint_controller("energy_swing_up", stiff, {"effort_limit": 0.01}, PERIOD)
+        make_controller("energy_swing_up", stiff, PERIOD, {"effort_limit": 0.01})
     with pytest.raises(DesignError, match=r"effort_limit is 0\.02 N m; expected more"):
-        make_joint_controller("energy_swing_up", stiff, {"effort_limit": 0.02}, PERIOD)
+        make_controller("energy_swing_up", stiff, PERIOD, {"effort_limit": 0.02})
     for changed in ({"gravity": 0.0}, {"pole_centre": 0.0}):
         floating = load_mechanism("cart_pole").with_values(changed)
         with pytest.raises(DesignError, match="pole of plant 'cart_pole' cannot be swung up by cart"):
@@ -178,17 +178,17 @@ def test_what_cannot_be_swung_up_so_is_refused_with_what_to_take() -> None:
 
 def test_who_takes_over_knows_what_was_learnt_and_whether_the_lqr_is_in_charge() -> None:
     plant = load_mechanism("cart_pole")
-    old, new = (make_joint_controller("energy_swing_up", plant, {}, PERIOD) for _ in range(2))
+    old, new = (make_controller("energy_swing_up", plant, PERIOD) for _ in range(2))
     old.margin.value = 0.03
     upright = (plant.coordinates.goal, (0.0, 0.0))
-    old.command(0.0, *upright)
+    old.efforts(0.0, *upright)
     new.carry_over(old)
     assert new.margin.value == 0.03
     assert new.catch.active
     new.reset()
     assert not new.catch.active
     assert new.margin.value == 0.0
-    shared = make_joint_controller("energy_swing_up", plant, {"catch_share": 0.1}, PERIOD)
+    shared = make_controller("energy_swing_up", plant, PERIOD, {"catch_share": 0.1})
     level = old.catch.region.level
     assert shared.catch.region.level == pytest.approx(0.1 * level)
     assert shared.catch.leave * shared.catch.region.level == pytest.approx(old.catch.leave * level)
@@ -199,7 +199,7 @@ def test_who_takes_over_knows_what_was_learnt_and_whether_the_lqr_is_in_charge()
 def test_a_period_that_is_measured_later_is_judged_without_another_design(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    controller = make_joint_controller(name, load_mechanism("cart_pole"), {})
+    controller = make_controller(name, load_mechanism("cart_pole"), 0.01, checked=False)
     monkeypatch.setattr(
         "pendulum_lqr.swing_up.mechanism_catch.sample_caught_region", lambda *_: pytest.fail("designed again")
     )

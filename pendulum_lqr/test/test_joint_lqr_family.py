@@ -10,8 +10,8 @@ import control
 import numpy as np
 import pytest
 
-from pendulum_lqr.controller_interface.interface import JointController
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.joint_lqg import JointLqg
 from pendulum_lqr.linear.analysis import delayed_spectral_radius
 from pendulum_lqr.linear.design import DesignError, kalman_gain
@@ -32,7 +32,7 @@ class _Run:
     def __init__(
         self,
         plant: MechanismParameters,
-        controller: JointController,
+        controller: Controller,
         *,
         noise: tuple[float, float] = (0.0, 0.0),
         push: float = 0.0,
@@ -47,7 +47,7 @@ class _Run:
         for k in range(round(10.0 / period)):
             q = np.array(state.position) + noise[0] * rng.standard_normal(n)
             v = np.array(state.velocity) + noise[1] * rng.standard_normal(n)
-            efforts.append(controller.command(k * period, tuple(map(float, q)), tuple(map(float, v))))
+            efforts.append(controller.efforts(k * period, tuple(map(float, q)), tuple(map(float, v))))
             state = simulated.step(efforts[-1], pushes)
             deviations.append(plant.coordinates.deviation(state.position))
         self.deviations, self.efforts = np.array(deviations), np.array(efforts)
@@ -56,21 +56,21 @@ class _Run:
 def test_the_discrete_lqr_holds_a_delayed_plant_that_the_sampled_one_cannot() -> None:
     plant = delayed_plant("furuta", 0.012)
     with pytest.raises(ParameterError, match=r"lqr asked every 0\.01 s does not settle on plant 'furuta'"):
-        make_joint_controller("lqr", plant, {}, PERIOD)
-    controller = make_joint_controller("discrete_lqr", plant, {}, PERIOD)
+        make_controller("lqr", plant, PERIOD)
+    controller = make_controller("discrete_lqr", plant, PERIOD)
     assert controller.describe().endswith(", 2 efforts on their way")
     first = _Run(plant, controller)
     assert np.abs(first.deviations[-1]).max() < 1e-3
     controller.reset()
     assert (_Run(plant, controller).efforts == first.efforts).all()
     # Who takes over knows what is on its way; who begins does not.
-    successor, stranger = (make_joint_controller("discrete_lqr", plant, {}, PERIOD) for _ in range(2))
+    successor, stranger = (make_controller("discrete_lqr", plant, PERIOD) for _ in range(2))
     asked = (near_upright(plant, 0.1, 0.1), (0.0, 0.0))
-    controller.command(0.0, *asked)
+    controller.efforts(0.0, *asked)
     successor.carry_over(controller)
-    expected = controller.command(0.01, *asked)
-    assert successor.command(0.01, *asked) == expected
-    assert stranger.command(0.01, *asked) != expected
+    expected = controller.efforts(0.01, *asked)
+    assert successor.efforts(0.01, *asked) == expected
+    assert stranger.efforts(0.01, *asked) != expected
     with pytest.raises(ParameterError, match=r"the loop is predicted every 0\.01 s; expected states at that period"):
         controller.check(0.002)
 
@@ -80,42 +80,42 @@ def test_integrals_leave_no_offset_of_the_driven_joints_under_a_constant_effort(
     plant = load_mechanism(name)
     push = 0.05 * plant.effort_limits[0]
     driven = list(plant.coordinates.driven)
-    plain = _Run(plant, make_joint_controller("lqr", plant, {}, PERIOD), push=push)
-    controller = make_joint_controller("lqi", plant, {}, PERIOD)
+    plain = _Run(plant, make_controller("lqr", plant, PERIOD), push=push)
+    controller = make_controller("lqi", plant, PERIOD)
     assert np.abs(plain.deviations[-1][driven]).max() > 0.01
     assert np.abs(_Run(plant, controller, push=push).deviations[-1][driven]).max() < 0.002
     # Beyond the limit nothing is wound up.
     controller.reset()
-    fresh = controller.command(0.0, near_upright(plant, 0.0, 0.0), (0.0, 0.0))
+    fresh = controller.efforts(0.0, near_upright(plant, 0.0, 0.0), (0.0, 0.0))
     for k in range(200):
-        far = controller.command(k * PERIOD, near_upright(plant, 0.0, 1.0), (0.0, 0.0))
+        far = controller.efforts(k * PERIOD, near_upright(plant, 0.0, 1.0), (0.0, 0.0))
     assert max(map(abs, far)) == max(plant.effort_limits)
-    assert controller.command(2.0, near_upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
+    assert controller.efforts(2.0, near_upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
     # Another weight does not let go of what the integrals hold; who begins anew does.
     _Run(plant, controller, push=push)
     controller.reset()
-    assert controller.command(0.0, near_upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
+    assert controller.efforts(0.0, near_upright(plant, 0.0, 0.0), (0.0, 0.0)) == fresh
     _Run(plant, controller, push=push)
-    other = make_joint_controller("lqi", plant, {"q_integral": 30.0}, PERIOD)
+    other = make_controller("lqi", plant, PERIOD, {"q_integral": 30.0})
     other.carry_over(controller)
     upright = (plant.coordinates.goal, (0.0, 0.0))
-    held = controller.command(0.0, *upright)
+    held = controller.efforts(0.0, *upright)
     assert held[0] < -0.8 * push
-    assert other.command(0.0, *upright) == pytest.approx(held)
+    assert other.efforts(0.0, *upright) == pytest.approx(held)
     with pytest.raises(ParameterError, match=r"it is integrated every 0\.01 s"):
         controller.check(0.002)
     with pytest.raises(ParameterError, match=r"lqi asked every 1 s does not settle"):
-        make_joint_controller("lqi", plant, {}, 1.0)
+        make_controller("lqi", plant, 1.0)
     # Designed before anybody knows the period, it is judged when that turns out to be the assumed one.
     with pytest.raises(ParameterError, match=r"lqi asked every 0\.01 s does not settle on plant 'furuta'"):
-        make_joint_controller("lqi", delayed_plant("furuta", 0.012), {}).check(PERIOD)
+        make_controller("lqi", delayed_plant("furuta", 0.012), 0.01, checked=False).check(PERIOD)
 
 
 @pytest.mark.parametrize("name", ["cart_pole", "acrobot_frictionless", "double_pendulum"])
 def test_an_integral_unwinds_at_the_limit_joint_by_joint_whatever_the_sign_of_its_gain(name: str) -> None:
     plant = load_mechanism(name)
     driven, n = plant.coordinates.driven, len(plant.joints)
-    controller = make_joint_controller("lqi", plant, {}, PERIOD)
+    controller = make_controller("lqi", plant, PERIOD)
     own = np.diag(controller.gain.rows[:, 2 * n :])
     hold = tuple(0.0 for _ in range(n))
     for count, joint in enumerate(driven):
@@ -124,7 +124,7 @@ def test_an_integral_unwinds_at_the_limit_joint_by_joint_whatever_the_sign_of_it
         side = [0.0] * n
         side[joint] = 1e-3
         for k in range(1000):
-            controller.command(k * PERIOD, near_upright(plant, *side), hold)
+            controller.efforts(k * PERIOD, near_upright(plant, *side), hold)
         filled = controller._integral.copy()
         assert filled[count] == pytest.approx(10.0 * 1e-3, rel=1e-6)
         fast = np.linalg.lstsq(controller.gain.rows[:, n : 2 * n], np.eye(len(driven))[count], rcond=None)[0]
@@ -133,7 +133,7 @@ def test_an_integral_unwinds_at_the_limit_joint_by_joint_whatever_the_sign_of_it
             before = controller._integral.copy()
             side[joint] = sign * 1e-3
             for k in range(100):
-                efforts = controller.command(k * PERIOD, near_upright(plant, *side), velocity)
+                efforts = controller.efforts(k * PERIOD, near_upright(plant, *side), velocity)
                 assert abs(efforts[count]) == plant.effort_limits[count]
             # Away from the limit it goes, further beyond it does not, and no other joint's moves.
             change = controller._integral - before
@@ -143,14 +143,14 @@ def test_an_integral_unwinds_at_the_limit_joint_by_joint_whatever_the_sign_of_it
 
 def test_the_spectral_radius_of_a_loop_with_integrals_is_that_of_the_law_as_it_answers() -> None:
     plant = lagging_plant(delayed_plant("double_pendulum", 0.003), 0.01)
-    controller = make_joint_controller("lqi", plant, {"q_integral": 50.0}, PERIOD)
+    controller = make_controller("lqi", plant, PERIOD, {"q_integral": 50.0})
     controller.effort_limits = (math.inf, math.inf)
     model = linearise(plant)
     sampled, goal = discretise(model, PERIOD), np.array(plant.coordinates.goal)
     columns = []
     for start in 1e-3 * np.eye(len(sampled.A) + 2):
         z, controller._integral = start[:-2], start[-2:]
-        u = controller.command(0.0, tuple(map(float, goal + z[:2])), tuple(map(float, z[2:4])))
+        u = controller.efforts(0.0, tuple(map(float, goal + z[:2])), tuple(map(float, z[2:4])))
         columns.append(1e3 * np.array([*(sampled.A @ z + sampled.B @ u), *controller._integral]))
     found = float(np.abs(np.linalg.eigvals(np.array(columns).T)).max())
     K = controller.gain.rows * np.array([1.0] * 4 + [PERIOD] * 2)
@@ -160,16 +160,16 @@ def test_the_spectral_radius_of_a_loop_with_integrals_is_that_of_the_law_as_it_a
 @pytest.mark.parametrize("name", ["lqi", "lqg", "discrete_lqr"])
 def test_the_limit_that_is_given_holds(name: str) -> None:
     plant = load_mechanism("cart_pole")
-    controller = make_joint_controller(name, plant, {"effort_limit": 2.0}, PERIOD)
+    controller = make_controller(name, plant, PERIOD, {"effort_limit": 2.0})
     for side in (1.0, -1.0):
-        (effort,) = controller.command(0.0, near_upright(plant, 0.0, side), (0.0, 0.0))
+        (effort,) = controller.efforts(0.0, near_upright(plant, 0.0, side), (0.0, 0.0))
         assert abs(effort) == 2.0
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.013])
 def test_what_the_filter_predicts_comes(delay: float) -> None:
     plant = delayed_plant("cart_pole", delay)
-    controller = make_joint_controller("lqg", plant, {}, PERIOD)
+    controller = make_controller("lqg", plant, PERIOD)
     simulated = MechanismPlant(plant, dt=PERIOD)
     state = simulated.reset(near_upright(plant, 0.0, 0.002))
     surprises, states = [], []
@@ -177,7 +177,7 @@ def test_what_the_filter_predicts_comes(delay: float) -> None:
         states.append(np.array([*plant.coordinates.deviation(state.position), *state.velocity]))
         if controller._predicted is not None:
             surprises.append(np.abs(states[-1] - controller._predicted))
-        state = simulated.step(controller.command(k * PERIOD, state.position, state.velocity))
+        state = simulated.step(controller.efforts(k * PERIOD, state.position, state.velocity))
     assert np.max(surprises) < 0.05 * np.max(np.abs(np.diff(states, axis=0)))
 
 
@@ -191,7 +191,7 @@ def test_the_gain_with_integrals_is_that_of_python_control(name: str) -> None:
     B = np.vstack([model.B, np.zeros((m, m))])
     q, r = plant.mechanism.weights
     K, _, _ = control.lqr(A, B, np.diag([*q, *(10.0,) * m]), r * np.eye(m))
-    controller = make_joint_controller("lqi", plant, {}, PERIOD)
+    controller = make_controller("lqi", plant, PERIOD)
     assert pytest.approx(K, rel=1e-6, abs=1e-9) == controller.gain.rows
 
 
@@ -200,8 +200,8 @@ def test_the_gain_with_integrals_is_that_of_python_control(name: str) -> None:
 def test_the_filter_asks_for_a_fraction_of_the_effort_where_velocities_are_noise(name: str, delay: float) -> None:
     plant = delayed_plant(name, delay)
     noise = (2e-4, 0.05)
-    plain = _Run(plant, make_joint_controller("discrete_lqr", plant, {}, PERIOD), noise=noise)
-    filtered = _Run(plant, make_joint_controller("lqg", plant, {}, PERIOD), noise=noise)
+    plain = _Run(plant, make_controller("discrete_lqr", plant, PERIOD), noise=noise)
+    filtered = _Run(plant, make_controller("lqg", plant, PERIOD), noise=noise)
     late = slice(-500, None)
     assert np.abs(filtered.deviations[late]).max() < 0.03
     if name == "furuta":  # its LQR is calm, and its dry friction hides what is left
@@ -219,7 +219,7 @@ def test_the_filter_is_that_of_python_control_and_uses_velocities_where_their_no
         ({**values, "velocity_noise": 0.0}, np.eye(2, 4), 1e-6 * np.eye(2)),
         (values, np.eye(4), np.diag([1e-6, 1e-6, 4e-4, 4e-4])),
     ):
-        controller = make_joint_controller("lqg", plant, chosen, PERIOD)
+        controller = make_controller("lqg", plant, PERIOD, chosen)
         _, P, _ = control.dlqe(sampled.A, E, C, 0.09 * np.eye(2), V)
         L = P @ C.T @ np.linalg.inv(C @ P @ C.T + V)
         assert pytest.approx(L, rel=1e-6, abs=1e-9) == controller.filter.L
@@ -228,13 +228,13 @@ def test_the_filter_is_that_of_python_control_and_uses_velocities_where_their_no
 
 def test_the_filter_follows_its_model_through_delay_and_whole_turns_and_forgets_what_is_beyond_all_bounds() -> None:
     plant = delayed_plant("pendubot_frictionless", 0.013)
-    controller = make_joint_controller("lqg", plant, {}, PERIOD)
+    controller = make_controller("lqg", plant, PERIOD)
     run = _Run(plant, controller)
     assert np.abs(run.deviations[-1]).max() < 1e-4
     # A turn of the elbow is no surprise: its deviation jumps from one end of the circle to the other.
     controller.reset()
     near, beyond = (near_upright(plant, 0.0, side * (math.pi - 1e-3)) for side in (1.0, -1.0))
-    controller.command(0.0, near, (0.0, 0.2))
+    controller.efforts(0.0, near, (0.0, 0.2))
     estimate = controller._state(beyond, (0.0, 0.2))
     assert abs(estimate[1]) == pytest.approx(math.pi, abs=0.1)
     assert abs(estimate[3]) < 3.0
@@ -242,15 +242,15 @@ def test_the_filter_follows_its_model_through_delay_and_whole_turns_and_forgets_
     controller.reset()
     assert controller._state(near, (0.3, 0.2)) == pytest.approx([0.0, math.pi - 1e-3, 0.3, 0.2])
     controller.reset()
-    controller.command(0.0, plant.coordinates.goal, (sys.float_info.max, 0.0))
+    controller.efforts(0.0, plant.coordinates.goal, (sys.float_info.max, 0.0))
     assert controller._state(plant.coordinates.goal, (0.1, 0.2)) == pytest.approx([0.0, 0.0, 0.1, 0.2])
     # Who takes over goes on with the estimate.
     controller.reset()
-    controller.command(0.0, near_upright(plant, 0.01, 0.0), (0.5, 0.0))
-    successor = make_joint_controller("lqg", plant, {}, PERIOD)
+    controller.efforts(0.0, near_upright(plant, 0.01, 0.0), (0.5, 0.0))
+    successor = make_controller("lqg", plant, PERIOD)
     successor.carry_over(controller)
     here = (near_upright(plant, 0.015, 0.0), (0.0, 0.0))
-    assert successor.command(0.01, *here) == controller.command(0.01, *here)
+    assert successor.efforts(0.01, *here) == controller.efforts(0.01, *here)
 
 
 def test_a_covariance_of_few_causes_is_taken_and_a_negative_one_refused() -> None:

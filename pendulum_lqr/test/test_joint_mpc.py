@@ -12,7 +12,7 @@ import scipy.integrate
 import scipy.linalg
 import scipy.optimize
 
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.controllers.joint_mpc import JointMpc
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
@@ -31,12 +31,12 @@ PERIOD = 0.01
 @pytest.mark.parametrize(("period", "horizon"), [(0.002, 50), (0.05, 20), (0.02, 200)])
 def test_without_active_limits_it_is_the_discrete_lqr(name: str, period: float, horizon: int) -> None:
     plant = load_mechanism(name)
-    controller = make_joint_controller("mpc", plant, {"horizon": horizon}, period)
+    controller = make_controller("mpc", plant, period, {"horizon": horizon})
     model = linearise(plant)
     cost = sampled_cost(model, *plant.mechanism.weights, period)
     K = np.atleast_2d(discrete_lqr(discretise(model, period), *cost).K)
     x = np.array([1e-3, -1e-3, 2e-3, -1e-3])
-    effort = controller.command(0.0, near_upright(plant, *x[:2]), tuple(x[2:]))
+    effort = controller.efforts(0.0, near_upright(plant, *x[:2]), tuple(x[2:]))
     expected = np.array(model.efforts) - K @ x
     assert np.abs(expected).max() < min(plant.effort_limits)
     assert effort == pytest.approx(expected, rel=1e-3, abs=1e-4 * max(plant.effort_limits))
@@ -111,11 +111,11 @@ def test_two_inputs_with_limits_of_their_own_and_two_positions_are_planned_as_by
 ) -> None:
     plant = load_mechanism("double_pendulum").with_values({"shoulder.effort_limit": 3.0, "elbow.effort_limit": 1.0})
     widths = [0.04, 0.1]
-    controller = make_joint_controller("mpc", plant, {"horizon": 6, "position_limits": widths}, 0.02)
+    controller = make_controller("mpc", plant, 0.02, {"horizon": 6, "position_limits": widths})
     assert isinstance(controller, JointMpc)
     state = sign * np.array(x)
     dear = 10.0 * max(plant.mechanism.weights[0])
-    answer = controller.command(0.0, near_upright(plant, *state[:2]), tuple(state[2:]))
+    answer = controller.efforts(0.0, near_upright(plant, *state[:2]), tuple(state[2:]))
     assert answer == pytest.approx(_planned(controller, state, widths, dear), abs=5e-3)
 
 
@@ -126,12 +126,12 @@ def test_a_cart_that_an_lqr_lets_hit_the_end_of_its_track_stops_before_it(
     plant = load_mechanism("cart_pole")
     farthest = {}
     for kind in ("lqr", "mpc"):
-        controller = make_joint_controller(kind, plant, {}, PERIOD)
+        controller = make_controller(kind, plant, PERIOD)
         cart = MechanismPlant(plant, PERIOD)
         state = cart.reset((place, math.pi + tilt), (velocity, 0.0))
         way = [place]
         for _ in range(500):
-            state = cart.step(controller.command(state.time, state.position, state.velocity))
+            state = cart.step(controller.efforts(state.time, state.position, state.velocity))
             way.append(state.position[0])
         assert np.abs(plant.coordinates.deviation(state.position)).max() < 0.02, kind
         farthest[kind] = max(way)
@@ -143,15 +143,15 @@ def test_a_cart_that_an_lqr_lets_hit_the_end_of_its_track_stops_before_it(
 @pytest.mark.parametrize(("period", "horizon", "enough"), [(0.002, 50, False), (0.005, 50, True), (0.01, 10, False)])
 def test_it_says_when_it_looks_less_far_ahead_than_a_pole_falls(period: float, horizon: int, enough: bool) -> None:
     plant = load_mechanism("cart_pole")
-    controller = make_joint_controller("mpc", plant, {"horizon": horizon}, period)
+    controller = make_controller("mpc", plant, period, {"horizon": horizon})
     assert ("s ahead, and to keep clear of a limit it may let fall" in controller.notice) is not enough
     # Without limits of positions its last cost sees all that comes.
-    free = make_joint_controller("mpc", plant, {"horizon": horizon, "position_limits": [0.0, 0.0]}, period)
+    free = make_controller("mpc", plant, period, {"horizon": horizon, "position_limits": [0.0, 0.0]})
     assert free.notice == ""
     cart = MechanismPlant(plant, period)
     state = cart.reset((1.65, math.pi), (0.3, 0.0))
     for _ in range(round(1.5 / period)):
-        state = cart.step(controller.command(state.time, state.position, state.velocity))
+        state = cart.step(controller.efforts(state.time, state.position, state.velocity))
     assert (abs(plant.coordinates.deviation(state.position)[1]) < 0.5) is enough
 
 
@@ -159,11 +159,11 @@ def test_a_pole_that_may_not_lean_far_leans_less_far() -> None:
     plant = load_mechanism("cart_pole")
     leaned = []
     for widest in (0.0, 0.03):
-        controller = make_joint_controller("mpc", plant, {"position_limits": [0.0, widest]}, PERIOD)
+        controller = make_controller("mpc", plant, PERIOD, {"position_limits": [0.0, widest]})
         cart = MechanismPlant(plant, PERIOD)
         state, way = cart.reset((0.8, math.pi)), []
         for _ in range(800):
-            state = cart.step(controller.command(state.time, state.position, state.velocity))
+            state = cart.step(controller.efforts(state.time, state.position, state.velocity))
             way.append(abs(state.position[1] - math.pi))
         assert np.abs(plant.coordinates.deviation(state.position)).max() < 0.02
         leaned.append(max(way))
@@ -175,32 +175,32 @@ def test_an_effort_that_holds_upright_is_within_the_limits_and_not_on_its_way(mo
     plant = delayed_plant("acrobot_frictionless", PERIOD)
     weighted = replace(linearise(plant), efforts=(2.0,))
     monkeypatch.setattr("pendulum_lqr.controllers.joint_lqr.linearise", lambda _: weighted)
-    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    controller = make_controller("mpc", plant, PERIOD)
     for _ in range(3):
-        assert controller.command(0.0, plant.coordinates.goal, (0.0, 0.0)) == pytest.approx((2.0,), abs=1e-4)
+        assert controller.efforts(0.0, plant.coordinates.goal, (0.0, 0.0)) == pytest.approx((2.0,), abs=1e-4)
     limit = plant.effort_limits[0]
-    far = [controller.command(0.0, near_upright(plant, sign * 0.5, 0.0), (0.0, 0.0))[0] for sign in (-1.0, 1.0)]
+    far = [controller.efforts(0.0, near_upright(plant, sign * 0.5, 0.0), (0.0, 0.0))[0] for sign in (-1.0, 1.0)]
     assert sorted(map(abs, far)) == pytest.approx([limit, limit], abs=1e-3)
     assert far[0] * far[1] < 0.0
 
 
 def test_begun_anew_it_gives_the_same_answers_to_the_last_bit() -> None:
     plant = load_mechanism("cart_pole")
-    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    controller = make_controller("mpc", plant, PERIOD)
     runs = []
     for _ in range(2):
         controller.reset()
-        runs.append([controller.command(0.0, (1.6 + 0.01 * k, math.pi), (0.5, 0.1)) for k in range(20)])
+        runs.append([controller.efforts(0.0, (1.6 + 0.01 * k, math.pi), (0.5, 0.1)) for k in range(20)])
     assert runs[0] == runs[1]
 
 
 def test_it_asks_for_no_more_than_each_limit_and_plans_with_it() -> None:
     plant = load_mechanism("cart_pole")
-    controller = make_joint_controller("mpc", plant, {"effort_limit": 3.0}, PERIOD)
+    controller = make_controller("mpc", plant, PERIOD, {"effort_limit": 3.0})
     cart = MechanismPlant(plant, PERIOD)
     state, asked = cart.reset((0.0, math.pi + 0.15)), []
     for _ in range(500):
-        asked.append(controller.command(state.time, state.position, state.velocity)[0])
+        asked.append(controller.efforts(state.time, state.position, state.velocity)[0])
         state = cart.step((asked[-1],))
     assert max(map(abs, asked)) == pytest.approx(3.0, abs=1e-3)
     assert max(map(abs, asked)) <= 3.0
@@ -209,27 +209,27 @@ def test_it_asks_for_no_more_than_each_limit_and_plans_with_it() -> None:
 
 def test_what_is_on_its_way_counts() -> None:
     plant = delayed_plant("acrobot_frictionless", 0.015)
-    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    controller = make_controller("mpc", plant, PERIOD)
     model = linearise(plant)
     gain = discrete_lqr(discretise(model, PERIOD), *sampled_cost(model, *plant.mechanism.weights, PERIOD))
     x = np.array([1e-3, 0.0, 0.0, 0.0])
     sent = [0.0, 0.0]
     for _ in range(4):
-        effort = controller.command(0.0, near_upright(plant, *x[:2]), tuple(x[2:]))[0]
+        effort = controller.efforts(0.0, near_upright(plant, *x[:2]), tuple(x[2:]))[0]
         assert effort == pytest.approx(-float(gain.K @ [*x, *sent]), rel=1e-3, abs=1e-4)
         sent = [sent[1], effort]
     # Designed anew at the same period, it knows what the one before has sent; begun anew, nothing is on its way.
-    after = make_joint_controller("mpc", plant, {"q": [20.0, 10.0, 1.0, 1.0]}, PERIOD)
+    after = make_controller("mpc", plant, PERIOD, {"q": [20.0, 10.0, 1.0, 1.0]})
     assert isinstance(after, JointMpc)
     after.carry_over(controller)
     assert [effort for (effort,) in after._on_their_way] == pytest.approx(sent)
     # At another period it is another time that they take.
-    slower = make_joint_controller("mpc", plant, {}, 0.02)
+    slower = make_controller("mpc", plant, 0.02)
     assert isinstance(slower, JointMpc)
     slower.carry_over(controller)
     assert set(slower._on_their_way) == {(0.0,)}
     controller.reset()
-    assert controller.command(0.0, near_upright(plant, *x[:2]), tuple(x[2:]))[0] == pytest.approx(
+    assert controller.efforts(0.0, near_upright(plant, *x[:2]), tuple(x[2:]))[0] == pytest.approx(
         -float(gain.K @ [*x, 0.0, 0.0]), rel=1e-3, abs=1e-4
     )
 
@@ -237,36 +237,36 @@ def test_what_is_on_its_way_counts() -> None:
 @pytest.mark.parametrize("name", ["acrobot_frictionless", "furuta"])
 def test_it_settles_a_plant_with_delay(name: str) -> None:
     plant = delayed_plant(name, 0.012)
-    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    controller = make_controller("mpc", plant, PERIOD)
     simulated = MechanismPlant(plant, PERIOD)
     state = simulated.reset(near_upright(plant, 0.01, -0.01))
     for _ in range(600):
-        state = simulated.step(controller.command(state.time, state.position, state.velocity))
+        state = simulated.step(controller.efforts(state.time, state.position, state.velocity))
     assert np.abs(plant.coordinates.deviation(state.position)).max() < 2e-3
 
 
 def test_where_the_solver_finds_no_plan_the_limited_lqr_answers_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     plant = load_mechanism("cart_pole")
-    controller = make_joint_controller("mpc", plant, {}, PERIOD)
+    controller = make_controller("mpc", plant, PERIOD)
     assert isinstance(controller, JointMpc)
     assert controller.notice == ""
     monkeypatch.setattr(controller._program, "first", lambda *_: None)
     x = np.array([0.01, 0.02, 0.0, 0.0])
     expected = -float(np.atleast_2d(controller.gain.K)[0] @ x)
-    assert controller.command(0.0, near_upright(plant, *x[:2]), (0.0, 0.0)) == pytest.approx((expected,))
-    assert controller.command(0.0, near_upright(plant, 0.0, 1.0), (0.0, 0.0)) == (-plant.effort_limits[0],)
+    assert controller.efforts(0.0, near_upright(plant, *x[:2]), (0.0, 0.0)) == pytest.approx((expected,))
+    assert controller.efforts(0.0, near_upright(plant, 0.0, 1.0), (0.0, 0.0)) == (-plant.effort_limits[0],)
     assert controller.notice == "no plan for 2 states: the LQR answered"
 
 
 @pytest.mark.parametrize("wild", [1e3, 1e12, 1e300])
 def test_a_wild_state_leaves_nothing_behind(wild: float) -> None:
     plant = load_mechanism("cart_pole")
-    controller, fresh = (make_joint_controller("mpc", plant, {}, PERIOD) for _ in range(2))
-    assert controller.command(0.0, near_upright(plant, 0.1, 0.1), (wild, -wild)) == (plant.effort_limits[0],)
+    controller, fresh = (make_controller("mpc", plant, PERIOD) for _ in range(2))
+    assert controller.efforts(0.0, near_upright(plant, 0.1, 0.1), (wild, -wild)) == (plant.effort_limits[0],)
     assert controller.notice == "no plan for 1 states: the LQR answered"
     for k in range(5):
         state = near_upright(plant, 0.1 * k, 0.1 - 0.02 * k), (0.3, 0.5 - 0.1 * k)
-        assert controller.command(0.0, *state) == fresh.command(0.0, *state)
+        assert controller.efforts(0.0, *state) == fresh.efforts(0.0, *state)
     assert controller.notice == "no plan for 1 states: the LQR answered"
     assert fresh.notice == ""
 
@@ -275,7 +275,7 @@ def test_what_a_solver_cannot_tell_the_lqr_answers_with_its_signs() -> None:
     plant = load_mechanism("double_pendulum")
     for wild in (1e6, 1e12):
         answers = [
-            make_joint_controller(kind, plant, {}, PERIOD).command(0.0, plant.coordinates.goal, (wild, -wild))
+            make_controller(kind, plant, PERIOD).efforts(0.0, plant.coordinates.goal, (wild, -wild))
             for kind in ("discrete_lqr", "mpc")
         ]
         assert answers[0] == answers[1]
@@ -283,7 +283,7 @@ def test_what_a_solver_cannot_tell_the_lqr_answers_with_its_signs() -> None:
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_state_that_is_not_finite_is_not_answered(bad: float) -> None:
-    loop = AnswerLoop(make_joint_controller("mpc", load_mechanism("furuta"), {}, PERIOD), math.inf)
+    loop = AnswerLoop(make_controller("mpc", load_mechanism("furuta"), PERIOD), math.inf)
     assert loop.answer(JointSample(1, (0.0, bad), (0.0, 0.0), (0.0, 0.0)), 1) is None
     assert loop.answered == 0
 
@@ -301,19 +301,19 @@ def test_positions_are_limited_where_there_are_end_stops_and_wherever_somebody_s
         widths = next(spec.default for spec in JointMpc.parameters(plant) if spec.name == "position_limits")
         assert widths == pytest.approx(expected)
     with pytest.raises(ParameterError, match=r"position_limits has 1 values; expected 2, for cart, pole"):
-        make_joint_controller("mpc", load_mechanism("cart_pole"), {"position_limits": [1.0]}, PERIOD)
-    told = make_joint_controller("mpc", load_mechanism("cart_pole"), {"position_limits": [0.5, 0.0]}, PERIOD)
+        make_controller("mpc", load_mechanism("cart_pole"), PERIOD, {"position_limits": [1.0]})
+    told = make_controller("mpc", load_mechanism("cart_pole"), PERIOD, {"position_limits": [0.5, 0.0]})
     assert "positions within [0.5, none]" in told.describe()
 
 
 @pytest.mark.parametrize("given", [{"position_limits": [1e-200, 0.0]}, {"effort_limit": 1e-300}])
 def test_limits_that_no_solver_takes_are_refused_in_words(given: dict[str, object]) -> None:
     with pytest.raises(ParameterError, match=r"limits of efforts \[.*\] and of states \[.*\] .* too far from one"):
-        make_joint_controller("mpc", load_mechanism("cart_pole"), given, PERIOD)
+        make_controller("mpc", load_mechanism("cart_pole"), PERIOD, given)
 
 
 def test_another_period_than_that_of_the_design_is_refused() -> None:
-    controller = make_joint_controller("mpc", load_mechanism("cart_pole"), {}, PERIOD)
+    controller = make_controller("mpc", load_mechanism("cart_pole"), PERIOD)
     controller.check(0.0101)
     with pytest.raises(ParameterError, match=r"the loop is predicted every 0\.01 s; expected states at that period"):
         controller.check(0.002)

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pendulum_lqr.controller_interface.controller import make_controller
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
 from pendulum_lqr.policies.onnx_file import observation_names
 from pendulum_lqr.policies.policy_file import dumps_policy, load_policy, loads_policy, write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
@@ -30,7 +29,8 @@ STILL = ((0.0, math.pi), (0.0, 0.0))
 def controller(tmp_path, policy, plant=CART_POLE, period=0.01, **values):
     """Return the controller of a policy, with all of its effort from the start unless told otherwise."""
     path = write_policy(tmp_path / "policy.npz", policy)
-    return make_joint_controller("policy", plant, {"policy": str(path), "start_time": 0.0, **values}, period)
+    given = {"policy": str(path), "start_time": 0.0, **values}
+    return make_controller("policy", plant, period or 0.01, given, checked=period is not None)
 
 
 def with_header(content, **changes):
@@ -64,7 +64,7 @@ def test_a_sample_holds_each_signal_of_the_joints_that_have_it_signal_by_signal(
     rows, efforts = [], [0.0]
     for k, (x, angle, v, rate) in enumerate([(0.1, 3.0, -0.4, 2.0), (0.2, -0.3, 0.6, -7.0)]):
         rows.append([-math.cos(angle), -math.sin(angle), x / 0.5, v / 2.0, rate / 5.0, efforts[-1] / 10.0])
-        efforts += learned.command(0.01 * k, (x, angle), (v, rate))
+        efforts += learned.efforts(0.01 * k, (x, angle), (v, rate))
     whole = np.array([[*rows[0], *rows[0]], [*rows[0], *rows[1]]], dtype=np.float32)
     assert efforts[1:] == pytest.approx(10.0 * policy.network.answer(whole)[:, 0], abs=1e-4)
 
@@ -74,12 +74,12 @@ def test_each_driven_joint_gets_its_own_answer_within_its_own_limit_and_rate(tmp
     learned = controller(tmp_path, policy, DOUBLE)
     rng = np.random.default_rng(0)
     states = rng.uniform(-3.0, 3.0, (300, 2, 2))
-    efforts = np.array([learned.command(0.01 * k, tuple(q), tuple(v)) for k, (q, v) in enumerate(states)])
+    efforts = np.array([learned.efforts(0.01 * k, tuple(q), tuple(v)) for k, (q, v) in enumerate(states)])
     assert np.all(np.abs(efforts) <= [6.0, 2.0])
     steps = np.abs(np.diff(efforts, axis=0, prepend=0.0)).max(axis=0)
     assert steps == pytest.approx([1.0, 0.1])
     small = controller(tmp_path, policy, DOUBLE, effort_limit=0.05)
-    assert np.abs([small.command(0.01 * k, tuple(q), tuple(v)) for k, (q, v) in enumerate(states)]).max() == 0.05
+    assert np.abs([small.efforts(0.01 * k, tuple(q), tuple(v)) for k, (q, v) in enumerate(states)]).max() == 0.05
 
 
 @pytest.mark.parametrize(
@@ -94,13 +94,13 @@ def test_each_driven_joint_gets_its_own_answer_within_its_own_limit_and_rate(tmp
 )
 def test_outside_of_the_box_of_any_joint_it_gives_up_for_good_and_names_it(tmp_path, position, velocity, told):
     learned = controller(tmp_path, random_policy(CART_POLE, seed=4))
-    assert learned.command(0.0, *STILL) != (0.0,)
-    assert learned.command(0.01, position, velocity) == (0.0,)
-    assert learned.command(0.02, *STILL) == (0.0,)
+    assert learned.efforts(0.0, *STILL) != (0.0,)
+    assert learned.efforts(0.01, position, velocity) == (0.0,)
+    assert learned.efforts(0.02, *STILL) == (0.0,)
     assert told in learned.notice
     assert learned.notice in learned.describe()
     learned.reset()
-    assert learned.command(0.0, *STILL) != (0.0,)
+    assert learned.efforts(0.0, *STILL) != (0.0,)
 
 
 def test_a_fallback_or_a_catch_that_does_not_settle_is_refused_as_soon_as_the_period_is_known(tmp_path):
@@ -117,53 +117,53 @@ def test_a_fallback_or_a_catch_that_does_not_settle_is_refused_as_soon_as_the_pe
 
 def test_a_chosen_fallback_answers_after_it_gave_up_and_begins_softly(tmp_path):
     learned = controller(tmp_path, random_policy(CART_POLE, velocity_box=(1.0, 1.0)), fallback="lqr", start_time=0.2)
-    lqr = make_joint_controller("lqr", CART_POLE, {}, 0.01)
+    lqr = make_controller("lqr", CART_POLE, 0.01)
     state = ((0.1, math.pi + 0.1), (2.0, 0.0))
-    efforts = [learned.command(0.01 * k, *state)[0] for k in range(30)]
+    efforts = [learned.efforts(0.01 * k, *state)[0] for k in range(30)]
     assert efforts[0] == 0.0
     assert abs(efforts[1]) == pytest.approx(0.5)
-    assert efforts[-1] == lqr.command(0.0, *state)[0] != 0.0
+    assert efforts[-1] == lqr.efforts(0.0, *state)[0] != 0.0
 
 
 def test_a_catch_takes_over_near_upright_and_the_policy_goes_on_from_its_efforts(tmp_path):
     policy = random_policy(CART_POLE, effort_rate=(20.0,), seed=5)
     bare, caught = controller(tmp_path, policy), controller(tmp_path, policy, catch="lqr")
-    lqr = make_joint_controller("lqr", CART_POLE, {}, 0.01)
+    lqr = make_controller("lqr", CART_POLE, 0.01)
     near, far = ((0.02, math.pi + 0.05), (0.1, 0.0)), ((0.1, 1.0), (0.1, 1.0))
     assert "LQR within x'Sx <=" in caught.describe()
     assert "LQR within" not in bare.describe()
     for k in range(3):
-        assert caught.command(0.01 * k, *far) == bare.command(0.01 * k, *far)
-    effort = caught.command(0.03, *near)[0]
-    assert effort == pytest.approx(lqr.command(0.03, *near)[0])
-    assert abs(effort - bare.command(0.03, *near)[0]) > 1.0
+        assert caught.efforts(0.01 * k, *far) == bare.efforts(0.01 * k, *far)
+    effort = caught.efforts(0.03, *near)[0]
+    assert effort == pytest.approx(lqr.efforts(0.03, *near)[0])
+    assert abs(effort - bare.efforts(0.03, *near)[0]) > 1.0
     # Its rate is limited from what acted, 0.2 N in a period.
-    assert caught.command(0.04, *far)[0] == pytest.approx(effort, abs=0.2 + 1e-9)
+    assert caught.efforts(0.04, *far)[0] == pytest.approx(effort, abs=0.2 + 1e-9)
     # Who gave up is not caught: its fallback answers.
-    caught.command(0.05, *near)
+    caught.efforts(0.05, *near)
     assert caught.catch.active
-    caught.command(0.06, (0.9, 0.0), (0.0, 0.0))
-    assert caught.command(0.07, *near) == (0.0,)
+    caught.efforts(0.06, (0.9, 0.0), (0.0, 0.0))
+    assert caught.efforts(0.07, *near) == (0.0,)
     caught.reset()
     assert not caught.catch.active
     # A state between the region's edge and twice that is held on by who holds already, after new parameters too.
     level, S = caught.catch.region.level, caught.catch.gain.S
     away = math.sqrt(1.5 * level / S[1, 1])
     between = ((0.0, math.pi + away), (0.0, 0.0))
-    caught.command(0.0, *near)
-    caught.command(0.01, *between)
+    caught.efforts(0.0, *near)
+    caught.efforts(0.01, *between)
     assert caught.catch.active
     changed = controller(tmp_path, policy, catch="lqr", start_time=0.3)
     changed.carry_over(caught)
-    changed.command(0.02, *between)
+    changed.efforts(0.02, *between)
     assert changed.catch.active
     caught.reset()
     assert not caught.catch.active
-    caught.command(0.0, *between)
+    caught.efforts(0.0, *between)
     assert not caught.catch.active
     soft = controller(tmp_path, policy, catch="lqr", start_time=0.2)
-    assert soft.command(0.0, *near) == (0.0,)
-    assert abs(soft.command(0.01, *near)[0]) == pytest.approx(0.5)
+    assert soft.efforts(0.0, *near) == (0.0,)
+    assert abs(soft.efforts(0.01, *near)[0]) == pytest.approx(0.5)
 
 
 def test_with_less_effort_a_catch_holds_fewer_states(tmp_path):
@@ -173,28 +173,28 @@ def test_with_less_effort_a_catch_holds_fewer_states(tmp_path):
     # Deviations that a limited effort brings back grow with it, so the level, a square, falls by far more.
     assert weak.catch.region.level < 0.1 * whole.catch.region.level
     state = ((0.0, math.pi + 0.3 * math.sqrt(whole.catch.region.level / whole.catch.gain.S[1, 1])), (0.0, 0.0))
-    whole.command(0.0, *state)
-    weak.command(0.0, *state)
+    whole.efforts(0.0, *state)
+    weak.efforts(0.0, *state)
     assert whole.catch.active
     assert not weak.catch.active
     near = ((0.0, math.pi + 0.01), (0.0, 0.0))
-    assert abs(weak.command(0.01, *near)[0]) <= 1.0
+    assert abs(weak.efforts(0.01, *near)[0]) <= 1.0
 
 
 def test_torque_begins_at_zero_and_states_at_another_rate_make_it_give_up(tmp_path):
     learned = controller(tmp_path, random_policy(CART_POLE, seed=4), start_time=0.2)
-    efforts = [abs(learned.command(0.01 * k, *STILL)[0]) for k in range(15)]
+    efforts = [abs(learned.efforts(0.01 * k, *STILL)[0]) for k in range(15)]
     assert efforts[0] == 0.0
     assert all(effort <= 10.0 * 0.01 * k / 0.2 + 1e-12 for k, effort in enumerate(efforts))
     for k in range(40):
-        learned.command(1.0 + 0.02 * k, *STILL)
+        learned.efforts(1.0 + 0.02 * k, *STILL)
     assert "states come every 0.02 s; it answers for every 0.01 s" in learned.notice
 
 
 def test_faster_states_get_each_answer_as_often_and_other_periods_are_refused(tmp_path):
     policy = random_policy(CART_POLE, seed=2)
     fast = controller(tmp_path, policy, period=0.002)
-    efforts = [fast.command(0.002 * k, (0.01 * k, 3.0), (0.1, 0.1 * k)) for k in range(20)]
+    efforts = [fast.efforts(0.002 * k, (0.01 * k, 3.0), (0.1, 0.1 * k)) for k in range(20)]
     assert all(len(set(efforts[k : k + 5])) == 1 for k in range(0, 20, 5))
     assert len(set(efforts)) == 4
     with pytest.raises(ParameterError, match=r"period of 0\.01 s and states come every 0\.004 s"):
@@ -207,12 +207,12 @@ def test_a_change_while_it_runs_does_not_forget_the_past(tmp_path):
     policy = random_policy(CART_POLE, effort_rate=(20.0,), seed=5)
     first, second = (controller(tmp_path, policy) for _ in range(2))
     for k in range(5):
-        first.command(0.01 * k, (0.01 * k, 3.0), (0.1, 1.0))
+        first.efforts(0.01 * k, (0.01 * k, 3.0), (0.1, 1.0))
     second.carry_over(first)
-    assert second.command(0.05, *STILL) == first.command(0.05, *STILL)
-    first.command(0.06, (0.9, 0.0), (0.0, 0.0))
+    assert second.efforts(0.05, *STILL) == first.efforts(0.05, *STILL)
+    first.efforts(0.06, (0.9, 0.0), (0.0, 0.0))
     second.carry_over(first)
-    assert second.command(0.07, *STILL) == (0.0,)
+    assert second.efforts(0.07, *STILL) == (0.0,)
 
 
 @pytest.mark.parametrize(
@@ -254,7 +254,7 @@ def test_a_plant_of_other_joints_or_other_motors_is_refused(tmp_path):
     with pytest.raises(ParameterError, match="trained on a plant of one joint, and this one is a cart_pole"):
         controller(tmp_path, one)
     with pytest.raises(ParameterError, match="policy is empty; expected the path of a policy file"):
-        make_joint_controller("policy", CART_POLE, {}, 0.01)
+        make_controller("policy", CART_POLE, 0.01)
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_lqr.controller_interface.controller import CONTROLLERS, make_controller
-from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS
+from pendulum_lqr.controller_interface.controller import CONTROLLERS, Row, make_controller
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.nodes.answering import StateRefusal
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -15,7 +14,7 @@ README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding=
 HOW_TO = (Path(__file__).resolve().parents[2] / "pendulum_msgs_py/docs/bring_your_own.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", sorted({*CONTROLLERS, *JOINT_CONTROLLERS}))
+@pytest.mark.parametrize("name", CONTROLLERS)
 def test_every_controller_is_listed(name):
     assert f"`{name}`" in README
 
@@ -48,7 +47,7 @@ def test_the_example_of_a_new_controller_runs_as_it_stands(tmp_path, monkeypatch
     (tmp_path / "mine_of_the_readme.py").write_text(textwrap.dedent(blocks[0]), encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     importlib.import_module("mine_of_the_readme")
-    monkeypatch.setitem(CONTROLLERS, "mine", "mine_of_the_readme:Mine")
+    monkeypatch.setitem(CONTROLLERS, "mine", Row("mine_of_the_readme:Mine"))
     controller = make_controller("mine", load_plant("thesis"), period=0.01, values={"kp": 20.0})
     assert controller.command(0.0, (0.1, 0.0)) == pytest.approx(-2.0)
     with pytest.raises(DesignError, match="mine makes the loop unstable"):

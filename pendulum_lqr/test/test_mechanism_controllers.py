@@ -7,11 +7,13 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.mechanism_controllers import DifferencedVelocity, make_mechanism_controller
 from pendulum_lqr.linear.design import DesignError, output_lqr
 from pendulum_lqr.linear.model import linearise
@@ -111,28 +113,28 @@ def test_tracking_brings_a_disturbed_swing_up_upright_and_open_loop_does_not(nam
     feedback: Vector = (0.02, -0.02, 0.0, 0.0)
     open_loop = feedback
     for k in range(2500):
-        feedback = step(plant, feedback, controller.command(k * DT, feedback))
-        effort = controller.efforts[k] if k < len(controller.efforts) else (0.0,)
+        feedback = step(plant, feedback, controller.efforts(k * DT, feedback[:2], feedback[2:]))
+        effort = controller.planned[k] if k < len(controller.planned) else (0.0,)
         open_loop = step(plant, open_loop, tuple(float(u) for u in effort))
     assert np.max(np.abs(deviation_of(plant.coordinates, feedback))) < 1e-3
     assert np.max(np.abs(deviation_of(plant.coordinates, open_loop))) > 0.5
     # Thrown far off it gives no effort where nobody recovers it, and does not jump back to the trajectory either.
     controller.reset()
-    controller.command(0.0, (0.0,) * 4)
-    assert controller.command(DT, (1.5, 3.0, 25.0, -25.0)) == (0.0,)
-    assert controller.command(2 * DT, (0.0,) * 4) == (0.0,)
+    controller.efforts(0.0, (0.0, 0.0), (0.0, 0.0))
+    assert controller.efforts(DT, (1.5, 3.0), (25.0, -25.0)) == (0.0,)
+    assert controller.efforts(2 * DT, (0.0, 0.0), (0.0, 0.0)) == (0.0,)
     controller.reset()
-    assert controller.command(0.0, (0.0,) * 4) != (0.0,)
+    assert controller.efforts(0.0, (0.0, 0.0), (0.0, 0.0)) != (0.0,)
 
 
 def test_a_swing_up_begins_at_hanging_whatever_turns_were_made_before() -> None:
     plant = load_mechanism("acrobot_frictionless")
-    controller = make_joint_controller("tvlqr", plant, {}, DT)
-    fresh = [controller.command(k * DT, (0.0, 0.0), (0.0, 0.0)) for k in range(5)]
+    controller = make_controller("tvlqr", plant, DT)
+    fresh = [controller.efforts(k * DT, (0.0, 0.0), (0.0, 0.0)) for k in range(5)]
     for turns in ((1, 0), (-1, 2)):
         controller.reset()
         hanging = (2.0 * math.pi * turns[0], 2.0 * math.pi * turns[1])
-        again = [controller.command(k * DT, hanging, (0.0, 0.0)) for k in range(5)]
+        again = [controller.efforts(k * DT, hanging, (0.0, 0.0)) for k in range(5)]
         assert again == [pytest.approx(effort, abs=1e-9) for effort in fresh]
     assert any(effort != (0.0,) for effort in fresh)
 
@@ -163,37 +165,37 @@ def test_iterative_lqr_and_mpc_bring_a_cart_pole_up_within_its_limits() -> None:
     x: Vector = (0.0,) * 4
     efforts = []
     for k in range(2500):
-        efforts.append(controller.command(k * DT, x))
+        efforts.append(controller.efforts(k * DT, x[:2], x[2:]))
         x = step(plant, x, efforts[-1])
     assert np.max(np.abs(deviation_of(plant.coordinates, x)[1:])) < 0.05
     assert max(abs(effort[0]) for effort in efforts) <= plant.effort_limits[0]
     controller.reset()
-    assert controller.command(0.0, (0.0,) * 4) == efforts[0]
+    assert controller.efforts(0.0, (0.0, 0.0), (0.0, 0.0)) == efforts[0]
     # A first plan takes so long that a plant in real time lets its answer go: the next does not search as long again.
     solved = []
     solve = controller.search.solve
     controller.search.solve = lambda *asked: (solved.append(asked), solve(*asked))[1]  # type: ignore[method-assign]
     controller.reset()
-    controller.command(0.0, (0.0,) * 4)
+    controller.efforts(0.0, (0.0, 0.0), (0.0, 0.0))
     assert len(solved) == PLAN.guesses
     solved.clear()
-    late = controller.command(0.1, (0.0,) * 4)
+    late = controller.efforts(0.1, (0.0, 0.0), (0.0, 0.0))
     assert len(solved) == 1 + RETRIES
     assert controller.search.arrives(controller._plan)
     assert late == pytest.approx(efforts[0], abs=0.5)
     # On the graph it is the same, and begins anew with a plant that begins anew, whatever turns were made before.
-    on_the_graph = make_joint_controller("nmpc", plant, {}, DT)
+    on_the_graph = make_controller("nmpc", plant, DT)
     assert "s by iterative LQR, then LQR within" in on_the_graph.describe()
     # What it was compiled with is no plan.
-    elsewhere = on_the_graph.command(0.0, (0.3, 2.0), (0.5, -1.0))
+    elsewhere = on_the_graph.efforts(0.0, (0.3, 2.0), (0.5, -1.0))
     on_the_graph.reset()
-    assert on_the_graph.command(0.0, (0.3, 2.0), (0.5, -1.0)) == elsewhere
+    assert on_the_graph.efforts(0.0, (0.3, 2.0), (0.5, -1.0)) == elsewhere
     for turned in (0.0, 2.0 * math.pi):
         on_the_graph.reset()
         again = []
         x = (0.0,) * 4
         for k in range(30):
-            again.append(on_the_graph.command(k * DT, (x[0], x[1] + turned), x[2:]))
+            again.append(on_the_graph.efforts(k * DT, (x[0], x[1] + turned), x[2:]))
             x = step(plant, x, again[-1])
         assert np.array(again) == pytest.approx(np.array(efforts[:30]), abs=1e-6)
     on_the_graph.check(DT)
@@ -215,7 +217,7 @@ def test_a_planned_swing_up_is_searched_once_and_anew_only_where_it_is_thrown_of
         searched.clear()
         efforts = []
         for k in range(2500):
-            (effort,) = controller.command(k * DT, x)
+            (effort,) = controller.efforts(k * DT, x[:2], x[2:])
             efforts.append(effort)
             x = step(plant, x, (effort,))
             if k == 200 and kick:
@@ -248,22 +250,22 @@ def test_a_planned_swing_up_is_searched_once_and_anew_only_where_it_is_thrown_of
     there = plan._replace(states=np.tile([*plant.coordinates.goal, 0.0, 0.0, 0.0], (2, 1)), cost=9.0)
     assert min(plan._replace(cost=1.0), there, there._replace(cost=8.0), key=controller._rank).cost == 8.0
     with pytest.raises(ParameterError, match=r"plan begins at .*nan.*; expected finite numbers"):
-        controller.command(0.0, (0.0, math.nan, 0.0, 0.0))
+        controller.efforts(0.0, (0.0, math.nan), (0.0, 0.0))
     # From where every plan runs away from all numbers there is nothing to follow.
-    assert controller.command(0.0, (0.0, 0.0, 1e200, 1e200)) == (0.0,)
+    assert controller.efforts(0.0, (0.0, 0.0), (1e200, 1e200)) == (0.0,)
 
 
 @pytest.mark.timeout(400)
 def test_ilqr_on_the_graph_swings_up_under_the_limit_that_it_was_given_and_gives_nothing_where_it_is_lost() -> None:
     plant = load_mechanism("cart_pole")
     limit = 0.8 * plant.effort_limits[0]
-    controller = make_joint_controller("ilqr", plant, {"guesses": 4, "effort_limit": limit}, 0.01)
+    controller = make_controller("ilqr", plant, 0.01, {"guesses": 4, "effort_limit": limit})
     assert "swing-up of 4 s by TVLQR, then LQR within" in controller.describe()
     simulated = MechanismPlant(plant, dt=0.01)
     q, v = (0.0, 0.0), (0.0, 0.0)
     efforts, way = [], []
     for k in range(600):
-        (effort,) = controller.command(0.01 * k, q, v)
+        (effort,) = controller.efforts(0.01 * k, q, v)
         state = simulated.step((effort,))
         q, v = state.position, state.velocity
         efforts.append(abs(effort))
@@ -272,9 +274,9 @@ def test_ilqr_on_the_graph_swings_up_under_the_limit_that_it_was_given_and_gives
     assert 0.5 * limit < max(efforts) <= limit
     assert max(way) < plant.stops[0][1]
     controller.reset()
-    assert controller.command(0.0, (0.5, 1.0), (0.0, 3.0)) == (0.0,)
+    assert controller.efforts(0.0, (0.5, 1.0), (0.0, 3.0)) == (0.0,)
     # It stays lost: a trajectory that was left is not found again by chance.
-    assert controller.command(0.01, (0.0, 0.0), (0.0, 0.0)) == (0.0,)
+    assert controller.efforts(0.01, (0.0, 0.0), (0.0, 0.0)) == (0.0,)
     with pytest.raises(ParameterError, match=r"the trajectory is followed every 0\.01 s"):
         controller.check(0.002)
 
@@ -300,21 +302,21 @@ def test_tvlqr_follows_the_file_of_a_search_and_refuses_that_of_another_mechanis
     )
     path = tmp_path / "cart_pole.json"
     write_trajectory(path, trajectory)
-    controller = make_joint_controller("tvlqr", plant, {"trajectory": str(path)}, DT)
+    controller = make_controller("tvlqr", plant, DT, {"trajectory": str(path)})
     assert "swing-up of 3 s by TVLQR" in controller.describe()
     x: Vector = (0.0, 0.0, 0.0, 0.0)
     for k in range(2500):
-        x = step(plant, x, controller.command(k * DT, x[:2], x[2:]))
+        x = step(plant, x, controller.efforts(k * DT, x[:2], x[2:]))
     assert np.max(np.abs(deviation_of(plant.coordinates, x)[1:])) < 0.05
     with pytest.raises(ParameterError, match="has the joints cart, pole and 1 motors; expected arm, pendulum and 1"):
-        make_joint_controller("tvlqr", load_mechanism("furuta"), {"trajectory": str(path)}, DT)
+        make_controller("tvlqr", load_mechanism("furuta"), DT, {"trajectory": str(path)})
     with pytest.raises(ParameterError, match=r"gone\.json does not exist"):
-        make_joint_controller("tvlqr", plant, {"trajectory": str(tmp_path / "gone.json")}, DT)
+        make_controller("tvlqr", plant, DT, {"trajectory": str(tmp_path / "gone.json")})
 
 
 def test_a_swing_up_whose_lqr_would_not_hold_what_comes_up_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"tvlqr asked every 0\.002 s does not settle on plant 'acrobot_friction"):
-        make_joint_controller("tvlqr", delayed_plant("acrobot_frictionless", 0.03), {}, DT)
+        make_controller("tvlqr", delayed_plant("acrobot_frictionless", 0.03), DT)
 
 
 @pytest.mark.parametrize("name", ["nmpc", "ilqr"])
@@ -322,7 +324,7 @@ def test_plans_without_dry_friction_are_not_for_a_passive_joint_that_has_some(na
     with pytest.raises(
         ParameterError, match=rf"{name} plans .* elbow of plant 'pendubot' is passive with 0\.12 N m; expected 0"
     ):
-        make_joint_controller(name, load_mechanism("pendubot"), {}, DT)
+        make_controller(name, load_mechanism("pendubot"), DT)
 
 
 @pytest.mark.timeout(400)
@@ -331,13 +333,13 @@ def test_a_swing_up_that_its_lqr_would_not_hold_at_this_period_is_refused() -> N
     late = delayed_plant("cart_pole", 0.3)
     refusal = r"nmpc asked every 0\.01 s does not settle on plant 'cart_pole': .*; expected a faster plant$"
     with pytest.raises(ParameterError, match=refusal):
-        make_joint_controller("nmpc", late, {}, 0.01)
+        make_controller("nmpc", late, 0.01)
     # As long as nobody knows the period, it is designed for one, and judged when the first states have come.
-    controller = make_joint_controller("nmpc", late, {})
+    controller = make_controller("nmpc", late, 0.01, checked=False)
     with pytest.raises(ParameterError, match=refusal):
         controller.check(0.01)
     # Of a period that differs by less than counts as another it is asked whether it settles at that one.
-    tardy = make_joint_controller("nmpc", delayed_plant("cart_pole", 0.05), {}, 0.05)
+    tardy = make_controller("nmpc", delayed_plant("cart_pole", 0.05), 0.05)
     with pytest.raises(ParameterError, match=r"nmpc asked every 0\.059 s does not settle on plant 'cart_pole'"):
         tardy.check(0.059)
     # The same where it is made for whole states.
@@ -355,15 +357,16 @@ def test_a_wild_state_does_not_cost_a_plan_and_from_wild_states_alone_there_is_n
     # In the middle of the swing a state at which it plans again is a glitch of the sensors, for one of them.
     for k in range(240):
         seen = (x, wild if k == 200 else x)
-        efforts = [each.command(k * DT, y)[0] for each, y in zip(controllers, seen, strict=True)]
+        efforts = [each.efforts(k * DT, y[:2], y[2:])[0] for each, y in zip(controllers, seen, strict=True)]
         assert abs(efforts[1] - efforts[0]) < 0.5
         x = step(plant, x, (efforts[0],))
     controllers[1].reset()
     for k in range(30):
-        assert controllers[1].command(k * DT, wild) == (0.0,)
+        assert controllers[1].efforts(k * DT, wild[:2], wild[2:]) == (0.0,)
     # What was no plan leaves nothing behind.
     controllers[0].reset()
-    assert controllers[1].command(30 * DT, x)[0] == pytest.approx(controllers[0].command(0.0, x)[0], abs=1.0)
+    late, fresh = controllers[1].efforts(30 * DT, x[:2], x[2:]), controllers[0].efforts(0.0, x[:2], x[2:])
+    assert late == pytest.approx(fresh, abs=1.0)
 
 
 @pytest.mark.timeout(400)
@@ -383,7 +386,7 @@ def test_mpc_plans_from_the_last_plan_and_searches_where_that_leads_nowhere_or_t
     def counted(k: int) -> int:
         asked.clear()
         nonlocal x
-        effort = controller.command(k * DT, x)
+        effort = controller.efforts(k * DT, x[:2], x[2:])
         x = step(plant, x, effort)
         return len(asked)
 
@@ -424,7 +427,7 @@ def test_nothing_is_planned_from_a_state_that_is_no_number() -> None:
     controller = MechanismMpc(DT, MechanismCatch(plant, gain, CaughtRegion(1.0, 0)))
     for x in ((0.0, math.nan, 0.0, 0.0), (0.0, 0.0, 0.0, math.inf)):
         with pytest.raises(ParameterError, match=r"plan begins at .*(nan|inf).*; expected finite numbers"):
-            controller.command(0.0, x)
+            controller.efforts(0.0, x[:2], x[2:])
 
 
 def test_a_search_whose_file_cannot_be_written_ends_before_it_begins(
@@ -441,23 +444,19 @@ def test_a_search_whose_file_cannot_be_written_ends_before_it_begins(
 def test_velocities_from_positions_are_the_true_ones_whatever_was_measured() -> None:
     plant = load_mechanism("acrobot_frictionless")
 
-    class Listener:
-        def __init__(self) -> None:
-            self.heard: list[Vector] = []
+    class Listener(Controller):
+        heard: ClassVar[list[Vector]] = []
 
-        def reset(self) -> None:
-            self.heard.clear()
-
-        def command(self, t: float, x: Vector) -> Vector:
-            self.heard.append(x)
+        def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
+            self.heard.append(position + velocity)
             return (2.0 * math.sin(9.0 * t),)
 
-    listener = Listener()
+    listener = Listener(plant.effort_limits)
     controller = DifferencedVelocity(plant, listener)
     x: Vector = (0.1, 0.4, 0.0, 0.0)
     for k in range(500):
         noise = 0.5 * (-1) ** k if k else 0.0
-        effort = controller.command(k * DT, (*x[:2], x[2] + noise, x[3] - noise))
+        effort = controller.efforts(k * DT, x[:2], (x[2] + noise, x[3] - noise))
         assert listener.heard[-1] == pytest.approx(x, rel=1e-3, abs=2e-3)
         x = step(plant, x, effort)
 

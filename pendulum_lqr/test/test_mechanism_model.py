@@ -10,7 +10,7 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.design_command.design_cli import main
 from pendulum_lqr.linear.analysis import analyse, delayed_spectral_radius
 from pendulum_lqr.linear.design import DesignError, continuous_lqr, output_lqr
@@ -115,13 +115,13 @@ def test_every_controller_holds_the_lagging_plant_or_refuses_it(name: str, contr
     plant = without_friction(lagging_plant(load_mechanism(name), 0.06))
     if name == "furuta" and controller in {"lqr", "lqi"}:
         with pytest.raises(DesignError, match=f"{controller} asked every 0.01 s does not settle on plant 'furuta'"):
-            make_joint_controller(controller, plant, {}, 0.01)
+            make_controller(controller, plant, 0.01)
         return
-    made = make_joint_controller(controller, plant, {}, 0.01)
+    made = make_controller(controller, plant, 0.01)
     simulated = MechanismPlant(plant, dt=0.01)
     state = simulated.reset(near_upright(plant, *(1e-3,) * len(plant.joints)))
     for k in range(1500):
-        state = simulated.step(made.command(0.01 * k, state.position, state.velocity))
+        state = simulated.step(made.efforts(0.01 * k, state.position, state.velocity))
     assert np.abs(plant.coordinates.deviation(state.position)).max() < 1e-6
 
 

@@ -69,13 +69,13 @@ def test_what_is_no_number_is_answered_by_none_so_that_it_is_refused_and_forgott
     plant = PLANTS[name]
     controller = _controller(plant)
     state = [0.3, 0.2, 0.1, -0.2]
-    before = controller.command(0.0, tuple(state[:2]), tuple(state[2:]))
+    before = controller.efforts(0.0, tuple(state[:2]), tuple(state[2:]))
     broken = [*state]
     broken[place] = math.nan
-    assert math.isnan(controller.command(0.01, tuple(broken[:2]), tuple(broken[2:]))[0])
+    assert math.isnan(controller.efforts(0.01, tuple(broken[:2]), tuple(broken[2:]))[0])
     assert not controller.catch.active
     assert controller.margin.value == 0.01
-    assert controller.command(0.02, tuple(state[:2]), tuple(state[2:])) == before
+    assert controller.efforts(0.02, tuple(state[:2]), tuple(state[2:])) == before
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -292,12 +292,12 @@ def test_a_pump_is_refused_where_no_law_is_known(name: str) -> None:
 
 def test_it_learns_from_passes_hands_over_upright_and_forgets_both_when_it_begins_anew() -> None:
     controller = _controller(PLANTS["cart_pole"])
-    controller.command(0.0, (0.0, math.pi - 0.1), (0.0, 8.0))
-    pumped = controller.command(0.01, (0.0, math.pi + 0.1), (0.0, 8.0))
+    controller.efforts(0.0, (0.0, math.pi - 0.1), (0.0, 8.0))
+    pumped = controller.efforts(0.01, (0.0, math.pi + 0.1), (0.0, 8.0))
     assert controller.margin.value == pytest.approx(0.005)
     assert not controller.catch.active
     assert pumped == (controller.pump.effort((0.0, math.pi + 0.1), (0.0, 8.0), 0.005),)
-    held = controller.command(0.02, (1e-4, math.pi), (0.0, 0.0))
+    held = controller.efforts(0.02, (1e-4, math.pi), (0.0, 0.0))
     assert controller.catch.active
     assert held == pytest.approx((-1e-4 * controller.catch.gain.K[0],))
     controller.reset()

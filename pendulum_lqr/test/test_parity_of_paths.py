@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pendulum_lqr.controller_interface.controller import CONTROLLERS, controller_parameters, make_controller
-from pendulum_lqr.controller_interface.joint_controller import (
-    JOINT_CONTROLLERS,
-    joint_controller_class,
-    make_joint_controller,
+from pendulum_lqr.controller_interface.controller import (
+    controller_class,
+    controller_names,
+    controller_parameters,
+    make_controller,
 )
 from pendulum_lqr.linear.analysis import delayed_spectral_radius
 from pendulum_lqr.linear.design import DesignError, continuous_lqr, output_lqr
@@ -52,7 +52,7 @@ def _both(name: str, plant: PlantParameters, period: float = PERIOD) -> tuple[An
     one, several = SAME[name]
     return (
         make_controller(name, plant, period, one),
-        make_joint_controller(name, mechanism_from_pendulum(plant), several, period),
+        make_controller(name, mechanism_from_pendulum(plant), period, several),
     )
 
 
@@ -73,7 +73,7 @@ def _runs(name: str, plant: PlantParameters, off: float) -> tuple[NDArray[np.flo
     for k in range(400):
         efforts = (
             one.command(k * PERIOD, (from_upright(state.theta), state.theta_dot)),
-            *several.command(k * PERIOD, joints.position, joints.velocity),
+            *several.efforts(k * PERIOD, joints.position, joints.velocity),
         )
         rows.append((from_upright(state.theta), from_upright(joints.position[0]), *efforts))
         state, joints = first.step(efforts[0]), second.step(efforts[1:])
@@ -82,7 +82,7 @@ def _runs(name: str, plant: PlantParameters, off: float) -> tuple[NDArray[np.flo
 
 
 def test_every_controller_that_both_paths_have_is_compared_or_is_another_method() -> None:
-    assert set(SAME) | set(OTHER_METHODS) == set(CONTROLLERS) & set(JOINT_CONTROLLERS)
+    assert set(SAME) | set(OTHER_METHODS) == set(controller_names()) & set(controller_names(several=True))
 
 
 @pytest.mark.parametrize("late", CHANGES)
@@ -137,7 +137,7 @@ def test_both_paths_refuse_from_the_same_delay_on_and_that_is_where_the_sampled_
         one, several = SAME[name]
         makers: list[Callable[[], object]] = [
             lambda: make_controller(name, plant, PERIOD, one),
-            lambda: make_joint_controller(name, mechanism_from_pendulum(plant), several, PERIOD),
+            lambda: make_controller(name, mechanism_from_pendulum(plant), PERIOD, several),
         ]
         return [_is_accepted(make) for make in makers]
 
@@ -170,4 +170,4 @@ def test_the_gain_that_knows_nothing_of_the_lag_falls_and_is_given_by_neither_pa
 def test_a_controller_that_both_paths_have_takes_the_same_parameters(name: str) -> None:
     plant = mechanism_from_pendulum(load_plant("dfki"))
     one = {spec.name for spec in controller_parameters(name)}
-    assert {spec.name for spec in joint_controller_class(name, plant).parameters(plant)} >= one
+    assert {spec.name for spec in controller_class(name, plant).parameters(plant)} >= one

@@ -8,9 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pendulum_lqr.controller_interface.controller import CONTROLLERS, BaseController, make_controller
+from pendulum_lqr.controller_interface.controller import (
+    BaseController,
+    controller_class,
+    controller_names,
+    make_controller,
+)
 from pendulum_lqr.controller_interface.loop_check import settles
-from pendulum_lqr.controller_interface.sampling import PeriodWatch, differs, rate_problem, uses_period
+from pendulum_lqr.controller_interface.sampling import PeriodWatch, differs, rate_problem
 from pendulum_lqr.linear.analysis import delayed_spectral_radius
 from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import linearise
@@ -22,8 +27,15 @@ THESIS = load_plant("thesis")
 
 
 def problem(kind, plant, designed, measured, **values):
+    known = controller_class(kind)
     return rate_problem(
-        lambda: make_controller(kind, plant, designed, values), kind, plant, designed, measured, uses=uses_period(kind)
+        known,
+        kind,
+        lambda: make_controller(kind, plant, designed, values),
+        plant,
+        designed,
+        measured,
+        uses=known.SAMPLED,
     )
 
 
@@ -102,15 +114,14 @@ def test_a_controller_that_is_not_meant_to_balance_is_left_alone():
 
 @pytest.mark.parametrize("kind", ["lqr", "pd_gravity", "sliding_mode", "energy_swing_up"])
 def test_who_is_said_to_ignore_the_period_does(kind):
-    assert not uses_period(kind)
-    assert uses_period(kind, "kalman")
+    assert not controller_class(kind).SAMPLED
     fast, slow = (make_controller(kind, DFKI, period) for period in (0.002, 0.02))
     for k, x in enumerate([(0.1, 0.2), (-0.3, 1.0), (3.0, -2.0), (0.01, 0.0)]):
         assert fast.command(0.01 * k, x) == slow.command(0.01 * k, x)
 
 
 def test_who_depends_on_the_period_is_known():
-    assert {kind for kind in CONTROLLERS if uses_period(kind)} == {
+    assert {kind for kind in controller_names() if controller_class(kind).SAMPLED} == {
         "lqi",
         "lqg",
         "lqr_friction",
@@ -123,7 +134,6 @@ def test_who_depends_on_the_period_is_known():
         "nmpc",
         "policy",
     }
-    assert uses_period("one_of_mine")
     fast, slow = (make_controller("discrete_lqr", THESIS, period) for period in (0.002, 0.02))
     assert fast.command(0.0, (0.1, 0.2)) != slow.command(0.0, (0.1, 0.2))
 

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from pendulum_lqr.controller_interface.controller import CONTROLLERS, controller_parameters, make_controller, unwrapped
+from pendulum_lqr.controller_interface.controller import controller_names, controller_parameters, make_controller
+from pendulum_lqr.controller_interface.interface import unwrapped
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
@@ -65,7 +66,7 @@ def test_after_its_start_it_is_the_controller_that_it_was(velocity):
     plain = make_controller("lqr", THESIS, PERIOD, values)
     soft = make_controller("lqr", THESIS, PERIOD, {**values, "start_time": 0.3})
     assert type(unwrapped(soft)) is type(unwrapped(plain))
-    assert soft.effort_limit == plain.effort_limit
+    assert soft.effort_limits == plain.effort_limits
     for _ in range(2):  # a restart begins anew
         for controller in (plain, soft):
             controller.reset()
@@ -84,7 +85,7 @@ def test_after_its_start_it_is_the_controller_that_it_was(velocity):
     assert abs(fresh.command(1.0, (0.02, 0.0)) - last) > 0.2 * abs(last)
 
 
-@pytest.mark.parametrize("kind", CONTROLLERS)
+@pytest.mark.parametrize("kind", controller_names())
 def test_every_controller_has_one_start_time(kind):
     found = [spec.default for spec in controller_parameters(kind) if spec.name == "start_time"]
     assert found == [0.2 if kind == "policy" else 0.0]

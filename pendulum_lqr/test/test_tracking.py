@@ -263,9 +263,9 @@ def test_a_gain_that_is_not_stable_along_the_way_is_refused():
     with pytest.raises(DesignError, match="lqr_tracking makes the loop unstable"):
         make_controller("lqr_tracking", SMOOTH, 0.01, {"velocity": "filtered_difference", "q": [4e4, 40.0], "r": 0.01})
     own = tracking(SMOOTH, 0.002)
-    own.check(SMOOTH, 0.01)
+    own.check(0.01)
     with pytest.raises(DesignError, match=r"with a period of 0\.2 s"):
-        own.check(SMOOTH, 0.2)
+        own.check(0.2)
 
 
 def test_the_rate_along_a_slow_reference_is_that_of_the_frozen_loop():

@@ -121,7 +121,7 @@ LINES = {
     ),
     "pendulum_lqr/controller_interface/controller.py": (
         "CONTROLLERS",
-        '"springy": "pendulum_lqr.controllers.springy:Springy",',
+        '"springy": Row("pendulum_lqr.controllers.springy:Springy"),',
     ),
     "pendulum_hw_bridge/backends/__init__.py": (
         "BACKENDS",

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.controller_interface.controller import CONTROLLERS, make_controller
+from pendulum_lqr.controller_interface.controller import controller_names, make_controller
 from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.playback import Playback
 from pendulum_lqr.linear.design import continuous_lqr
@@ -51,7 +51,7 @@ def rows() -> Iterator[Row]:
 
 
 def _answer_times() -> Iterator[Row]:
-    for name in CONTROLLERS:
+    for name in controller_names():
         if name == "policy":  # in the area `learn`, with a trained one
             continue
         plant = load_plant("dfki" if name in SWING_UP else "thesis")

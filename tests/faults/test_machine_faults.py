@@ -19,7 +19,7 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.nodes.bridge_node import BridgeNode
 from pendulum_hw_bridge.port.actuator import Strategy
 from pendulum_hw_bridge.port.clocks import SteppedClock
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_msgs_py.contract.commands import Refusal
 from pendulum_msgs_py.contract.supervisor import Input, Mode, PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
@@ -49,7 +49,7 @@ class Machine:
         port = self.bridge.modules[0].port
         assert isinstance(port, JointPort)
         self.emulated = port.machine
-        self.controller = make_joint_controller("lqr", parameters, {}, 1.0 / values["feedback_rate"])
+        self.controller = make_controller("lqr", parameters, 1.0 / values["feedback_rate"])
         self.answering = False
         self.source = "lqr"
         self.outcomes: list[Outcome] = []
@@ -61,7 +61,7 @@ class Machine:
         for _ in range(count):
             sample = self.bridge.observe(0.005)
             if sample is not None and self.answering:
-                self.answer(sample, self.controller.command(0.0, sample.position, sample.velocity))
+                self.answer(sample, self.controller.efforts(0.0, sample.position, sample.velocity))
             self.outcomes.append(self.bridge.act())
             self.supervisor.report_applied(self.outcomes[-1].effort)
 

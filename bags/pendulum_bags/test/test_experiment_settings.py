@@ -10,7 +10,7 @@ import pytest
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RAMP_SPEEDS, RegulationSettings
 from pendulum_hw_bridge.bridge.node_specs import SPECS
-from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, CONTROLLERS, controller_parameters
+from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, controller_names, controller_parameters
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.plant_specs import limits_from_parameters
@@ -27,7 +27,7 @@ from pendulum_testing.policies import linear_policy
 _NODE_OWN = {"controller", "plant", "use_sim_time"}
 
 
-@pytest.mark.parametrize("kind", CONTROLLERS)
+@pytest.mark.parametrize("kind", controller_names())
 def test_every_controller_is_started_with_parameters_that_it_has(kind: str, tmp_path: Path) -> None:
     if kind == "policy":
         with pytest.raises(ParameterError, match=r"controller is 'policy' without a file; expected .*\.npz"):

@@ -14,7 +14,7 @@ from pendulum_bags.ranking import joint_choice
 from pendulum_bags.ranking.joint_choice import joint_cost_parts, rank_joints, rankable
 from pendulum_bags.ranking.present import Words, same_choice
 from pendulum_bags.verdict import Mark
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.noise import uniform_array
@@ -32,7 +32,7 @@ DESIGNS = ("q=10,100,1,1 r=0.1", "q=10,100,1,1 r=1", "q=1,1000,1,1 r=10")
 def record(bag: Path, run: JointRun, **_: Any) -> Path:
     """Write what a run gives, in this process: plant, controller as it was tuned, and noise of the run's seed."""
     plant, own = load_mechanism(run.plant), run.settings
-    controller = make_joint_controller("lqr", load_mechanism(run.design or own.plant), dict(run.tuning), PERIOD)
+    controller = make_controller("lqr", load_mechanism(run.design or own.plant), PERIOD, dict(run.tuning))
     model = MechanismPlant(plant, PERIOD)
     state = model.reset(plant.coordinates.goal)
     noise = uniform_array(own.seed, 0, round(own.duration / PERIOD), float(own.amplitude or 0.0))
@@ -42,7 +42,7 @@ def record(bag: Path, run: JointRun, **_: Any) -> Path:
             writer.add_topic(f"{run.namespace}/{topic}", STATE)
         for k, push in enumerate(map(float, noise)):
             stamp = round((1.0 + k * PERIOD) * NANOSECONDS)
-            command = controller.command(k * PERIOD, state.position, state.velocity)
+            command = controller.efforts(k * PERIOD, state.position, state.velocity)
             told = encode_joints(stamp, "plant", names, state.position, state.velocity, (0.0, 0.0))
             writer.write(f"{run.namespace}/joint_states", stamp, told)
             writer.write(f"{run.namespace}/effort_command", stamp, encode_joints(stamp, "c", driven, effort=command))

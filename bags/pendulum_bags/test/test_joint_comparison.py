@@ -24,7 +24,7 @@ from pendulum_bags.runs.run_data import joints_of, read_run
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_bags.verdict.answer import answer_of_joints, join_joints
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.errors import DataError, ParameterError
@@ -45,7 +45,7 @@ def regulate(plant: MechanismParameters, sensor_seed: int, *, duration: float = 
     """Hold the cart-pole upright under noise on the cart; rows of position, velocity, command and noise."""
     period = 0.01
     model = MechanismPlant(plant, period)
-    controller = make_joint_controller("lqr", load_mechanism("cart_pole"), {}, period)
+    controller = make_controller("lqr", load_mechanism("cart_pole"), period)
     state = model.reset((0.0, np.pi))
     count = round(duration / period)
     noise = uniform_array(5, 0, count, 3.0)
@@ -54,7 +54,7 @@ def regulate(plant: MechanismParameters, sensor_seed: int, *, duration: float = 
     for k in range(count):
         q = tuple(np.asarray(state.position) + 1e-5 * sensor.standard_normal(2))
         v = tuple(np.asarray(state.velocity) + 1e-3 * sensor.standard_normal(2))
-        (command,) = controller.command(k * period, q, v)
+        (command,) = controller.efforts(k * period, q, v)
         rows[k] = *q, *v, command, noise[k]
         state = model.step((command + float(noise[k]),))
     return {"position": rows[:, :2], "velocity": rows[:, 2:4], "command": rows[:, 4:5], "noise": rows[:, 5:]}

@@ -23,6 +23,7 @@ from pendulum_bags.studies.mechanism_benchmark import (
     time_above_line,
 )
 from pendulum_bags.studies.mechanism_benchmark_runs import Disturbances, Trial, robustness_of, robustness_trials
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.mechanism_controllers import make_mechanism_controller
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.policies.policy_file import write_policy
@@ -119,17 +120,15 @@ def test_each_disturbance_moves_the_plant_as_the_public_simulation_does(name: st
         assert end == pytest.approx(ENDS[name][case], abs=2e-8), case
 
 
-class Waving:
+class Waving(Controller):
     """The same controller, as controllers are."""
 
     def __init__(self, driven: int) -> None:
+        super().__init__((6.0,))
         self.driven = driven
 
-    def reset(self) -> None:
-        """Nothing to forget."""
-
-    def command(self, t: float, x: Vector) -> Vector:
-        return (answer(self.driven)(t, x)[self.driven],)
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        return (answer(self.driven)(t, position + velocity)[self.driven],)
 
 
 @pytest.mark.parametrize("name", ["acrobot", "pendubot"])
@@ -206,7 +205,7 @@ def test_a_policy_file_is_scored_with_an_lqr_near_upright_and_without(tmp_path) 
     assert rows[0]["criteria"] == rows[1]["criteria"]
     answers = make_mechanism_controller(f"{file}+lqr", plant, 0.002), make_mechanism_controller(str(file), plant, 0.002)
     near = (math.pi + 0.02, -0.01, 0.0, 0.05)
-    caught, bare = (controller.command(0.0, near) for controller in answers)
+    caught, bare = (controller.efforts(0.0, near[:2], near[2:]) for controller in answers)
     assert caught != bare
     with pytest.raises(ParameterError, match="trained on a double_pendulum driven at shoulder, and this one is"):
         make_mechanism_controller(str(file), benchmark_plant("acrobot"), 0.002)

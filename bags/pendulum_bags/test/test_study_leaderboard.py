@@ -25,7 +25,7 @@ from pendulum_bags.studies.leaderboard import (
 )
 from pendulum_bags.studies.leaderboard_hardware import HARDWARE_PERTURBATIONS, arrays_of_bag
 from pendulum_bags.studies.leaderboard_page import write_page
-from pendulum_lqr.controller_interface.controller import CONTROLLERS
+from pendulum_lqr.controller_interface.controller import CONTROLLERS, Row, controller_names
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag
@@ -96,7 +96,7 @@ def test_a_motor_too_weak_to_lift_the_pendulum_needs_a_swing_up() -> None:
 
 
 def test_every_controller_is_on_the_board() -> None:
-    assert set(contenders()) == set(CONTROLLERS) - {"playback", "policy", "lqr_tracking"}
+    assert set(contenders()) == set(controller_names()) - {"playback", "policy", "lqr_tracking"}
 
 
 MINE = """
@@ -119,7 +119,7 @@ def test_a_controller_that_is_added_to_the_table_is_on_the_board(
 ) -> None:
     (tmp_path / "plugged_in.py").write_text(MINE, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(CONTROLLERS, "mine", "plugged_in:Mine")
+    monkeypatch.setitem(CONTROLLERS, "mine", Row("plugged_in:Mine"))
     assert "mine" in contenders()
     out = tmp_path / "board"
     arguments = ["leaderboard", "--plants", "thesis", "--controllers", "mine,lqr", "--no-robustness"]

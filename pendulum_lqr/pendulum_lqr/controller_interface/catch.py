@@ -79,8 +79,6 @@ class CatchingController(BaseController):
         catch: LQR with hysteresis at the set-point.
     """
 
-    SERIES_ELASTIC = False
-
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(p["effort_limit"], p["set_point"])
         gain, level, hold = _proven(plant, tuple(p["catch_q"]), p["catch_r"], self.effort_limit, self.set_point)

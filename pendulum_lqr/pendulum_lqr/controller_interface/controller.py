@@ -1,7 +1,7 @@
-"""One interface for every controller, and the table that a name is looked up in.
+"""The table of controllers, what their classes share, and how one is designed by its name.
 
-A controller is a class in a file of its own under ``controllers/`` plus one line in ``CONTROLLERS``. It sees
-x = [wrap(theta - pi), theta_dot] and returns a torque; it depends on neither ROS nor a clock.
+A controller is a class in a file of its own under ``controllers/`` plus one line in ``CONTROLLERS``. It sees the states
+of all joints and returns efforts of the driven ones; it depends on neither ROS nor a clock.
 """
 
 from __future__ import annotations
@@ -9,53 +9,91 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar, cast
+from typing import NamedTuple, cast
 
-from pendulum_lqr.controller_interface.interface import Controller
-from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS
+from pendulum_lqr.controller_interface.interface import AnyPlant, Controller
 from pendulum_lqr.controller_interface.law import Law, clamped, deviation
 from pendulum_lqr.controller_interface.loop_check import require_stable
 from pendulum_lqr.controller_interface.velocity import VELOCITY_ESTIMATORS, VelocityEstimator
-from pendulum_lqr.linear.analysis import Feedback
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, suggestion, validate
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.extras import how_to_install
 
 __all__ = [
     "COMMON_PARAMETERS",
     "CONTROLLERS",
+    "ONE_JOINT",
+    "RIGID",
+    "SEVERAL_JOINTS",
+    "START_TIME",
     "BaseController",
     "EstimatedVelocity",
     "LawController",
+    "Row",
     "SoftStart",
     "controller_class",
+    "controller_names",
     "controller_parameters",
     "make_controller",
     "soft_start",
-    "unwrapped",
 ]
 
-CONTROLLERS: dict[str, str] = {
-    "lqr": "pendulum_lqr.controllers.lqr:Lqr",
-    "lqi": "pendulum_lqr.controllers.lqi:Lqi",
-    "lqg": "pendulum_lqr.controllers.lqg:Lqg",
-    "lqr_friction": "pendulum_lqr.controllers.lqr_friction:LqrFriction",
-    "lqr_tracking": "pendulum_lqr.controllers.lqr_tracking:LqrTracking",
-    "discrete_lqr": "pendulum_lqr.controllers.discrete_lqr:DiscreteLqr",
-    "pid": "pendulum_lqr.controllers.pid:Pid",
-    "pd_gravity": "pendulum_lqr.controllers.pd_gravity:PdGravity",
-    "energy_swing_up": "pendulum_lqr.controllers.energy_swing_up:EnergySwingUp",
-    "time_optimal": "pendulum_lqr.controllers.time_optimal:TimeOptimal",
-    "tvlqr": "pendulum_lqr.controllers.tvlqr:Tvlqr",
-    "mpc": "pendulum_lqr.controllers.mpc:LinearMpc",
-    "nmpc": "pendulum_lqr.controllers.nmpc:NonlinearMpc",
-    "sliding_mode": "pendulum_lqr.controllers.sliding_mode:SlidingMode",
-    "playback": "pendulum_lqr.controllers.playback:Playback",
-    "policy": "pendulum_lqr.controllers.policy:LearnedPolicy",
-}
-"""Name -> ``module:class``; modules are imported on demand, so that LQR does not pay for CasADi."""
+ONE_JOINT, SEVERAL_JOINTS, RIGID = "one joint", "several joints", "a plant without a drivetrain"
+"""What a controller may need."""
 
+
+class Row(NamedTuple):
+    """A row of the table of controllers.
+
+    Attributes:
+        target: ``module:class``; the module is imported on demand, so that LQR does not pay for CasADi.
+        needs: What the plant must have; nothing for every plant.
+        several: ``module:class`` of the method that plants of several joints have under the same name.
+    """
+
+    target: str
+    needs: tuple[str, ...] = (ONE_JOINT,)
+    several: str = ""
+
+
+_ANY: tuple[str, ...] = ()
+_RIGID = (ONE_JOINT, RIGID)
+_HERE = "pendulum_lqr.controllers"
+CONTROLLERS: dict[str, Row] = {
+    "lqr": Row(f"{_HERE}.lqr:Lqr", several=f"{_HERE}.joint_lqr:JointLqr"),
+    "lqi": Row(f"{_HERE}.lqi:Lqi", several=f"{_HERE}.joint_lqi:JointLqi"),
+    "lqg": Row(f"{_HERE}.lqg:Lqg", several=f"{_HERE}.joint_lqg:JointLqg"),
+    "lqr_friction": Row(f"{_HERE}.lqr_friction:LqrFriction"),
+    "lqr_tracking": Row(f"{_HERE}.lqr_tracking:LqrTracking"),
+    "discrete_lqr": Row(f"{_HERE}.discrete_lqr:DiscreteLqr", several=f"{_HERE}.joint_discrete_lqr:JointDiscreteLqr"),
+    "pid": Row(f"{_HERE}.pid:Pid"),
+    "pd_gravity": Row(f"{_HERE}.pd_gravity:PdGravity"),
+    "energy_swing_up": Row(
+        f"{_HERE}.energy_swing_up:EnergySwingUp", _RIGID, f"{_HERE}.joint_energy_swing_up:JointEnergySwingUp"
+    ),
+    "time_optimal": Row(f"{_HERE}.time_optimal:TimeOptimal", _RIGID),
+    "tvlqr": Row(f"{_HERE}.tvlqr:Tvlqr", _RIGID, f"{_HERE}.joint_swing_up:JointSwingUp"),
+    "ilqr": Row(f"{_HERE}.joint_ilqr:JointIlqr", (SEVERAL_JOINTS,)),
+    "mpc": Row(f"{_HERE}.mpc:LinearMpc", several=f"{_HERE}.joint_mpc:JointMpc"),
+    "nmpc": Row(f"{_HERE}.nmpc:NonlinearMpc", _RIGID, f"{_HERE}.joint_nmpc:JointNmpc"),
+    "sliding_mode": Row(f"{_HERE}.sliding_mode:SlidingMode", _RIGID),
+    "playback": Row(f"{_HERE}.playback:Playback"),
+    "policy": Row(f"{_HERE}.policy:LearnedPolicy", several=f"{_HERE}.joint_policy:JointPolicy"),
+}
+"""The controllers by name."""
+
+START_TIME = ParameterSpec(
+    "start_time",
+    0.0,
+    "s",
+    "Time in which the torque that it may ask for rises from zero to its limit, after the first state, for a plant "
+    "that lets nobody begin with much (`start_effort_limit`); 0 for at once.",
+    minimum=0.0,
+    maximum=5.0,
+)
 COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
     ParameterSpec("set_point", 0.0, "rad", "Angle to hold, from upright.", minimum=-math.pi, maximum=math.pi),
     ParameterSpec(
@@ -68,17 +106,9 @@ COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
         "velocity", "measured", "", "Where the velocity comes from.", choices=("measured", *VELOCITY_ESTIMATORS)
     ),
-    ParameterSpec(
-        "start_time",
-        0.0,
-        "s",
-        "Time in which the torque that it may ask for rises from zero to its limit, after the first state, for a plant "
-        "that lets nobody begin with much (`start_effort_limit`); 0 for at once.",
-        minimum=0.0,
-        maximum=5.0,
-    ),
+    START_TIME,
 )
-"""Parameters that every controller has."""
+"""Parameters that every controller of one joint has; those of several joints have the last one."""
 
 
 def soft_start(effort: float, limit: float, t: float, start_time: float) -> float:
@@ -94,93 +124,18 @@ def soft_start(effort: float, limit: float, t: float, start_time: float) -> floa
     return min(bound, max(-bound, effort))
 
 
-class BaseController:
-    """What most controllers share: a limit, a set-point, and no state.
+class BaseController(Controller):
+    """A controller of a plant of one joint, which defines ``command``: a limit, a set-point, and no state.
 
     Attributes:
         effort_limit: Largest torque [N m].
         set_point: Angle to hold, from upright [rad].
-        notice: Notice for the user while it runs; empty for nothing.
-        feedback: What it is near its set-point where that is a gain; None for any other law.
     """
 
-    feedback: Feedback | None = None
-    SUMMARY: ClassVar[str] = ""
-    """One sentence for tables."""
-    PARAMETERS: ClassVar[tuple[ParameterSpec, ...]] = ()
-    """Parameters of this controller beyond ``COMMON_PARAMETERS``."""
-    SERIES_ELASTIC: ClassVar[bool] = True
-    """Whether its design reckons with motor and spring; others refuse such a plant."""
-    PREDICTS: ClassVar[bool] = False
-    """Whether it predicts the plant from the torques that it sent, and so needs the holding torque."""
-    STARTS_SOFTLY: ClassVar[bool] = False
-    """Whether it applies ``start_time`` itself; for others :class:`SoftStart` does."""
-    FEEDBACK: ClassVar[bool] = True
-    """Whether it closes a loop whose linear model has to be stable."""
-
-    TIME_INVARIANT: ClassVar[bool] = True
-    """Whether a state gives the same command at any time, so that the loop has a frequency response."""
-
     def __init__(self, effort_limit: float, set_point: float = 0.0) -> None:
-        self.notice = ""
+        super().__init__((effort_limit,))
         self.effort_limit = effort_limit
         self.set_point = set_point
-
-    @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> BaseController:
-        """Return the controller for a plant; by default what the class makes of these three.
-
-        Args:
-            plant: Plant parameters.
-            period: Sampling period of the loop [s].
-            p: Checked values of ``COMMON_PARAMETERS`` and ``PARAMETERS``; ``effort_limit`` is already the one to keep.
-
-        Raises:
-            ParameterError: The values do not make a controller for this plant.
-        """
-        make: Any = cls
-        designed: BaseController = make(plant, period, p)
-        return designed
-
-    @classmethod
-    def judged_at(cls, p: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
-        """Return what is set, one judgement after the other, where the loop is judged before it moves a plant.
-
-        Where a loop rests is one thing, whether it is stable another: the holding torque belongs to the first.
-
-        Args:
-            p: Checked values of all parameters.
-        """
-        return ({} if p.get("feedforward", True) else {"feedforward": True},)
-
-    def check(self, plant: PlantParameters, period: float) -> None:
-        """Refuse a period at which states come and for which this controller is not; any period by default.
-
-        Args:
-            plant: Plant parameters.
-            period: Period of the states [s].
-
-        Raises:
-            ParameterError: It is not for this period.
-        """
-
-    def reset(self) -> None:
-        """Forget everything."""
-
-    def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque [N m] for the state x = [angle from upright [rad], velocity [rad/s]] at time t [s]."""
-        raise NotImplementedError(f"{type(self).__name__}.command")
-
-    def describe(self) -> str:
-        """Return gains and figures in one line."""
-        return type(self).__name__
-
-    def carry_over(self, previous: Controller) -> None:
-        """Take over what the previous controller remembers, wherever its velocity came from."""
-        self.take_over(unwrapped(previous))
-
-    def take_over(self, previous: Controller) -> None:
-        """Take over what the previous controller remembers; nothing by default."""
 
     def clamp(self, effort: float) -> float:
         """Return the torque within the limit [N m]."""
@@ -231,8 +186,8 @@ class LawController(BaseController):
         return self.law(t, x[0], x[1], self.memory, self.numbers)
 
 
-class EstimatedVelocity(BaseController):
-    """A controller that sees an estimated velocity in place of the measured one.
+class EstimatedVelocity(Controller):
+    """A controller of one joint that sees an estimated velocity in place of the measured one.
 
     Args:
         inner: The controller.
@@ -240,8 +195,8 @@ class EstimatedVelocity(BaseController):
     """
 
     def __init__(self, inner: Controller, estimator: VelocityEstimator) -> None:
-        super().__init__(inner.effort_limit)
-        self.inner = inner
+        super().__init__(inner.effort_limits)
+        self.inner: Controller = inner
         self.estimator = estimator
         self._last_effort = 0.0
 
@@ -270,26 +225,27 @@ class EstimatedVelocity(BaseController):
         self.inner.carry_over(previous)
 
 
-class SoftStart(BaseController):
-    """A controller whose torque begins at zero and may reach its limit after a while; a predictive one ignores it.
+class SoftStart(Controller):
+    """A controller whose efforts begin at zero and may reach their limits after a while; a predictive one ignores it.
 
     Args:
         inner: The controller.
-        start_time: Time from the first state until it has all of its torque [s].
+        start_time: Time from the first state until it has all of its effort [s].
     """
 
     def __init__(self, inner: Controller, start_time: float) -> None:
-        super().__init__(inner.effort_limit)
-        self.inner = inner
+        super().__init__(inner.effort_limits)
+        self.inner: Controller = inner
         self.start_time = start_time
 
     def reset(self) -> None:
         """Forget everything."""
         self.inner.reset()
 
-    def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the inner controller's torque, within what it may have so long after its start [N m]."""
-        return soft_start(self.inner.command(t, x), self.effort_limit, t, self.start_time)
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return the inner controller's efforts, within what they may be so long after the start [N m or N]."""
+        wanted = zip(self.inner.efforts(t, position, velocity), self.effort_limits, strict=True)
+        return tuple(soft_start(effort, limit, t, self.start_time) for effort, limit in wanted)
 
     def describe(self) -> str:
         """Return the inner controller's line and the time."""
@@ -300,42 +256,72 @@ class SoftStart(BaseController):
         self.inner.carry_over(previous)
 
 
-def unwrapped(controller: Controller) -> Controller:
-    """Return the controller itself, without what gives it its velocity and what lets its torque rise."""
-    while isinstance(controller, (EstimatedVelocity, SoftStart)):
-        controller = controller.inner
-    return controller
+def controller_names(*, several: bool = False) -> list[str]:
+    """Return the names of the controllers for plants of one joint, or of several."""
+    return [name for name, row in CONTROLLERS.items() if _target(row, several=several)]
 
 
-def controller_class(name: str) -> type[BaseController]:
+def controller_class(name: str, plant: AnyPlant | None = None) -> type[Controller]:
     """Return the class behind a name of ``CONTROLLERS``.
 
+    Args:
+        name: The name.
+        plant: The plant that it is for; None for any of one joint.
+
     Raises:
-        ParameterError: No such controller; the message lists those there are. Or a library of it is not installed.
+        ParameterError: No such controller for this plant; the message lists those there are. Or a library of it is not
+            installed.
     """
+    several = isinstance(plant, MechanismParameters)
     if not isinstance(name, str) or name not in CONTROLLERS:  # a file may say 7
-        if name in list(JOINT_CONTROLLERS):
-            raise ParameterError(f"{name} is for plants of several joints; expected one of {', '.join(CONTROLLERS)}")
-        raise ParameterError(f"controller is {name!r}; {suggestion(name, CONTROLLERS)}")
-    module, kind = CONTROLLERS[name].split(":")
+        raise ParameterError(f"controller is {name!r}; {suggestion(name, controller_names(several=several))}")
+    row = CONTROLLERS[name]
+    target = _target(row, several=several)
+    if not target:
+        has = f", and plant {plant.name!r} has {', '.join(plant.coordinates.names)}" if plant is not None else ""
+        raise ParameterError(
+            f"{name} is for plants of {row.needs[0]}{has}; expected one of "
+            f"{', '.join(controller_names(several=several))}"
+        )
+    if RIGID in row.needs and isinstance(plant, PlantParameters) and plant.drivetrain is not None:
+        others = [other for other in controller_names() if RIGID not in CONTROLLERS[other].needs]
+        raise ParameterError(
+            f"{name} knows rigid plants alone, and plant {plant.name!r} is series elastic; expected one of "
+            f"{', '.join(others)}, or a plant file without a drivetrain"
+        )
+    module, kind = target.split(":")
     try:
-        return cast("type[BaseController]", getattr(importlib.import_module(module), kind))
+        return cast("type[Controller]", getattr(importlib.import_module(module), kind))
     except ImportError as error:
         if text := how_to_install(error):
             raise ParameterError(f"controller {name}: {text}") from error
         raise
 
 
-def controller_parameters(name: str) -> tuple[ParameterSpec, ...]:
-    """Return the specs of a controller: common ones first, but for those of which it has its own."""
-    kind = controller_class(name)
-    own = {spec.name for spec in kind.PARAMETERS}
-    return (*(spec for spec in COMMON_PARAMETERS if spec.name not in own), *kind.PARAMETERS)
+def _target(row: Row, *, several: bool) -> str:
+    """Return ``module:class`` of a row for plants of one joint or several; empty where it has none."""
+    if several and row.several:
+        return row.several
+    return "" if (ONE_JOINT if several else SEVERAL_JOINTS) in row.needs else row.target
+
+
+def controller_parameters(name: str, plant: AnyPlant | None = None) -> tuple[ParameterSpec, ...]:
+    """Return the specs of a controller: common ones first, but for those of which it has its own.
+
+    Args:
+        name: The name.
+        plant: The plant that it is for, on which defaults may depend; None for any of one joint.
+    """
+    kind = controller_class(name, plant)
+    own = kind.PARAMETERS if plant is None else kind.parameters(plant)
+    common = (START_TIME,) if isinstance(plant, MechanismParameters) else COMMON_PARAMETERS
+    names = {spec.name for spec in own}
+    return (*(spec for spec in common if spec.name not in names), *own)
 
 
 def make_controller(
     name: str,
-    plant: PlantParameters,
+    plant: AnyPlant,
     period: float,
     values: Mapping[str, object] | None = None,
     *,
@@ -355,28 +341,27 @@ def make_controller(
         ParameterError: Unknown controller or parameter, a value out of domain, a design that does not exist, or a loop
             that is unstable on the linear model of the plant at this period, delay included.
     """
-    kind = controller_class(name)
-    p = validate(controller_parameters(name), values or {})
+    kind = controller_class(name, plant)
+    p = validate(controller_parameters(name, plant), values or {})
     if not (math.isfinite(period) and period > 0.0):
         raise ParameterError(f"period is {period} s; expected a finite value > 0")
-    p["effort_limit"] = min(p["effort_limit"], plant.effort_limit) if p["effort_limit"] > 0.0 else plant.effort_limit
-    if plant.drivetrain is not None and not kind.SERIES_ELASTIC:
-        raise ParameterError(
-            f"{name} knows rigid plants alone, and plant {plant.name!r} is series elastic; expected lqr, lqi, lqg, "
-            "lqr_friction, lqr_tracking, mpc, pid or pd_gravity, or a plant file without a drivetrain"
-        )
+    one_joint = plant if isinstance(plant, PlantParameters) else None
+    if one_joint is not None:
+        p["effort_limit"] = min(p["effort_limit"] or math.inf, one_joint.effort_limit)
     designed = kind.design(plant, period, p)
     if checked:
-        designed.check(plant, period)
+        designed.check(period)
     controller: Controller = designed
     if p["start_time"] > 0.0 and not kind.STARTS_SOFTLY:
         controller = SoftStart(controller, p["start_time"])
+    if one_joint is None:
+        return controller
     if p["velocity"] != "measured":
-        controller = EstimatedVelocity(controller, VELOCITY_ESTIMATORS[p["velocity"]](plant, period))
+        controller = EstimatedVelocity(controller, VELOCITY_ESTIMATORS[p["velocity"]](one_joint, period))
     if checked and kind.FEEDBACK and p.get("tuning") != "manual":
         for changed in kind.judged_at(p):
             judged, at = controller, {**p, **changed}
             if changed:
                 judged = make_controller(name, plant, period, {**(values or {}), **changed}, checked=False)
-            require_stable(name, judged, plant, period, at["set_point"])
+            require_stable(name, judged, one_joint, period, at["set_point"])
     return controller

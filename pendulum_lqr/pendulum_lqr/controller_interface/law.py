@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, MutableSequence, Sequence
+from collections.abc import Callable, Iterable, MutableSequence, Sequence
 
 from pendulum_msgs_py.contract.angles import wrap_angle
+from pendulum_msgs_py.contract.values import Vector
 
 __all__ = [
     "EFFORT_LIMIT",
@@ -16,6 +17,7 @@ __all__ = [
     "clamped",
     "deviation",
     "winds_up",
+    "within_limits",
 ]
 
 Law = Callable[[float, float, float, MutableSequence[float], Sequence[float]], float]
@@ -39,6 +41,11 @@ def clamped(effort: float, limit: float) -> float:
     if effort < -limit:  # not by max(), whose result for NaN differs where it is compiled
         return -limit
     return effort
+
+
+def within_limits(wanted: Iterable[float], limits: Vector) -> Vector:
+    """Return efforts within limits either way [N m or N]; NaN stays NaN, which the sender refuses."""
+    return tuple(top if u > top else max(float(u), -top) for u, top in zip(wanted, limits, strict=True))
 
 
 def deviation(angle: float, set_point: float) -> float:

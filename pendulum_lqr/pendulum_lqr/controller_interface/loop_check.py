@@ -7,20 +7,17 @@ delay included. What grows there is refused before it moves a machine.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pendulum_lqr.controller_interface.interface import Controller, unwrapped
 from pendulum_lqr.linear.analysis import Feedback, delayed_spectral_radius
 from pendulum_lqr.linear.design import DesignError, Gain, output_lqr
 from pendulum_lqr.linear.model import RigidPlant, linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-
-if TYPE_CHECKING:
-    from pendulum_lqr.controller_interface.interface import Controller
 
 __all__ = ["growth", "require_settling", "require_stable", "settles", "settling_lqr"]
 
@@ -49,7 +46,7 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
         set_point: The angle that it holds, from upright [rad].
     """
     model = linearise(plant, UPRIGHT + set_point)
-    if (feedback := getattr(controller, "feedback", None)) is not None:
+    if (feedback := controller.feedback) is not None:
         return delayed_spectral_radius(model, feedback.K, period, summed=feedback.summed) ** _WINDOW
     sampled = discretise(model, period)
     n = model.A.shape[0]
@@ -60,11 +57,7 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
     A, B = sampled.A, sampled.B[:, 0]
     controller.reset()
     # A predictive law needs the true holding torque; any other may rest at its own first command.
-    law = controller
-    while (inner := getattr(law, "inner", None)) is not None:
-        law = inner
-    predicts = getattr(law, "PREDICTS", False)
-    hold = model.effort if predicts else controller.command(0.0, (set_point, 0.0))
+    hold = model.effort if unwrapped(controller).PREDICTS else controller.command(0.0, (set_point, 0.0))
     controller.reset()
     spreads: list[float] = []
     for window in range(_WINDOWS):

@@ -19,7 +19,6 @@ __all__ = [
     "goes_on",
     "rate_problem",
     "require_period",
-    "uses_period",
 ]
 
 ASSUMED_PERIOD = 0.01
@@ -29,10 +28,6 @@ TOLERANCE = 0.2
 _WINDOW = 15
 _ENOUGH = 9
 _GAP_NS = NANOSECONDS
-_IGNORE_PERIOD = frozenset({"lqr", "pd_gravity", "sliding_mode", "energy_swing_up", "playback"})
-_BALANCING = frozenset(
-    {"lqr", "lqi", "lqg", "lqr_friction", "discrete_lqr", "pid", "pd_gravity", "mpc", "sliding_mode"}
-)
 _FAST_PERIOD = 2e-3
 """Up to this period a design in continuous time is taken at its word [s]."""
 
@@ -98,16 +93,6 @@ def differs(measured: float, designed: float) -> bool:
     return abs(measured / designed - 1.0) > TOLERANCE
 
 
-def uses_period(kind: str, velocity: str = "measured") -> bool:
-    """Return whether a controller's commands depend on the sampling period that it was designed for.
-
-    Args:
-        kind: Name of the controller; an unknown one counts as dependent.
-        velocity: Where it takes the velocity from; every estimator depends on it.
-    """
-    return kind not in _IGNORE_PERIOD or velocity != "measured"
-
-
 def require_period(what: str, designed: float, period: float) -> None:
     """Refuse states at another period than that of the design.
 
@@ -124,8 +109,9 @@ def require_period(what: str, designed: float, period: float) -> None:
 
 
 def rate_problem(
+    kind: type[Controller],
+    name: str,
     make: Callable[[], Controller],
-    kind: str,
     plant: PlantParameters,
     designed: float,
     measured: float,
@@ -139,25 +125,26 @@ def rate_problem(
     one of zero torque, is intended.
 
     Args:
-        make: Designs the controller.
-        kind: Its name.
+        kind: Class of the controller.
+        name: Its name.
+        make: Designs it.
         plant: The plant that it was designed for.
         designed: Period of the design [s].
         measured: Period of the states [s].
-        uses: Whether its commands depend on the period, see :func:`uses_period`.
+        uses: Whether its commands depend on the period.
         set_point: Angle to hold, from upright [rad].
     """
     own = designed if uses else _FAST_PERIOD
-    if kind not in _BALANCING or not differs(measured, own) or (not uses and measured < own):
+    if not kind.BALANCES or not differs(measured, own) or (not uses and measured < own):
         return ""
     if settles(make(), plant, measured, set_point) or not settles(make(), plant, own, set_point):
         return ""
     if uses:
         return (
-            f"period is {designed:g} s, but states come every {measured:g} s, at which {kind} designed for the former "
+            f"period is {designed:g} s, but states come every {measured:g} s, at which {name} designed for the former "
             f"does not settle; expected period:={measured:g}, or 0 to take it from the states"
         )
     return (
-        f"states come every {measured:g} s, at which {kind} does not settle on plant {plant.name!r}; expected a faster "
+        f"states come every {measured:g} s, at which {name} does not settle on plant {plant.name!r}; expected a faster "
         "plant, or a controller that is designed for its period, such as discrete_lqr"
     )

@@ -61,6 +61,7 @@ class DiscreteLqr(LawController):
     """Discrete LQR with delay compensation: u = u* - K [x - x*; lagged torque; torques on their way, oldest first]."""
 
     PREDICTS = True
+    BALANCES = True
     SUMMARY = "discrete LQR for zero-order hold, with compensation of a known delay"
     PARAMETERS = (
         Q,

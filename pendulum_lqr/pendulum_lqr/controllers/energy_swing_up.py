@@ -36,6 +36,7 @@ class EnergySwingUp(CatchingController):
     Source: Astrom and Furuta, Swinging up a pendulum by energy control, Automatica 36(2), 2000, eq. 7.
     """
 
+    SAMPLED = False
     SUMMARY = "swing-up by energy shaping, caught by LQR with hysteresis"
     PARAMETERS = (
         ParameterSpec(

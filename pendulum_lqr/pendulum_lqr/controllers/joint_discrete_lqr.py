@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.controller_interface.interface import Controller, JointController
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.law import within_limits
 from pendulum_lqr.controller_interface.sampling import require_period
 from pendulum_lqr.controllers.joint_lqr import UprightController, gain_text
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
-from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
@@ -30,8 +30,8 @@ class JointDiscreteLqr(UprightController):
 
     SUMMARY = "discrete LQR for zero-order hold, with compensation of the plant's lag and delay"
 
-    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
-        super().__init__(plant, p, period)
+    def __init__(self, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
         self.model = discretise(self._linear, period)
         self.cost = sampled_cost(self._linear, p["q"], p["r"], period)
         self.gain = discrete_lqr(self.model, *self.cost)
@@ -50,7 +50,7 @@ class JointDiscreteLqr(UprightController):
         self._on_their_way.extend([(0.0,) * len(self._hold)] * self.model.pending)
         self._predicted: Array | None = None
 
-    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts [N m or N]."""
         x = self._state(position, velocity)
         moving = [u for sent in self._on_their_way for u in sent]
@@ -76,7 +76,7 @@ class JointDiscreteLqr(UprightController):
         """Return gain and efforts on their way."""
         return f"K = [{gain_text(self._K)}], {len(self._on_their_way)} efforts on their way"
 
-    def carry_over(self, previous: Controller | JointController) -> None:
+    def take_over(self, previous: Controller) -> None:
         """Take over what is on its way, and what is predicted."""
         if isinstance(previous, JointDiscreteLqr) and previous.period == self.period:
             self._on_their_way.extend(previous._on_their_way)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from pendulum_lqr.controller_interface.interface import Controller, JointController
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, require_catching
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
 from pendulum_lqr.linear.design import DesignError
@@ -24,7 +24,7 @@ _REST = 0.1
 """Velocity below which nothing is learnt of where the pendulum turns back [rad/s]."""
 
 
-class JointEnergySwingUp(JointController):
+class JointEnergySwingUp(Controller):
     """Pumps energy into a pendulum by moving its hinge until the LQR can catch it.
 
     The energy is that of :mod:`pendulum_lqr.swing_up.mechanism_pump`.
@@ -75,7 +75,7 @@ class JointEnergySwingUp(JointController):
         )  # fmt: skip
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointEnergySwingUp:
+    def design(cls, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> JointEnergySwingUp:
         """Return the controller; its region takes a second to sample.
 
         Raises:
@@ -106,7 +106,7 @@ class JointEnergySwingUp(JointController):
         self.catch.active = False
         self.margin.reset()
 
-    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return the motor's effort."""
         deviation = deviation_of(self._coordinates, position + velocity)
         if self.catch.holds(deviation):
@@ -121,7 +121,7 @@ class JointEnergySwingUp(JointController):
         K = ", ".join(f"{value:.4g}" for value in self.catch.gain.K)
         return f"pumps by {joint.name}{within}, LQR K = [{K}] within {self.catch.region.describe()}"
 
-    def carry_over(self, previous: Controller | JointController) -> None:
+    def take_over(self, previous: Controller) -> None:
         """Take over what was learnt, and whether the LQR is in charge."""
         if isinstance(previous, JointEnergySwingUp):
             self.margin.take_over(previous.margin)

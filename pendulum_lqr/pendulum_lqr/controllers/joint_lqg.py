@@ -32,8 +32,8 @@ class JointLqg(JointDiscreteLqr):
 
     SUMMARY = "discrete LQR on the state that a Kalman filter estimates from positions"
 
-    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
-        super().__init__(plant, p, period)
+    def __init__(self, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
         n = len(plant.joints)
         entry = self._linear.E.copy()
         entry[:, list(plant.coordinates.driven)] = self._linear.B

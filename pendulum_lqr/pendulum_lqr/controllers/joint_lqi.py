@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controller_interface.interface import Controller, JointController
-from pendulum_lqr.controller_interface.law import winds_up
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.law import winds_up, within_limits
 from pendulum_lqr.controller_interface.loop_check import require_settling
 from pendulum_lqr.controller_interface.sampling import require_period
 from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, SMALLER_Q, UprightController, gain_text, joint_weights
 from pendulum_lqr.linear.analysis import Feedback
 from pendulum_lqr.linear.design import output_lqr, with_integrals
-from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -32,8 +31,8 @@ class JointLqi(UprightController):
 
     SUMMARY = "LQR with integrals of the driven joints: no offset of theirs under a constant effort"
 
-    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
-        super().__init__(plant, p, period)
+    def __init__(self, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
         self._driven, n, m = list(plant.coordinates.driven), len(plant.joints), len(self._hold)
         self.gain = output_lqr(with_integrals(self._linear, self._driven), [*p["q"], *(p["q_integral"],) * m], p["r"])
         self._K, self._KI = self.gain.rows[:, : 2 * n], self.gain.rows[:, 2 * n :]
@@ -56,7 +55,7 @@ class JointLqi(UprightController):
         """Empty the integrals."""
         self._integral = np.zeros(len(self._hold))
 
-    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts [N m or N]."""
         deviation = self._deviation(position)
         error = np.array([deviation[joint] for joint in self._driven])
@@ -71,7 +70,7 @@ class JointLqi(UprightController):
         """Return the gain."""
         return f"K = [{gain_text(self.gain.rows)}]"
 
-    def carry_over(self, previous: Controller | JointController) -> None:
+    def take_over(self, previous: Controller) -> None:
         """Keep the efforts that the integrals stand for, though the gain on them has changed."""
         if isinstance(previous, JointLqi):
             self._integral = np.linalg.solve(self._KI, previous._KI @ previous._integral)

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controller_interface.interface import JointController
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.law import within_limits
 from pendulum_lqr.controller_interface.loop_check import require_settling
 from pendulum_lqr.linear.analysis import Feedback
 from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
-from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -68,7 +68,7 @@ def gain_text(rows: Iterable[Iterable[float]]) -> str:
     return "; ".join(", ".join(f"{value:.6g}" for value in row) for row in rows)
 
 
-class UprightController(JointController):
+class UprightController(Controller):
     """Feedback of all deviations about upright, by the linear model there.
 
     Args:
@@ -80,7 +80,7 @@ class UprightController(JointController):
         ParameterError: There is no such feedback for these weights.
     """
 
-    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
+    def __init__(self, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(joint_limits(plant, p["effort_limit"]))
         self.period = period
         self._plant = plant
@@ -100,8 +100,8 @@ class JointLqr(UprightController):
     SUMMARY = "continuous LQR, sampled"
     SAMPLED = False
 
-    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
-        super().__init__(plant, p, period)
+    def __init__(self, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
         self.gain = output_lqr(self._linear, p["q"], p["r"])
         # Plain floats: indexing an array on every state costs more than the law itself.
         self._rows = tuple(tuple(float(value) for value in row) for row in self.gain.rows)
@@ -110,7 +110,7 @@ class JointLqr(UprightController):
         """Refuse a period at which it does not settle [s]."""
         require_settling("lqr", self._plant, Feedback(self.gain.K), period, SMALLER_Q)
 
-    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts."""
         x = self._deviation(position) + velocity
         wanted = (

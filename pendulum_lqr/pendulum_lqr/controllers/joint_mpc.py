@@ -35,8 +35,8 @@ class JointMpc(JointDiscreteLqr):
 
     SUMMARY = "linear MPC with limits of efforts and positions (OSQP)"
 
-    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
-        super().__init__(plant, p, period)
+    def __init__(self, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
         self.failures = 0
         self._position_limits = p["position_limits"]
         if len(self._position_limits) != len(plant.joints):
@@ -49,6 +49,7 @@ class JointMpc(JointDiscreteLqr):
             self.model, self.gain, self.cost[1], int(p["horizon"]), limits, self.effort_limits, _DEAR * max(p["q"])
         )
         self._enough = _enough_samples(self.model.A) if limits else 0
+        self._warn()
 
     @classmethod
     def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
@@ -59,9 +60,8 @@ class JointMpc(JointDiscreteLqr):
         horizon = ParameterSpec("horizon", 50, "-", "Samples of the horizon.", minimum=1, maximum=200)
         return (*joint_weights(plant), horizon, limits, JOINT_LIMIT)
 
-    @property
-    def notice(self) -> str:
-        """That the horizon is too short, and how often the solver found no plan."""
+    def _warn(self) -> None:
+        """Note that the horizon is too short, and how often the solver found no plan."""
         notices = []
         if self._program.horizon < self._enough:
             notices.append(
@@ -70,7 +70,7 @@ class JointMpc(JointDiscreteLqr):
             )
         if self.failures:
             notices.append(f"no plan for {self.failures} states: the LQR answered")
-        return "; ".join(notices)
+        self.notice = "; ".join(notices)
 
     def reset(self) -> None:
         """Forget the plan and what was sent."""
@@ -83,6 +83,7 @@ class JointMpc(JointDiscreteLqr):
         plan = self._program.first(state, -limits - self._hold, limits - self._hold)
         if plan is None:
             self.failures += 1
+            self._warn()
             return super()._wanted(state)
         return plan
 

@@ -27,11 +27,12 @@ class JointNmpc(CaughtController):
     EVERY_STATE = "nmpc plans for answers"
     DESIGNING = "compiles its model, which takes some ten seconds"
 
-    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
+    def __init__(self, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> None:
         refuse_passive_friction("nmpc", plant)
         inner = MechanismMpc(period, default_catch(plant))
         super().__init__(inner, period)
-        inner.command(0.0, (0.0,) * (2 * len(plant.joints)))
+        still = (0.0,) * len(plant.joints)
+        inner.efforts(0.0, still, still)
         inner.reset()
 
     def describe(self) -> str:

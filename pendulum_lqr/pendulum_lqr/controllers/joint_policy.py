@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pendulum_lqr.controller_interface.interface import Controller, JointController
-from pendulum_lqr.controller_interface.joint_controller import make_joint_controller
+from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controller_interface.policy_answers import (
     START_TIME,
     ZERO,
@@ -29,7 +29,7 @@ __all__ = ["JointPolicy"]
 _FALLBACKS = (ZERO, "lqr")
 
 
-class JointPolicy(JointController):
+class JointPolicy(Controller):
     """Runs the network of a policy file, as :class:`pendulum_lqr.controllers.policy.LearnedPolicy` does.
 
     Args:
@@ -41,6 +41,7 @@ class JointPolicy(JointController):
         catch: LQR that takes over near upright; None for none.
     """
 
+    STARTS_SOFTLY = True
     SUMMARY = "a learned policy from a file"
 
     def __init__(
@@ -48,7 +49,7 @@ class JointPolicy(JointController):
         policy: Policy,
         hold: int,
         effort_limits: Vector,
-        fallback: JointController | None = None,
+        fallback: Controller | None = None,
         *,
         start_time: float = START_TIME,
         catch: MechanismCatch | None = None,
@@ -73,7 +74,7 @@ class JointPolicy(JointController):
         return (*policy_specs(_FALLBACKS), catch, JOINT_LIMIT)
 
     @classmethod
-    def design(cls, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> JointPolicy:
+    def design(cls, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> JointPolicy:
         """Return the controller of the parameter ``policy``.
 
         Raises:
@@ -82,7 +83,7 @@ class JointPolicy(JointController):
         """
         fallback = None
         if p["fallback"] != ZERO:
-            fallback = make_joint_controller(p["fallback"], plant, {"effort_limit": p["effort_limit"]})
+            fallback = make_controller(p["fallback"], plant, period, {"effort_limit": p["effort_limit"]}, checked=False)
         if not p["policy"]:
             raise ParameterError("policy is empty; expected the path of a policy file (.npz)")
         policy = load_policy(p["policy"])
@@ -97,6 +98,10 @@ class JointPolicy(JointController):
     def notice(self) -> str:
         """Why it gave up; empty as long as it did not."""
         return self._answers.notice
+
+    @notice.setter
+    def notice(self, text: str) -> None:
+        self._answers.notice = text
 
     def check(self, period: float) -> None:
         """Refuse a period that the policy's is no multiple of, and at which catch or fallback do not settle [s]."""
@@ -114,12 +119,12 @@ class JointPolicy(JointController):
         if self.fallback is not None:
             self.fallback.reset()
 
-    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return the policy's efforts, the catch's near upright, or the fallback's after it gave up [N m or N]."""
         efforts = self._answers.answer(t, self._deviation(position), velocity)
         if efforts is None:
             fallback = self.fallback
-            ask = None if fallback is None else lambda: fallback.command(t, position, velocity)
+            ask = None if fallback is None else lambda: fallback.efforts(t, position, velocity)
             efforts = self._answers.fall_back(t, position + velocity, ask)
         elif self.catch is not None:
             x = deviation_of(self.policy.coordinates, position + velocity)
@@ -134,7 +139,7 @@ class JointPolicy(JointController):
         text = self._answers.describe("no effort" if self.fallback is None else self.fallback.describe())
         return text if self.catch is None else f"{text}; LQR within {self.catch.region.describe()}"
 
-    def carry_over(self, previous: Controller | JointController) -> None:
+    def take_over(self, previous: Controller) -> None:
         """Take over samples and efforts from the same kind of policy, and that it gave up."""
         if not isinstance(previous, JointPolicy):
             return

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pendulum_lqr.controller_interface.interface import JointController
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controller_interface.sampling import require_period
 from pendulum_lqr.controllers.joint_lqr import require_catching
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
@@ -28,7 +28,7 @@ _FILE = ParameterSpec(
 )
 
 
-class CaughtController(JointController):
+class CaughtController(Controller):
     """A controller of whole states that ends with an LQR; the inner controller defines how.
 
     Args:
@@ -55,9 +55,9 @@ class CaughtController(JointController):
         """Restart, hanging."""
         self._inner.reset()
 
-    def command(self, t: float, position: Vector, velocity: Vector) -> Vector:
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts."""
-        return self._inner.command(t, position + velocity)
+        return self._inner.efforts(t, position, velocity)
 
 
 class JointSwingUp(CaughtController):
@@ -73,7 +73,7 @@ class JointSwingUp(CaughtController):
     EVERY_STATE = "the trajectory is followed"
     DESIGNING = "tries out from where the LQR catches, which takes some seconds"
 
-    def __init__(self, plant: MechanismParameters, p: Mapping[str, Any], period: float) -> None:
+    def __init__(self, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> None:
         catch, trajectory = self._find(plant, p)
         self._duration = trajectory.duration
         q, r = plant.mechanism.weights

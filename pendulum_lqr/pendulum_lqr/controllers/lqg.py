@@ -30,6 +30,7 @@ class Lqg(BaseController):
     """
 
     PREDICTS = True
+    BALANCES = True
     SUMMARY = "LQR on the state that a Kalman filter estimates, motor, lag, delay and constant torques included"
     PARAMETERS = (
         Q,

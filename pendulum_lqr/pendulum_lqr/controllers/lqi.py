@@ -44,6 +44,7 @@ class Lqi(LawController):
     The integral does not wind up at the torque limit: :func:`~pendulum_lqr.controller_interface.law.winds_up`.
     """
 
+    BALANCES = True
     SUMMARY = "LQR with an integral state: no offset under a constant torque"
     PARAMETERS = (
         Q,

@@ -34,6 +34,8 @@ class Lqr(LawController):
     Where the plant has states that are not measured, K is the best gain on angle and velocity.
     """
 
+    SAMPLED = False
+    BALANCES = True
     SUMMARY = "linear quadratic regulator of the thesis, u = u* - K (x - x*)"
     PARAMETERS: ClassVar[tuple[ParameterSpec, ...]] = (Q, R, FEEDFORWARD)
 

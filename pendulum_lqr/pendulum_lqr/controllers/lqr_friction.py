@@ -59,6 +59,7 @@ class LqrFriction(LawController):
         limit cycles by too much of it); Khalil, Nonlinear Systems, 3rd ed., 2002, section 7.2 (describing function).
     """
 
+    BALANCES = True
     SUMMARY = "LQR with most of the dry friction fed forward by a smooth sign: rests nearer to the set-point"
     PARAMETERS = (
         Q,

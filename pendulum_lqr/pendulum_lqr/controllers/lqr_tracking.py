@@ -72,6 +72,7 @@ class LqrTracking(BaseController):
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(p["effort_limit"], p["set_point"])
+        self._plant = plant
         self.reference = Reference(p["reference"], p["set_point"], p["amplitude"], p["frequency"], p["move_time"])
         if self.reference.shape == "steps" and self.reference.move_time > 0.5 * self.reference.period:
             raise ParameterError(
@@ -101,9 +102,9 @@ class LqrTracking(BaseController):
         ends = {wrap(p["set_point"] + side * p["amplitude"]) for side in (-1.0, 0.0, 1.0)}
         return [{"set_point": end, "amplitude": 0.0, "approach_time": 0.0} for end in sorted(ends)]
 
-    def check(self, plant: PlantParameters, period: float) -> None:
+    def check(self, period: float) -> None:
         """Refuse a period at which a frozen loop, or the loop along the reference, is unstable."""
-        self.margins = scheduled_margins(plant, period, self.reference, self.schedule)
+        self.margins = scheduled_margins(self._plant, period, self.reference, self.schedule)
 
     def reset(self) -> None:
         """Forget the way onto the reference."""

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from pendulum_lqr.controller_interface.interface import JointController
+from pendulum_lqr.controller_interface.interface import Controller, unwrapped
 from pendulum_lqr.controller_interface.policy_answers import check_policy_period, states_to_hold
 from pendulum_lqr.controllers.joint_lqr import require_catching
 from pendulum_lqr.controllers.joint_policy import JointPolicy
 from pendulum_lqr.policies.policy import require_plant
 from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy
 from pendulum_lqr.swing_up.mechanism_catch import make_mechanism_catch
-from pendulum_lqr.swing_up.mechanism_controller import MechanismController
 from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
 from pendulum_lqr.swing_up.mechanism_planned import PlannedSwingUp
 from pendulum_lqr.swing_up.stored_swing_up import CALM_WEIGHTS, default_catch, tracked_swing_up
@@ -26,7 +25,7 @@ _CATCH_SUFFIX = "+lqr"
 """What the name of a policy file ends with where an LQR takes over near upright."""
 
 
-class DifferencedVelocity:
+class DifferencedVelocity(Controller):
     """Gives a controller velocities from the last two positions in place of the measured ones.
 
     The slope between two positions is the velocity in their middle; half a period of the model's acceleration brings
@@ -34,20 +33,21 @@ class DifferencedVelocity:
     period come through as noise.
     """
 
-    def __init__(self, plant: MechanismParameters, controller: MechanismController) -> None:
-        self.plant, self.controller = plant, controller
+    def __init__(self, plant: MechanismParameters, inner: Controller) -> None:
+        super().__init__(plant.effort_limits)
+        self.plant = plant
+        self.inner: Controller = inner
         self.reset()
 
     def reset(self) -> None:
         """Forget the last position; the first velocity is the measured one."""
-        self.controller.reset()
+        self.inner.reset()
         self._last: tuple[float, Vector] | None = None
         self._effort = (0.0,) * len(self.plant.effort_limits)
 
-    def command(self, t: float, x: Vector) -> Vector:
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return the controller's efforts [N m or N]."""
-        n = len(self.plant.joints)
-        q, v = x[:n], x[n:]
+        q, v = position, velocity
         if self._last is not None and t > self._last[0]:
             before, old = self._last
             h = t - before
@@ -55,30 +55,15 @@ class DifferencedVelocity:
             a = self.plant.acceleration(q, slope, self.plant.coordinates.spread(self._effort))
             v = tuple(middle + 0.5 * h * each for middle, each in zip(slope, a, strict=True))
         self._last = (t, q)
-        self._effort = self.controller.command(t, (*q, *v))
+        self._effort = self.inner.efforts(t, q, v)
         return self._effort
 
 
-class _WholeStates:
-    """Adapts a controller of the graph to whole states."""
-
-    def __init__(self, inner: JointController, joints: int) -> None:
-        self._inner, self._joints = inner, joints
-
-    def reset(self) -> None:
-        """Forget the past."""
-        self._inner.reset()
-
-    def command(self, t: float, x: Vector) -> Vector:
-        """Return m efforts [N m or N]."""
-        return self._inner.command(t, x[: self._joints], x[self._joints :])
-
-
-def _tvlqr_mpc(plant: MechanismParameters, period: float) -> MechanismController:
+def _tvlqr_mpc(plant: MechanismParameters, period: float) -> Controller:
     return DifferencedVelocity(plant, tracked_swing_up(plant, period, recovers=True))
 
 
-_CONTROLLERS: dict[str, Callable[[MechanismParameters, float], MechanismController]] = {
+_CONTROLLERS: dict[str, Callable[[MechanismParameters, float], Controller]] = {
     "tvlqr": tracked_swing_up,
     "ilqr": lambda plant, period: PlannedSwingUp(period, default_catch(plant)),
     "mpc": lambda plant, period: DifferencedVelocity(plant, MechanismMpc(period, default_catch(plant))),
@@ -91,7 +76,7 @@ def mechanism_controller_names() -> tuple[str, ...]:
     return tuple(_CONTROLLERS)
 
 
-def make_mechanism_controller(name: str, plant: MechanismParameters, period: float) -> MechanismController:
+def make_mechanism_controller(name: str, plant: MechanismParameters, period: float) -> Controller:
     """Design a controller; ilqr and mpc compile for some ten seconds the first time.
 
     Args:
@@ -115,12 +100,12 @@ def make_mechanism_controller(name: str, plant: MechanismParameters, period: flo
         # It has all of its effort from the start.
         inner = JointPolicy(policy, hold, plant.effort_limits, start_time=0.0, catch=catch)
         inner.check(period)
-        return _WholeStates(inner, len(plant.joints))
+        return inner
     if name not in _CONTROLLERS:
         raise ParameterError(
             f"controller {name!r} is unknown; expected one of {', '.join(_CONTROLLERS)}, or a policy file (.npz)"
         )
-    controller: Any = _CONTROLLERS[name](plant, period)
-    require_catching(name, getattr(controller, "controller", controller).catch, period)
-    found: MechanismController = controller
-    return found
+    controller = _CONTROLLERS[name](plant, period)
+    caught: Any = unwrapped(controller)
+    require_catching(name, caught.catch, period)
+    return controller

@@ -34,6 +34,8 @@ class PdGravity(LawController):
     Holds any angle, upright or not; gain is the actuator's torque per commanded torque, 1 for a rigid plant.
     """
 
+    SAMPLED = False
+    BALANCES = True
     SUMMARY = "PD with gravity compensation: holds any angle"
     PARAMETERS = (
         ParameterSpec(

@@ -55,6 +55,7 @@ class Pid(LawController):
     Source: Astrom and Hagglund, Advanced PID Control, 2006, sections 3.3 to 3.5.
     """
 
+    BALANCES = True
     SUMMARY = "PID on the angle alone, tuned on the model for the cost that the LQR minimises"
     PARAMETERS = (
         ParameterSpec(

@@ -34,6 +34,7 @@ class Playback(BaseController):
 
     FEEDBACK = False
     TIME_INVARIANT = False
+    SAMPLED = False
     SUMMARY = "open loop: plays a recorded torque"
     PARAMETERS = (
         ParameterSpec("file", "", "", "CSV file with a header line and the columns time [s] and effort [N m]."),

@@ -55,11 +55,13 @@ class LearnedPolicy(BaseController):
         fallback: Controller | None = None,
         *,
         start_time: float = START_TIME,
+        plant: PlantParameters | None = None,
     ) -> None:
         self._answers = PolicyAnswers(policy, hold, (effort_limit,), start_time)
         super().__init__(self._answers.limits[0])
         self.policy = policy
         self.fallback = fallback
+        self.plant: Any = plant or policy.plant
 
     @classmethod
     def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LearnedPolicy:
@@ -76,13 +78,15 @@ class LearnedPolicy(BaseController):
         if p["fallback"] != ZERO:
             values = {"effort_limit": p["effort_limit"]}
             fallback = make_controller(p["fallback"], plant, period, values, checked=False)
-        return cls(policy, states_to_hold(policy, period), p["effort_limit"], fallback, start_time=p["start_time"])
+        return cls(
+            policy, states_to_hold(policy, period), p["effort_limit"], fallback, start_time=p["start_time"], plant=plant
+        )
 
-    def check(self, plant: PlantParameters, period: float) -> None:
+    def check(self, period: float) -> None:
         """Refuse a period that the policy's is no whole multiple of, and a fallback that is unstable at it."""
         check_policy_period(self.policy, period)
         if self.fallback is not None:
-            require_stable("the fallback", self.fallback, plant, period)
+            require_stable("the fallback", self.fallback, self.plant, period)
 
     @property
     def notice(self) -> str:

@@ -27,7 +27,8 @@ class SlidingMode(BaseController):
     Source: Slotine and Li, Applied Nonlinear Control, 1991, section 7.2.
     """
 
-    SERIES_ELASTIC = False
+    SAMPLED = False
+    BALANCES = True
     SUMMARY = "sliding mode with a boundary layer: gives way by d / (lambda (b + k / phi)) to a constant torque d"
     PARAMETERS = (
         ParameterSpec("rate", 5.0, "1/s", "Slope of the sliding line, lambda.", minimum=0.0, exclusive_minimum=True),

@@ -78,8 +78,8 @@ class Tvlqr(CatchingController):
             [np.interp(times, trajectory.times, trajectory.states[:, axis]) for axis in (0, 1)]
         )
         # A held sample does best with the torque of the middle of its interval.
-        self.efforts = np.interp(times + 0.5 * period, trajectory.times, trajectory.efforts)
-        self.efforts[times >= trajectory.duration] = catch.hold
+        self.planned = np.interp(times + 0.5 * period, trajectory.times, trajectory.efforts)
+        self.planned[times >= trajectory.duration] = catch.hold
         self.gains = _gains(plant, period, self.states, p["q"], p["r"], catch.gain.S)
         self.states[:, 0] -= self._centre
         self._scaled = self.states / np.array([_ANGLE_SCALE, _VELOCITY_SCALE])
@@ -104,7 +104,7 @@ class Tvlqr(CatchingController):
             # By time, not by commands: a state without a command does not hold up the trajectory.
             began, first = self._joined
             self._index = first + round((t - began) / self.period)
-            if self._index >= len(self.efforts) or self._distance(self._index, angle, velocity) > _LOST:
+            if self._index >= len(self.planned) or self._distance(self._index, angle, velocity) > _LOST:
                 self._index = None
                 self._losses += 1
         # A plant that cannot be kept on the trajectory differs from the model; energy control needs less of it.
@@ -117,7 +117,7 @@ class Tvlqr(CatchingController):
         gain = self.gains[k]
         error = wrap(self._sign * angle - float(nominal[0]))
         feedback = float(gain[0]) * error + float(gain[1]) * (self._sign * velocity - float(nominal[1]))
-        return self.clamp(self._sign * (float(self.efforts[k]) - feedback))
+        return self.clamp(self._sign * (float(self.planned[k]) - feedback))
 
     def take_over(self, previous: Controller) -> None:
         """Take over whether the LQR is in charge; a trajectory of its own has to be rejoined."""

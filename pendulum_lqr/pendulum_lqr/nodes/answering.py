@@ -7,9 +7,8 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
-from typing import Any, cast
 
-from pendulum_lqr.controller_interface.interface import Controller, JointController
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.nodes.answer_rules import (
     DUPLICATE,
     FROM_FUTURE,
@@ -20,7 +19,6 @@ from pendulum_lqr.nodes.answer_rules import (
     is_saturated,
     judge_state,
 )
-from pendulum_msgs_py.contract.angles import deviation_from_upright
 from pendulum_msgs_py.contract.rules import NEVER
 from pendulum_msgs_py.contract.timing import RingOfTimes
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample, Vector, written
@@ -72,7 +70,7 @@ class AnswerLoop:
 
     def __init__(
         self,
-        controller: Controller | JointController,
+        controller: Controller,
         state_timeout: float,
         *,
         simulated_time: bool = False,
@@ -113,26 +111,15 @@ class AnswerLoop:
         self.start_ns = None
         self.last_effort = self._nothing
 
-    def replace(self, controller: Controller | JointController) -> None:
+    def replace(self, controller: Controller) -> None:
         """Swap the controller between two states; integrals and filters are carried over."""
-        # All controllers of one loop are for the same joints, so both are of one kind.
-        controller.carry_over(cast("Any", self.controller))
+        controller.carry_over(self.controller)
         self.controller = controller
         self._take(controller)
 
-    def _take(self, controller: Controller | JointController) -> None:
-        """Bind the control law: of a controller of several joints, or of one that sees [angle from upright, speed]."""
-        self._command: Callable[[float, JointSample], Vector]
-        if isinstance(controller, JointController):
-            several = controller.command
-            self._limits = controller.effort_limits
-            self._command = lambda t, sample: several(t, sample.position, sample.velocity)
-        else:
-            one = controller.command
-            self._limits = (controller.effort_limit,)
-            self._command = lambda t, sample: (
-                one(t, (deviation_from_upright(sample.position[0]), sample.velocity[0])),
-            )
+    def _take(self, controller: Controller) -> None:
+        """Bind the control law."""
+        self._efforts, self._limits = controller.efforts, controller.effort_limits
         self._nothing = (0.0,) * len(self._limits)
 
     def answer(self, sample: JointSample | None, now_ns: int, problem: str = "") -> Vector | None:
@@ -160,7 +147,8 @@ class AnswerLoop:
         began = self._monotonic()
         reason = ""
         try:
-            effort = self._command((sample.stamp_ns - self.start_ns) / NANOSECONDS, sample)
+            time_s = (sample.stamp_ns - self.start_ns) / NANOSECONDS
+            effort = self._efforts(time_s, sample.position, sample.velocity)
         except (ArithmeticError, ValueError, RuntimeError) as error:
             # A solver that fails must not end the node: without a command the plant's timeout applies zero torque.
             effort, reason = (math.nan,), f"{type(error).__name__}: {error}"

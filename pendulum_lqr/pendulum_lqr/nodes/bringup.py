@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pendulum_lqr.controller_interface.controller import CONTROLLERS
+from pendulum_lqr.controller_interface.controller import controller_names
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import load_yaml, parameter_sections, suggestion
@@ -49,7 +49,7 @@ ARGUMENTS: tuple[Argument, ...] = (
         "",
         "Lab file, for plant:=hebi: selects the actuator and sets its zero, sign, limits and rate.",
     ),
-    Argument("controller", "lqr", "Controller of each plant.", (*CONTROLLERS, "none")),
+    Argument("controller", "lqr", "Controller of each plant.", (*controller_names(), "none")),
     Argument(
         "controller_waits",
         "auto",

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controller_interface.controller import LawController, unwrapped
-from pendulum_lqr.controller_interface.interface import Controller, JointController
+from pendulum_lqr.controller_interface.controller import LawController
+from pendulum_lqr.controller_interface.interface import Controller, unwrapped
 from pendulum_lqr.controller_interface.law import MOST_MEMORY, MOST_NUMBERS
 from pendulum_lqr.controller_interface.sampling import PeriodWatch
 from pendulum_lqr.nodes.answering import AnswerLoop
@@ -59,14 +59,14 @@ class CompiledController:
 
     def __init__(
         self,
-        controller: Controller | JointController | None,
+        controller: Controller | None,
         watch: PeriodWatch,
         answering: Callable[[], AnswerLoop | None],
         refusal: str = "",
     ) -> None:
         self._watch = watch
         self._answering = answering
-        alone = None if controller is None or isinstance(controller, JointController) else unwrapped(controller)
+        alone = None if controller is None else unwrapped(controller)
         own = law_of(alone)
         self._law = None if own is None else own.law
         self._lent: LawController | None = None

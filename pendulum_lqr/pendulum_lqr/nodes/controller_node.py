@@ -20,30 +20,23 @@ from std_msgs.msg import Float64MultiArray
 
 from pendulum_lqr.controller_interface.controller import (
     CONTROLLERS,
-    BaseController,
+    controller_class,
+    controller_names,
     controller_parameters,
     make_controller,
-    unwrapped,
 )
-from pendulum_lqr.controller_interface.interface import Controller, JointController
-from pendulum_lqr.controller_interface.joint_controller import (
-    JOINT_CONTROLLER_NAMES,
-    JOINT_CONTROLLERS,
-    joint_controller_class,
-    make_joint_controller,
-)
-from pendulum_lqr.controller_interface.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem, uses_period
+from pendulum_lqr.controller_interface.interface import AnyPlant, Controller, unwrapped
+from pendulum_lqr.controller_interface.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_lqr.nodes.compiled_controller import CompiledController
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joints
-from pendulum_msgs_py.contract.joints import ONE_JOINT
 from pendulum_msgs_py.contract.plant_specs import COMPILED, REALTIME_PRIORITY
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import JointSample, Vector
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import (
     MECHANISM_PRESETS,
     PRESET_NAMES,
@@ -71,14 +64,14 @@ from pendulum_msgs_py.ros.timers import create_wall_timer
 
 __all__ = ["NODE_SPECS", "ControllerNode", "main"]
 
+_SEVERAL = " or ".join(", ".join(controller_names(several=True)).rsplit(", ", 1))
 NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
-        "controller", "lqr", "", "Which controller.", choices=tuple(dict.fromkeys((*CONTROLLERS, *JOINT_CONTROLLERS))),
-        read_only=True,
+        "controller", "lqr", "", "Which controller.", choices=tuple(CONTROLLERS), read_only=True,
     ),
     ParameterSpec(
         "plant", "thesis", "", f"Plant to design for: {PRESET_NAMES} or the path of a plant file; of several joints, "
-        f"with {JOINT_CONTROLLER_NAMES}: {', '.join(MECHANISM_PRESETS)}.", read_only=True,
+        f"with {_SEVERAL}: {', '.join(MECHANISM_PRESETS)}.", read_only=True,
     ),
     ParameterSpec(
         "period", 0.0, "s", "Sampling period of the loop, which discrete designs and filters need; 0 takes it from the "
@@ -124,24 +117,19 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._loop: AnswerLoop | None = None
         kind, plant = self._choose("controller"), self._choose("plant")
         self._own = {spec.name for spec in NODE_SPECS}
-        self._plant: PlantParameters | MechanismParameters
-        self._plant = load_mechanism(plant) if is_mechanism(plant) else load_plant(plant)
-        self._coordinates, takes_time = ONE_JOINT, ""
-        if isinstance(self._plant, MechanismParameters):
-            several = joint_controller_class(kind, self._plant)
-            self._coordinates, takes_time = self._plant.coordinates, several.DESIGNING
-            own = several.parameters(self._plant)
-        else:
-            own = controller_parameters(kind)
+        self._plant: AnyPlant = load_mechanism(plant) if is_mechanism(plant) else load_plant(plant)
+        self._coordinates = self._plant.coordinates
+        self._kind = controller_class(kind, self._plant)
+        own = controller_parameters(kind, self._plant)
         self._joints, self._driven = self._coordinates.names, self._coordinates.driven_names
         self._settings = NodeParameters(self, NODE_SPECS + own, self._design, self._swap)
         self._period = self._settings["period"] or ASSUMED_PERIOD
         self._period_measured = False
-        if takes_time:
+        if takes_time := self._kind.DESIGNING:
             # Nothing interrupts a compiler: the first Ctrl-C waits for it, and nothing is commanded.
             self.get_logger().info(f"{takes_time}; Ctrl-C waits for it, a second one does not")
         # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
-        self._pending: Controller | JointController | None = self._design(self._settings.values)
+        self._pending: Controller | None = self._design(self._settings.values)
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._watch = PeriodWatch(exact=self._simulated_time)
         self._period_known = False
@@ -253,7 +241,7 @@ class ControllerNode(LifecycleNode, PollingNode):
                 encode_joints(sample.stamp_ns, self._full_name, self._driven, (), (), effort)
             )
 
-    def _swap(self, controller: Controller | JointController) -> None:
+    def _swap(self, controller: Controller) -> None:
         """Take over the new design; a failed design never gets here, and leaves the old gain in force."""
         if self._loop is None:
             self._pending = controller
@@ -283,20 +271,11 @@ class ControllerNode(LifecycleNode, PollingNode):
 
     # A design may take seconds without replies; plants on the same core are not to wait for it.
     @as_ordinary()
-    def _design(self, values: Mapping[str, Any]) -> Controller | JointController:
+    def _design(self, values: Mapping[str, Any]) -> Controller:
         # Until the period is known, the loop's stability cannot be checked.
         known = bool(values["period"]) or self._period_measured
-        if isinstance(self._plant, MechanismParameters):
-            own = self._own_values(values)
-            return make_joint_controller(values["controller"], self._plant, own, self._period if known else None)
-        return self._design_one(values, self._plant, checked=known)
-
-    def _design_one(self, values: Mapping[str, Any], plant: PlantParameters, *, checked: bool = True) -> Controller:
-        return make_controller(values["controller"], plant, self._period, self._own_values(values), checked=checked)
-
-    def _own_values(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values of the controller's own parameters, without those of the node."""
-        return {name: value for name, value in values.items() if name not in self._own}
+        own = {name: value for name, value in values.items() if name not in self._own}
+        return make_controller(values["controller"], self._plant, self._period, own, checked=known)
 
     def _design_for(self, period: float) -> None:
         """Take another period, and redesign where that makes a difference."""
@@ -311,9 +290,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         self.get_logger().info(f"designed for states every {period:g} s: {self._loop.controller.describe()}")
 
     def _uses_period(self) -> bool:
-        if isinstance(self._plant, MechanismParameters):
-            return joint_controller_class(self._settings["controller"], self._plant).SAMPLED
-        return uses_period(self._settings["controller"], self._settings["velocity"])
+        return self._kind.SAMPLED or self._settings.values.get("velocity", "measured") != "measured"
 
     def _may_answer(self) -> bool:
         """Return whether the design is for the rate of the states, as far as that is known."""
@@ -337,26 +314,18 @@ class ControllerNode(LifecycleNode, PollingNode):
         plant = self._plant
         try:
             self._period_measured = True
-            if isinstance(plant, MechanismParameters):
-                if not self._uses_period():
-                    self._period = measured
-                elif not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:
-                    self._design_for(measured)
-                # Not by another design, which may take longer than the gap that counts as a plant's restart.
-                if self._loop is not None and isinstance(self._loop.controller, JointController):
-                    self._loop.controller.check(measured)
-                self._period_known = True
-                return True
             if not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:
                 self._design_for(measured)
-            elif not values["period"] and self._uses_period():
+            elif not values["period"] and self._uses_period() and not self._kind.DESIGNING:
+                # Not a slow design, which may take longer than the gap that counts as a plant's restart.
                 self._design(values)
-            if (own := self._own_controller()) is not None:
-                own.check(plant, measured)
-            self._refusal = rate_problem(
-                lambda: self._design_one(values, plant), values["controller"], plant, self._period, measured,
-                uses=self._uses_period(), set_point=values["set_point"],
-            )  # fmt: skip
+            if self._loop is not None:
+                unwrapped(self._loop.controller).check(measured)
+            if isinstance(plant, PlantParameters):
+                self._refusal = rate_problem(
+                    self._kind, values["controller"], lambda: self._design(values), plant, self._period, measured,
+                    uses=self._uses_period(), set_point=values["set_point"],
+                )  # fmt: skip
         except PendulumError as error:
             self._refusal = f"states come every {measured:g} s: {error}"
         if self._refusal:
@@ -364,20 +333,6 @@ class ControllerNode(LifecycleNode, PollingNode):
             return False
         self._period_known = True
         return True
-
-    def _own_controller(self) -> BaseController | None:
-        """Return the running controller, without its velocity estimator."""
-        if self._loop is None or isinstance(self._loop.controller, JointController):
-            return None
-        inner = unwrapped(self._loop.controller)
-        return inner if isinstance(inner, BaseController) else None
-
-    def _notice(self) -> str:
-        """Return the running controller's notice for the user."""
-        if self._loop is not None and isinstance(self._loop.controller, JointController):
-            return self._loop.controller.notice
-        own = self._own_controller()
-        return "" if own is None else own.notice
 
     def _autostart(self) -> None:
         if self.trigger_configure() != TransitionCallbackReturn.SUCCESS:
@@ -428,7 +383,7 @@ class ControllerNode(LifecycleNode, PollingNode):
                 if not self._told_other_rate:
                     self.get_logger().warning(text)
             self._told_other_rate = other_rate
-        notice = self._notice()
+        notice = "" if self._loop is None else unwrapped(self._loop.controller).notice
         if notice:
             level = max(level, DiagnosticStatus.WARN)
             text = f"{text}; {notice}"
@@ -441,9 +396,8 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._diagnostics.publish(self._now(), level, text, values)
 
 
-def _limit(controller: Controller | JointController) -> str:
-    limits = controller.effort_limits if isinstance(controller, JointController) else (controller.effort_limit,)
-    return ", ".join(f"{limit:g}" for limit in limits)
+def _limit(controller: Controller) -> str:
+    return ", ".join(f"{limit:g}" for limit in controller.effort_limits)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -463,7 +417,7 @@ def _specs_for_help(arguments: Sequence[str]) -> tuple[ParameterSpec, ...]:
     """Return the parameters of the controller that the command line names, LQR by default."""
     for argument in arguments:
         name, separator, value = argument.partition(":=")
-        if separator and name == "controller" and value in CONTROLLERS:
+        if separator and name == "controller" and value in controller_names():
             # The node refuses one whose library is missing, in a sentence.
             with contextlib.suppress(PendulumError):
                 return controller_parameters(value)

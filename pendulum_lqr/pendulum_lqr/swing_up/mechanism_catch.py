@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pendulum_lqr.controller_interface.law import within_limits
 from pendulum_lqr.linear.design import DesignError, Gain, output_lqr
 from pendulum_lqr.linear.model import linearise
-from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.joints import Coordinates, Vector
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic

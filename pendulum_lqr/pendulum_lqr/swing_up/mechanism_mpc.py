@@ -7,8 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.law import within_limits
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
-from pendulum_lqr.swing_up.mechanism_controller import within_limits
 from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrWeights
 from pendulum_lqr.swing_up.mechanism_search import PlanSearch, PlanSettings
 from pendulum_msgs_py.contract.joints import Vector
@@ -25,7 +26,7 @@ PATIENCE, RETRIES = 8, 2
 """Plans after which some guesses are tried again where the plan does not end upright, and how many."""
 
 
-class MechanismMpc:
+class MechanismMpc(Controller):
     """Follows the first interval of a plan, replans from where it is, and hands over to the LQR near upright.
 
     Args:
@@ -34,9 +35,9 @@ class MechanismMpc:
     """
 
     def __init__(self, period: float, catch: MechanismCatch) -> None:
+        super().__init__(catch.plant.effort_limits)
         self.plant, self.period, self.catch = catch.plant, period, catch
         self.search = PlanSearch(catch, PLAN)
-        self._limits = self.plant.effort_limits
         self.reset()
 
     def reset(self) -> None:
@@ -46,10 +47,11 @@ class MechanismMpc:
         self._plan: IlqrPlan | None = None
         self._planned = 0.0
         self._age = 0
-        self._before = (0.0,) * len(self._limits)
+        self._before = (0.0,) * len(self.effort_limits)
 
-    def command(self, t: float, x: Vector) -> Vector:
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return the efforts [N m or N]."""
+        x = position + velocity
         step = PLAN.step
         deviation = deviation_of(self.plant.coordinates, x)
         if self.catch.holds(deviation):
@@ -70,12 +72,12 @@ class MechanismMpc:
         plan = self._plan
         if not math.isfinite(plan.cost):
             # From far beyond a machine's speeds every plan runs away from all numbers: there is none to follow.
-            self._plan, self._before = None, (0.0,) * len(self._limits)
+            self._plan, self._before = None, (0.0,) * len(self.effort_limits)
             return self._before
         share = min(1.0, (t + 0.5 * self.period - self._planned) / step)
         n = len(self.plant.joints)
         first = plan.states[0, 2 * n :]
-        self._before = within_limits(first + share * (plan.efforts[0] - first), self._limits)
+        self._before = within_limits(first + share * (plan.efforts[0] - first), self.effort_limits)
         return self._before
 
     def _plan_again(self, t: float, x: Vector) -> None:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
 from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrWeights
 from pendulum_lqr.swing_up.mechanism_search import PlanSearch, PlanSettings
@@ -24,7 +25,7 @@ _TUBE = 10.0
 """Width of the tube about a plan, as a multiple of the caught region's level; beyond it, it replans."""
 
 
-class PlannedSwingUp:
+class PlannedSwingUp(Controller):
     """Plans to the end, follows the plan by time-varying LQR, and replans only where tracking fails.
 
     A search takes about a second: simulated time waits for it, a real plant does not.
@@ -36,6 +37,7 @@ class PlannedSwingUp:
     """
 
     def __init__(self, period: float, catch: MechanismCatch, settings: PlanSettings = _PLAN) -> None:
+        super().__init__(catch.plant.effort_limits)
         self.plant, self.period, self.catch = catch.plant, period, catch
         self.search = PlanSearch(catch, settings)
         self.reset()
@@ -45,10 +47,11 @@ class PlannedSwingUp:
         self.catch.active = False
         self.search.reset()
         self._followed: MechanismTvlqr | None = None
-        self._before = (0.0,) * len(self.plant.effort_limits)
+        self._before = (0.0,) * len(self.effort_limits)
 
-    def command(self, t: float, x: Vector) -> Vector:
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return the efforts [N m or N]."""
+        x = position + velocity
         deviation = deviation_of(self.plant.coordinates, x)
         if self.catch.holds(deviation):
             self._followed = None

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.law import within_limits
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
-from pendulum_lqr.swing_up.mechanism_controller import MechanismController, within_limits
 from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
@@ -71,7 +72,7 @@ def whole_turns(plant: MechanismParameters, x: Vector) -> Array:
     return np.where(turns, 2.0 * math.pi * np.rint(np.array(x) / (2.0 * math.pi)), 0.0)
 
 
-class MechanismTvlqr:
+class MechanismTvlqr(Controller):
     """u = u0(t) - K(t) (x - x0(t)) along a swing-up, then LQR; another controller where both are far.
 
     It starts the trajectory at hanging. A state off it, beyond ``tube`` in the tracking's own cost, is caught
@@ -98,7 +99,7 @@ class MechanismTvlqr:
         *,
         q: Sequence[float],
         r: float,
-        recover: MechanismController | None = None,
+        recover: Controller | None = None,
         tube: float = 1.0,
     ) -> None:
         plant = catch.plant
@@ -109,15 +110,15 @@ class MechanismTvlqr:
                 f"trajectory of {trajectory.plant!r} has the joints {', '.join(trajectory.joints)} and "
                 f"{trajectory.efforts.shape[1]} motors; expected {', '.join(names)} and {m}"
             )
+        super().__init__(plant.effort_limits)
         self.plant, self.period, self.catch, self.recover = plant, period, catch, recover
         count = round(trajectory.duration / period)
         times = period * np.arange(count + 1)
         self.states, _ = trajectory.at(times)
         # A held sample does best with the effort of the middle of its interval.
-        _, self.efforts = trajectory.at(times[:-1] + 0.5 * period)
-        self.gains, self.costs = tracking_gains(plant, self.states, self.efforts, period, q, r, catch.gain.S)
+        _, self.planned = trajectory.at(times[:-1] + 0.5 * period)
+        self.gains, self.costs = tracking_gains(plant, self.states, self.planned, period, q, r, catch.gain.S)
         self._tube = tube * catch.region.level
-        self._limits = plant.effort_limits
         self.reset()
 
     def reset(self) -> None:
@@ -135,15 +136,16 @@ class MechanismTvlqr:
             # The trajectory starts on turn 0, so the turns made before are subtracted.
             self._began, self._turned = t, whole_turns(self.plant, x)
         k = round((t - self._began) / self.period)
-        if self._following and k < len(self.efforts):
+        if self._following and k < len(self.planned):
             error = np.array(x) - self._turned - self.states[k]
             if float(error @ self.costs[k] @ error) <= self._tube:
-                return within_limits(self.efforts[k] - self.gains[k] @ error, self._limits)
+                return within_limits(self.planned[k] - self.gains[k] @ error, self.effort_limits)
         self._following = False
         return None
 
-    def command(self, t: float, x: Vector) -> Vector:
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return the efforts [N m or N]."""
+        x = position + velocity
         effort = self.followed(t, x)
         if effort is not None:
             return effort
@@ -151,5 +153,5 @@ class MechanismTvlqr:
         if self.catch.holds(deviation):
             return self.catch.command(deviation)
         if self.recover is None:
-            return (0.0,) * len(self._limits)
-        return self.recover.command(t, x)
+            return (0.0,) * len(self.effort_limits)
+        return self.recover.efforts(t, position, velocity)

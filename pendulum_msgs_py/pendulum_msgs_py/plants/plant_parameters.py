@@ -20,6 +20,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates, Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown
 from pendulum_msgs_py.plants.friction_terms import term_fields
@@ -187,6 +188,16 @@ class PlantParameters(_FrictionTerms):
                 f"static_friction is {self.static_friction} N m; "
                 f"expected >= coulomb_friction = {self.coulomb_friction} N m"
             )
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """The only joint, which is driven."""
+        return ONE_JOINT
+
+    @property
+    def effort_limits(self) -> Vector:
+        """Largest effort of each driven joint [N m]."""
+        return (self.effort_limit,)
 
     def with_values(self, **changes: Any) -> PlantParameters:
         """Return a copy with some values changed, checked again.

@@ -11,8 +11,7 @@ from nicegui import run, ui
 
 from pendulum_bags.console.graph import Graph
 from pendulum_bags.console.jobs import Jobs
-from pendulum_lqr.controller_interface.controller import CONTROLLERS
-from pendulum_lqr.controller_interface.joint_controller import JOINT_CONTROLLERS
+from pendulum_lqr.controller_interface.controller import controller_names
 from pendulum_msgs_py.errors import FaultError, PendulumError
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 
@@ -29,10 +28,10 @@ def offered(plant: str) -> list[str]:
         plant: Preset or plant file; empty where unknown.
     """
     # A file of another machine, or an emulator's, is no reason to offer nothing: the controller reports refusals.
+    several = False
     with contextlib.suppress(PendulumError):
-        if plant and is_mechanism(plant):
-            return [kind for kind in JOINT_CONTROLLERS if kind not in _NEED_A_FILE]
-    return [kind for kind in CONTROLLERS if kind not in _NEED_A_FILE]
+        several = bool(plant) and is_mechanism(plant)
+    return [kind for kind in controller_names(several=several) if kind not in _NEED_A_FILE]
 
 
 class ControllerChoice:

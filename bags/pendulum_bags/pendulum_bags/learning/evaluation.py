@@ -141,7 +141,7 @@ def run_trial(policy: Policy, trial: Trial, start_time: float = START_TIME) -> t
         t, position, velocity = k * policy.period, state.position, state.velocity
         if isinstance(controller, JointPolicy):
             x: Vector = coordinates.deviation(position)
-            effort = controller.command(t, position, velocity)
+            effort = controller.efforts(t, position, velocity)
         else:
             x = (from_upright(position[0]),)
             effort = (controller.command(t, (x[0], velocity[0])),)

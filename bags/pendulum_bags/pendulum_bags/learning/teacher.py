@@ -57,7 +57,7 @@ class Teacher:
         goal = np.array([*plant.coordinates.goal, *([0.0] * n)])
         gain = tracked.catch.gain
         self.states = np.vstack([tracked.states[:-1] - goal, np.zeros(2 * n)])
-        self.efforts = np.vstack([tracked.efforts, np.zeros(m)])
+        self.efforts = np.vstack([tracked.planned, np.zeros(m)])
         self._gains = np.concatenate([tracked.gains, gain.rows[None]])
         self._costs = np.concatenate([tracked.costs[:-1], gain.S[None]]) / tracked.catch.region.level
         upright = _nearest(self.states, self.states[-1:], self._costs[-1:], self._turns)[1]

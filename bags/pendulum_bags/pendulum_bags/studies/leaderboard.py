@@ -17,7 +17,7 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.in_process import RunArrays, simulate_plant
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_lqr.controller_interface.controller import CONTROLLERS
+from pendulum_lqr.controller_interface.controller import controller_names
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import PendulumError
@@ -282,4 +282,4 @@ def motion_of(arrays: RunArrays) -> Array:
 
 def contenders() -> list[str]:
     """Return the controllers of the board."""
-    return [name for name in CONTROLLERS if name not in EXCLUDED]
+    return [name for name in controller_names() if name not in EXCLUDED]

@@ -18,7 +18,7 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.studies.mechanism_benchmark import criteria_of, score_v2, time_above_line
-from pendulum_lqr.swing_up.mechanism_controller import MechanismController
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
@@ -239,7 +239,7 @@ def simulate(
 
 
 def swing_up(
-    plant: MechanismParameters, stepper: Stepper, controller: MechanismController
+    plant: MechanismParameters, stepper: Stepper, controller: Controller
 ) -> tuple[Trajectory, dict[str, float], float]:
     """Return the undisturbed run of 10 s, its criteria and its score v2."""
     controller.reset()
@@ -290,7 +290,7 @@ def robustness_trials(plant: MechanismParameters, seed: int = 1) -> list[Trial]:
     return trials
 
 
-def try_once(plant: MechanismParameters, stepper: Stepper, controller: MechanismController, trial: Trial) -> bool:
+def try_once(plant: MechanismParameters, stepper: Stepper, controller: Controller, trial: Trial) -> bool:
     """Return whether a run ends upright: within 0.35 rad and 1 rad/s of each joint."""
     controller.reset()
     # Added up, 5000 times 2 ms stay a little below 10 s, and the public loop takes one step more.
@@ -315,7 +315,7 @@ def robustness_of(trials: Sequence[Trial], successes: Sequence[bool]) -> Robustn
 
 
 def knock_downs(
-    plant: MechanismParameters, stepper: Stepper, controller: MechanismController, seed: int
+    plant: MechanismParameters, stepper: Stepper, controller: Controller, seed: int
 ) -> tuple[Trajectory, float]:
     """Return a run of 60 s with 15 knock-downs and its score v3, the share of time above the line.
 
@@ -335,7 +335,7 @@ def knock_downs(
 class _KnockDowns:
     """The controller, interrupted: what the public tester of global policies does, its oddities included."""
 
-    def __init__(self, plant: MechanismParameters, controller: MechanismController, rng: np.random.Generator) -> None:
+    def __init__(self, plant: MechanismParameters, controller: Controller, rng: np.random.Generator) -> None:
         self._answer = _answering(plant, controller)
         self._plant = plant
         self._goals = rng.uniform(-math.pi, math.pi, (KNOCKS, 2))
@@ -384,9 +384,10 @@ def _gravity(plant: MechanismParameters, x: Vector) -> Vector:
     return tuple(complex_step(lambda *q: (potential(q, p),), x[:2])[0])
 
 
-def _answering(plant: MechanismParameters, controller: MechanismController) -> Callable[[float, Vector], Vector]:
+def _answering(plant: MechanismParameters, controller: Controller) -> Callable[[float, Vector], Vector]:
     spread = plant.coordinates.spread
-    return lambda t, x: spread(controller.command(t, x))
+    n = len(plant.joints)
+    return lambda t, x: spread(controller.efforts(t, x[:n], x[n:]))
 
 
 def _kicks(rng: np.random.Generator) -> tuple[float, ...]:

@@ -22,8 +22,8 @@ from pendulum_bags.studies.mechanism_benchmark_runs import (
     swing_up,
     try_once,
 )
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.mechanism_controllers import make_mechanism_controller
-from pendulum_lqr.swing_up.mechanism_controller import MechanismController
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["Bench", "Job", "Row", "document", "prepare", "run_job", "score_rows"]
@@ -83,7 +83,7 @@ class Bench:
 class _Prepared:
     plant: MechanismParameters
     stepper: Stepper
-    controllers: dict[str, MechanismController]
+    controllers: dict[str, Controller]
     trials: list[Trial]
 
 
