@@ -105,6 +105,7 @@ def _rows(specs: Iterable[ParameterSpec]) -> list[str]:
     from pendulum_msgs_py.parameters import markdown_table
 
     rows = markdown_table(specs).splitlines()[2:]
+    rows = [row.replace(" | – | ", " | | ").replace(" | any | ", " | | ") for row in rows]
     return [re.sub(r"^(\| `[^`]*`)(.*?) Read-only\. \|$", r"\1*\2 |", row) for row in rows]
 
 
@@ -135,7 +136,7 @@ def _tables(tables: Mapping[str, tuple[str, list[str]]], shared: str) -> list[st
 
 
 def _programs() -> list[str]:
-    """Return a line for each program; what a package offers of another is named only."""
+    """Return a line for each program; those that a package offers of another are named only."""
     from pendulum_msgs_py.programs.executables import summary
 
     parts: list[str] = []
@@ -144,9 +145,10 @@ def _programs() -> list[str]:
         module = importlib.import_module(f"{package}.executables")
         table = {**module.EXECUTABLES, **getattr(module, "COMMANDS", {})}
         said = {name: summary(name, target) for name, target in table.items()}
-        parts += [f"- `python -m {package} {name}`: {text}." for name, text in said.items() if seen.get(name) != text]
+        parts.append(f"\n`python -m {package} ...`\n")
+        parts += [f"- `{name}`: {text}." for name, text in said.items() if seen.get(name) != text]
         again = ", ".join(f"`{name}`" for name, text in said.items() if seen.get(name) == text)
-        parts += [f"- `python -m {package}` also has {again}."] if again else []
+        parts += [f"- {again}, as above."] if again else []
         seen |= said
     return parts
 
@@ -162,7 +164,7 @@ def reference() -> str:
     parts = [
         "# Reference\n\nGenerated from the code by `python .docs/build.py --reference`; a test compares it.\n",
         "Parameters with a star are read-only: they are set at the start.\n",
-        "## Programs\n",
+        "## Programs",
         *_programs(),
         "\n## Parameters of the nodes\n",
     ]

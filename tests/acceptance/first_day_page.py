@@ -31,13 +31,24 @@ class Step:
     code: int
 
 
+def _compact(output: str) -> str:
+    """Return output whose tables have no rules and no padding, which would take a third of the page."""
+    lines = []
+    for line in output.splitlines():
+        if not set(line) & set("┃│┏┡└"):
+            lines.append(line.strip() if line.startswith("     ") else line)
+        elif set(line) & set("┃│"):
+            lines.append(" ".join(re.sub("[┃│]", "|", line).split()))
+    return "".join(f"{line}\n" for line in lines)
+
+
 def text_of(steps: list[Step]) -> str:
     """Return the day in Markdown."""
     text = ""
     for step in steps:
         text += f"\n### {step.heading}\n" if step.heading else ""
         text += f"\n{step.words}\n" if step.words else ""
-        text += f"\n```console\n$ {step.command}\n{step.output}```\n"
+        text += f"\n```console\n$ {step.command}\n{_compact(step.output)}```\n"
     return text
 
 
