@@ -36,7 +36,7 @@ class Pulse:
     def start(self) -> None:
         """Begin."""
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Nothing keeps a reader of simulated time from looking."""
 
     def stop(self) -> Sequence[float]:

@@ -30,7 +30,7 @@ class Punctual:
     def start(self) -> None:
         """Begin."""
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Nothing keeps a reader of simulated time from looking."""
 
     def stop(self) -> Sequence[float]:

@@ -167,7 +167,9 @@ def test_a_record_that_a_busy_host_reads_late_is_compared_with_what_had_been_sen
         measured = begin + count * STEP
         # The command that answers record n leaves half a millisecond after it was measured.
         while begin + told * STEP + MILLISECOND // 2 <= measured + waits:
-            watched.monitor.told(Command(pwm=0.01 * told), Strategy.DIRECT_PWM, begin + told * STEP + MILLISECOND // 2)
+            watched.monitor.note_sent(
+                Command(pwm=0.01 * told), Strategy.DIRECT_PWM, begin + told * STEP + MILLISECOND // 2
+            )
             told += 1
         record = feedback_record(measured, count, effort=1e-9 * count, pwm_command=0.01 * (count - 1) + wrong)
         # By a clock of the module's own, or by none.
@@ -185,8 +187,8 @@ def test_setpoints_that_a_stalled_host_sent_late_had_not_arrived_before_they_had
     monitor = SafetyMonitor(LIMITS, PERIOD)
     now = 1_000_000_000
     monitor.left(now)  # nothing was sent
-    monitor.told(Command(pwm=1.0), Strategy.DIRECT_PWM, now)
-    monitor.told(Command(pwm=2.0), Strategy.DIRECT_PWM, now + STEP)
+    monitor.note_sent(Command(pwm=1.0), Strategy.DIRECT_PWM, now)
+    monitor.note_sent(Command(pwm=2.0), Strategy.DIRECT_PWM, now + STEP)
     monitor.left(now + 3 * STEP)
     before, after = now + 3 * STEP - MILLISECOND, now + 3 * STEP + MILLISECOND
     assert [command.pwm for command in monitor._in_force(before)] == [1.0, 2.0]
@@ -201,7 +203,7 @@ def test_a_record_may_show_the_newest_command_that_arrived_and_those_around_it()
     def shown(*ages: int) -> list[float]:
         monitor.stopped()
         for age in ages:
-            monitor.told(Command(pwm=float(age)), Strategy.DIRECT_PWM, now - age)
+            monitor.note_sent(Command(pwm=float(age)), Strategy.DIRECT_PWM, now - age)
         return [command.pwm for command in monitor._in_force(now)]
 
     assert shown(window + 1) == [window + 1]
@@ -214,14 +216,14 @@ def test_a_record_may_show_the_newest_command_that_arrived_and_those_around_it()
     assert shown(-5, -3, -1) == [-1]
     # Those of another strategy are no setpoints of this one.
     shown(window)
-    monitor.told(Command(effort=1.0), Strategy.PARALLEL_PWM, now - window)
+    monitor.note_sent(Command(effort=1.0), Strategy.PARALLEL_PWM, now - window)
     assert [command.effort for command in monitor._in_force(now)] == [1.0, 1.0]
 
 
 def test_as_many_commands_are_remembered_as_the_way_back_may_take() -> None:
     monitor = SafetyMonitor(LIMITS, PERIOD)
     for number in range(20):
-        monitor.told(Command(pwm=float(number)), Strategy.DIRECT_PWM, number)
+        monitor.note_sent(Command(pwm=float(number)), Strategy.DIRECT_PWM, number)
     assert [command.pwm for command in monitor._in_force(19)] == list(range(4, 20))
 
 

@@ -10,7 +10,7 @@ from scipy import stats
 
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.bridge.bridge_parameters import BRIDGE_SPECS as SPECS
-from pendulum_hw_bridge.bridge.bridge_parameters import make_port, told_plants
+from pendulum_hw_bridge.bridge.bridge_parameters import described_plants, make_port
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
 from pendulum_hw_bridge.nodes.procedure import StaircaseTrial
@@ -150,17 +150,17 @@ def test_hand_trials_depend_on_seed_and_number_alone_and_alternate() -> None:
 
 @pytest.mark.parametrize(("plant", "designed"), [("thesis", "thesis"), ("x5_9", "x5_9")])
 def test_a_controller_for_the_preset_that_is_emulated_is_for_the_plant_that_runs(plant: str, designed: str) -> None:
-    told = told_plants(validate(SPECS, {"plant": plant}))
+    told = described_plants(validate(SPECS, {"plant": plant}))
     assert plant_mismatch(load_plant(designed), told) == ""
     assert plant_mismatch(load_emulator(plant).plant, told) == ""
     assert "runs" in plant_mismatch(load_plant("dfki"), told)
-    flat = told_plants(validate(SPECS, {"plant": plant, "flat": True}))
+    flat = described_plants(validate(SPECS, {"plant": plant, "flat": True}))
     assert "gravity" in plant_mismatch(load_plant(designed), flat)
 
 
 @pytest.mark.parametrize("backend", ["hebi", "emulator_process", "replay"])
 def test_what_is_behind_the_bridge_is_unknown_unless_a_plant_file_says_it(backend: str, tmp_path: Path) -> None:
-    assert told_plants(validate(SPECS, {"plant": "thesis", "backend": backend})) == []
+    assert described_plants(validate(SPECS, {"plant": "thesis", "backend": backend})) == []
     path = write_plant(tmp_path / "mine.yaml", load_plant("x5_9").with_values(damping=1.0, name="mine"))
-    (told,) = told_plants(validate(SPECS, {"plant": str(path), "backend": backend}))
+    (told,) = described_plants(validate(SPECS, {"plant": str(path), "backend": backend}))
     assert (told.name, told.damping) == ("mine", 1.0)

@@ -594,7 +594,7 @@ def test_no_reset_takes_back_a_press_that_nobody_has_carried_out_yet() -> None:
     [
         lambda plant: plant.offer(Input.EFFORT_COMMAND, JointCommand.of_one(0, 0.0, "/c"), 0),
         lambda plant: plant.set_commander_conflict(""),
-        lambda plant: plant.hear_enable(0, held=False),
+        lambda plant: plant.receive_enable(0, held=False),
         lambda plant: plant.end_stop(),
         lambda plant: plant.accept_trajectory(_hold(), 0, JointSample.of_one(0, 0.0, 0.0)),
         lambda plant: plant.arm(0, JointSample.of_one(0, 0.0, 0.0)),

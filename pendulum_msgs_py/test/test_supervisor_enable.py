@@ -39,7 +39,7 @@ class Plant:
 
 def _held(**limits: float) -> Plant:
     plant = Plant(**limits)
-    plant.supervisor.hear_enable(plant.now_ns, held=True)
+    plant.supervisor.receive_enable(plant.now_ns, held=True)
     assert plant.arm() == ""
     assert plant.wait(10) == 1.0
     return plant
@@ -49,7 +49,7 @@ def test_a_plant_without_a_switch_asks_for_none() -> None:
     plant = Plant(enable_timeout=math.inf)
     assert plant.arm() == ""
     assert plant.wait(60_000) == 1.0
-    plant.supervisor.hear_enable(plant.now_ns, held=False)
+    plant.supervisor.receive_enable(plant.now_ns, held=False)
     assert plant.wait(10) == 1.0
 
 
@@ -58,17 +58,17 @@ def test_a_switch_that_is_not_held_refuses_arming() -> None:
     for _ in range(2):
         assert plant.arm() == "enable switch is not held; expected true on enable_input, all the time"
         assert plant.supervisor.mode is Mode.DISARMED
-        plant.supervisor.hear_enable(plant.now_ns, held=False)
-    plant.supervisor.hear_enable(plant.now_ns, held=True)
+        plant.supervisor.receive_enable(plant.now_ns, held=False)
+    plant.supervisor.receive_enable(plant.now_ns, held=True)
     plant.now_ns += 201 * _MS
     assert plant.arm() == "enable switch is silent for 201 ms; expected a message within 0.2 s"
-    plant.supervisor.hear_enable(plant.now_ns, held=True)
+    plant.supervisor.receive_enable(plant.now_ns, held=True)
     assert plant.arm() == ""
 
 
 def test_its_release_disarms_before_the_next_decision() -> None:
     plant = _held()
-    plant.supervisor.hear_enable(plant.now_ns, held=False)
+    plant.supervisor.receive_enable(plant.now_ns, held=False)
     assert plant.supervisor.mode is Mode.DISARMED
     assert plant.supervisor.reason.startswith("disarmed: enable switch is not held")
     assert plant.supervisor.decide(plant.now_ns, None).kind is DriveKind.OFF
@@ -91,21 +91,21 @@ def test_a_clock_that_steps_back_keeps_no_switch_held() -> None:
 def test_holding_it_goes_on_and_holding_it_again_does_not_arm() -> None:
     plant = _held()
     for _ in range(20):
-        plant.supervisor.hear_enable(plant.now_ns, held=True)
+        plant.supervisor.receive_enable(plant.now_ns, held=True)
         assert plant.wait(100) == 1.0
     assert plant.wait(500) == 0.0
-    plant.supervisor.hear_enable(plant.now_ns, held=True)
+    plant.supervisor.receive_enable(plant.now_ns, held=True)
     assert plant.wait(10) == 0.0
     assert plant.supervisor.mode is Mode.DISARMED
 
 
 def test_a_release_stops_by_the_category_that_was_set_and_clears_no_latch() -> None:
     plant = _held(stop_time=0.1)
-    plant.supervisor.hear_enable(plant.now_ns, held=False)
+    plant.supervisor.receive_enable(plant.now_ns, held=False)
     assert plant.wait(10) == pytest.approx(0.9)
     plant = _held()
     plant.supervisor.e_stop(plant.now_ns)
-    plant.supervisor.hear_enable(plant.now_ns, held=False)
+    plant.supervisor.receive_enable(plant.now_ns, held=False)
     assert plant.supervisor.mode is Mode.E_STOP
 
 

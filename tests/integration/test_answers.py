@@ -182,7 +182,7 @@ def test_requests_without_pause_are_answered_at_a_bounded_rate_and_every_service
     peer.executor.add_node(node)
     answer_who_listens(node)
     node.poll_services()
-    assert node.told_of_requests is told
+    assert node.notified_of_requests is told
     try:
         assert list(node.services) == [], "an executor is woken for requests"
         flood, client = (peer.node.create_client(Trigger, f"/plant/{name}") for name in ("busy", "other"))

@@ -129,7 +129,7 @@ def test_a_reset_that_waits_takes_back_no_stop_that_is_pressed_after_it(lab: Lab
         wait_for(lambda: not lab.hub._order.holds(FIRST), DEADLINE, "the reset to wait")
         asyncio.run(lab.hub.e_stop([FIRST]))
 
-    assert "was told to stop again meanwhile" in lab.reset(FIRST, press_again)
+    assert "got another stop meanwhile" in lab.reset(FIRST, press_again)
     assert lab.state(FIRST) == "stopped"
     assert FIRST in lab.stopped
 

@@ -230,7 +230,7 @@ TARGETS: tuple[Target, ...] = (
             "PlantInterface._on_e_stop_reset",
             "PlantInterface._is_outdated",
             "PlantInterface._unread_press",
-            "PlantInterface._hear_enable",
+            "PlantInterface._receive_enable",
             "PlantInterface._on_enable",
             "PlantInterface.decide",
             "PlantInterface.e_stop",

@@ -43,7 +43,7 @@ def _event(mode: str, stamp_ns: int = _NOW, name: str = "plant_mode") -> bytes:
 )
 def test_a_fault_and_an_e_stop_are_written_with_the_second_after_them(event: bytes, due: bool) -> None:
     box: BlackBox[str] = BlackBox(10.0)
-    box.look(event, _NOW)
+    box.poll(event, _NOW)
     assert not box.is_due(_NOW + _S - 1)
     assert box.is_due(_NOW + _S) is due
     assert box.reason.endswith("why") is due

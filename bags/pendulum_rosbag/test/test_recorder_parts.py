@@ -273,7 +273,7 @@ def test_a_node_without_parameters_is_asked_for_none_and_its_neighbour_is_read(d
     made: set[str] = set()
 
     def read() -> bool:
-        reader.look()
+        reader.poll()
         made.update(name for name, _ in peer.node.get_client_names_and_types_by_node("asks", "/"))
         return "/serves" in reader.values
 

@@ -91,7 +91,7 @@ class Assembly:
     Attributes:
         coordinates: Joints, and which of them are driven.
         limits: Limits of the supervisor.
-        told: What the plant is known to be; empty where nobody says.
+        described: What the plant is known to be; empty where nobody says.
         hardware: What it is, in a few words.
         effort_strategy: How a torque becomes a setpoint.
         mapping: That of the first drive.
@@ -100,7 +100,7 @@ class Assembly:
 
     coordinates: Coordinates
     limits: PlantLimits
-    told: list[AnyPlant]
+    described: list[AnyPlant]
     hardware: str
     effort_strategy: str
     mapping: EffortMapping
@@ -176,9 +176,9 @@ def _one(values: Mapping[str, Any], *, lockstep: bool) -> Assembly:
         port = bridge_parameters.make_port(values, clock, lockstep=lockstep)
         return [DrivenModule(port, mapping, SafetyMonitor(safety, period, plant.drivetrain), settings)]
 
-    told = list(bridge_parameters.told_plants(values))
+    described = list(bridge_parameters.described_plants(values))
     return Assembly(
-        ONE_JOINT, limits, [*told], f"X5-9, {values['backend']}", values["effort_strategy"], mapping, modules
+        ONE_JOINT, limits, [*described], f"X5-9, {values['backend']}", values["effort_strategy"], mapping, modules
     )
 
 
@@ -280,11 +280,11 @@ def _group(values: Mapping[str, Any], plant: MechanismParameters, limits: PlantL
         raise ParameterError("initial_positions is for the emulator; expected it left out with backend 'hebi'")
     group = GroupAssembly(values, plant.coordinates, limits)
     # A preset is no measurement of the machine that stands here.
-    told: list[AnyPlant] = [] if values["plant"] in MECHANISM_PRESETS else [plant]
+    described: list[AnyPlant] = [] if values["plant"] in MECHANISM_PRESETS else [plant]
     return Assembly(
         plant.coordinates,
         limits,
-        told,
+        described,
         f"group of X5-9, {values['backend']}",
         values["effort_strategy"],
         group.mappings[0],

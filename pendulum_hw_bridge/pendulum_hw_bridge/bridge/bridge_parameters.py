@@ -31,13 +31,13 @@ __all__ = [
     "BRIDGE_SPECS",
     "POSITION_LOOP_STRATEGY",
     "bridge_settings",
+    "described_plants",
     "effort_mapping",
     "make_port",
     "plant_of",
     "require_real_time",
     "safety_limits",
     "supervisor_limits",
-    "told_plants",
     "trajectory_gains",
 ]
 
@@ -233,7 +233,7 @@ def plant_of(values: Mapping[str, Any]) -> PlantParameters:
     return load_emulator(values["plant"]).plant
 
 
-def told_plants(values: Mapping[str, Any]) -> list[PlantParameters]:
+def described_plants(values: Mapping[str, Any]) -> list[PlantParameters]:
     """Return what the plant behind the bridge is known to be; empty where nobody says.
 
     An emulator in this process is what it emulates: the machine ``thesis`` also the rigid plant that the thesis's

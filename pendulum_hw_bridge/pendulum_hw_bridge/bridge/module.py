@@ -205,7 +205,7 @@ class DrivenModule(Module):
             self._strategy = strategy
             self._confirm(self.port.set_strategy(strategy, command), strategy)
             applied = Applied(command, strategy, limited=False, sent_ns=now)
-        self.monitor.told(applied.command, strategy, applied.sent_ns)
+        self.monitor.note_sent(applied.command, strategy, applied.sent_ns)
         return applied
 
     def stop(self) -> Exception | None:

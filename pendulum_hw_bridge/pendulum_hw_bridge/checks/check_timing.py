@@ -33,7 +33,7 @@ class Punctuality(Protocol):
     def start(self) -> None:
         """Begin."""
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Note that whoever reads is awake, which asked to be by the end of a pulse after it was last."""
 
     def stop(self) -> Sequence[float]:
@@ -57,7 +57,7 @@ class HostWatch:
         self._thread = threading.Thread(target=self._run, name="punctuality", daemon=True)
         self._thread.start()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Note that whoever reads is awake."""
         now, before = time.monotonic(), self._looked
         self._looked = now

@@ -233,7 +233,7 @@ def _stretch(port: EncoderPort, host: Punctuality, seconds: float) -> tuple[list
         end = port.now_ns() + round(seconds * NANOSECONDS)
         while port.now_ns() < end:
             record = port.read(PULSE)
-            host.look()
+            host.poll()
             if record is not None:
                 records.append(record)
     finally:

@@ -78,24 +78,24 @@ def run_machine_checklist(
     return found
 
 
-def names_problem(told: Sequence[str], joints: Sequence[str]) -> str:
+def names_problem(reported: Sequence[str], joints: Sequence[str]) -> str:
     """Return in words why modules are not those of the joints, one for each and in their order; empty where they are.
 
     Args:
-        told: What each module says that it is called.
+        reported: What each module says that it is called.
         joints: Names of the joints.
     """
-    problems = [f"{name} is there {count} times" for name, count in Counter(told).items() if count > 1]
-    problems += [f"{name} is missing" for name in joints if name not in told]
-    problems += [f"{name} is no joint of this plant" for name in dict.fromkeys(told) if name not in joints]
-    if not problems and tuple(told) != tuple(joints):
+    problems = [f"{name} is there {count} times" for name, count in Counter(reported).items() if count > 1]
+    problems += [f"{name} is missing" for name in joints if name not in reported]
+    problems += [f"{name} is no joint of this plant" for name in dict.fromkeys(reported) if name not in joints]
+    if not problems and tuple(reported) != tuple(joints):
         problems = ["they are swapped"]
     return "; ".join(problems)
 
 
 def _connect(modules: Sequence[Module], found: Checklist, progress: Callable[[str], None]) -> bool:
     """Connect all; return whether each is the module of its joint."""
-    told: list[str] = []
+    reported: list[str] = []
     for module in modules:
         progress(f"{module.joint}: connecting")
         try:
@@ -103,16 +103,16 @@ def _connect(modules: Sequence[Module], found: Checklist, progress: Callable[[st
         except PendulumError as error:
             found.items.append(_named(error_item(error), module.joint))
             continue
-        told.append(info.name)
+        reported.append(info.name)
         item = CheckItem("module answers", True, identity(info), "the one that is meant")
         found.items.append(_named(item, module.joint))
     joints = [module.joint for module in modules]
-    problem = names_problem(told, joints)
+    problem = names_problem(reported, joints)
     found.items.append(
         CheckItem(
             "modules are those of the joints",
             not problem,
-            f"{', '.join(told) or 'none'}{f' ({problem})' if problem else ''}",
+            f"{', '.join(reported) or 'none'}{f' ({problem})' if problem else ''}",
             ", ".join(joints),
             "an effort would act on another joint: set names and order of the modules right before anything else",
         )

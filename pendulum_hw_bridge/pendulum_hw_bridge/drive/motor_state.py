@@ -83,12 +83,12 @@ class MotorWatch:
         if before is None or not 0 < now - before[0] <= _LONGEST_SPAN_NS:
             return 0.0, 0.0, 0.0
         elapsed = (now - before[0]) / NANOSECONDS
-        told = feedback.motor_velocity / self._gear_ratio
+        reported = feedback.motor_velocity / self._gear_ratio
         turned = (motor - before[1]) / elapsed
-        speeds = [told, turned, feedback.velocity, (link - before[2]) / elapsed]
+        speeds = [reported, turned, feedback.velocity, (link - before[2]) / elapsed]
         if not all(map(math.isfinite, speeds)):
             return 0.0, 0.0, 0.0
         slack = _ANGLE_STEP / self._gear_ratio / elapsed + _SLACK
-        believed = min(turned + slack, max(turned - slack, told))
+        believed = min(turned + slack, max(turned - slack, reported))
         believed = min(self._fastest, max(-self._fastest, believed))
         return believed, max(min(0.0, max(speeds)), -self._fastest), min(max(0.0, min(speeds)), self._fastest)

@@ -105,7 +105,7 @@ class SafetyMonitor:
         """Age of feedback that is a fault [s]."""
         return self.limits.feedback_cycles * self.period
 
-    def told(self, command: Command, strategy: Strategy, sent_ns: int) -> None:
+    def note_sent(self, command: Command, strategy: Strategy, sent_ns: int) -> None:
         """Take note of what was sent, to compare with what the module then acts on."""
         if strategy is not self._strategy:
             self._sent.clear()

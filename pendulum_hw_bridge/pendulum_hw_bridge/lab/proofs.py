@@ -233,7 +233,7 @@ class _GentleDrive:
         command = Command(pwm=PROOF_DUTY)
         sent_ns = self._port.write(command).sent_ns
         pause, self.sent_ns = (sent_ns - self.sent_ns) / NANOSECONDS, sent_ns
-        self._monitor.told(command, Strategy.DIRECT_PWM, sent_ns)
+        self._monitor.note_sent(command, Strategy.DIRECT_PWM, sent_ns)
         if pause >= self._settings.command_lifetime:
             raise ActuatorError(
                 "host_stalled",

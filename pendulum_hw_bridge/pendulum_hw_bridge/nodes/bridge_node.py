@@ -91,7 +91,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         # Made here, so that a refused parameter ends the process with its sentence.
         self._assembly = assembly = assemble(values, specs, lockstep=self._lockstep)
         self._mapping = assembly.mapping
-        self._told_plants = describe_plants(assembly.told)
+        self._described_plants = describe_plants(assembly.described)
         self._no_effort = (0.0,) * len(assembly.coordinates.driven)
         self._supervisor = SharedSupervisor(
             assembly.limits,
@@ -417,7 +417,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         bridge = self._bridge
         values: dict[str, object] = {
             "active": self._active,
-            PLANT_PARAMETERS: self._told_plants,
+            PLANT_PARAMETERS: self._described_plants,
             "backend": self._values["backend"],
             "effort_strategy": self._assembly.effort_strategy,
         }

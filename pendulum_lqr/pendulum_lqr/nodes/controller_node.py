@@ -250,7 +250,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         self.get_logger().info(f"changed while running: {controller.describe()}")
 
     def _on_timer(self) -> None:
-        self._running_plant.look()
+        self._running_plant.poll()
         self._publish_diagnostics()
         if self._loop is None:
             return

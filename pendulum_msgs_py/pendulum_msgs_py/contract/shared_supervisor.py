@@ -125,10 +125,10 @@ class SharedSupervisor(PlantSupervisor):
         with self._in_turn():
             super().set_commander_conflict(conflict)
 
-    def hear_enable(self, now_ns: int, *, held: bool) -> None:
+    def receive_enable(self, now_ns: int, *, held: bool) -> None:
         """Take note of a message of the hold-to-run switch."""
         with self._in_turn():
-            super().hear_enable(now_ns, held=held)
+            super().receive_enable(now_ns, held=held)
 
     def accept_trajectory(self, trajectory: Trajectory, now_ns: int, sample: JointSample) -> str:
         """Start to follow a trajectory."""

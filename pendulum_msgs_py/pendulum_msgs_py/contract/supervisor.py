@@ -110,7 +110,7 @@ class PlantSupervisor:
         """
         self.commander_conflict = conflict
 
-    def hear_enable(self, now_ns: int, *, held: bool) -> None:
+    def receive_enable(self, now_ns: int, *, held: bool) -> None:
         """Take note of a message of the hold-to-run switch; its release disarms at once."""
         self._held_ns = now_ns if held else None
         self._keep_enabled(now_ns)

@@ -49,11 +49,11 @@ EXIT_USAGE = 2
 """Exit code of a program whose arguments or request are invalid."""
 
 
-class _Told(int):
+class _Reported(int):
     """An exit code of a program that has printed the reason itself."""
 
 
-EXIT_INTERRUPTED = _Told(130)
+EXIT_INTERRUPTED = _Reported(130)
 """Exit code after Ctrl-C, by the shell's convention of 128 + SIGINT; printed already, with what is left."""
 
 
@@ -218,7 +218,7 @@ def cli_main(
         where = f"{os.fsdecode(error.filename)} cannot be read or written: " if error.filename else ""
         return report_error(ParameterError(f"{where}{error.strerror}"))
     # typer turns Ctrl-C into a bare 130, which has not been reported yet.
-    if result == EXIT_INTERRUPTED and not isinstance(result, _Told):
+    if result == EXIT_INTERRUPTED and not isinstance(result, _Reported):
         print("interrupted", file=sys.stderr)
     return int(result) if isinstance(result, int) else 0
 

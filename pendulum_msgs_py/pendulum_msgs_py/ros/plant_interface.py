@@ -113,7 +113,7 @@ class PlantInterface:
         self._joints = supervisor.coordinates.names
         self._driven = supervisor.coordinates.driven_names
         self._more_diagnostics = more_diagnostics
-        self._told_mode: tuple[Mode, bool, bool] | None = None
+        self._reported_mode: tuple[Mode, bool, bool] | None = None
         self._mode_lines = Throttle(_LEAST_BETWEEN_LINES)
         self._told_refusals = 0
         self.commander_watch = CommanderWatch(node, supervisor)
@@ -210,12 +210,12 @@ class PlantInterface:
     def decide(self, now_ns: int | None = None) -> Drive:
         """Return what to do now, by the supervisor's rules; says on the log when the answer changes."""
         if self._enable is not None and self._enable.came():
-            self._hear_enable()
+            self._receive_enable()
         drive = self.supervisor.decide(self.clock() if now_ns is None else now_ns, self.sample)
-        told = (self.supervisor.mode, drive.starved, self.supervisor.trajectory_finished)
-        if told != self._told_mode:
+        report = (self.supervisor.mode, drive.starved, self.supervisor.trajectory_finished)
+        if report != self._reported_mode:
             self._tell(drive)
-            self._told_mode = told
+            self._reported_mode = report
         return drive
 
     def publish_applied(self, stamp_ns: int, effort: Vector) -> None:
@@ -264,7 +264,7 @@ class PlantInterface:
 
     def measured(self) -> tuple[int, JointSample | None]:
         """Return the time and the newest state after a preparation, in which the hold-to-run switch was not heard."""
-        self._hear_enable()
+        self._receive_enable()
         return self.clock(), self.sample
 
     def safe_stop(self, reason: str) -> None:
@@ -289,7 +289,7 @@ class PlantInterface:
             "starved_periods": supervisor.starved_periods,
             "saturated_periods": supervisor.saturated_periods,
             "start_effort_limit": supervisor.limits.start_effort,
-            "requests": "told by the middleware" if self.node.told_of_requests else "looked for",
+            "requests": "reported by the middleware" if self.node.notified_of_requests else "polled",
         }
         for kind in self.inputs:
             gate = supervisor.gates[kind]
@@ -399,7 +399,7 @@ class PlantInterface:
         self.publish_diagnostics()
         return response
 
-    def _hear_enable(self) -> None:
+    def _receive_enable(self) -> None:
         if self._enable is not None:
             with self.supervisor.alone():
                 # No more than it keeps: e-stop and actuator wait meanwhile, however fast others publish.
@@ -424,7 +424,7 @@ class PlantInterface:
         # Of two switches one would hide that the other is released or silent.
         alone = self._enable.subscription.get_publisher_count() == 1
         held = data[4:5] == b"\x01"
-        self.supervisor.hear_enable(self.clock() - round(self._enable_waited), held=held and alone)
+        self.supervisor.receive_enable(self.clock() - round(self._enable_waited), held=held and alone)
 
     def _on_e_stop_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         refusal = "asked for before the e-stop was pressed; reset it once more"
@@ -447,7 +447,7 @@ class PlantInterface:
         supervisor = self.supervisor
         logger = self.node.get_logger()
         text = f"{supervisor.mode.value}: {supervisor.reason}"
-        same_mode = self._told_mode is not None and self._told_mode[0] is supervisor.mode
+        same_mode = self._reported_mode is not None and self._reported_mode[0] is supervisor.mode
         # Commands that come more slowly than they age start and starve the plant with each of them.
         left_out = self._mode_lines.ask(time.monotonic(), urgent=not same_mode)
         timeout = supervisor.limits.command_timeout
@@ -458,7 +458,7 @@ class PlantInterface:
         elif left_out:
             many = f"{left_out} changes since the last line: do commands come more slowly than every {timeout:g} s?"
             logger.warning(f"{text}; {many}")  # noqa: G004  # ROS's logger formats nothing
-        elif drive.starved and self._told_mode is not None:
+        elif drive.starved and self._reported_mode is not None:
             logger.warning(text)
         else:
             logger.info(text)
@@ -491,7 +491,7 @@ class PlantInterface:
         mode = self.supervisor.mode
         if mode in {Mode.FAULT, Mode.E_STOP}:
             return DiagnosticStatus.ERROR
-        starved = self._told_mode is not None and self._told_mode[1]
+        starved = self._reported_mode is not None and self._reported_mode[1]
         conflict = bool(self.supervisor.commander_conflict)
         warn = starved or conflict or self._second_commander
         return DiagnosticStatus.WARN if warn else DiagnosticStatus.OK

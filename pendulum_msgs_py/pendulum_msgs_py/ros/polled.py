@@ -153,7 +153,7 @@ class PollingNode(Node):
         return (each for each in super().services if each not in self._served_in_turn)
 
     @property
-    def told_of_requests(self) -> bool:
+    def notified_of_requests(self) -> bool:
         """Whether the middleware says when a request has come; otherwise each service is looked at every 10 ms."""
         return self._requests is not None and self._requests.works
 

@@ -114,8 +114,8 @@ def send_response(service: Service, send: Callable[[Any, Any], None], response: 
             kind.destroy(message)
     if code == _TIMEOUT:
         rcl.rcutils_reset_error()
-        told = f"failed to send response to {service.srv_name} (timeout): client will not receive response"
-        warnings.warn(told, RuntimeWarning, stacklevel=2)
+        text = f"failed to send response to {service.srv_name} (timeout): client will not receive response"
+        warnings.warn(text, RuntimeWarning, stacklevel=2)
         return True
     _expect(rcl, code, f"answer of {service.srv_name} was not sent")
     return False

@@ -46,7 +46,7 @@ class RunningPlant:
         self._heard = b""
         self._source = node.create_polled_input(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Take what was said since the last look; warn on the log where the plant turns out to be another one."""
         self._source.take(self._on_diagnostics)
 

@@ -49,4 +49,4 @@ class Watched:
 
     def tell(self, strategy: Strategy = Strategy.DIRECT_PWM, **setpoints: float) -> None:
         """Tell what is sent at the time of the newest record."""
-        self.monitor.told(Command(**setpoints), strategy, self.now_ns)
+        self.monitor.note_sent(Command(**setpoints), strategy, self.now_ns)

@@ -186,7 +186,7 @@ class Hub:
             await asyncio.sleep(0.01)
         with self._order_lock:
             if self._order.holds(node):
-                raise FaultError(f"{node} was told to stop again meanwhile: its e-stop is not reset")
+                raise FaultError(f"{node} got another stop meanwhile: its e-stop is not reset")
         return await self.trigger(f"{node}/e_stop_reset")
 
     def _keep_stopping(self) -> None:
@@ -338,7 +338,7 @@ class Hub:
 
     def _look(self) -> None:
         """Find plants by their e-stop service."""
-        self._reader.look(forget=True)
+        self._reader.poll(forget=True)
         found = {
             name.removesuffix(_STOP_SERVICE)
             for name, types in self._node.get_service_names_and_types()

@@ -179,13 +179,13 @@ def winner(
     """
     from pendulum_bags.course.winner import check_winner
 
-    def told(letter: str) -> None:
+    def report(letter: str) -> None:
         typer.echo(f"running {letter.upper()} on the emulated machine", err=True)
 
     tasks = _tasks(course)
     with tempfile.TemporaryDirectory() as folder:
         try:
-            judgement = check_winner(tasks, name, Path(folder), on_run=told)
+            judgement = check_winner(tasks, name, Path(folder), on_run=report)
         except KeyboardInterrupt:
             typer.echo("interrupted: all programs have ended", err=True)
             raise typer.Exit(EXIT_INTERRUPTED) from None

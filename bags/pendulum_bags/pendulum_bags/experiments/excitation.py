@@ -247,7 +247,7 @@ def _is_armed(plant: PlantClient, *, may_arm: bool) -> bool:
     if plant.is_armed():
         return True
     if not may_arm:
-        state = f"is {mode}" if (mode := plant.newest_mode()) else "has not said its mode"
+        state = f"is {mode}" if (mode := plant.newest_mode()) else "has not reported its mode"
         raise ParameterError(f"{plant.namespace} {state}; expected it armed, or --arm to arm it for the excitation")
     return False
 

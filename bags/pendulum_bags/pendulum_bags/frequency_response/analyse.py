@@ -92,7 +92,7 @@ def _read(path: Path) -> tuple[Record, Mapping[str, Any]]:
     facts = run_record(runs[joints[0]].metadata)
     disturbed = (facts.get("disturbance") or {}).get("joints") or []
     if len(disturbed) != 1:
-        found = ", ".join(disturbed) or "nobody says which joint"
+        found = ", ".join(disturbed) or "no recorded joint"
         raise DataError(f"{path} has {found} disturbed; expected one joint, so that excitation and response are known")
     return record_of_joints(runs, disturbed[0]), facts
 

@@ -75,13 +75,13 @@ def frequency_response(
     from pendulum_lqr.responses.gap_metric import Scaling
 
     scaling = Scaling(angle, velocity, torque)
-    responses, told, ran = read_responses(bags)
+    responses, recorded, ran = read_responses(bags)
     several = bool(responses[0].joints)
     if several and (typed := typed_options(context, {"angle", "velocity", "torque"})):
         raise ParameterError(f"{typed[0]} is for plants of one joint; of several the LQR weights are the units")
     analysis = analyse_responses(
         responses,
-        plant or told,
+        plant or recorded,
         design or ran,
         scaling=None if several else scaling,
         margin=None if several and not typed_options(context, {"gap_margin"}) else gap_margin,
@@ -192,8 +192,8 @@ def experiment(
             progress.phase("simulation" if spec.side == "sim" else "hardware", length)
             record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh, hosts=hosts)
         progress.phase("analysing", 12.0)
-        responses, told, ran = read_responses([folder])
-        analysis = analyse_responses(responses, told, design or ran, scaling=scaling, margin=gap_margin)
+        responses, recorded, ran = read_responses([folder])
+        analysis = analyse_responses(responses, recorded, design or ran, scaling=scaling, margin=gap_margin)
     _tell(console, analysis, folder, json_output=json_output)
     console.print(f"bags    {folder / 'sim'}, {folder / 'hw'}\n({time.monotonic() - started:.0f} s)", soft_wrap=True)
 

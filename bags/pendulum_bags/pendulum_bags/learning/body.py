@@ -69,7 +69,7 @@ class Body:
         offsets: Columns of the constant effort at each driven joint.
         longest: Longest step of the integrator [s].
         advance: Compiled: motion, parameters, efforts, delays, kicks, period and longest step to the next motion.
-        told: From parameters (N, p) to what the critic sees of them, shape (N, k).
+        privileged: From parameters (N, p) to what the critic sees of them, shape (N, k).
         height: From deviations (N, n) to how high it stands, -1 to 1, shape (N,).
         excess: From deviations (N, n), velocities (N, n) and parameters (N, p) to how much more energy it has
             than upright at rest, -1 hanging at rest, shape (N,); None where each joint is driven.
@@ -87,7 +87,7 @@ class Body:
     offsets: tuple[int, ...]
     longest: float
     advance: Callable[..., None]
-    told: Callable[[Array], list[Array]]
+    privileged: Callable[[Array], list[Array]]
     height: Callable[[Array], Array]
     excess: Callable[[Array, Array, Array], Array] | None
     possible: Callable[[Array], NDArray[np.bool_]]
@@ -222,7 +222,7 @@ def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]])
     lightest = ranges.get("inertia", (plant.inertia, plant.inertia))[0]
     longest = min(_LONGEST, _GROWTH * lightest / fastest if fastest > 0.0 else _LONGEST)
 
-    def told(parameters: Array) -> list[Array]:
+    def privileged(parameters: Array) -> list[Array]:
         return [
             parameters[:, gravity] / limit - plant.gravity / limit,
             parameters[:, inertia] / plant.inertia - 1.0,
@@ -243,7 +243,7 @@ def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]])
         offsets=(columns["torque_offset"],),
         longest=longest,
         advance=_pendulum_kernel(),
-        told=told,
+        privileged=privileged,
         height=lambda x: np.cos(x[:, 0]),
         excess=None,
         possible=lambda parameters: np.ones(len(parameters), dtype=np.bool_),
@@ -308,7 +308,7 @@ def _mechanism(plant: MechanismParameters, ranges: Mapping[str, tuple[float, flo
         offsets=tuple(last + i for i in driven),
         longest=min(_LONGEST_OF_SEVERAL, _GROWTH / max(_decay(plant), 1.0)),
         advance=_mechanism_kernel(mechanism.name, goal),
-        told=lambda parameters: [(parameters[:, k] - centre[k]) / half for k, half in scales.items()],
+        privileged=lambda parameters: [(parameters[:, k] - centre[k]) / half for k, half in scales.items()],
         height=height,
         excess=excess if len(driven) < n else None,
         possible=lambda parameters: can_exist(mechanism, parameters[:, :width]),

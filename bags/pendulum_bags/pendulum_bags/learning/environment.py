@@ -110,7 +110,7 @@ class SwingUp:
         extra = [
             np.cos(x[:, turns]), np.sin(x[:, turns]), x[:, ~turns] / self.reach[~turns], v / self.scale,
             self.push / self.body.kicks, self.delay[:, None] / (2.0 * self.task.period),
-            *(each[:, None] for each in self.body.told(self.parameters)),
+            *(each[:, None] for each in self.body.privileged(self.parameters)),
         ]  # fmt: skip
         return self._samples.copy(), np.concatenate(extra, axis=1).astype(np.float32)
 

@@ -104,13 +104,13 @@ def train(
     began = time.monotonic()
     try:
         with counting_bar(console, TextColumn("{task.fields[told]}"), TimeRemainingColumn()) as bar:
-            shown = bar.add_task("updates", total=settings.updates, told="compiling")
+            shown = bar.add_task("updates", total=settings.updates, status="compiling")
 
             def on_update(done: int, measured: Mapping[str, float]) -> None:
-                bar.update(shown, completed=done, told=f"reward {measured['reward']:+.4f}")
+                bar.update(shown, completed=done, status=f"reward {measured['reward']:+.4f}")
 
             def on_trial(done: int, of: int) -> None:
-                bar.update(shown, description="trials", completed=done, total=of, told="")
+                bar.update(shown, description="trials", completed=done, total=of, status="")
 
             policy, curves = train_policy(settings, out, on_update=on_update, on_trial=on_trial)
     except KeyboardInterrupt:

@@ -111,7 +111,7 @@ class Training:
         }  # fmt: skip
 
 
-def _told(settings: Training) -> str:
+def _settings_text(settings: Training) -> str:
     return json.dumps(settings.to_json(), sort_keys=True)
 
 
@@ -239,7 +239,7 @@ def _keep(
 ) -> None:
     arrays: dict[str, NDArray[Any]] = {f"learner/{name}": each for name, each in learner.state().items()}
     arrays |= {f"environment/{name}": each for name, each in learner.environment.state().items()}
-    words = {"settings": _told(settings), "generator": json.dumps(generator.bit_generator.state)}
+    words = {"settings": _settings_text(settings), "generator": json.dumps(generator.bit_generator.state)}
     arrays |= {name: np.frombuffer(text.encode(), dtype=np.uint8) for name, text in words.items()}
     buffer = io.BytesIO()
     np.savez(buffer, curves=np.array(curves), fastest=fastest, **arrays)
@@ -286,7 +286,7 @@ def _restore(
         if path.stat().st_size > _LARGEST_CHECKPOINT:
             raise DataError(f"checkpoint {path} has more than {_LARGEST_CHECKPOINT} bytes; expected one of ours")
         with np.load(path, allow_pickle=False) as kept:
-            if kept["settings"].tobytes().decode() != _told(settings):
+            if kept["settings"].tobytes().decode() != _settings_text(settings):
                 raise ParameterError(
                     f"checkpoint {path} is of a training with other settings; expected the same ones, another --out, "
                     "or the checkpoint removed"

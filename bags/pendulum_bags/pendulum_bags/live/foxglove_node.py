@@ -134,7 +134,7 @@ class LiveNode(PollingNode):
         self._lost += topic.lost
 
     def _look(self) -> None:
-        self._reader.look()
+        self._reader.poll()
         there = {name: types for name, types in self.get_topic_names_and_types() if self.count_publishers(name)}
         for name, types in there.items():
             if name in self._topics or name in self._unknown:
@@ -149,7 +149,7 @@ class LiveNode(PollingNode):
         for name in self._topics.keys() - there.keys():
             self._leave(self._topics.pop(name))
         for topic in self._topics.values():
-            topic.look()
+            topic.poll()
         self._look_for_services()
         self._look_for_plants()
 

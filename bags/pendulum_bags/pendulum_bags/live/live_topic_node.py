@@ -66,7 +66,7 @@ class LiveTopic:
                 self.lost += number - self._newest - 1
             self._newest = number
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Update the publishers: sequence numbers of several are of no use."""
         self._has_one_publisher = self._node.count_publishers(self._topic) == 1
 

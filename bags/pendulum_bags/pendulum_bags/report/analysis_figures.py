@@ -58,7 +58,7 @@ def equivalence(verdict: Verdict) -> Figure:
         f"{quantity(closest.interval.low)} to {quantity(closest.interval.high)}, resting on "
         f"{closest.interval.blocks} independent blocks."
     )
-    names = [test.quantity if test in measured else f"{test.quantity}: not told" for test in tests]
+    names = [test.quantity if test in measured else f"{test.quantity}: not measured" for test in tests]
     reach = max(1.3, *(abs(value) * 1.08 for test in measured for value in _relative(test)))
     panel = Panel(
         "difference [margins]",

@@ -24,9 +24,9 @@ def follows_reference(metadata: Mapping[str, Any], space: str) -> bool:
         metadata: Metadata of the bag.
         space: Namespace of the plant.
     """
-    told = _parameters(metadata, space)
-    kinds = {told.get("controller"), record_named(run_record(metadata), "controller").get("kind")}
-    return _KIND in kinds and told.get("amplitude") != 0.0
+    recorded = _parameters(metadata, space)
+    kinds = {recorded.get("controller"), record_named(run_record(metadata), "controller").get("kind")}
+    return _KIND in kinds and recorded.get("amplitude") != 0.0
 
 
 def recorded_reference(
@@ -45,12 +45,12 @@ def recorded_reference(
     """
     if not follows_reference(metadata, space):
         return None
-    told = _parameters(metadata, space)
+    recorded = _parameters(metadata, space)
     counts = record_named(record_named(metadata, "pendulum.recorder.counts"), f"{space}/effort_command")
     if counts.get("before"):
         return None
     try:
-        values = [kind(told[name]) for name, kind in _FIELDS.items()]
+        values = [kind(recorded[name]) for name, kind in _FIELDS.items()]
     except (KeyError, TypeError, ValueError):
         return None
     reference = Reference(*values)

@@ -150,9 +150,9 @@ def _read_hebi_log(path: Path, lab: str | Path | Mapping[str, Any] | None) -> Re
         raise DataError(f"{path}: mapping is given as values; expected the lab file of a HEBI log")
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "log.csv"
-        told = [] if lab is None else ["--lab", str(lab)]
+        options = [] if lab is None else ["--lab", str(lab)]
         try:
-            done = run_bridge_program("convert", str(path), "--out", str(table), *told, timeout=_TIMEOUT)
+            done = run_bridge_program("convert", str(path), "--out", str(table), *options, timeout=_TIMEOUT)
         except subprocess.TimeoutExpired:
             raise DataError(f"{path} was not read within {_TIMEOUT:g} s") from None
         if done.returncode != 0:

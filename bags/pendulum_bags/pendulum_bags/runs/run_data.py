@@ -305,9 +305,9 @@ def stand_in_of(run: RunData) -> str:
 
 def noise_hold_time(run: RunData) -> float | None:
     """Return how long each noise sample was held [s]: what the run says, else what its disturbance shows."""
-    told = run_record(run.metadata).get("disturbance")
-    if isinstance(told, Mapping):
-        value = told.get("hold_time")
+    recorded = run_record(run.metadata).get("disturbance")
+    if isinstance(recorded, Mapping):
+        value = recorded.get("hold_time")
         if isinstance(value, (int, float)) and value > 0.0:
             return float(value)
     if run.disturbance is None or run.disturbance.t.size < 4:

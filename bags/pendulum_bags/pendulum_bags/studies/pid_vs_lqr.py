@@ -177,7 +177,7 @@ def _sentences(paired: Sequence[Mapping[str, Any]]) -> list[str]:
         elif pair["low"] > 1.0 or pair["high"] < 1.0:
             verdict = f"{100.0 * abs(pair['ratio'] - 1.0):.1f} % {'more' if pair['ratio'] > 1.0 else 'less'} than"
         else:
-            verdict = "not told apart from"
+            verdict = "not distinguishable from"
         said.append(
             f"On {pair['plant']}, {pair['metric']} of {pair['of']} is {verdict} that of {pair['per']}: ratio "
             f"{pair['ratio']:.3f} (95 % interval {pair['low']:.3f} to {pair['high']:.3f}, {pair['seeds']} pairs)."

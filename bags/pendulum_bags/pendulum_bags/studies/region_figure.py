@@ -23,7 +23,7 @@ class _Picture:
         x, y: Deviations from upright along both axes, shape (n,) each.
         labels: Of both axes.
         curve: Edge of a region from another source, shape (k, 2).
-        told: Its text in the legend.
+        label: Its text in the legend.
         title: Above all.
     """
 
@@ -31,7 +31,7 @@ class _Picture:
     y: NDArray[np.float64]
     labels: tuple[str, str]
     curve: NDArray[np.float64]
-    told: str
+    label: str
     title: str
 
 
@@ -82,9 +82,9 @@ def write_region_figure(path: Path, result: RegionResult | JointRegionResult) ->
         edge = result.believed.astype(float)
         ax.contour(x, y, edge, levels=[0.5], colors="black", linestyles="dashed", linewidths=1.4)
         legend.append(Line2D([], [], color="black", ls="--", lw=1.4, label="edge for the believed plant"))
-    if picture.told:
+    if picture.label:
         ax.plot(*picture.curve.T, color="black", lw=1.8, path_effects=halo)
-        legend.append(Line2D([], [], color="black", lw=1.8, label=picture.told))
+        legend.append(Line2D([], [], color="black", lw=1.8, label=picture.label))
     ax.plot([0.0], [0.0], "o", mfc="white", mec="black", ms=6)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[0], y[-1])

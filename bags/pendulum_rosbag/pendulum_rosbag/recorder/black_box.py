@@ -48,7 +48,7 @@ class BlackBox(Generic[_Source]):
         while self._messages and self._bytes > self._max_bytes:
             self._bytes -= len(self._messages.popleft()[2])
 
-    def look(self, event: bytes, now_ns: int) -> None:
+    def poll(self, event: bytes, now_ns: int) -> None:
         """Record whether an event reports a fault or an e-stop.
 
         Args:

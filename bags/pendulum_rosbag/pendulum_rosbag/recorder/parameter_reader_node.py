@@ -41,7 +41,7 @@ class ParameterReader:
         self._finished: list[Client] = []
         node.create_subscription(ParameterEvent, "/parameter_events", self._on_event, qos_profile_parameter_events)
 
-    def look(self, *, forget: bool = False) -> None:
+    def poll(self, *, forget: bool = False) -> None:
         """Poll for new nodes, and send requests to those whose services have appeared.
 
         Args:

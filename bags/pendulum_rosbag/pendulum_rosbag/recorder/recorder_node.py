@@ -216,7 +216,7 @@ class Recorder(PollingNode):
                 self._black_box.keep(tap, items)
                 if tap.topic.endswith(f"/{names.EVENTS}"):
                     for time_ns, data in items:
-                        self._black_box.look(data, time_ns)
+                        self._black_box.poll(data, time_ns)
             return
         if items or missing:
             self._offer(tap, session, items, missing)
@@ -308,7 +308,7 @@ class Recorder(PollingNode):
                 self._refuse(topic, f"it has the types {', '.join(sorted(published))}; expected one")
                 continue
             self._tap(topic, publishers)
-        self._parameter_reader.look()
+        self._parameter_reader.poll()
 
     def _tap(self, topic: str, publishers: list[TopicEndpointInfo]) -> None:
         tap = self._taps.get(topic)
