@@ -17,9 +17,13 @@ import pytest
 from pendulum_bags.experiments.experiment_cli import main
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME
 from pendulum_bags.runs.run_folder import read_stalls
+from pendulum_bags.runs.run_record import run_record
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.reader import read_bag
 from pendulum_testing.fixtures import PROJECT
 from pendulum_testing.processes import ProcessGroup, RunningProgram
+
+pytestmark = pytest.mark.timeout(600)
 
 NOISE = 5.0
 RAMP = math.pi / 0.002 / 100.0
@@ -34,7 +38,7 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningProg
         patch.delenv("ROS_DOMAIN_ID", raising=False)
         program = processes.start_command(["make", "--no-print-directory", "experiment", f"OUT={folder / 'run'}"])
     try:
-        assert program.wait(360) == 0, program.output
+        assert program.wait(540) == 0, program.output
         assert processes.leftovers() == []
         yield program
     finally:
@@ -80,6 +84,28 @@ def test_experiment_leaves_two_bags_a_summary_figures_and_a_report(run_folder: P
     assert {"paired", "unpaired", "seed", "strategy", "versions"} <= summary.keys()
     assert list((run_folder / "figures").glob("*.png"))
     assert (run_folder / "report.html").stat().st_size < 5_000_000
+
+
+def test_one_run_answers_for_the_given_plant_and_for_the_one_that_it_identifies(run_folder: Path) -> None:
+    summary = json.loads((run_folder / "summary.json").read_text(encoding="utf-8"))
+    found = summary["identified"]
+    # On a busy computer the budget may end it early: then it is said.
+    assert found is not None or summary["left_out"]
+    if found is None:
+        return
+    assert load_plant(found["plant"]).inertia > 2.0 * load_plant("thesis").inertia
+    assert found["answer"]["layers"][0]["mark"] == "yes"
+    for answer in (summary["answer"], found["answer"]):
+        missing = [layer["layer"] for layer in answer["layers"] if layer["mark"] == "not measured"]
+        assert not missing or summary["left_out"]
+    # Both simulations are beside one recording of the machine, the second beside noise that its fit has not seen.
+    bags = {str(path.parent.relative_to(run_folder)) for path in run_folder.rglob("metadata.yaml")}
+    assert {"hw", "repeats/1/hw", "identified/sim", "identified/hw"} <= bags
+    assert "identified/frequency_response/hw" not in bags
+    seeds = [
+        run_record(read_bag(run_folder / name).metadata)["seed"] for name in ("hw", "repeats/1/hw", "identified/hw")
+    ]
+    assert len(set(seeds)) == 3
 
 
 def test_both_bags_hold_the_whole_experiment(run_folder: Path) -> None:
@@ -172,6 +198,47 @@ def test_a_run_whose_bridge_stood_still_is_measured_again_and_ctrl_c_leaves_read
         assert "fault" not in [event.get("mode") for event in bag.events() if event["name"] == "plant_mode"]
 
 
+FAST = ("--ramp-speed", "0.8", "--duration", "1")
+"""A run in real time of a quarter of a minute."""
+
+
+def test_ctrl_c_behind_the_first_layer_gives_the_answer_so_far(
+    processes: ProcessGroup, domain_id: int, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    program = processes.start("pendulum_bags", "experiment", "thesis", "--out", folder, *FAST, alone=True)
+    program.wait_for_output(r"^identifying the plant", 300)
+    program.interrupt()
+
+    assert program.wait(120) == 130
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    output = " ".join(program.output.split())
+    assert summary["answer"]["mark"] == "no"
+    assert summary["answer"]["sentence"] in output
+    assert f"what was recorded is in {folder}" in output
+    assert (folder / "report.html").is_file()
+    assert processes.leftovers() == []
+
+
+def test_a_spent_budget_ends_with_what_was_measured_and_says_what_was_left_out(
+    processes: ProcessGroup, domain_id: int, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    program = processes.start(
+        "pendulum_bags", "experiment", "thesis", "--out", folder, *FAST, "--budget", "4", alone=True
+    )
+    assert program.wait(300) == 0, program.output
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert summary["answer"]["layers"][0]["mark"] == "no"
+    assert summary["identified"] is None
+    (note,) = summary["left_out"]
+    assert note.startswith("The budget of 4 s was spent: ")
+    assert note in " ".join(program.output.split())
+    # The next step keeps the options of this run.
+    assert "--ramp-speed 0.8 --duration 1 --budget 16" in program.output
+    assert processes.leftovers() == []
+
+
 def _command_line(process: psutil.Process) -> set[str]:
     """Return the words of a command line, none where the process has just ended."""
     try:
@@ -190,6 +257,7 @@ def _command_line(process: psutil.Process) -> set[str]:
         (["--hold-time", "0"], "noise hold time is 0.0 s; expected"),
         (["--out", "."], "exists and is not empty"),
         (["--out", "/proc/run"], "cannot be made"),
+        (["--only", "everything"], "--only is everything; expected one of same_run, identified, same_plant"),
         (["--domain", "400"], "ROS domain is 400; expected 0 to 100"),
     ],
 )

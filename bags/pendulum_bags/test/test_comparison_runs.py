@@ -194,8 +194,7 @@ def test_the_terminal_says_of_which_samples_its_figures_are(
 ) -> None:
     second = write_run_folder(tmp_path / "second", 2, ramps=False)
     comparison = compare_folders([folder, second])
-    summary = {**comparison.to_json(), "hardware": "hebi"}
-    _print_summary(make_console(), summary)
+    _print_summary(make_console(), comparison, "hebi")
     assert main([str(folder), str(second)]) == 0
     for told in capsys.readouterr().out.split("Plants during the noise"):
         words = " ".join(told.split())

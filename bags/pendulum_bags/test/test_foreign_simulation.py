@@ -73,7 +73,6 @@ def test_the_node_has_our_simulators_name_and_absolute_paths(model: Path, monkey
     assert in_lockstep.full_name == "/sim/simulator"
     assert "plant" not in in_lockstep.parameters
     assert lockstep_spec(settings, side="hw").foreign is None
-    assert settings.lockstep_command(Path("bag"))[-2:] == ["--simulation", model.name]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.residual_tests import _stretches, _told
 from pendulum_bags.pages.terms import Terms
 from pendulum_bags.runs.datasets import Recording
-from pendulum_bags.runs.next_test import measurement_of, next_test_of, question_of
+from pendulum_bags.runs.next_test import measurement_of, next_test_of, question_of, with_budget
 from pendulum_bags.verdict.same_run import same_run_layer
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_testing.plant_pairs import SIMULATED, pair
@@ -92,6 +92,20 @@ def test_other_layers_are_measured_of_the_plants_that_were_compared(
 )
 def test_no_experiment_on_the_emulator_is_told_to_measure_another_machine(command: str) -> None:
     assert measurement_of([{"command": command}], "ranking") == ""
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        (f"{THESIS} --only same_run --seed 7 --budget=30 -o /tmp/a", "--seed 7"),
+        (f"{THESIS} --plant my.yaml --q 1 1 --only=same_run --only identified", "--plant my.yaml --q 1 1"),
+    ],
+)
+def test_an_experiment_whose_budget_was_spent_is_carried_out_again_with_all_its_other_options(
+    command: str, options: str
+) -> None:
+    assert with_budget([{}, {"command": command}], 480.0) == f"{THESIS} {options} --budget 480"
+    assert with_budget([{"command": "by hand"}], 480.0) == ""
 
 
 def test_the_emulated_machine_of_several_joints_is_kept_for_the_next_test(tmp_path: Path) -> None:

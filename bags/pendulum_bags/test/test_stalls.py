@@ -14,6 +14,7 @@ from pendulum_bags.experiments.stalls import ATTEMPTS, is_stall, run_undisturbed
 from pendulum_bags.report import write_report
 from pendulum_bags.runs.run_folder import create_run_folder, discard_if_empty, read_stalls
 from pendulum_bags.verdict.answer import answer_of
+from pendulum_bags.whole.carry_out import Findings, Simulated
 from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 from pendulum_msgs_py.programs.terminal import make_console
 from pendulum_testing.synthetic_runs import write_run_folder
@@ -90,9 +91,11 @@ def test_runs_that_broke_off_are_told_by_the_comparison_the_terminal_and_the_rep
     folder.mkdir()
     run_undisturbed(run, folder, emulated=True, tell=lambda _: None)
     comparison = compare_folders([folder])
-    summary = _summary(RegulationSettings(), comparison, answer_of(comparison))
+    settings, answer = RegulationSettings(), answer_of(comparison)
+    found = Findings(Simulated("thesis", settings, folder, comparison=comparison))
+    summary = _summary(settings, found, answer, [answer])
     assert summary["stalls"] == [{"run": "run", "reason": f"/hw went to fault: {reason}", "logs": ""}]
-    _print_summary(make_console(highlight=False), summary)
+    _print_summary(make_console(highlight=False), comparison, "emulator")
     page = write_report(folder, summary, comparison=comparison, recordings=[], formats=[]).read_text(encoding="utf-8")
     for told in (capsys.readouterr().out, page):
         words = " ".join(told.split())

@@ -36,6 +36,7 @@ def decide(
     *,
     on_look: Callable[[int, float], None] = lambda number, duration: None,
     on_wait: Callable[[], None] = lambda: None,
+    on_comparison: Callable[[Comparison], None] = lambda found: None,
     record: Callable[..., None] = record_repeat,
 ) -> Comparison:
     """Compare a run folder, and record repeats into it until the comparison is decided.
@@ -50,10 +51,13 @@ def decide(
         budget: Limit of the repeats.
         on_look: Called with the number of a repeat and its duration of noise [s] before it is recorded.
         on_wait: Called while waiting.
+        on_comparison: Called with the comparison after each analysis.
         record: Records what a repeat lacks.
     """
     if not settings.can_repeat or budget.seconds <= 0.0:
-        return compare_folders([folder], margin=margins)
+        comparison = compare_folders([folder], margin=margins)
+        on_comparison(comparison)
+        return comparison
     started = budget.clock()
     number = 0
     while repeat_folder(folder, number + 1).is_dir():
@@ -64,6 +68,7 @@ def decide(
     while True:
         write_looks(folder, look)
         comparison = compare_folders([folder], margin=margins, looks=Looks(look))
+        on_comparison(comparison)
         spent = budget.clock() - started
         # The next repeat has at most twice the noise of the last one.
         decided = comparison.verdict.outcome is not Outcome.UNDECIDED or comparison.unlike_references

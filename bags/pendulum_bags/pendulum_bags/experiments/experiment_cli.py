@@ -6,6 +6,7 @@ import shutil
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -38,7 +39,6 @@ from pendulum_bags.experiments.settings import (
     NoiseSettings,
     RegulationSettings,
 )
-from pendulum_bags.experiments.simulation import recorded_difference
 from pendulum_bags.experiments.trials_cli import add_commands as add_trial_commands
 from pendulum_bags.frequency_response.frequency_response_cli import experiment as frequency_response
 from pendulum_bags.runs.run_folder import versions, write_json
@@ -55,8 +55,9 @@ from pendulum_msgs_py.programs.options import Domain, Json, Lab, Storage, Yes, o
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
-    from pendulum_bags.comparison import Comparison, Margins
+    from pendulum_bags.comparison import Comparison
     from pendulum_bags.verdict import Answer
+    from pendulum_bags.whole.carry_out import Findings, Simulated
 
 __all__ = ["app", "main"]
 
@@ -80,6 +81,13 @@ Seed = Annotated[int, typer.Option(help="Seed of the noise; one seed is one sign
 Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m].")]
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
 Duration = Annotated[float, typer.Option(help="Length of the noise [s].")]
+Only = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Measure this alone: same_run, identified, same_plant, which_controllers or same_choice; may be given "
+        "again. The layer same_run comes first in any case."
+    ),
+]
 Controller = Annotated[str, typer.Option(help="Kind of controller, or a policy file (.npz).")]
 
 
@@ -87,7 +95,7 @@ _OF_SEVERAL_JOINTS = {"duration", "amplitude", "hold_time"}
 """Options of ``thesis`` whose defaults are others for several joints."""
 _OF_ONE_JOINT = {
     *("simulation", "mapping", "accept_differences", "hardware", "hardware_mapping", "lab", "yes", "domain"),
-    *("strategy", "controller", "q", "r", "ramp_speed", "budget"),
+    *("strategy", "controller", "q", "r", "ramp_speed", "budget", "only", "contenders"),
 }
 """Options of ``thesis`` that plants of several joints do not have."""
 
@@ -140,23 +148,29 @@ def thesis(
     budget: Annotated[
         float,
         typer.Option(
-            help="Longest wall time for repeats on the emulator, where the first look does not decide; 0 for none [s].",
+            help="Longest wall time of what follows the run in real time, where hardware is emulated: repeats, "
+            "identification, further layers; 0 for that run alone [s].",
             min=0.0,
         ),
-    ] = 60.0,
+    ] = 120.0,
+    only: Only = None,
+    contenders: Annotated[
+        int, typer.Option(help="Controllers of the layer same_choice; each differs from all others.", min=3, max=32)
+    ] = 6,
     json_output: Json = False,
 ) -> None:
     """Regulate the upright pendulum under noise on simulator and hardware: is the simulation good enough?
 
-    On the emulator it goes on with new noise until the answer is yes or no, or the budget is spent. With a plant of
-    several joints, such as acrobot, it is the experiment joints.
+    On the emulator it goes on with new noise until the first layer is yes or no, identifies a plant where that is no,
+    and measures the other layers of both plants, until the budget is spent. Ctrl-C ends it with the answer so far.
+    With a plant of several joints, such as acrobot, it is the experiment joints.
 
     Example: python -m pendulum_bags experiment thesis --out /tmp/my_run --seed 7 --margin delay=8ms
     """
     from pendulum_bags.comparison import Margins
-    from pendulum_bags.experiments.stalls import run_undisturbed
-    from pendulum_bags.experiments.thesis import run_thesis
-    from pendulum_bags.verdict.terminal import print_answer, print_tests
+    from pendulum_bags.whole.carry_out import STEPS, Order, carry_out
+    from pendulum_bags.whole.page import write_whole_report
+    from pendulum_bags.whole.words import whole_answer
 
     if plant is not None and is_mechanism(plant):
         if typed := typed_options(context, _OF_ONE_JOINT):
@@ -192,6 +206,9 @@ def thesis(
         ramp_speed=ramp_speed,
     )
     margins = Margins.of(margins_file, margin)
+    steps = only or STEPS
+    if unknown := set(steps) - set(STEPS):
+        raise ParameterError(f"--only is {min(unknown)}; expected one of {', '.join(STEPS)}")
     domain = check_domain(domain)
     if (foreign := settings.foreign) is not None and plant is None and not accept_differences:
         foreign.require_equation()
@@ -206,32 +223,28 @@ def thesis(
             equation = foreign.write_equation(folder)
             settings = settings if plant else replace(settings, plant=str(equation))
         started = time.monotonic()
-        with PhaseProgress(settings.expected_wall_time, console) as progress:
-            run_undisturbed(
-                partial(
-                    run_thesis,
-                    folder,
-                    settings,
-                    domain,
-                    progress,
-                    repeat=hardware == "emulator" and settings.can_repeat and budget > 0.0,
-                ),
-                folder,
-                emulated=settings.is_emulated,
-                tell=progress.start_again,
-            )
-            comparison, answer, summary = _analyse(folder, settings, margins, budget, progress)
-    if json_output:
-        print(json_text(summary))
-    else:
-        _print_summary(console, summary)
-        print_tests(console, comparison)
-        print_answer(console, answer)
-    elapsed = time.monotonic() - started
-    console.print(
-        f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",
-        soft_wrap=True,
-    )
+        order = Order(settings, margins, budget, steps, contenders, domain)
+        with PhaseProgress(order.expected_wall_time, console) as progress:
+            found = carry_out(folder, order, progress, partial(_print_first, console, json_output=json_output))
+            progress.phase("writing the report", 6.0)
+            answer, answers = whole_answer(found)
+            summary = _summary(settings, found, answer, answers)
+            write_json(folder / "summary.json", summary)
+            if found.interrupted:
+                console.print(answer.sentence, highlight=False, markup=False)
+                console.print("Writing the page; Ctrl-C once more leaves it.")
+            write_whole_report(folder, summary, found, answer, answers)
+        if json_output:
+            print(json_text(summary))
+        else:
+            _print_whole(console, found, answer, answers)
+        elapsed = time.monotonic() - started
+        console.print(
+            f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",
+            soft_wrap=True,
+        )
+        if found.interrupted:
+            raise KeyboardInterrupt
 
 
 @app.command()
@@ -344,36 +357,15 @@ def _plan(settings: RegulationSettings) -> str:
     )
 
 
-def _analyse(
-    folder: Path, settings: RegulationSettings, margins: Margins, budget: float, progress: PhaseProgress
-) -> tuple[Comparison, Answer, dict[str, Any]]:
-    from pendulum_bags.experiments.decide import Budget, decide
-    from pendulum_bags.report import write_report
-    from pendulum_bags.verdict.answer import answer_of
+def _summary(
+    settings: RegulationSettings, found: Findings, answer: Answer, answers: Sequence[Answer]
+) -> dict[str, Any]:
+    from pendulum_bags.whole.carry_out import IDENTIFIED
 
-    progress.phase("comparing", 2.0)
-    comparison = decide(
-        folder,
-        settings,
-        margins,
-        Budget(budget),
-        on_look=lambda number, duration: progress.phase(f"undecided: {duration:.0f} s more", 4.0 + 0.25 * duration),
-        on_wait=progress.refresh,
-    )
-    if (space := settings.running("sim")) is not None:
-        comparison = replace(comparison, unproved=[recorded_difference(folder / "sim", space, settings.plant)])
-    again = f'make experiment ARGS="--budget {4 * budget:.0f}"' if comparison.is_emulated and budget else ""
-    answer = answer_of(comparison, more=again)
-    progress.phase("writing the report", 4.0)
-    summary = _summary(settings, comparison, answer)
-    write_json(folder / "summary.json", summary)
-    write_report(folder, summary, comparison=comparison, recordings=None, answer=answer)
-    return comparison, answer, summary
-
-
-def _summary(settings: RegulationSettings, comparison: Comparison, answer: Answer) -> dict[str, Any]:
+    given, *others = found.plants
+    assert given.comparison is not None
     return {
-        **comparison.to_json(),
+        **given.comparison.to_json(),
         # The requested seed: where the first run is excluded, the comparison has that of a repeat.
         "experiment": "thesis",
         "hardware": settings.hardware,
@@ -381,19 +373,47 @@ def _summary(settings: RegulationSettings, comparison: Comparison, answer: Answe
         "strategy": settings.strategy,
         "versions": versions(),
         "answer": answer.to_json(),
+        IDENTIFIED: {"plant": others[0].settings.plant, "answer": answers[1].to_json()} if others else None,
+        "left_out": found.notes,
     }
 
 
-def _print_summary(console: Console, summary: dict[str, Any]) -> None:
+def _print_first(console: Console, plant: Simulated, *, json_output: bool) -> None:
+    """Print the first layer of the given plant, while the others are measured."""
+    from pendulum_bags.verdict.terminal import print_tests
+
+    assert plant.comparison is not None
+    if not json_output:
+        _print_summary(console, plant.comparison, plant.settings.hardware)
+        print_tests(console, plant.comparison)
+    console.print(plant.answer().sentence, style="bold", highlight=False, markup=False)
+
+
+def _print_whole(console: Console, found: Findings, answer: Answer, answers: Sequence[Answer]) -> None:
+    from pendulum_bags.verdict.terminal import layers_table, print_sentence, print_tests
+
+    for plant, own in zip(found.plants, answers, strict=True):
+        if plant is found.identified and plant.comparison is not None:
+            console.print(
+                f"\n{plant.name}, identified from these recordings, under noise of another seed", style="bold"
+            )
+            print_tests(console, plant.comparison)
+        console.print(layers_table(own, f"The layers of the answer, {plant.name}"))
+    for note in found.notes:
+        console.print(note, style="yellow", highlight=False, markup=False)
+    print_sentence(console, answer)
+
+
+def _print_summary(console: Console, comparison: Comparison, hardware: str) -> None:
     from pendulum_bags.figures.terminal_table import plants_table
     from pendulum_bags.runs.run_data import timing_warning
 
-    emulated = summary["emulated"]
+    emulated, summary = comparison.is_emulated, comparison.to_json()
     title = f"Simulation and {'emulated hardware' if emulated else 'hardware'} under the same noise"
     if summary["runs"] > 1:
         title += f", all samples of {summary['runs']} runs"
     plants = summary["plants"]
-    stands_in = "emulator" if summary["hardware"] in HARDWARE else "a simulation"
+    stands_in = "emulator" if hardware in HARDWARE else "a simulation"
     headings = [f"hw ({stands_in})" if name == "hw" and emulated else name for name in plants]
     rows = (
         (r"noise recorded \[s]", "duration_s", ".1f"),

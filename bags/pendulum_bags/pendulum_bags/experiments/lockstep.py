@@ -84,7 +84,7 @@ def lockstep_spec(settings: RegulationSettings, *, side: str) -> RunSpec:
     return RunSpec(
         side=side,
         plant=settings.plant if side == "sim" else "thesis",
-        design_plant=settings.plant,
+        design_plant=settings.design_plant,
         strategy=settings.strategy,
         controller=settings.kind,
         controller_parameters=settings.tuning,

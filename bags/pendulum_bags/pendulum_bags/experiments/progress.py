@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from types import TracebackType
 
@@ -10,9 +11,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 __all__ = ["PhaseProgress"]
 
+_LONGEST_SILENCE = 4.0
+"""Time between two signs of life [s]."""
+
 
 class PhaseProgress:
-    """A bar that moves with time through phases of known length; one line a phase where the output is no terminal.
+    """A bar that moves with time through phases of known length; where the output is no terminal, lines.
 
     Args:
         total: Expected length of all phases [s].
@@ -33,27 +37,42 @@ class PhaseProgress:
         self._task = self._bar.add_task("", total=total)
         self._done = 0.0
         self._length = 0.0
+        self._name = ""
         self._started = time.monotonic()
+        self._ended = threading.Event()
+        self._ticker = threading.Thread(target=self._tick, daemon=True)
 
     def __enter__(self) -> PhaseProgress:
         """Show the bar."""
         self._bar.start()
+        self._ticker.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Remove the bar."""
+        self._ended.set()
+        self._ticker.join()
         self._bar.stop()
 
     def phase(self, name: str, expected: float) -> None:
         """Begin a phase of an expected length [s]; the one before counts as done."""
         self._done += self._length
-        self._length = expected
+        self._name, self._length = name, expected
         self._started = time.monotonic()
         self._bar.update(self._task, description=name, completed=self._done)
         if not self._console.is_terminal:
             self._console.print(f"{name} ({expected:.0f} s)", highlight=False)
+
+    def _tick(self) -> None:
+        """Show that a phase goes on, also while nothing else in this process can."""
+        while not self._ended.wait(_LONGEST_SILENCE):
+            self.refresh()
+            if self._name and not self._console.is_terminal:
+                elapsed = time.monotonic() - self._started
+                if elapsed > 0.9 * _LONGEST_SILENCE:
+                    self._console.print(f"  {self._name}: {elapsed:.0f} of {self._length:.0f} s", highlight=False)
 
     def start_again(self, why: str) -> None:
         """Restart, and print the reason."""

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.in_process import RunArrays, simulate
-from pendulum_bags.experiments.lockstep import lockstep_spec, run_lockstep
+from pendulum_bags.experiments.lockstep import lockstep_spec, record_run
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.runs.run_data import END_EVENT, START_EVENT
@@ -24,7 +25,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.storage import BagWriter
 
-__all__ = ["SHORTEST", "record_repeat", "record_simulation", "repeat_folder", "repeat_settings"]
+__all__ = ["SHORTEST", "record_repeat", "record_simulation", "record_spec", "repeat_folder", "repeat_settings"]
 
 SEED_STEP = 10_000_000
 """Added to the seed for each repeat, so that the repeats of one seed are not another seed's run."""
@@ -65,13 +66,29 @@ def record_repeat(
     """
     chosen = repeat_settings(settings, number)
     place = repeat_folder(folder, number)
-    if not (place / "hw").exists():
-        if chosen.foreign_of("hw") is not None:
-            record_simulation(place / "hw", lockstep_spec(chosen, side="hw"))
-        else:
-            run_lockstep(place / "hw", chosen, side="hw", on_wait=on_wait)
-    if not (place / "sim").exists():
-        record_simulation(place / "sim", lockstep_spec(chosen, side="sim"))
+    for side in ("hw", "sim"):
+        if not (place / side).exists():
+            record_spec(place / side, lockstep_spec(chosen, side=side), on_wait=on_wait)
+
+
+def record_spec(
+    bag: Path, spec: RunSpec, *, hosts: HostPool | None = None, on_wait: Callable[[], None] = lambda: None
+) -> Path:
+    """Record a run in lockstep: a simulation in this process, the emulated hardware over DDS; return the bag.
+
+    Args:
+        bag: Folder of the bag.
+        spec: The run.
+        hosts: As of :func:`record_run`.
+        on_wait: Called while waiting.
+
+    Raises:
+        BagError: The bag exists, or cannot be written.
+        FaultError: A program ended or did not respond, or the plant faulted.
+    """
+    if spec.has_bridge:
+        return record_run(bag, spec, hosts=hosts, on_wait=on_wait)
+    return record_simulation(bag, spec)
 
 
 def record_simulation(bag: Path, spec: RunSpec) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -98,7 +97,8 @@ class RegulationSettings:
     """Regulation of the upright pendulum under noise, on simulator and hardware, as in the thesis.
 
     Attributes:
-        plant: Preset or file of the simulated plant; the controller is designed on it too.
+        plant: Preset or file of the simulated plant.
+        design: Preset or file that the controller is designed on; empty for the simulated plant.
         hardware: ``emulator``, or ``hebi`` for the machine of a lab file; or a second third-party simulation (a model
             file or ``gymnasium:ID``), or a plant that runs already, ``ros:/namespace``.
         lab: The lab file, for ``hebi``.
@@ -131,6 +131,7 @@ class RegulationSettings:
     mapping: str = ""
     hardware_mapping: str = ""
     ramp_speed: float = RAMP_SPEED
+    design: str = ""
 
     def __post_init__(self) -> None:
         """Refuse unknown plants and backends, and a policy that cannot be read, before anything is started."""
@@ -177,6 +178,11 @@ class RegulationSettings:
                     f"{name} is {getattr(self, name)} for controller {self.controller!r}, which has no such parameter; "
                     "expected it left out"
                 )
+
+    @property
+    def design_plant(self) -> str:
+        """Preset or file that the controller is designed on."""
+        return self.design or self.plant
 
     @property
     def kind(self) -> str:
@@ -287,24 +293,9 @@ class RegulationSettings:
             return machine.bridge_program(self.strategy, bag)
         return graph.bridge("/hw", backend=self.hardware, effort_strategy=self.strategy, **EMULATOR_PATIENCE)
 
-    def lockstep_command(self, bag: Path, *, side: str = "sim") -> list[str]:
-        """Return the command that records one side by itself, in lockstep."""
-        noise = self.noise
-        return [
-            *(sys.executable, "-m", "pendulum_bags", "experiment", "lockstep"),
-            *(("--side", side) if side != "sim" else ()),
-            *("--bag", str(bag)),
-            *("--plant", self.plant, "--strategy", self.strategy),
-            *("--controller", self.controller, "--q", *map(repr, self.q), "--r", repr(self.r)),
-            *("--seed", str(noise.seed), "--amplitude", repr(noise.amplitude), "--hold-time", repr(noise.hold_time)),
-            *("--duration", repr(noise.duration), "--storage", self.storage),
-            *(("--simulation", self.simulation) if self.simulation and self.running("sim") is None else ()),
-            *(("--mapping", self.mapping) if self.mapping else ()),
-        ]
-
     def controller_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:
         """Return the controller of one of the plants."""
-        parameters = {"controller": self.kind, "plant": absolute_plant(self.plant), **self.tuning}
+        parameters = {"controller": self.kind, "plant": absolute_plant(self.design_plant), **self.tuning}
         return graph.controller(namespace, **{**parameters, **changes})
 
     def disturbance_program(self, namespace: str, **changes: graph.ParameterArgument) -> NodeProgram:

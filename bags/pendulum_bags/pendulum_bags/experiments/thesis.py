@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,10 +10,10 @@ from pathlib import Path
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.graph_plant import join
-from pendulum_bags.experiments.lockstep import lockstep_spec, longest_run
-from pendulum_bags.experiments.processes import Child, ProcessSet
+from pendulum_bags.experiments.lockstep import lockstep_spec
+from pendulum_bags.experiments.processes import Child
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.repeats import SHORTEST, record_simulation, repeat_folder, repeat_settings
+from pendulum_bags.experiments.repeats import record_simulation
 from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.experiments.session import (
     ANSWER_PRIORITY,
@@ -41,7 +41,7 @@ def run_thesis(
     domain: int | None,
     progress: PhaseProgress,
     *,
-    repeat: bool = False,
+    on_idle: Callable[[], None] = lambda: None,
 ) -> None:
     """Run the experiment and leave the bags ``sim``, ``hw`` and ``sim_500hz`` in the folder.
 
@@ -50,7 +50,7 @@ def run_thesis(
         settings: What to run.
         domain: ROS domain, or None for any free one.
         progress: Shows where it is.
-        repeat: Record the emulated hardware's side of a first repeat too, while the ramp down leaves the machine idle.
+        on_idle: Called when the ramp down begins, which leaves the computer idle.
 
     Raises:
         FaultError: A program ended, a plant refused or faulted; everything is at rest again when this is raised.
@@ -63,21 +63,16 @@ def run_thesis(
         _refuse_occupied_domain(session.conductor, settings)
         plants, recorders = _start(session, folder, settings)
         session.drives(*plants)
-        beside = _regulate(session, plants, settings, progress, folder if repeat else None)
+        _regulate(session, plants, settings, progress, on_idle)
         progress.phase("closing the bags", 2.0)
         # Before any wait: messages from here on are no part of the experiment.
         for recorder in recorders:
             session.close(recorder)
         for plant in plants:
             session.leaves(plant)
-        # Nothing else computes while the repeat is still simulated.
-        session.processes.stop(keep=beside)
+        session.processes.stop()
         if settings.running("sim") is None:
             _simulate_own_protocol(folder, settings)
-        for child in beside:
-            # It has limits of its own and ends by itself; on a busy machine it takes minutes.
-            longest = longest_run(max(SHORTEST, settings.noise.duration))
-            session.processes.wait(child, longest, on_wait=progress.refresh)
 
 
 def _start(
@@ -119,10 +114,10 @@ def _regulate(
     plants: Sequence[PlantClient],
     settings: RegulationSettings,
     progress: PhaseProgress,
-    repeated: Path | None,
-) -> list[Child]:
-    """Carry out the phases, ramp to ramp; return what was started meanwhile: a repeat for a run's folder, if any."""
-    conductor, processes, noise = session.conductor, session.processes, settings.noise
+    on_idle: Callable[[], None],
+) -> None:
+    """Carry out the phases, ramp to ramp."""
+    conductor, noise = session.conductor, settings.noise
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
         recorded = [f"{plant.namespace}/{topic}" for topic in (*names.SIGNALS, names.JOINT_TRAJECTORY)]
@@ -151,8 +146,7 @@ def _regulate(
         )
 
     durations = _start_move(conductor, plants, settings, 0.0, "ramp_down", progress)
-    # The ramp leaves the machine idle: emulated hardware gets new noise, in case that this run alone does not decide.
-    beside = [] if repeated is None else [_start_repeat(processes, repeated, settings)]
+    on_idle()
     # Before the ramp ends: a controller that is still active then would take over a pendulum half a turn from upright.
     for plant in plants:
         plant.switch_controller(on=False)
@@ -161,7 +155,6 @@ def _regulate(
         plant.disarm()
         plant.mark("done")
     conductor.spin(0.2)
-    return beside
 
 
 def _noise_ended(plant: PlantClient) -> bool:
@@ -176,12 +169,6 @@ def _simulate_own_protocol(folder: Path, settings: RegulationSettings) -> None:
     hold_time = 0.002 if foreign is None else max(0.002, foreign.period)
     noise = replace(settings.noise, seed=settings.noise.seed + OWN_PROTOCOL_SEED_STEP, hold_time=hold_time)
     record_simulation(folder / "sim_500hz", lockstep_spec(replace(settings, noise=noise), side="sim"))
-
-
-def _start_repeat(processes: ProcessSet, folder: Path, settings: RegulationSettings) -> Child:
-    """Start the hardware's side of the first repeat, in a domain of its own and behind all others."""
-    command = repeat_settings(settings, 1).lockstep_command(repeat_folder(folder, 1) / "hw", side="hw")
-    return processes.start("repeat_1", command, ends_by_itself=True, niceness=10, environment={"ROS_DOMAIN_ID": ""})
 
 
 def _start_move(

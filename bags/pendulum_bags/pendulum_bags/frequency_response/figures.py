@@ -33,7 +33,7 @@ def _name(measured: MeasuredResponse) -> str:
 def response_figures(analysis: Analysis) -> list[Figure]:
     """Return the figures of one or two measured plants."""
     certifier, designs = analysis.certifier, analysis.designs
-    figures = [_bode(analysis), _quality(analysis.responses)]
+    figures = [bode(analysis), _quality(analysis.responses)]
     if certifier is not None:
         figures.append(gap_figure(certifier, analysis.difference, designs))
         figures += [_nyquist(certifier, design) for design in designs[:1] if design.K is not None]
@@ -61,7 +61,7 @@ def _channels(measured: MeasuredResponse, scaling: SignalScaling) -> list[tuple[
     return [*sizes, (measured.driven, f"phase of {measured.joints[measured.driven]}\n[deg]", _phase)]
 
 
-def _bode(analysis: Analysis) -> Figure:
+def bode(analysis: Analysis) -> Figure:
     """Draw the continuous plants: what hold and folding add was taken out, so that rates may differ."""
     responses, model, difference = analysis.responses, analysis.model, analysis.difference
     channels = _channels(responses[0], analysis.scaling)

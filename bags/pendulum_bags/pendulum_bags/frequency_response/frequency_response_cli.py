@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -131,8 +131,10 @@ def experiment(
     from pendulum_bags.experiments.lockstep import record_run
     from pendulum_bags.experiments.new_run import new_run
     from pendulum_bags.experiments.progress import PhaseProgress
-    from pendulum_bags.experiments.run_spec import RunSpec
+    from pendulum_bags.experiments.repeats import record_simulation
+    from pendulum_bags.experiments.run_spec import SIDES, RunSpec
     from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
+    from pendulum_bags.frequency_response.multisine import Multisine
     from pendulum_lqr.policies.policy_file import named_controller
     from pendulum_lqr.responses.controller_response import require_time_invariant
     from pendulum_lqr.responses.gap_metric import Scaling
@@ -144,18 +146,8 @@ def experiment(
     kind, parameters = named_controller(controller)
     require_time_invariant(kind)
     check_domain(domain)
-    disturbance: dict[str, Any] = {
-        "kind": "multisine",
-        "amplitude": amplitude,
-        "signal_period": signal_period,
-        "frequency": lowest,
-        "frequency_end": highest,
-        "lines": lines,
-        "hold_time": 0.01,
-    }
     console = make_console(stderr=json_output, highlight=False)
-    # Both hold each sample for the slower plant's period: the same torque as a function of time.
-    specs = [
+    sim, hw = (
         RunSpec(
             side=side,
             plant=(plant or "thesis") if side == "sim" else "thesis",
@@ -165,21 +157,18 @@ def experiment(
             strategy=strategy,
             controller=kind,
             controller_parameters=parameters,
-            disturbance=disturbance,
-            duration=signal_period * (periods + 1) + 0.1,
             seed=seed,
             storage=storage,
             clock="realtime" if realtime else "lockstep",
         )
-        for side in ("sim", "hw")
-    ]
-    if (foreign := specs[0].foreign) is not None:
-        foreign.check(disturbance["hold_time"])
-        if plant is None and not accept_differences:
-            foreign.require_equation()
+        for side in SIDES
+    )
+    specs: Sequence[RunSpec] = Multisine(amplitude, signal_period, periods, lowest, highest, lines).specs(sim, hw)
+    if (foreign := sim.foreign) is not None and plant is None and not accept_differences:
+        foreign.require_equation()
     started = time.monotonic()
-    shares = (1.0, 1.0) if realtime else (0.35, 0.15)
-    expected = [6.0 + share * spec.duration for spec, share in zip(specs, shares, strict=True)]
+    starting, shares = ((6.0, 6.0), (1.0, 1.0)) if realtime else ((0.0, 6.0), (0.05, 0.15))
+    expected = [start + share * spec.duration for spec, start, share in zip(specs, starting, shares, strict=True)]
     with (
         new_run(out, "frequency_response", console) as folder,
         open_pool() as hosts,
@@ -187,10 +176,13 @@ def experiment(
     ):
         if foreign is not None and plant is None:
             equation = str(foreign.write_equation(folder))
-            specs = [replace(spec, design_plant=equation) for spec in specs]
+            specs = tuple(replace(spec, design_plant=equation) for spec in specs)
         for spec, length in zip(specs, expected, strict=True):
             progress.phase("simulation" if spec.side == "sim" else "hardware", length)
-            record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh, hosts=hosts)
+            if spec.has_bridge or realtime:
+                record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh, hosts=hosts)
+            else:
+                record_simulation(folder / spec.side, spec)
         progress.phase("analysing", 12.0)
         responses, recorded, ran = read_responses([folder])
         analysis = analyse_responses(responses, recorded, design or ran, scaling=scaling, margin=gap_margin)

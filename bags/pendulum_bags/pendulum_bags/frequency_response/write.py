@@ -18,7 +18,7 @@ from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import name_in, write_layer
 from pendulum_lqr.responses.measured_response import write_response
 
-__all__ = ["write_analysis"]
+__all__ = ["designs_tables", "write_analysis", "write_numbers"]
 
 _THEOREM = (
     "The certificate is Vinnicombe's theorem with the upper 95 % limit of the measurement. It speaks of the linear "
@@ -32,6 +32,31 @@ _LIMITS = (
     "stiffness, damping and inertia are continued (of several joints, its ratio to the model), and the error of both "
     "widens the discs. What begins only below the lowest frequency was not seen."
 )
+
+
+def write_numbers(folder: Path, analysis: Analysis) -> None:
+    """Write responses, layers and numbers into a folder, from which designs can be certified later."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for response in analysis.responses:
+        write_response(folder / f"{response.label}_response.json", response)
+    for layer in analysis.layers:
+        write_layer(folder, layer)
+    write_json(folder / NUMBERS, analysis.to_json())
+
+
+def designs_tables(analysis: Analysis) -> list[Table]:
+    """Return the table of certified designs; nothing where there are none."""
+    if not analysis.designs:
+        return []
+    return [
+        Table(
+            "Which designs carry over",
+            f"Designed on plant {analysis.plant}. Certified: margin above the gap's upper limit, "
+            "or loop distance below 1 at every frequency.",
+            ("row", "design", "margin b(P, K)", "loop distance", "modulus margin on the hardware", "certified"),
+            design_rows(analysis.designs),
+        )
+    ]
 
 
 def write_analysis(
@@ -48,28 +73,13 @@ def write_analysis(
         formats: Of the figures.
         step: Called with what is written next.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    for response in analysis.responses:
-        write_response(folder / f"{response.label}_response.json", response)
-    for layer in analysis.layers:
-        write_layer(folder, layer)
-    write_json(folder / NUMBERS, analysis.to_json())
+    write_numbers(folder, analysis)
     step("drawing")
     # Thousands of small matrices: threads of the linear algebra would only get into each other's way.
     with threadpool_limits(1):
         figures = name_in(response_figures(analysis), emulated=analysis.is_emulated)
     write_figures(figures, folder / "figures", formats)
-    tables = []
-    if analysis.designs:
-        tables.append(
-            Table(
-                "Which designs carry over",
-                f"Designed on plant {analysis.plant}. Certified: margin above the gap's upper limit, "
-                "or loop distance below 1 at every frequency.",
-                ("row", "design", "margin b(P, K)", "loop distance", "modulus margin on the hardware", "certified"),
-                design_rows(analysis.designs),
-            )
-        )
+    tables = designs_tables(analysis)
     page = folder / "frequency_response.html"
     return write_layer_page(
         page,

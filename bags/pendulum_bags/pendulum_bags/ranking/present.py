@@ -19,7 +19,15 @@ from pendulum_bags.runs.case import UNKNOWN, Case
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, name_in, write_layer
 
-__all__ = ["REGRET_MARGIN", "Words", "print_ranking", "same_choice", "write_ranking"]
+__all__ = [
+    "REGRET_MARGIN",
+    "Words",
+    "print_ranking",
+    "ranking_figure",
+    "ranking_tables",
+    "same_choice",
+    "write_ranking",
+]
 
 REGRET_MARGIN = 0.1
 """Regret that does not matter, as a share of the hardware's best cost."""
@@ -185,6 +193,28 @@ def _pair_rows(ranking: Ranking) -> list[tuple[str, ...]]:
     ]
 
 
+def ranking_tables(ranking: Ranking, words: Words = Words()) -> list[Table]:
+    """Return the table of the contenders, and that of the pairs in the wrong order."""
+    tables = [Table("Controllers", words.cost, _HEAD, ranking_rows(ranking))]
+    if ranking.wrong:
+        tables.append(
+            Table(
+                "Pairs in the wrong order",
+                f"The {min(_SHOWN_PAIRS, len(ranking.wrong))} dearest of {len(ranking.wrong)}, sure ones first.",
+                (
+                    "simulation prefers",
+                    "hardware prefers",
+                    "better in simulation by",
+                    "dearer on hardware by",
+                    "sure",
+                    "reason",
+                ),
+                _pair_rows(ranking),
+            )
+        )
+    return tables
+
+
 def write_ranking(
     folder: Path,
     ranking: Ranking,
@@ -212,23 +242,7 @@ def write_ranking(
     write_layer(folder, layer)
     figures = [name_in(ranking_figure(ranking), emulated=emulated)]
     write_figures(figures, folder / "figures", formats)
-    tables = [Table("Controllers", words.cost, _HEAD, ranking_rows(ranking))]
-    if ranking.wrong:
-        tables.append(
-            Table(
-                "Pairs in the wrong order",
-                f"The {min(_SHOWN_PAIRS, len(ranking.wrong))} dearest of {len(ranking.wrong)}, sure ones first.",
-                (
-                    "simulation prefers",
-                    "hardware prefers",
-                    "better in simulation by",
-                    "dearer on hardware by",
-                    "sure",
-                    "reason",
-                ),
-                _pair_rows(ranking),
-            )
-        )
+    tables = ranking_tables(ranking, words)
     return write_layer_page(
         folder / "ranking.html", "Ranking of controllers", [layer], figures, tables, notes, emulated=emulated
     )

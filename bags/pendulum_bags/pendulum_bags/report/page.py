@@ -25,6 +25,7 @@ __all__ = ["Page", "facts_of_tests", "page_of", "render_page"]
 SECTIONS = (
     "Verdict",
     "Frequency response",
+    "Same choice",
     "Paired comparison",
     "Repeated runs",
     "Plants under noise",
@@ -73,6 +74,7 @@ class Page:
         runs: How many runs there are; sections that show the first of several have a note.
         unpaired: The answer without pairs, shown with the thesis's analysis.
         noise_note: A sentence about noise that was held differently, shown there too.
+        others: Further simulated plants, by name, and their answers.
     """
 
     title: str
@@ -91,6 +93,7 @@ class Page:
     runs: int = 1
     unpaired: str = ""
     noise_note: str = ""
+    others: Sequence[tuple[str, Answer]] = ()
 
 
 def page_of(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,6 +44,7 @@ def write_report(
     formats: Sequence[str] = ("png", "pdf"),
     answer: Answer | None = None,
     certified: Analysis | None = None,
+    extend: Callable[[Page], Page] = lambda page: page,
     open_bag: OpenBag = read_bag,
 ) -> Path:
     """Write ``report.html`` and ``figures/`` into a folder.
@@ -60,6 +61,7 @@ def write_report(
         formats: Formats of the figures.
         answer: The sum of all layers; by default of the comparison and of the run folder.
         certified: Which designs carry over to the measured machine; by default by the run folder's response.
+        extend: Returns the page with what else was measured.
         open_bag: How bags are opened.
 
     Returns:
@@ -94,7 +96,7 @@ def write_report(
         missing,
         title=title_of([Path(folder) for folder in folders] or [out], len(comparison.pairs)),
     )
-    return _save(out, page, formats)
+    return _save(out, extend(page), formats)
 
 
 def write_joint_report(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Collection, Mapping, Sequence, Set
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
-__all__ = ["MACHINE_FILE", "measurement_of", "next_test_of", "plant_file_of", "question_of"]
+__all__ = ["MACHINE_FILE", "measurement_of", "next_test_of", "plant_file_of", "question_of", "with_budget"]
 
 _EXPERIMENTS = ("thesis", "joints")
 MACHINE_FILE = "machine.yaml"
@@ -61,6 +61,23 @@ def measurement_of(records: Sequence[Mapping[str, Any]], experiment: str) -> str
     return ""
 
 
+def with_budget(records: Sequence[Mapping[str, Any]], seconds: float) -> str:
+    """Return the command that carries out a recorded experiment again, all of it, with another budget.
+
+    Args:
+        records: What bags say of their runs; the first that was an experiment on plants of one joint counts.
+        seconds: The budget [s].
+
+    Returns:
+        The command; empty where no record tells of such an experiment.
+    """
+    for words in map(_words, records):
+        if words[:5] == ["python", "-m", "pendulum_bags", "experiment", "thesis"]:
+            kept, _ = _without(words[5:], ("--budget", "--only", "--out", "-o"))
+            return shlex.join([*words[:5], *kept, "--budget", f"{seconds:.0f}"])
+    return ""
+
+
 def plant_file_of(records: Sequence[Mapping[str, Any]]) -> str:
     """Return the plant file that the recorded experiment simulated, as its command names it; empty for a preset."""
     named = (name for record in records for name in _values_of("--plant", _words(record)))
@@ -77,18 +94,26 @@ def _again(record: Mapping[str, Any], plant: str, seen: Set[str]) -> str:
     words = _words(record)
     if words[:4] != ["python", "-m", "pendulum_bags", "experiment"] or " ".join(words[4:5]) not in _EXPERIMENTS:
         return ""
-    kept, seed = words[:5], "1"
-    rest = iter(words[5:])
-    for word in rest:
-        name, has_value, value = word.partition("=")
-        if name in _REPLACED:
-            value = value if has_value else next(rest, "")
-            seed = value if name == "--seed" else seed
-        elif name not in _LEFT_OUT and not (word.startswith("-o") and word[1:2] != "-"):
-            kept.append(word)
+    kept, left = _without(words[5:], _REPLACED)
+    seed = left.get("--seed", "1")
+    kept = [word for word in kept if word not in _LEFT_OUT]
     first = int(seed) + 1 if seed.isdecimal() else 2
     unseen = next(number for number in count(first) if str(number) not in seen)
-    return shlex.join([*kept, "--plant", plant, "--seed", str(unseen)])
+    return shlex.join([*words[:5], *kept, "--plant", plant, "--seed", str(unseen)])
+
+
+def _without(words: Sequence[str], names: Collection[str]) -> tuple[list[str], dict[str, str]]:
+    """Return words without some options and their values, and the last value of each that was there."""
+    kept: list[str] = []
+    left: dict[str, str] = {}
+    rest = iter(words)
+    for word in rest:
+        name, has_value, value = word.partition("=")
+        if name in names:
+            left[name] = value if has_value else next(rest, "")
+        elif not (word.startswith("-o") and word[1:2] != "-"):
+            kept.append(word)
+    return kept, left
 
 
 def _values_of(option: str, words: Sequence[str]) -> list[str]:

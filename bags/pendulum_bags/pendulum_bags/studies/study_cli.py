@@ -172,17 +172,21 @@ def _shipped(name: str, what: str, example: str) -> Callable[..., None]:
 
 
 def run(
-    spec: Annotated[Path, typer.Argument(help="JSON file with one run.")],
-    bag: Annotated[Path, typer.Option(help="Folder of the bag; it must not exist.")],
+    spec: Annotated[Path, typer.Argument(help="JSON file with one run, or with a list of runs and their bags.")],
+    bag: Annotated[Path | None, typer.Option(help="Folder of the bag of one run; it must not exist.")] = None,
 ) -> None:
-    """Carry out one run of a study; its programs start each other this way.
+    """Carry out one run of a study, or runs one after the other; programs start each other this way.
 
     Example: python -m pendulum_bags experiment run run.json --bag /tmp/bag
     """
     from pendulum_bags.experiments.host_pool import kept_pool
     from pendulum_bags.experiments.lockstep import record_run
+    from pendulum_bags.experiments.machine import record_listed
     from pendulum_bags.experiments.run_spec import RunSpec
 
+    if bag is None:
+        record_listed(spec)
+        return
     try:
         values = json.loads(spec.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

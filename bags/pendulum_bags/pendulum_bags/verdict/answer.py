@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.verdict.layers import Answer, Layer, LayerResult, Mark, read_layers, sum_up
@@ -28,6 +29,7 @@ def answer_of(
     *,
     more: str = "",
     anew: Sequence[LayerResult] = (),
+    how: Mapping[Layer, str] = MappingProxyType({}),
 ) -> Answer:
     """Return the answer of a comparison.
 
@@ -36,6 +38,7 @@ def answer_of(
         folders: Folders that may have further layers: of the run, or of experiments that measured them.
         more: How to record more, where that is what is missing.
         anew: Layers that were judged again, and replace those of the folders.
+        how: The command that measures a layer, where it is another than that of the recordings' plants.
 
     Raises:
         DataError: A stored layer cannot be read, is in two of the folders, or is of other plants.
@@ -43,7 +46,8 @@ def answer_of(
     first = same_run_layer(comparison, more=more)
     known = {Layer.SAME_RUN, *(one.layer for one in anew)}
     others = [one for folder in folders for one in read_layers(folder, first.case) if one.layer not in known]
-    return sum_up([first, *anew, *others], emulated=comparison.is_emulated, how=how_to_measure(comparison))
+    commands = {**how_to_measure(comparison), **how}
+    return sum_up([first, *anew, *others], emulated=comparison.is_emulated, how=commands)
 
 
 def join_joints(results: Mapping[str, LayerResult]) -> LayerResult:

@@ -22,6 +22,7 @@ from pendulum_msgs_py.json_values import without_nan
 
 __all__ = [
     "HOW",
+    "WHAT_HOLDS",
     "Answer",
     "Evidence",
     "Layer",
@@ -32,6 +33,8 @@ __all__ = [
     "write_layer",
 ]
 
+WHAT_HOLDS = " What holds: "
+"""Begins the part of the answer's text that stays true where it is not yes."""
 FOLDER = "layers"
 """Folder within a run folder in which layers are stored, each in a file ``<key>.json``."""
 
@@ -250,8 +253,16 @@ def sum_up(
         mark = Mark.YES
         text = f"Yes: {_reasons(by_mark[mark])}."
     holds = [result.holds for result in layers if result.holds]
+    if {given[layer].mark for layer in (Layer.SAME_RUN, Layer.WHICH_CONTROLLERS) if layer in given} == {
+        Mark.YES,
+        Mark.NO,
+    }:
+        text += (
+            f" About the stability of a design “{Layer.WHICH_CONTROLLERS.title}” decides, about how closely it moves "
+            f"as simulated “{Layer.SAME_RUN.title}”."
+        )
     if holds and mark is not Mark.YES:
-        text += f" What holds: {'; '.join(holds)}."
+        text += f"{WHAT_HOLDS}{'; '.join(holds)}."
     if mark is Mark.YES and by_mark[Mark.NOT_MEASURED]:
         missing = _listed([f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED]])
         text += f" Not measured: {missing}."

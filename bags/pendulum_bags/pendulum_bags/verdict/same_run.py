@@ -15,7 +15,7 @@ from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 
-__all__ = ["case_of", "design_plant", "how_to_measure", "in_words", "same_run_layer", "seen_note"]
+__all__ = ["case_of", "design_plant", "how_to_measure", "in_words", "recordings_of", "same_run_layer", "seen_note"]
 
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
@@ -175,7 +175,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     steps = []
     names = {test.quantity for test in failed}
     shapes = {name for name in names if name != "delay" and not name.startswith("mean")}
-    source = " ".join(map(shlex.quote, _recordings(comparison))) or "RUN/hw"
+    source = " ".join(map(shlex.quote, recordings_of(comparison))) or "RUN/hw"
     late = next((test for test in failed if test.quantity == "delay"), None)
     foreign = _foreign_simulation(comparison)
     if any(name.startswith("spread") or "less the delay" in name for name in shapes):
@@ -211,7 +211,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
     return tuple(steps)
 
 
-def _recordings(comparison: Comparison) -> list[str]:
+def recordings_of(comparison: Comparison) -> list[str]:
     """Return the recordings of the hardware to identify it from: those that were compared, as many as a line holds.
 
     A repeat in lockstep stays upright, where gravity shows little of itself: the run that it repeats comes first, also

@@ -18,7 +18,7 @@ from pendulum_bags.verdict.same_run import seen_note
 from pendulum_msgs_py.programs.terminal import WholeTable
 from pendulum_msgs_py.programs.typed_commands import as_typed
 
-__all__ = ["layers_table", "print_answer", "print_tests", "tests_table"]
+__all__ = ["layers_table", "print_answer", "print_sentence", "print_tests", "tests_table"]
 
 SIGNS = {
     Mark.YES: "✓ yes",
@@ -37,9 +37,9 @@ _STYLES = {
 }
 
 
-def layers_table(answer: Answer) -> WholeTable:
+def layers_table(answer: Answer, title: str = "The layers of the answer") -> WholeTable:
     """Return the table of the layers: question, mark, sentence."""
-    table = WholeTable("layer", "answer", "because", title="The layers of the answer", title_justify="left")
+    table = WholeTable("layer", "answer", "because", title=title, title_justify="left")
     for number, result in enumerate(answer.layers, start=1):
         mark = Text(SIGNS[result.mark], _STYLES[result.mark])
         because = Text(textwrap.fill(result.layer.question, _WIDTH), "italic")
@@ -75,6 +75,11 @@ def print_tests(console: Console, comparison: Comparison) -> None:
 def print_answer(console: Console, answer: Answer) -> None:
     """Print layers, the answer in one sentence, and what to do next, near the prompt."""
     console.print(layers_table(answer))
+    print_sentence(console, answer)
+
+
+def print_sentence(console: Console, answer: Answer) -> None:
+    """Print the answer in one sentence, and what to do next."""
     console.print("\nIs the simulation good enough to design a controller on?")
     console.print(Text(answer.sentence, _STYLES[answer.mark]), highlight=False)
     if answer.next_steps:

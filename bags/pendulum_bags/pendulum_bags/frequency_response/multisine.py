@@ -1,0 +1,60 @@
+"""The multisine that measures both plants of one joint, as a run of each side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from pendulum_bags.experiments.run_spec import RunSpec
+
+__all__ = ["FOLDER", "Multisine"]
+
+FOLDER = "frequency_response"
+"""Folder within a run folder that holds the recordings under the multisine."""
+_HOLD_TIME = 0.01
+"""Both plants hold each sample for the slower one's period: the same torque as a function of time [s]."""
+
+
+@dataclass(frozen=True)
+class Multisine:
+    """Whole periods of a multisine.
+
+    Attributes:
+        amplitude: Largest torque [N m].
+        signal_period: Length of one period [s].
+        periods: Periods that are averaged; one more settles.
+        lowest: Lowest frequency [Hz].
+        highest: Highest frequency [Hz].
+        lines: Number of frequencies, at most.
+    """
+
+    amplitude: float = 2.5
+    signal_period: float = 4.0
+    periods: int = 8
+    lowest: float = 0.25
+    highest: float = 47.5
+    lines: int = 48
+
+    def specs(self, sim: RunSpec, hw: RunSpec) -> tuple[RunSpec, RunSpec]:
+        """Return the runs of both sides under the multisine.
+
+        Args:
+            sim: The simulation under any disturbance.
+            hw: The hardware likewise.
+
+        Raises:
+            ParameterError: The simulation is too slow for it.
+        """
+        if (foreign := sim.foreign) is not None:
+            foreign.check(_HOLD_TIME)
+        disturbance = {
+            "kind": "multisine",
+            "amplitude": self.amplitude,
+            "signal_period": self.signal_period,
+            "frequency": self.lowest,
+            "frequency_end": self.highest,
+            "lines": self.lines,
+            "hold_time": _HOLD_TIME,
+        }
+        duration = self.signal_period * (self.periods + 1) + 0.1
+        ours, theirs = (replace(spec, disturbance=disturbance, duration=duration) for spec in (sim, hw))
+        return ours, theirs

@@ -1,0 +1,91 @@
+"""The page of a whole answer: that of the given plant, and the tests, responses and rankings of the identified one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from pendulum_bags.figures.figure import Figure
+from pendulum_bags.figures.table import Table
+from pendulum_bags.frequency_response.figures import bode
+from pendulum_bags.frequency_response.write import designs_tables
+from pendulum_bags.pages.layer_page import evidence_table
+from pendulum_bags.ranking.present import ranking_figure, ranking_tables
+from pendulum_bags.report.analysis_figures import equivalence
+from pendulum_bags.report.page import Page
+from pendulum_bags.report.tables import tests_table
+from pendulum_bags.report.write import write_report
+from pendulum_bags.verdict import Answer, Layer, Mark
+from pendulum_bags.whole.carry_out import Findings, Simulated
+
+__all__ = ["write_whole_report"]
+
+
+def write_whole_report(
+    folder: Path, summary: Mapping[str, Any], found: Findings, answer: Answer, answers: Sequence[Answer]
+) -> Path:
+    """Write ``report.html`` and ``figures/`` of a run; return the page.
+
+    Args:
+        folder: The run's folder.
+        summary: Content of ``summary.json``.
+        found: What the run found.
+        answer: The answer that takes all in.
+        answers: That of each plant.
+    """
+    given = found.given
+
+    def extend(page: Page) -> Page:
+        figures, tables = list(page.figures), list(page.tables)
+        for plant, own in zip(found.plants, answers, strict=True):
+            _add(figures, tables, plant, own, given=plant is given)
+        others = [(plant.name, own) for plant, own in zip(found.plants[1:], answers[1:], strict=True)]
+        return replace(page, figures=figures, tables=tables, others=others, notes=[*page.notes, *found.notes])
+
+    return write_report(
+        folder,
+        summary,
+        comparison=given.comparison,
+        recordings=None,
+        answer=answer,
+        certified=given.analysis,
+        extend=extend,
+    )
+
+
+def _add(figures: list[Figure], tables: list[Table], plant: Simulated, answer: Answer, *, given: bool) -> None:
+    """Add what was found of a plant; of the given one, the page has tests and evidence already."""
+    assert plant.comparison is not None
+    section = "" if given else f"With {plant.name}"
+    mine: list[Figure] = []
+    listed: list[Table] = []
+    if not given:
+        mine.append(equivalence(plant.comparison.verdict))
+        listed.append(tests_table(plant.comparison))
+        listed += [
+            evidence_table(one)
+            for one in answer.layers
+            if one.layer is not Layer.SAME_RUN and one.mark is not Mark.NOT_MEASURED
+        ]
+    if plant.analysis is not None:
+        with threadpool_limits(1):
+            mine.append(bode(plant.analysis))
+        listed += designs_tables(plant.analysis)
+    if plant.ranking is not None:
+        mine.append(replace(ranking_figure(plant.ranking), section="Same choice"))
+        listed += [replace(one, section="Same choice") for one in ranking_tables(plant.ranking)]
+    for figure in mine:
+        named = (
+            figure
+            if given
+            else replace(figure, name=f"{figure.name}_identified", title=f"{figure.title}, {plant.name}")
+        )
+        figures.append(replace(named, section=section or figure.section))
+    tables += [
+        replace(one, title=one.title if given else f"{one.title}, {plant.name}", section=section or one.section)
+        for one in listed
+    ]

@@ -1,0 +1,164 @@
+"""The whole answer: contenders that differ, recordings made once, a budget that holds, and one sentence."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.lockstep import lockstep_spec
+from pendulum_bags.experiments.machine import Machine, MachineRun
+from pendulum_bags.experiments.repeats import record_simulation
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
+from pendulum_bags.runs.run_data import read_run
+from pendulum_bags.verdict import Answer, Layer, LayerResult, Mark
+from pendulum_bags.whole import carry_out, words
+from pendulum_bags.whole.carry_out import Findings, Simulated
+from pendulum_bags.whole.contenders import contender_specs, place_of, simulate_contenders
+from pendulum_msgs_py.errors import BagError, FaultError
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
+
+NOISE = {"kind": "uniform", "amplitude": 2.5, "hold_time": 0.01}
+
+
+def test_contenders_differ_in_what_they_command_and_run_under_the_same_seeds_on_both_sides() -> None:
+    sim, hw = (RunSpec(side=side) for side in ("sim", "hw"))
+    found = contender_specs(sim, hw, 32, 5)
+    assert next(iter(found)) == "lqr"
+    # The file lists the thesis's LQR a second time, under the name of its weights.
+    assert "lqr_q100_0.01_r0.1" not in found
+    commands = [simulate(replace(both[0][0], duration=0.5)).command for both in found.values()]
+    for i, own in enumerate(commands):
+        assert not any(np.allclose(own, other, rtol=1e-6, equal_nan=True) for other in commands[:i])
+    for both in found.values():
+        assert [(a.seed, b.seed) for a, b in both] == [(5, 5), (6, 6), (7, 7)]
+        assert all(a.controller == b.controller and a.disturbance == b.disturbance for a, b in both)
+    assert list(contender_specs(sim, hw, 6, 5)) == list(found)[:6]
+
+
+def test_a_simulated_run_of_a_ranking_is_read_back_as_a_run_of_a_study(tmp_path: Path) -> None:
+    from pendulum_bags.ranking.collect import collect_contenders
+
+    specs = {
+        name: [RunSpec(side=side, disturbance=NOISE, duration=1.0, controller=name) for side in ("sim", "hw")]
+        for name in ("lqr", "pid")
+    }
+    simulate_contenders(tmp_path, {name: [both[0]] for name, both in specs.items()})
+    assert (place_of(tmp_path, "lqr", specs["lqr"][0]) / "run.npz").is_file()
+    # Nothing ran on the other side.
+    assert collect_contenders([tmp_path])[0] == []
+
+
+def test_recordings_are_made_one_after_the_other_and_a_failure_is_told_by_its_own_bag_alone(tmp_path: Path) -> None:
+    first, second, third = (RunSpec(disturbance=NOISE, duration=0.2, seed=seed) for seed in (1, 2, 3))
+    runs = [MachineRun(tmp_path / name, spec) for name, spec in (("a", first), ("b", second), ("c", third))]
+    record_simulation(tmp_path / "b", first)
+    waits: list[int] = []
+    with Machine(tmp_path, runs, lambda: waits.append(1)) as machine:
+        with pytest.raises(FaultError, match="was not recorded"):
+            machine.wait(tmp_path / "a")
+        machine.start()
+        machine.wait(tmp_path / "a")
+        with pytest.raises((FaultError, BagError), match=r"exists|not recorded"):
+            machine.wait(tmp_path / "b")
+        machine.discard()
+    assert waits
+    assert not (tmp_path / "a").exists()
+
+
+def test_an_identified_plant_runs_under_the_controller_of_the_given_one(tmp_path: Path) -> None:
+    file = write_plant(tmp_path / "plant.yaml", load_plant("thesis").with_values(inertia=0.2))
+    noise = NoiseSettings(duration=0.5)
+    settings = RegulationSettings(plant=str(file), design="thesis", noise=noise)
+    spec = lockstep_spec(settings, side="sim")
+    assert (spec.plant, spec.design_plant) == (str(file), "thesis")
+    assert settings.controller_program("/sim").parameters["plant"] == "thesis"
+    run = read_run(record_simulation(tmp_path / "sim", spec))
+    own = replace(spec, design_plant=str(file))
+    # Another gain: the one that was designed on the plant itself commands otherwise.
+    assert not np.allclose(run.window.effort, simulate(own).command[:-1], atol=1e-3)
+
+
+def test_a_budget_interrupts_when_the_first_layer_is_there_and_not_before() -> None:
+    compared, spent = threading.Event(), threading.Event()
+
+    def held() -> None:
+        with carry_out._ends_with_budget(0.05, compared, spent, lambda: 0.01):
+            assert not spent.wait(0.3)
+            compared.set()
+            # It comes as Ctrl-C does.
+            threading.Event().wait(20.0)
+
+    with pytest.raises(KeyboardInterrupt):
+        held()
+    assert spent.is_set()
+
+
+def test_what_ends_before_its_budget_is_not_interrupted() -> None:
+    compared, spent = threading.Event(), threading.Event()
+    compared.set()
+    with carry_out._ends_with_budget(60.0, compared, spent, lambda: 10.0):
+        pass
+    assert not spent.is_set()
+
+
+def _answer(mark: Mark, choice: Mark) -> Answer:
+    layers = [LayerResult(layer, mark, "A sentence.", reason="a reason") for layer in list(Layer)[:3]]
+    text = f"{mark.value.capitalize()}: a reason."
+    return Answer(mark, text, [*layers, LayerResult(Layer.SAME_CHOICE, choice, "Another.")], ("the next step",))
+
+
+@pytest.mark.parametrize(
+    ("marks", "choices", "expected"),
+    [
+        (
+            (Mark.NO, Mark.YES),
+            (Mark.YES, Mark.YES),
+            (
+                "No with thesis, the plant that you had: a reason. Yes with plant.yaml, which this run found. "
+                "Of these 6 controllers the simulation picks the right one with both."
+            ),
+        ),
+        (
+            (Mark.NO, Mark.UNDECIDED),
+            (Mark.NO, Mark.YES),
+            (
+                "No with thesis, the plant that you had: a reason. Undecided with plant.yaml, which this run found: "
+                "a reason. Of these 6 controllers the simulation picks a wrong one with thesis and picks the right one "
+                "with plant.yaml."
+            ),
+        ),
+        (
+            (Mark.NO, Mark.YES),
+            (Mark.NOT_MEASURED, Mark.NOT_MEASURED),
+            "No with thesis, the plant that you had: a reason. Yes with plant.yaml, which this run found.",
+        ),
+    ],
+)
+def test_one_sentence_names_both_plants_and_the_choice(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    marks: tuple[Mark, Mark],
+    choices: tuple[Mark, Mark],
+    expected: str,
+) -> None:
+    class Ranked:
+        names = tuple("abcdef")
+
+    answers = iter([_answer(*both) for both in zip(marks, choices, strict=True)])
+    monkeypatch.setattr(Simulated, "answer", lambda _: next(answers))
+    settings = RegulationSettings()
+    given, identified = (
+        Simulated(name, settings, tmp_path, comparison=object(), ranking=Ranked())  # type: ignore[arg-type]
+        for name in ("thesis", "plant.yaml")
+    )
+    answer, own = words.whole_answer(Findings(given, identified))
+    assert answer.sentence == expected
+    assert answer.mark is marks[0]
+    assert [one.mark for one in own] == list(marks)
+    assert ("design on it" in answer.next_steps[0]) is (marks[1] is Mark.YES)
