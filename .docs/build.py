@@ -100,15 +100,6 @@ def for_the_site(text: str, page: str, gathered: set[str]) -> str:
     return "".join(parts)
 
 
-def _rows(specs: Iterable[ParameterSpec]) -> list[str]:
-    """Return the rows of a table of parameters, those that are read-only marked by a star."""
-    from pendulum_msgs_py.parameters import markdown_table
-
-    rows = markdown_table(specs).splitlines()[2:]
-    rows = [row.replace(" | – | ", " | | ").replace(" | any | ", " | | ") for row in rows]
-    return [re.sub(r"^(\| `[^`]*`)(.*?) Read-only\. \|$", r"\1*\2 |", row) for row in rows]
-
-
 def _tables(tables: Mapping[str, tuple[str, list[str]]], shared: str) -> list[str]:
     """Return a section for each table; rows that several have stand once, in a section of their own.
 
@@ -119,7 +110,9 @@ def _tables(tables: Mapping[str, tuple[str, list[str]]], shared: str) -> list[st
     Returns:
         Markdown, in parts.
     """
-    head = "| parameter | default | unit | allowed | meaning |\n|---|---|---|---|---|\n"
+    from pendulum_msgs_py.parameters import markdown_table
+
+    head = markdown_table([])
     count = Counter(row for _, rows in tables.values() for row in rows)
     common = [row for row, tables_with_it in count.items() if tables_with_it > 1]
     parts = [f"### {shared}\n\n{head}" + "\n".join(common) + "\n"] if common else []
@@ -158,8 +151,12 @@ def reference() -> str:
     from pendulum_hw_bridge.drive.safety import FAULTS
     from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, controller_class, controller_names
     from pendulum_lqr.nodes.bringup import ARGUMENTS
+    from pendulum_msgs_py.parameters import markdown_table
     from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
     from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS
+
+    def table_rows(specs: Iterable[ParameterSpec]) -> list[str]:
+        return markdown_table(specs).splitlines()[2:]
 
     parts = [
         "# Reference\n\nGenerated from the code by `python .docs/build.py --reference`; a test compares it.\n",
@@ -171,26 +168,26 @@ def reference() -> str:
     nodes: dict[str, tuple[str, list[str]]] = {}
     for name, module, tables in NODES:
         found = [getattr(importlib.import_module(module), table) for table in tables]
-        nodes[name] = ("", _rows(spec for table in found for spec in getattr(table, "specs", table)))
+        nodes[name] = ("", table_rows(spec for table in found for spec in getattr(table, "specs", table)))
     node = importlib.import_module("pendulum_lqr.nodes.controller_node").NODE_SPECS
-    nodes["controller"] = ("", _rows([*node, *COMMON_PARAMETERS]))
+    nodes["controller"] = ("", table_rows([*node, *COMMON_PARAMETERS]))
     parts += _tables(nodes, "several nodes")
     classes = {name: controller_class(name) for name in controller_names()}
     parts.append("## Controllers\n")
     parts += _tables(
-        {name: (own.SUMMARY, _rows(own.PARAMETERS)) for name, own in classes.items()}, "several controllers"
+        {name: (own.SUMMARY, table_rows(own.PARAMETERS)) for name, own in classes.items()}, "several controllers"
     )
     parts.append("## Controllers of several joints\n\nParameters as for the preset `cart_pole`.\n")
     mechanism = load_mechanism("cart_pole")
     joint = {name: controller_class(name, mechanism) for name in controller_names(several=True)}
     tables_of_joints = {
-        f"{name}, several joints": (own.SUMMARY, _rows(own.parameters(mechanism))) for name, own in joint.items()
+        f"{name}, several joints": (own.SUMMARY, table_rows(own.parameters(mechanism))) for name, own in joint.items()
     }
     parts += _tables(tables_of_joints, "several controllers of joints")
     parts.append("## Faults of the bridge\n\n| fault | meaning |\n|---|---|")
     parts += [f"| `{name}` | {meaning} |" for name, meaning in FAULTS.items()]
-    parts += ["\n## Plant files\n", *_tables({"plant": ("", _rows(PLANT_SPECS))}, "")]
-    parts += _tables({"drivetrain": ("", _rows(DRIVETRAIN_SPECS))}, "")
+    parts += ["\n## Plant files\n", *_tables({"plant": ("", table_rows(PLANT_SPECS))}, "")]
+    parts += _tables({"drivetrain": ("", table_rows(DRIVETRAIN_SPECS))}, "")
     parts.append("## Arguments of `bringup.launch.py`\n\n| argument | default | choices | meaning |\n|---|---|---|---|")
     parts += [
         f"| `{it.name}` | `{it.default or chr(34) * 2}` | {', '.join(it.choices) or 'any'} | {it.description} |"

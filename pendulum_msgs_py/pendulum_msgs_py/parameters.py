@@ -384,14 +384,12 @@ def dump_yaml(document: Mapping[str, Any], what: str = "file") -> str:
 
 
 def markdown_table(specs: Iterable[ParameterSpec]) -> str:
-    """Return the table of parameters for a README."""
-    rows = ["| parameter | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
+    """Return a table of parameters for a page: name, starred if read-only; default with unit and domain; meaning."""
+    rows = ["| parameter | default; allowed | meaning |", "|---|---|---|"]
     for spec in specs:
-        default = str(spec.default).lower() if isinstance(spec.default, bool) else f"{spec.default}"
-        if spec.default == "":
-            default = '""'
-        fixed = " Read-only." if spec.read_only else ""
-        rows.append(
-            f"| `{spec.name}` | `{default}` | {spec.unit or '–'} | {spec.domain or 'any'} | {spec.description}{fixed} |"
-        )
+        default = str(spec.default).lower() if isinstance(spec.default, bool) else f"{spec.default}" or '""'
+        unit = f" {spec.unit}" if spec.unit not in ("", "-") else ""
+        allowed = f"; {spec.domain}" if spec.domain else ""
+        star = "*" if spec.read_only else ""
+        rows.append(f"| `{spec.name}`{star} | `{default}`{unit}{allowed} | {spec.description} |")
     return "\n".join(rows) + "\n"

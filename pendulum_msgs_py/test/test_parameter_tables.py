@@ -116,8 +116,8 @@ def test_a_value_passes_where_its_domain_has_it_and_raises_our_error_everywhere_
 def test_the_markdown_table_has_a_row_for_each_parameter() -> None:
     lines = markdown_table(_SPECS).splitlines()
     assert len(lines) == len(_SPECS) + 2
-    assert lines[2] == "| `rate_hz` | `500.0` | Hz | > 0 | Rate. |"
-    assert lines[7] == "| `verbose` | `false` | – | any | Talk. Read-only. |"
+    assert lines[2] == "| `rate_hz` | `500.0` Hz; > 0 | Rate. |"
+    assert lines[7] == "| `verbose`* | `false` | Talk. |"
 
 
 # --- YAML ------------------------------------------------------------------------------------------------------
