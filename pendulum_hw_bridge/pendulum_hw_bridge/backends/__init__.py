@@ -80,13 +80,13 @@ BACKENDS: dict[str, Backend] = {
     "emulator": Backend("pendulum_hw_bridge.backends.emulator:EmulatorBackend", is_machine=False, in_process=True),
     "emulator_process": Backend(
         "pendulum_hw_bridge.backends.emulator_process:EmulatorProcessBackend",
-        _fixed("emulator_address", "127.0.0.1:17590", "`emulator_process`: where the emulated actuator listens."),
+        _fixed("emulator_address", "127.0.0.1:17590", "`emulator_process`: address of the emulated actuator."),
         is_machine=False,
     ),
     "hebi": Backend(
         "pendulum_hw_bridge.backends.hebi:HebiBackend",
         (
-            *_fixed("hebi_log", "", "`hebi`: new .hebilog file that hebi-py writes beside the bag; empty for none."),
+            *_fixed("hebi_log", "", "`hebi`: new .hebilog file that hebi-py writes; empty for none."),
             *_OF_GROUPS,
         ),
     ),

@@ -113,7 +113,7 @@ def for_plant(specs: tuple[ParameterSpec, ...], plant: str, backend: str = "emul
     Args:
         specs: The parameters, with the defaults of an X5-9.
         plant: Preset or file, as given.
-        backend: What stands behind the actuator port.
+        backend: Backend of the actuator port.
 
     Raises:
         ParameterError: There is no such plant.

@@ -89,8 +89,8 @@ START_TIME = ParameterSpec(
     "start_time",
     0.0,
     "s",
-    "Time in which the torque that it may ask for rises from zero to its limit, after the first state, for a plant "
-    "that lets nobody begin with much (`start_effort_limit`); 0 for at once.",
+    "Time in which the torque limit rises from zero after the first state, for plants with `start_effort_limit`; "
+    "0 for at once.",
     minimum=0.0,
     maximum=5.0,
 )
@@ -103,9 +103,7 @@ COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
         "Largest torque of the controller; 0 for the plant's own limit.",
         minimum=0.0,
     ),
-    ParameterSpec(
-        "velocity", "measured", "", "Where the velocity comes from.", choices=("measured", *VELOCITY_ESTIMATORS)
-    ),
+    ParameterSpec("velocity", "measured", "", "Source of the velocity.", choices=("measured", *VELOCITY_ESTIMATORS)),
     START_TIME,
 )
 """Parameters that every controller of one joint has; those of several joints have the last one."""

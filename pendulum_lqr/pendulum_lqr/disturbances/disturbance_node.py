@@ -44,7 +44,7 @@ __all__ = ["NODE_SPECS", "DisturbanceNode", "main"]
 
 NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("autostart", False, "", "Start with the first state, without a call of ~/start.", read_only=True),
-    ParameterSpec("duration", 0.0, "s", "How long to disturb; 0 until ~/stop.", minimum=0.0),
+    ParameterSpec("duration", 0.0, "s", "Duration of the disturbance; 0 until ~/stop.", minimum=0.0),
     ParameterSpec(
         "file",
         "",
@@ -55,8 +55,8 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
         "joints",
         [""],
         "",
-        "Joints to disturb, in the plant's order, each by a signal of its own: the seed counts up "
-        "from one to the next. Empty for the joint of a pendulum.",
+        "Joints to disturb, in the plant's order, each by its own signal with the next seed. "
+        "Empty for the joint of a pendulum.",
         read_only=True,
     ),
     COMPILED,

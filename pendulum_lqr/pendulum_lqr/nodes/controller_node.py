@@ -67,7 +67,7 @@ __all__ = ["NODE_SPECS", "ControllerNode", "main"]
 _SEVERAL = " or ".join(", ".join(controller_names(several=True)).rsplit(", ", 1))
 NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
-        "controller", "lqr", "", "Which controller.", choices=tuple(CONTROLLERS), read_only=True,
+        "controller", "lqr", "", "Name of the controller.", choices=tuple(CONTROLLERS), read_only=True,
     ),
     ParameterSpec(
         "plant", "thesis", "", f"Plant to design for: {PRESET_NAMES} or the path of a plant file; of several joints, "

@@ -28,8 +28,7 @@ REALTIME_PRIORITY = ParameterSpec(
     "realtime_priority",
     0,
     "-",
-    "Priority of the process before all ordinary ones, 1 to 99 (SCHED_FIFO); 0 for the usual one; -1 for 50 where the "
-    "user may have it and time is that of the wall.",
+    "Real-time priority (SCHED_FIFO), 1 to 99; 0 for an ordinary process; -1 for 50 if permitted and in wall time.",
     minimum=-1,
     maximum=99,
     read_only=True,
@@ -40,7 +39,7 @@ COMPILED = ParameterSpec(
     "compiled",
     True,
     "",
-    "Run ordinary periods in compiled code where it can be had; diagnostics say which.",
+    "Use the compiled loop if available; diagnostics report which one runs.",
     read_only=True,
 )
 """Likewise."""
@@ -74,7 +73,7 @@ LOOP_SPECS: tuple[ParameterSpec, ...] = (
         "lockstep_duration",
         0.0,
         "s",
-        "Simulated time after which the plant stops stepping and says so, in lockstep; 0 for never.",
+        "Simulated time after which the plant stops stepping and publishes `lockstep_finished`; 0 for never.",
         minimum=0.0,
         read_only=True,
     ),
@@ -95,7 +94,7 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         "command_timeout",
         0.05,
         "s",
-        "Age at which a command counts for nothing and the torque goes to zero.",
+        "Age at which a command expires and the torque goes to zero.",
         minimum=0.0,
         exclusive_minimum=True,
         read_only=True,

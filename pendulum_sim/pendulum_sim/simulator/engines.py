@@ -201,11 +201,9 @@ OWN = Engine(
             "initial_position",
             [0.0],
             "rad or m",
-            "Of several joints: where each is at a given start; one value stands for all.",
+            "Several joints: position of each at a given start; one value for all.",
         ),
-        ParameterSpec(
-            "initial_velocity", [0.0], "rad/s or m/s", "Of several joints: how fast each is at a given start."
-        ),
+        ParameterSpec("initial_velocity", [0.0], "rad/s or m/s", "Several joints: velocity of each at a given start."),
     ),
     make=_make_own,
     foreign=False,
