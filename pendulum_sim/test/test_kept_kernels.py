@@ -207,8 +207,8 @@ def test_the_loop_of_a_batch_is_kept_with_its_numbers(monkeypatch: pytest.Monkey
 
     In the folder of all: a test of batches compiles the same one.
     """
-    factory, made = batch_kernels.general_kernel.__wrapped__, []
-    monkeypatch.setattr(batch_kernels, "general_kernel", lambda method: made.append(factory(method)) or made[-1])
+    factory, made = batch_kernels.loop.__wrapped__, []
+    monkeypatch.setattr(batch_kernels, "loop", lambda *of, **kind: made.append(factory(*of, **kind)) or made[-1])
     plant = load_plant("dfki").with_values(transport_delay=0.0033, effort_limit=20.0)
     runs = [simulate_batch(plant, steps=50, method="etd2", seeds=[1, 2], amplitude=2.5, record=True) for _ in range(2)]
     assert len(made) == 2

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -15,7 +17,7 @@ import pytest
 
 from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
 from pendulum_bags.experiments.experiment_cli import main
-from pendulum_bags.studies.chunks import cluster_client
+from pendulum_bags.studies.chunks import chunk_path, cluster_client, read_columns
 from pendulum_bags.studies.monte_carlo import MonteCarlo, sobol
 from pendulum_bags.studies.random_runs import draw_chunk, replay, run_chunk, run_monte_carlo
 from pendulum_bags.studies.uncertain import Uncertainty, parse_uncertainty, uncertainty_of
@@ -144,6 +146,41 @@ def test_indices_of_what_does_not_vary_are_null_for_readers_of_json(
     assert told["sobol"]["indices"] == [
         {"factor": "noise", "first": None, "first_confidence": None, "total": None, "total_confidence": None}
     ]
+
+
+@arrow
+@pytest.mark.parametrize(
+    "study",
+    [
+        ("monte_carlo", "--runs", "5", "--hold-time", "0.01", "--sobol", "0"),
+        ("region_of_attraction", "--plants", "1", "--points", "3"),
+    ],
+)
+def test_a_study_on_a_simulated_gpu_has_the_numbers_of_the_processor(tmp_path: Path, study: tuple[str, ...]) -> None:
+    tables = []
+    for device, simulator in (("cpu", "0"), ("auto", "1")):
+        out = tmp_path / device
+        options = ["--duration", "0.02", "--device", device, "--out", str(out)]
+        command = [sys.executable, "-m", "pendulum_bags", "experiment", *study, *options]
+        subprocess.run(command, env={**os.environ, "NUMBA_ENABLE_CUDASIM": simulator}, check=True, capture_output=True)
+        tables.append(read_columns(chunk_path(out, 0), ("theta_end", "theta_dot_end")))
+    settings = json.loads((tmp_path / "auto" / "settings.json").read_text())["settings"]
+    assert settings["device"] == "cuda"
+    for name, values in tables[0].items():
+        np.testing.assert_allclose(values, tables[1][name], rtol=0.0, atol=1e-12)
+        assert np.ptp(values) > 0.0
+
+
+def test_without_a_gpu_the_program_says_so_in_one_sentence(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pendulum_bags", "experiment", "monte_carlo", "--device", "cuda"]
+    environment = {**os.environ, "NUMBA_DISABLE_CUDA": "1", "NUMBA_ENABLE_CUDASIM": "0"}
+    done = subprocess.run(
+        [*command, "--out", str(tmp_path)], env=environment, check=False, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "device is 'cuda', but numba finds no GPU here" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_sobol_indices_see_that_noise_rules_and_damping_comes_next() -> None:

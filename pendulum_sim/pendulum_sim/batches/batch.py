@@ -19,15 +19,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_msgs_py.contract.angles import UPRIGHT
-from pendulum_msgs_py.contract.noise import stream_key
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_sim.batches.engine import Batch, batch_size, seed_column
 from pendulum_sim.stepping.dry_friction import DRY, LAG, PACKED
 from pendulum_sim.stepping.integrators import get_integrator
-from pendulum_sim.stepping.plant import check_step, pack
+from pendulum_sim.stepping.plant import pack
 from pendulum_sim.stepping.stability import MOST_GROWTH, check_stability, growth_rate
 
-__all__ = ["BatchResult", "batch_size", "check_counts", "noise_keys", "simulate_batch"]
+__all__ = ["BatchResult", "simulate_batch"]
 
 Array = NDArray[np.float64]
 
@@ -77,6 +77,7 @@ def simulate_batch(
     hold: int = 1,
     record: bool = False,
     threads: int | None = None,
+    device: str = "cpu",
 ) -> BatchResult:
     """Integrate a batch; its size B is that of the longest argument, and single values hold for all.
 
@@ -97,24 +98,18 @@ def simulate_batch(
         hold: Steps for which a noise sample is held, >= 1.
         record: Return the trajectories.
         threads: Threads to use; None for numba's default.
+        device: ``cpu``, ``cuda`` for the GPU, or ``auto`` for the GPU where there is one; results agree to rounding.
 
     Raises:
         ParameterError: Shapes do not go together, or a value is outside its domain.
+        FaultError: There is no GPU.
     """
-    from pendulum_sim.batches.batch_kernels import (
-        BLOCK,
-        ROWS,
-        coefficients_kernel,
-        general_kernel,
-        run_blocks,
-        smooth_kernel,
-    )
+    from pendulum_sim.batches.batch_kernels import Layout, coefficients_kernel
 
-    check_step(dt, substeps)
+    batch = Batch(steps, dt, substeps, hold, record, threads, device)
     integrator = get_integrator(method)
     if method == "adaptive":
         raise ParameterError("method is 'adaptive' in a batch; expected a compiled one, such as etd4")
-    check_counts(steps, hold, threads)
     if not math.isfinite(target):
         raise ParameterError(f"target is {target} rad; expected a finite number")
     plants = [parameters] if isinstance(parameters, PlantParameters) else list(parameters)
@@ -132,106 +127,60 @@ def simulate_batch(
     }
     if columns["amplitude"].min() < 0.0:
         raise ParameterError(f"amplitude has a value of {columns['amplitude'].min()} N m; expected >= 0")
-    own_keys = noise_keys(seeds)
+    own_seeds = seed_column(seeds)
     lengths = {name: column.size for name, column in columns.items()}
     varied = {name: _column(name, values) for name, values in (variations or {}).items()}
     if "coulomb_friction" in varied and "static_friction" not in varied and _static_follows(plants):
         varied["static_friction"] = varied["coulomb_friction"]
     _check_variations(varied, plants)
     lengths |= {name: column.size for name, column in varied.items()}
-    lengths |= {"parameters": len(plants), "gain": len(gains), "seeds": len(own_keys)}
-    size = batch_size(lengths)
+    batch_size({**lengths, "parameters": len(plants), "gain": len(gains), "seeds": len(own_seeds)})
 
-    packed = np.array([pack(plant) for plant in plants], dtype=np.float64)
+    packed = dict(zip(PACKED, np.array([pack(plant) for plant in plants], dtype=np.float64).T, strict=True)) | varied
+    _check_friction(packed)
     h = dt / substeps
+    rates = packed["damping"] / packed["inertia"]
     if varied:
-        packed = np.repeat(packed, size, axis=0)
-        for name, column in varied.items():
-            packed[:, PACKED.index(name)] = column
-        _check_friction(packed)
-        rates = packed[:, 1] / packed[:, 0]
-        count = len(integrator.coefficients(float(rates[0]), h))
-        by_rate = np.empty((count, size))
-        coefficients_kernel(method)(rates, h, by_rate)
-        coefficients = by_rate.T
+        coefficients = np.empty((len(integrator.coefficients(1.0, h)), rates.size))
+        coefficients_kernel(method)(rates, h, coefficients)
     else:
-        rows_of = [integrator.coefficients(float(row[1] / row[0]), h) for row in packed]
-        coefficients = np.array(rows_of, dtype=np.float64)
-    growth = growth_rate(integrator, packed[:, 1] / packed[:, 0], packed[:, 2] / packed[:, 0], h, list(coefficients.T))
+        coefficients = np.array([integrator.coefficients(float(rate), h) for rate in rates], dtype=np.float64).T
+    growth = growth_rate(integrator, rates, packed["gravity"] / packed["inertia"], h, list(coefficients))
     if (worst := int(np.argmax(growth))) >= 0 and growth[worst] > MOST_GROWTH:
-        values = {name: float(packed[worst, PACKED.index(name)]) for name in ("inertia", "damping", "gravity")}
+        values = {
+            name: float(packed[name][min(worst, len(packed[name]) - 1)]) for name in ("inertia", "damping", "gravity")
+        }
         # The plant at fault, rebuilt, so that its own check reports the cause and a value that works.
         check_stability(integrator, plants[min(worst, len(plants) - 1)].with_values(**values), dt, substeps, h)
     delays = np.array([plant.transport_delay for plant in plants])
-    smooth = not (delays.any() or packed[:, DRY].any() or packed[:, LAG].any())
-
-    keys = np.broadcast_to(own_keys, (size,)).copy()
-    record_of = np.empty((steps, 3, size)) if record else np.empty((0, 3, size))
-    table = np.zeros((len(ROWS) + coefficients.shape[1], size))
-    rows = dict(zip(ROWS, table, strict=False))
-    rows["x"][:], rows["v"][:], rows["amplitude"][:] = (
-        columns["theta"],
-        columns["theta_dot"],
-        columns["amplitude"],
+    smooth = not (delays.any() or any(packed[PACKED[index]].any() for index in (*DRY, LAG)))
+    result = batch.run(
+        Layout(method),
+        {
+            "q": [columns["theta"]],
+            "v": [columns["theta_dot"]],
+            "goal": [np.array([target])],
+            "amplitude": [columns["amplitude"]],
+            "limit": [np.array([plant.effort_limit for plant in plants])],
+            "gain": list(gains.T),
+            "delay": [delays],
+            "p": list(packed.values()),
+            "table": list(coefficients),
+        },
+        own_seeds,
+        smooth=smooth,
     )
-    rows["gain_1"][:], rows["gain_2"][:] = gains.T
-    rows["limit"][:] = [plant.effort_limit for plant in plants]
-    rows["delay"][:] = delays
-    for name, values in zip(PACKED, packed.T, strict=True):
-        rows[name][:] = values
-    table[len(ROWS) :] = coefficients.T
-    run = smooth_kernel(method, coefficients.shape[1]) if smooth else general_kernel(method)
-    run_blocks(run, BLOCK if smooth else 1, threads, table, keys, target, dt, steps, hold, substeps, record_of)
-    mean_x, mean_v = rows["sum_x"] / steps, rows["sum_v"] / steps
     return BatchResult(
-        theta=rows["x"].copy(),
-        theta_dot=rows["v"].copy(),
-        max_effort=rows["max"].copy(),
-        max_theta=rows["max_x"].copy(),
-        mean_theta=mean_x,
-        std_theta=np.sqrt(np.maximum(0.0, rows["sum_xx"] / steps - mean_x**2)),
-        mean_theta_dot=mean_v,
-        std_theta_dot=np.sqrt(np.maximum(0.0, rows["sum_vv"] / steps - mean_v**2)),
-        trajectories=record_of if record else None,
+        theta=result.position[:, 0],
+        theta_dot=result.velocity[:, 0],
+        max_effort=result.max_effort[:, 0],
+        max_theta=result.max_deviation[:, 0],
+        mean_theta=result.mean_deviation[:, 0],
+        std_theta=result.std_deviation[:, 0],
+        mean_theta_dot=result.mean_velocity[:, 0],
+        std_theta_dot=result.std_velocity[:, 0],
+        trajectories=result.trajectories,
     )
-
-
-def check_counts(steps: object, hold: object, threads: object) -> None:
-    """Refuse steps, steps of a noise sample or threads (None for the default) that are no whole number >= 1."""
-    counts = {"steps": steps, "hold": hold, **({} if threads is None else {"threads": threads})}
-    for name, value in counts.items():
-        if not _is_whole(value) or value < 1:  # type: ignore[operator]
-            raise ParameterError(f"{name} is {value!r}; expected a whole number >= 1")
-
-
-def noise_keys(seeds: ArrayLike) -> NDArray[np.uint64]:
-    """Return the key of each seed's noise, shape (1,) or (B,).
-
-    Raises:
-        ParameterError: A seed is no whole number from 0 to 2^64 - 1.
-    """
-    given = np.atleast_1d(np.asarray(seeds, dtype=object))
-    for seed in given:
-        if not _is_whole(seed) or not 0 <= seed < 2**64:
-            raise ParameterError(f"seeds has {seed!r}; expected whole numbers from 0 to 2^64 - 1")
-    return np.array([stream_key(int(seed)) for seed in given], dtype=np.uint64)
-
-
-def batch_size(lengths: Mapping[str, int]) -> int:
-    """Return the size of a batch, that of its longest argument; all others have one entry, or as many.
-
-    Raises:
-        ParameterError: One has another number of them.
-    """
-    size = max(lengths.values())
-    for name, length in lengths.items():
-        if length not in {1, size}:
-            raise ParameterError(f"{name} has {length} entries; expected 1 or {size}")
-    return size
-
-
-def _is_whole(value: object) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))
 
 
 def _static_follows(plants: Sequence[PlantParameters]) -> bool:
@@ -239,8 +188,8 @@ def _static_follows(plants: Sequence[PlantParameters]) -> bool:
     return all(plant.static_friction == plant.coulomb_friction for plant in plants)
 
 
-def _check_friction(packed: Array) -> None:
-    coulomb, static = packed[:, PACKED.index("coulomb_friction")], packed[:, PACKED.index("static_friction")]
+def _check_friction(packed: Mapping[str, Array]) -> None:
+    coulomb, static = np.broadcast_arrays(packed["coulomb_friction"], packed["static_friction"])
     wrong = np.flatnonzero(static < coulomb)
     if wrong.size:
         first = wrong[0]

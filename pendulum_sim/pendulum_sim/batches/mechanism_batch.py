@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,37 +17,13 @@ from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.joint_steps import COULOMB, JOINT_ROWS, LOWER, STATIC, UPPER
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
-from pendulum_sim.batches.batch import batch_size, check_counts, noise_keys
+from pendulum_sim.batches.engine import Batch, Results, batch_size, finite_columns, seed_column
 from pendulum_sim.stepping.mechanism_plant import check_decay, check_stable_step, is_smooth_mechanism
-from pendulum_sim.stepping.plant import check_step
 
-__all__ = ["MechanismBatch", "simulate_mechanisms"]
+__all__ = ["simulate_mechanisms"]
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class MechanismBatch:
-    """Results of a batch of B plants of n joints, m of them driven.
-
-    Attributes:
-        position: Final positions, shape (B, n), not wrapped [rad or m].
-        velocity: Final velocities, shape (B, n).
-        max_effort: Largest |K x| before noise and limit, shape (B, m) [N m or N].
-        max_deviation: Largest |q - goal|, wrapped where it turns, shape (B, n).
-        mean_deviation: Mean of q - goal over the steps, shape (B, n).
-        std_deviation: Its standard deviation, shape (B, n).
-        trajectories: Positions, velocities and applied efforts of all joints at the start of each step, shape
-            (steps, 3 n, B); None unless requested.
-    """
-
-    position: Array
-    velocity: Array
-    max_effort: Array
-    max_deviation: Array
-    mean_deviation: Array
-    std_deviation: Array
-    trajectories: Array | None = None
+Rows = dict[str, list[Array]]
 
 
 def simulate_mechanisms(
@@ -67,7 +42,8 @@ def simulate_mechanisms(
     hold: int = 1,
     record: bool = False,
     threads: int | None = None,
-) -> MechanismBatch:
+    device: str = "cpu",
+) -> Results:
     """Integrate a batch; its size B is that of the longest argument, and single values hold for all.
 
     Args:
@@ -85,70 +61,50 @@ def simulate_mechanisms(
         hold: Steps for which a noise sample is held, >= 1.
         record: Return the trajectories.
         threads: Threads to use; None for numba's default.
+        device: As of :func:`pendulum_sim.batches.batch.simulate_batch`.
 
     Raises:
         ParameterError: Shapes do not go together, or a value is outside its domain.
+        FaultError: There is no GPU.
     """
-    from pendulum_sim.batches.batch_kernels import BLOCK, run_blocks
-    from pendulum_sim.batches.mechanism_kernels import Layout, general_joints_kernel, smooth_joints_kernel
+    from pendulum_sim.batches.batch_kernels import Layout
 
-    check_step(dt, substeps)
-    check_counts(steps, hold, threads)
+    batch = Batch(steps, dt, substeps, hold, record, threads, device)
     coordinates = parameters.coordinates
     n, m = len(coordinates.joints), len(coordinates.driven)
     aim = np.array(coordinates.goal if goal is None else goal, dtype=np.float64)
     if aim.shape != (n,) or not np.isfinite(aim).all():
         raise ParameterError(f"goal is {aim.tolist()}; expected {n} finite numbers")
-    own_keys = noise_keys(seeds)
+    own_seeds = seed_column(seeds)
     columns = {
-        "q": _table("position", aim if position is None else position, n),
-        "v": _table("velocity", np.full(n, velocity) if np.ndim(velocity) == 0 else velocity, n),
-        "gain": _table("gain", _flat_gain(gain, m, n), m * 2 * n),
-        "amplitude": _table("amplitude", np.full(m, amplitude) if np.ndim(amplitude) == 0 else amplitude, m),
+        "q": finite_columns("position", aim if position is None else position, n),
+        "v": finite_columns("velocity", np.full(n, velocity) if np.ndim(velocity) == 0 else velocity, n),
+        "gain": finite_columns("gain", _flat_gain(gain, m, n), m * 2 * n),
+        "amplitude": finite_columns("amplitude", np.full(m, amplitude) if np.ndim(amplitude) == 0 else amplitude, m),
         "limit": np.array([parameters.effort_limits]),
+        "goal": aim[None, :],
+        "delay": np.array([[common_delay(parameters)]]),
         "p": np.array([parameters.packed]),
         "table": np.concatenate([np.array(row) for row in pack_joints(parameters)])[None, :],
     }
     if columns["amplitude"].size and columns["amplitude"].min() < 0.0:
         raise ParameterError(f"amplitude has a value of {columns['amplitude'].min()}; expected >= 0")
-    varied = {name: _table(name, np.reshape(values, (-1, 1)), 1)[:, 0] for name, values in (variations or {}).items()}
-    lengths = {name: len(column) for name, column in {**columns, **varied}.items()} | {"seeds": len(own_keys)}
-    size = batch_size(lengths)
-    wide = {name: np.repeat(column, size // len(column), axis=0) for name, column in columns.items()}
+    varied = {
+        name: finite_columns(name, np.reshape(values, (-1, 1)), 1)[:, 0] for name, values in (variations or {}).items()
+    }
+    lengths = {name: len(column) for name, column in {**columns, **varied}.items()} | {"seeds": len(own_seeds)}
+    batch_size(lengths)
+    rows = {name: list(column.T) for name, column in columns.items()}
     for name, values in varied.items():
-        _vary(parameters, wide, name, values)
+        _vary(parameters, rows, name, values)
     if varied:
-        _check_varied(parameters, wide, dt / substeps)
-    _check_starts(parameters, wide)
+        _check_varied(parameters, rows, dt / substeps)
+    _check_starts(parameters, rows)
     check_stable_step(parameters, dt / substeps)
 
-    layout = Layout(parameters.mechanism.name, coordinates.driven)
-    starts = layout.starts
-    w = np.zeros((starts["end"], size))
-    for name, column in wide.items():
-        w[starts[name] : starts[name] + column.shape[1]] = column.T
-    keys = np.broadcast_to(own_keys, (size,)).copy()
-    recorded = np.empty((steps, 3 * n, size)) if record else np.empty((0, 3 * n, size))
     smooth = is_smooth_mechanism(parameters) and not any(name.partition(".")[2] in JOINT_ROWS for name in varied)
-    if smooth:
-        run_blocks(smooth_joints_kernel(layout), BLOCK, threads, w, keys, aim, dt, steps, hold, substeps, recorded)
-    else:
-        more = np.array([float(substeps), common_delay(parameters)])
-        run_blocks(general_joints_kernel(layout), 1, threads, w, keys, aim, dt, steps, hold, more, recorded)
-
-    def rows(name: str, count: int) -> Array:
-        return w[starts[name] : starts[name] + count].T.copy()
-
-    mean = rows("sum", n) / steps
-    return MechanismBatch(
-        position=rows("q", n),
-        velocity=rows("v", n),
-        max_effort=rows("max_effort", m),
-        max_deviation=rows("max", n),
-        mean_deviation=mean,
-        std_deviation=np.sqrt(np.maximum(0.0, rows("square", n) / steps - mean**2)),
-        trajectories=recorded if record else None,
-    )
+    layout = Layout("rk4", parameters.mechanism.name, coordinates.driven)
+    return batch.run(layout, rows, own_seeds, smooth=smooth)
 
 
 def _flat_gain(gain: ArrayLike | None, m: int, n: int) -> Array:
@@ -160,17 +116,7 @@ def _flat_gain(gain: ArrayLike | None, m: int, n: int) -> Array:
     return K.reshape(-1, m * 2 * n)
 
 
-def _table(name: str, values: ArrayLike, width: int) -> Array:
-    """Return values as rows of a given width, (1, width) or (B, width)."""
-    table = np.atleast_2d(np.asarray(values, dtype=np.float64))
-    if table.ndim != 2 or table.shape[1] != width:
-        raise ParameterError(f"{name} has shape {np.shape(values)}; expected ({width},) or (B, {width})")
-    if not np.isfinite(table).all():
-        raise ParameterError(f"{name} has a value that is not finite; expected numbers")
-    return table
-
-
-def _vary(parameters: MechanismParameters, wide: dict[str, Array], name: str, values: Array) -> None:
+def _vary(parameters: MechanismParameters, rows: Rows, name: str, values: Array) -> None:
     """Put values in place of one parameter, by its name."""
     if name not in parameters.specs:
         raise ParameterError(f"variation {name!r} is unknown; expected one of {', '.join(parameters.specs)}")
@@ -179,50 +125,52 @@ def _vary(parameters: MechanismParameters, wide: dict[str, Array], name: str, va
     names = parameters.mechanism.parameter_names
     joint, _, key = name.partition(".")
     if name in names:
-        wide["p"][:, names.index(name)] = values
+        rows["p"][names.index(name)] = values
         return
     index = parameters.coordinates.names.index(joint)
     if key == "effort_limit":
-        wide["limit"][:, parameters.coordinates.driven.index(index)] = values
+        rows["limit"][parameters.coordinates.driven.index(index)] = values
         return
     if key == "transport_delay":
         raise ParameterError(f"variation {name!r} is one delay for all; expected it in the plant, or a batch for each")
     n = len(parameters.joints)
-    wide["table"][:, JOINT_ROWS.index(key) * n + index] = values
+    rows["table"][JOINT_ROWS.index(key) * n + index] = values
     if key == "coulomb_friction" and parameters.joints[index].static_friction is None:
-        wide["table"][:, STATIC * n + index] = values
+        rows["table"][STATIC * n + index] = values
 
 
-def _check_starts(parameters: MechanismParameters, wide: Mapping[str, Array]) -> None:
+def _check_starts(parameters: MechanismParameters, rows: Rows) -> None:
     n = len(parameters.joints)
-    low, high = (wide["table"][:, row * n : (row + 1) * n] for row in (LOWER, UPPER))
-    outside = ~((low <= wide["q"]) & (wide["q"] <= high) & (low < high))
-    if outside.any():
-        row, joint = (int(value[0]) for value in np.nonzero(outside))
-        each = parameters.mechanism.joints[joint]
-        raise ParameterError(
-            f"position of {each.name} of plant {row} is {wide['q'][row, joint]} {each.unit}; expected "
-            f"{low[row, joint]:g} to {high[row, joint]:g}, between its stops"
-        )
+    for i, joint in enumerate(parameters.mechanism.joints):
+        q, low, high = np.broadcast_arrays(rows["q"][i], *(rows["table"][row * n + i] for row in (LOWER, UPPER)))
+        outside = ~((low <= q) & (q <= high) & (low < high))
+        if outside.any():
+            plant = int(np.argmax(outside))
+            raise ParameterError(
+                f"position of {joint.name} of plant {plant} is {q[plant]} {joint.unit}; expected "
+                f"{low[plant]:g} to {high[plant]:g}, between its stops"
+            )
 
 
-def _check_varied(parameters: MechanismParameters, wide: Mapping[str, Array], h: float) -> None:
+def _check_varied(parameters: MechanismParameters, rows: Rows, h: float) -> None:
     n = len(parameters.joints)
-    coulomb, static = (wide["table"][:, row * n : (row + 1) * n] for row in (COULOMB, STATIC))
-    if (static < coulomb).any():
-        row, joint = (int(value[0]) for value in np.nonzero(static < coulomb))
-        raise ParameterError(
-            f"static_friction of {parameters.coordinates.names[joint]} of plant {row} is {static[row, joint]}; "
-            f"expected >= coulomb_friction = {coulomb[row, joint]}"
-        )
+    for i, name in enumerate(parameters.coordinates.names):
+        coulomb, static = np.broadcast_arrays(*(rows["table"][row * n + i] for row in (COULOMB, STATIC)))
+        if (static < coulomb).any():
+            plant = int(np.argmax(static < coulomb))
+            raise ParameterError(
+                f"static_friction of {name} of plant {plant} is {static[plant]}; "
+                f"expected >= coulomb_friction = {coulomb[plant]}"
+            )
     mass = in_arithmetic(parameters.mechanism.mass, np)
-    p = tuple(wide["p"].T)
+    p = np.broadcast_arrays(*rows["p"])
+    damping = np.stack(p[-n:], axis=1)
     for angle in np.linspace(0.0, 2.0 * math.pi, 16, endpoint=False):
-        entries = [np.broadcast_to(value, (len(wide["p"]),)) for row in mass((float(angle),) * n, p) for value in row]
-        rows = np.array(entries).T.reshape(-1, n, n)
-        lowest = np.linalg.eigvalsh(rows)[:, 0]
+        entries = [np.broadcast_to(value, p[0].shape) for row in mass((float(angle),) * n, tuple(p)) for value in row]
+        matrices = np.array(entries).T.reshape(-1, n, n)
+        lowest = np.linalg.eigvalsh(matrices)[:, 0]
         if (worst := int(np.argmin(lowest))) >= 0 and not lowest[worst] > 0.0:
             raise ParameterError(f"the masses and inertias of plant {worst} of the batch give no positive inertia")
-        decay = np.linalg.solve(rows, wide["p"][:, -n:, None] * np.eye(n))
+        decay = np.linalg.solve(matrices, damping[:, :, None] * np.eye(n))
         rate = np.max(np.linalg.eigvals(decay).real, axis=1)
         check_decay(float(rate.max()), h, f"plant {int(np.argmax(rate))} of the batch")

@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 MOST_GROWTH = 0.1
 """Growth that counts as stable [1/s]: some methods let an undamped pendulum gain energy, far more slowly than this."""
 _MOST_SUBSTEPS = 10_000
+_PART = 4096
 _DIFFERENCE = 1e-5
 """Half the distance of the points that a slope is taken from [rad, rad/s]."""
 
@@ -48,6 +49,13 @@ def growth_rate(
     """
     rates = np.asarray(damping_rates, dtype=np.float64)
     stiffness = np.abs(np.asarray(stiffness_rates, dtype=np.float64))
+    if max(rates.size, stiffness.size) > _PART:
+        # Parts that stay in the processor's cache.
+        rates, stiffness, *wide = np.broadcast_arrays(rates, stiffness, *coefficients)
+        parts = [slice(first, first + _PART) for first in range(0, rates.size, _PART)]
+        return np.concatenate(
+            [growth_rate(integrator, rates[at], stiffness[at], h, [c[at] for c in wide]) for at in parts]
+        )
     worst = np.full(np.broadcast_shapes(rates.shape, stiffness.shape), -np.inf)
     with np.errstate(all="ignore"):
         for sign, which in ((1.0, -1), (-1.0, 0)):

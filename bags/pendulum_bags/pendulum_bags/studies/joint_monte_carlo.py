@@ -69,6 +69,7 @@ class JointMonteCarlo(RandomRuns):
             hold=max(1, round(self.hold_time / self.dt)),
             record=record,
             threads=threads,
+            device=self.device,
         )
         columns = dict(drawn)
         for i, name in enumerate(plant.coordinates.names):

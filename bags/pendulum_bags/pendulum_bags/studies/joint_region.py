@@ -141,6 +141,7 @@ class JointRegion(StartGrid):
             velocity=np.tile(states[:, n:], (count, 1)),
             gain=self.gain(plant).rows,
             threads=threads,
+            device=self.device,
         )
         off = np.array([plant.coordinates.deviation(tuple(position)) for position in result.position])
         near = (np.abs(off) < self.tolerance[0]).all(axis=1)

@@ -89,6 +89,7 @@ class MonteCarlo(RandomRuns):
             hold=max(1, round(self.hold_time / self.dt)),
             record=record,
             threads=threads,
+            device=self.device,
         )
         columns = {
             **drawn,

@@ -18,6 +18,7 @@ from pendulum_msgs_py.programs.counted_progress import counted_progress
 from pendulum_msgs_py.programs.executables import typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
+from pendulum_sim.batches.devices import DEVICES, resolve_device
 
 if TYPE_CHECKING:
     from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo
@@ -36,6 +37,13 @@ Uncertain = Annotated[
 Q = Annotated[tuple[float, float], typer.Option(help="Diagonal of Q.")]
 R = Annotated[float, typer.Option(help="R.")]
 Scheduler = Annotated[str, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")]
+Device = Annotated[
+    str,
+    typer.Option(
+        help=f"Where the batches run: {', '.join(DEVICES)}; auto takes a GPU where there is one. Equal to rounding.",
+        callback=resolve_device,
+    ),
+]
 Workers = Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)]
 
 _OF_ONE_JOINT = {"q", "r", "sobol"}
@@ -68,6 +76,7 @@ def monte_carlo(
     sobol: Annotated[int, typer.Option(help="Base sample of Sobol indices, a power of two; 0 for none.", min=0)] = 1024,
     scheduler: Scheduler = "",
     workers: Workers = 0,
+    device: Device = "cpu",
     replay: Annotated[int, typer.Option(help="Only replay this run, and write its motion as CSV.")] = -1,
     json_output: Json = False,
 ) -> None:
@@ -103,6 +112,7 @@ def monte_carlo(
             start=start,
             duration=duration,
             bound=bound,
+            device=device,
         )
     if replay >= 0:
         _replay(console, settings, replay, folder)
@@ -152,7 +162,7 @@ def _joints(context: typer.Context) -> JointMonteCarlo:
     from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo, joint_shares
 
     plant = context.params["plant"]
-    shared = ("runs", "seed", "bound", "start", "amplitude", "hold_time", "duration")
+    shared = ("runs", "seed", "bound", "start", "amplitude", "hold_time", "duration", "device")
     uncertainty, chosen = options_of_several(context, _OF_ONE_JOINT, shared)
     return JointMonteCarlo(plant=plant, shares=joint_shares(uncertainty, plant), **chosen)
 

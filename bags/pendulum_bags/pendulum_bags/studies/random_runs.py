@@ -29,7 +29,16 @@ from pendulum_bags.studies.chunks import (
 )
 from pendulum_msgs_py.errors import BagError, ParameterError
 
-__all__ = ["Columns", "RandomRuns", "draw_chunk", "figures_of_runs", "replay", "run_chunk", "run_monte_carlo"]
+__all__ = [
+    "Columns",
+    "RandomRuns",
+    "draw_chunk",
+    "figures_of_runs",
+    "on_device",
+    "replay",
+    "run_chunk",
+    "run_monte_carlo",
+]
 Columns = dict[str, NDArray[Any]]
 """Columns of a table by name, shape (n,) each; SI units."""
 
@@ -56,6 +65,7 @@ class RandomRuns(ABC):
         dt: Period of the loop [s].
         bound: Distance from upright that a run should not leave [rad or m].
         chunk: Runs in a chunk; part of the result's definition.
+        device: Where the batches run, ``cpu`` or ``cuda``.
     """
 
     UNITS: ClassVar[tuple[str, str]] = ("rad or m", "N m or N")
@@ -71,6 +81,7 @@ class RandomRuns(ABC):
     dt: float = 0.002
     bound: float = 0.2
     chunk: int = 10_000
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
@@ -124,9 +135,14 @@ class RandomRuns(ABC):
 
     def fingerprint(self) -> str:
         """Return a hash of all that a run depends on; how many runs there are is not among that."""
-        settings = {name: value for name, value in asdict(self).items() if name != "runs"}
+        settings = {name: value for name, value in on_device(self).items() if name != "runs"}
         content = json.dumps([settings, self.numbers_of_plant()], sort_keys=True, default=asdict)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def on_device(settings: Any) -> dict[str, Any]:
+    """Return settings of a fingerprint: a GPU's results differ by rounding, and the processor needs no mention."""
+    return {name: value for name, value in asdict(settings).items() if (name, value) != ("device", "cpu")}
 
 
 def draw_chunk(settings: RandomRuns, index: int, plant: Any = None) -> Columns:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pendulum_bags.studies.monte_carlo_cli import Plant, Q, R, Scheduler, Uncertain, Workers, options_of_several
+from pendulum_bags.studies.monte_carlo_cli import Device, Plant, Q, R, Scheduler, Uncertain, Workers, options_of_several
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counted_progress
@@ -56,6 +56,7 @@ def region_of_attraction(
     seed: Annotated[int, typer.Option(help="Seed of the plants.", min=0)] = 1,
     scheduler: Scheduler = "",
     workers: Workers = 0,
+    device: Device = "cpu",
     json_output: Json = False,
 ) -> None:
     """Map the starts from which the LQR reaches upright under a torque limit, over everything not known of the plant.
@@ -89,6 +90,7 @@ def region_of_attraction(
             velocity_span=velocity_span,
             duration=duration,
             seed=seed,
+            device=device,
         )
     started = time.monotonic()
     with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
@@ -109,6 +111,6 @@ def _joints(context: typer.Context, axes: str, spans: tuple[float, float]) -> Jo
     from pendulum_bags.studies.joint_region import JointRegion
 
     plant = context.params["plant"]
-    uncertainty, chosen = options_of_several(context, _OF_ONE_JOINT, ("plants", "points", "duration", "seed"))
+    uncertainty, chosen = options_of_several(context, _OF_ONE_JOINT, ("plants", "points", "duration", "seed", "device"))
     both = tuple(part.strip() for part in axes.split(",") if part.strip())
     return JointRegion(plant=plant, axes=both, spans=spans, shares=joint_shares(uncertainty, plant), **chosen)

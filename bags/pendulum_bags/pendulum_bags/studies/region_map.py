@@ -124,6 +124,7 @@ class RegionMap(StartGrid):
             theta_dot=speeds,
             gain=gain,
             threads=threads,
+            device=self.device,
         )
         near = (np.abs(wrap(result.theta - UPRIGHT)) < self.tolerance[0]) & (
             np.abs(result.theta_dot) < self.tolerance[1]

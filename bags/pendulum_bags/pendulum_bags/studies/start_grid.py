@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pendulum_bags.arrays import Array
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.chunks import Connect, open_results, run_chunks, write_columns
-from pendulum_bags.studies.random_runs import Columns
+from pendulum_bags.studies.random_runs import Columns, on_device
 from pendulum_msgs_py.errors import ParameterError
 
 __all__ = ["StartGrid", "inside_ellipse", "run_map", "share_inside"]
@@ -37,6 +37,7 @@ class StartGrid(ABC):
         tolerance: Largest distance of a position from upright [rad or m] and of a velocity from rest at the end at
             which upright is reached.
         seed: Seed of the plants.
+        device: Where the batches run, ``cpu`` or ``cuda``.
     """
 
     RUNS_OF_CHUNK: ClassVar[int]
@@ -49,6 +50,7 @@ class StartGrid(ABC):
     dt: float = 0.002
     tolerance: tuple[float, float] = (0.1, 0.2)
     seed: int = 1
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
@@ -106,7 +108,7 @@ class StartGrid(ABC):
 
     def fingerprint(self) -> str:
         """Return a hash of all that the result depends on."""
-        content = json.dumps([asdict(self), self.numbers_of_plant()], sort_keys=True)
+        content = json.dumps([on_device(self), self.numbers_of_plant()], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
