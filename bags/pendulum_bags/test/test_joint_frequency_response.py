@@ -66,9 +66,9 @@ def _record(name: str, *, periods: int = 3, noise: float = 0.0, label: str = "si
     return Record(label, PERIOD, r, u, y, parameters, joints=coordinates.names, driven=coordinates.driven[0])
 
 
-def _exact(model: LinearModel, plant: MechanismParameters, label: str) -> MeasuredResponse:
+def _exact(model: LinearModel, plant: MechanismParameters, label: str, lowest: float = 0.25) -> MeasuredResponse:
     """Return what a faultless measurement of a linear plant would tell."""
-    lines = np.unique(2 * np.round((np.geomspace(1, 400, 48) - 1) / 2) + 1) * 0.25
+    lines = np.unique(2 * np.round((np.geomspace(1, 100 / lowest, 48) - 1) / 2) + 1) * lowest
     response = model_response(model, lines, PERIOD)
     small = 1e-6 * np.abs(response)
     coordinates = plant.coordinates
@@ -181,7 +181,9 @@ def test_what_noise_makes_of_the_lines_counts_between_them_too() -> None:
 @pytest.mark.parametrize("name", DRIVEN_ALONE)
 def test_the_same_plant_is_yes_and_all_that_stabilises_it_is_certified(name: str) -> None:
     plant, model = load_mechanism(name), _model(name)
-    analysis = analyse_responses([_exact(model, plant, "sim"), _exact(model, plant, "hw")], name)
+    # A cart that rolls away has to be measured from below its loop's slowest mode.
+    both = [_exact(model, plant, side, 0.1) for side in ("sim", "hw")]
+    analysis = analyse_responses(both, name)
     assert [layer.mark for layer in analysis.layers] == [Mark.YES, Mark.YES]
     assert len(analysis.designs) == 4
     assert all(design.certified for design in analysis.designs)
@@ -201,7 +203,8 @@ def test_no_certified_gain_fails_on_the_machine_that_was_measured(name: str) -> 
     for seed in range(6):
         machine = stand_in_for(plant, share=0.1, delay=0.0, seed=seed)
         other = replace(linearise(machine), delay=float(generator.uniform(0.0, 0.01)))
-        certifier = Certifier(model, Machine.beside(_exact(other, plant, "hw"), model), _scaling(plant, model))
+        measured = _exact(other, plant, "hw", 0.05)
+        certifier = Certifier(model, Machine.beside(measured, model), _scaling(plant, model))
         sampled = discretise(other, PERIOD)
         for _ in range(40):
             K = _gains(model, plant.mechanism.weights[0], generator)
@@ -212,6 +215,40 @@ def test_no_certified_gain_fails_on_the_machine_that_was_measured(name: str) -> 
             sound += stable and found.worst_modulus > 0.5
     assert sound >= 10
     assert certified > 0.5 * sound
+
+
+@pytest.mark.parametrize("stiffness", [-1.0, -0.45, 0.2, 0.45, 0.6, 0.8])
+def test_no_loop_that_an_unseen_stiffness_of_the_cart_may_tip_is_certified(stiffness: float) -> None:
+    """The model's cart has poles at 0: no line shows how many unstable poles the machine has below the lowest one."""
+    plant, model = load_mechanism("cart_pole"), _model("cart_pole")
+    A, drive = model.A.copy(), model.B[:, 0]
+    A[:, 0] -= drive * stiffness / drive[2]
+    other = replace(model, A=A)
+    certifier = Certifier(model, Machine.beside(_exact(other, plant, "hw"), model), _scaling(plant, model))
+    sampled, generator = discretise(other, PERIOD), np.random.default_rng(11)
+    refused = fell = certified = 0
+    for _ in range(80):
+        K = _gains(model, plant.mechanism.weights[0], generator)
+        found, stable = certifier.gain(K), is_stable(sampled, K)
+        assert stable or not found.certified, K
+        certified += found.certified
+        refused += bool(found.unseen) and (found.by_gap or found.by_frequency)
+        fell += bool(found.unseen) and (found.by_gap or found.by_frequency) and not stable
+        assert not found.unseen or found.unseen < certifier.machine.lowest
+    assert refused
+    # Without the refusal some of these would be certified and fall.
+    assert fell or stiffness < 0.2 or stiffness > 0.7
+    assert certified or abs(stiffness) > 0.5
+
+
+def test_a_loop_slower_than_the_lowest_line_is_measured_again_from_below_it() -> None:
+    plant, model = load_mechanism("cart_pole"), _model("cart_pole")
+    both = [_exact(model, plant, side) for side in ("sim", "hw")]
+    layer = analyse_responses(both, "cart_pole").layers[1]
+    assert layer.mark is Mark.UNDECIDED
+    # The slowest mode of the default designs is at 0.148 Hz.
+    assert [step.rpartition(" --")[2] for step in layer.next_steps] == ["signal-period 7"]
+    assert "as many unstable poles as the model has, 1, and no resonance" in layer.sentence
 
 
 def test_a_machine_that_falls_under_the_design_is_not_certified() -> None:

@@ -41,6 +41,14 @@ def test_contenders_differ_in_what_they_command_and_run_under_the_same_seeds_on_
     assert list(contender_specs(sim, hw, 6, 5)) == list(found)[:6]
 
 
+def test_a_controller_that_refuses_the_plant_leaves_its_place_to_the_next() -> None:
+    # Sliding mode is for rigid plants alone, and x5_9 has a spring.
+    sim, hw = (RunSpec(side=side, plant="x5_9", design_plant="x5_9") for side in ("sim", "hw"))
+    found = contender_specs(sim, hw, 6, 1)
+    assert len(found) == 6
+    assert "sliding_mode" not in found
+
+
 def test_a_simulated_run_of_a_ranking_is_read_back_as_a_run_of_a_study(tmp_path: Path) -> None:
     from pendulum_bags.ranking.collect import collect_contenders
 
@@ -88,7 +96,7 @@ def test_a_budget_interrupts_when_the_first_layer_is_there_and_not_before() -> N
     compared, spent = threading.Event(), threading.Event()
 
     def held() -> None:
-        with carry_out._ends_with_budget(0.05, compared, spent, lambda: 0.01):
+        with carry_out._ends_with_budget(0.05, compared, spent):
             assert not spent.wait(0.3)
             compared.set()
             # It comes as Ctrl-C does.
@@ -102,7 +110,7 @@ def test_a_budget_interrupts_when_the_first_layer_is_there_and_not_before() -> N
 def test_what_ends_before_its_budget_is_not_interrupted() -> None:
     compared, spent = threading.Event(), threading.Event()
     compared.set()
-    with carry_out._ends_with_budget(60.0, compared, spent, lambda: 10.0):
+    with carry_out._ends_with_budget(60.0, compared, spent):
         pass
     assert not spent.is_set()
 

@@ -5,16 +5,20 @@ Two certificates, both by Vinnicombe's theorem and both with the upper confidenc
 ``gap``        one number for the machine (the nu-gap in the task's units) below one number for the design, b(P, K)
 ``frequency``  at each frequency, with the weights that certify most (:func:`.gap_metric.loop_distance`)
 
+They presume that the machine has as many unstable poles as the model, a pendulum upright one, and no resonance
+narrower than the distance of two lines. Poles below the lowest line cannot be counted: of one joint the stiffness is
+continued to 0 with its error; of several, where the model has such poles, no loop with a mode below that line is
+certified.
+
 Both concern the linear machine, on a grid dense enough for lightly damped loops
 (:mod:`pendulum_lqr.responses.machine_response` defines how it is made of measured lines). From the highest line to the
-Nyquist frequency the machine is taken to be smooth, or, where lines end well below, to roll off. Both take the machine
-to have as many unstable poles as the model, a pendulum upright one. Neither covers saturation, or dry friction at
-rest.
+Nyquist frequency the machine is taken to be smooth, or, where lines end well below, to roll off. Neither covers
+saturation, or dry friction at rest.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +40,8 @@ __all__ = ["Certificate", "Certifier", "GapProfile", "compare_machine", "is_stab
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+_FASTEST = 1e-6
+"""Smallest eigenvalue of a sampled loop that counts as a mode."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +135,8 @@ class Certificate:
         worst_modulus: Smallest distance of any loop within the confidence discs from -1, the machine's own modulus
             margin with 95 % confidence; 0 where a disc reaches it.
         possible: Whether at each frequency some plant within the confidence disc has a loop distance below 1.
+        unseen: Frequency from which a measurement would have to begin to show what moves the model's slow poles [Hz];
+            0 where it began there, or no such pole matters.
     """
 
     stable_on_model: bool
@@ -139,16 +147,17 @@ class Certificate:
     at: float
     worst_modulus: float
     possible: bool = False
+    unseen: float = 0.0
 
     @property
     def undecided(self) -> bool:
-        """Whether only the measurement's error prevents certification: a longer measurement may certify it."""
+        """Whether only the measurement prevents certification: a longer one may certify it."""
         return self.possible and not self.certified
 
     @property
     def certified(self) -> bool:
         """Whether either certificate holds."""
-        return self.by_gap or self.by_frequency
+        return (self.by_gap or self.by_frequency) and not self.unseen
 
 
 def is_stable(sampled: DiscreteModel, K: ArrayLike) -> bool:
@@ -177,6 +186,8 @@ class Certifier:
         self.profile = compare_machine(plant, machine, scaling)
         self._model = model_response(plant, machine.frequency, machine.period)
         self._sampled = discretise(plant, machine.period)
+        poles = np.abs(np.linalg.eigvals(plant.A))
+        self._has_slow_poles = machine.response.shape[0] > 2 and bool(np.any(poles < 2.0 * np.pi * machine.lowest))
         top = 0.5 / machine.period
         # A plant of several joints may have no response at 0: a cart rolls away.
         lowest = machine.frequency[:1] if machine.response.shape[0] > 2 else np.zeros(1)
@@ -190,7 +201,13 @@ class Certifier:
             K: Shape (2,) [N m/rad, N m s/rad], or (2 k,) for a plant of k joints.
         """
         stable = is_stable(self._sampled, K)
-        return self.feedback(np.asarray(K, dtype=np.complex128).reshape(-1, 1), stable=stable)
+        found = self.feedback(np.asarray(K, dtype=np.complex128).reshape(-1, 1), stable=stable)
+        if not (stable and self._has_slow_poles):
+            return found
+        modes = np.linalg.eigvals(closed_loop(self._sampled, K)).astype(np.complex128)
+        # Modes at 0 of a delay are the fastest there are.
+        slowest = float(np.min(np.abs(np.log(modes[np.abs(modes) > _FASTEST])))) / self.machine.period / (2.0 * np.pi)
+        return replace(found, unseen=slowest) if slowest < self.machine.lowest else found
 
     def feedback(self, response: ArrayLike, *, stable: bool) -> Certificate:
         """Return the certificate of any linear controller.

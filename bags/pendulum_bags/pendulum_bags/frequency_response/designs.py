@@ -75,6 +75,7 @@ class DesignResult:
             "loop_distance": found.distance,
             "loop_distance_at_hz": found.at,
             "stable_on_model": found.stable_on_model,
+            "unseen_from_hz": found.unseen,
             "modulus_on_hardware": found.worst_modulus,
         }
 
@@ -117,6 +118,8 @@ def design_rows(designs: Sequence[DesignResult]) -> list[tuple[str, ...]]:
         how = "by its margin" if found.by_gap else "by frequency" if found.by_frequency else "no"
         if found.undecided:
             how = "undecided: measure longer"
+        if found.unseen:
+            how = f"undecided: measure from {found.unseen:.2g} Hz"
         rows.append(
             (
                 str(number),

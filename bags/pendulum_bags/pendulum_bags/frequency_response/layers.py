@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+
+import numpy as np
 
 from pendulum_bags.frequency_response.compare import SMALLEST, Difference
 from pendulum_bags.frequency_response.designs import DesignResult
@@ -17,6 +20,8 @@ GAP_MARGIN = 0.2
 _CLOSE = {True: "close enough for feedback, not identical", False: "close enough for feedback"}
 """By whether a difference at single frequencies was found."""
 _WEAK_COHERENCE = 0.5
+_UNSTABLE = 1e-6
+"""Real part above which a pole of a model counts as unstable [1/s]: poles at 0 are computed with an error."""
 LONGER = "python -m pendulum_bags experiment frequency_response --periods 40"
 """Measures the thesis's plant longer than by default."""
 
@@ -104,6 +109,7 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
         longer: The command that measures longer.
     """
     profile = certifier.profile
+    unstable = int(np.sum(np.linalg.eigvals(certifier.plant.A).real > _UNSTABLE))
     good = [design for design in designs if design.certified]
     bad = [design for design in designs if not design.certified]
     unsure = bool(bad) and all(design.undecided for design in bad)
@@ -146,12 +152,18 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
         for design in bad
         if design.unknown
     )
-    if any(design.undecided and not design.unknown for design in bad):
+    # Not a matter of the measurement's error, but of where it begins.
+    slow = [design.certificate.unseen for design in bad if design.certificate.undecided and design.certificate.unseen]
+    if any(design.undecided and not (design.unknown or design.certificate.unseen) for design in bad):
         steps += (f"measure longer: {longer}",)
+    if slow:
+        steps += (f"measure from lower frequencies: {longer} --signal-period {math.ceil(1.0 / min(slow))}",)
     return LayerResult(
         Layer.WHICH_CONTROLLERS,
         mark,
-        f"Certified for the hardware: {verdict}; {limit}. Torque limits and friction at rest are outside it.",
+        f"Certified for the hardware: {verdict}; {limit}. It presumes as many unstable poles as the model has, "
+        f"{unstable}, and no resonance between two measured frequencies; torque limits and friction at rest are "
+        "outside it.",
         tuple(evidence),
         steps,
         limit if mark is Mark.YES else f"{', '.join(d.name for d in bad)} not certified for the hardware",
@@ -170,6 +182,11 @@ def _row(design: DesignResult, limit: float) -> Evidence:
         )
     if not found.stable_on_model:
         how = "does not stabilise the model, sampled as the hardware is"
+    elif found.unseen and found.undecided:
+        how = (
+            f"the model has poles below the lowest frequency, and the loop a mode at {found.unseen:.2g} Hz: what moves "
+            "these poles cannot be seen"
+        )
     elif found.by_gap:
         how = "certified by its margin"
     elif found.by_frequency:

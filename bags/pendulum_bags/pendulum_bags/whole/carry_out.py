@@ -66,6 +66,9 @@ _SHARE = 0.4
 """Share of the budget for repeats of one plant, so that the other layers have time, too."""
 _WRITING = 10.0
 """Processor time to end all programs and write the page [s]."""
+_OWN_LOAD = 2.0
+"""Programs of this run that want to run at once: this one, and of the machine's one at a time."""
+_POLL = 0.2
 _MOST_WRITING = 0.5
 """Largest share of the budget that is left for it, where this computer is busy."""
 
@@ -189,7 +192,7 @@ def carry_out(folder: Path, order: Order, progress: PhaseProgress, on_first: Cal
         run.measure()
         spent = threading.Event()
         try:
-            with _ends_with_budget(order.budget, run.compared, spent, lambda: _WRITING * run.slowness):
+            with _ends_with_budget(order.budget, run.compared, spent):
                 run.compare_given()
                 for step in run.steps():
                     run.carry_out(step)
@@ -215,7 +218,6 @@ class _Run:
         self.found = Findings(Simulated(settings.plant, settings, folder, 0.0 if order.alone else 4.0 * order.budget))
         self.now = ""
         self.compared = threading.Event()
-        self.slowness = 1.0
         self.tested = replace(
             settings,
             noise=replace(
@@ -269,8 +271,6 @@ class _Run:
         self._compare(self.found.given, 0.0 if self.order.alone else share * self.order.budget)
 
     def _compare(self, plant: Simulated, seconds: float) -> None:
-        began = time.monotonic(), time.thread_time()
-
         def take(comparison: Comparison) -> None:
             first = plant.comparison is None
             settings = plant.settings
@@ -279,7 +279,6 @@ class _Run:
                 comparison = replace(comparison, unproved=[unproved])
             plant.comparison = comparison
             if first and plant is self.found.given:
-                self.slowness = max(1.0, (time.monotonic() - began[0]) / (time.thread_time() - began[1]))
                 self.on_first(plant)
                 self.compared.set()
 
@@ -381,25 +380,29 @@ def _of(plant: Simulated, spec: RunSpec) -> RunSpec:
     )
 
 
+def _slowness() -> float:
+    """Return how many times longer than alone a computation takes, by the programs that others want to run."""
+    return max(1.0, (os.getloadavg()[0] - _OWN_LOAD) / (os.cpu_count() or 1))
+
+
 @contextmanager
-def _ends_with_budget(
-    budget: float, compared: threading.Event, spent: threading.Event, writing: Callable[[], float]
-) -> Iterator[None]:
+def _ends_with_budget(budget: float, compared: threading.Event, spent: threading.Event) -> Iterator[None]:
     """Interrupt the main thread when the budget less the time to write the page is spent, as Ctrl-C would.
 
     Args:
         budget: Wall time from now on; 0 for no end [s].
         compared: Set when the first layer is there, for which there is always time.
         spent: Set before the interruption.
-        writing: Time to write the page, known when the first layer is there [s].
     """
     ends, done = time.monotonic() + budget, threading.Event()
 
     def end() -> None:
         compared.wait()
-        if not done.wait(max(0.0, ends - min(writing(), _MOST_WRITING * budget) - time.monotonic())):
-            spent.set()
-            os.kill(os.getpid(), signal.SIGINT)
+        while time.monotonic() < ends - min(_WRITING * _slowness(), _MOST_WRITING * budget):
+            if done.wait(_POLL):
+                return
+        spent.set()
+        os.kill(os.getpid(), signal.SIGINT)
 
     watch = threading.Thread(target=end, daemon=True)
     if budget > 0.0:

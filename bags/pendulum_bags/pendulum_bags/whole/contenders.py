@@ -17,6 +17,7 @@ from pendulum_bags.runs.case import Case
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.results import run_metrics
 from pendulum_bags.studies.study_file import load_study
+from pendulum_msgs_py.errors import PendulumError
 
 __all__ = ["DEFAULT", "MOST", "contender_specs", "keep_run", "rank_folders", "simulate_contenders"]
 
@@ -33,7 +34,8 @@ _PROBE = 1.0
 def contender_specs(sim: RunSpec, hw: RunSpec, count: int, seed: int) -> dict[str, list[tuple[RunSpec, RunSpec]]]:
     """Return the runs of each contender on both sides, under each seed of the noise.
 
-    Of controllers that command the same, the first alone contends: it would count twice in a correlation.
+    Of controllers that command the same, the first alone contends: it would count twice in a correlation. One that
+    refuses the plant does not contend.
 
     Args:
         sim: The simulation under any controller and disturbance.
@@ -51,7 +53,10 @@ def contender_specs(sim: RunSpec, hw: RunSpec, count: int, seed: int) -> dict[st
         law: dict[str, Any] = {"controller": spec.controller, "controller_parameters": spec.controller_parameters}
         noise: dict[str, Any] = {"disturbance": spec.disturbance, "duration": spec.duration}
         own, theirs = (replace(one, **law, **noise) for one in (sim, hw))
-        commands = simulate(replace(own, duration=_PROBE, seed=seed)).command
+        try:
+            commands = simulate(replace(own, duration=_PROBE, seed=seed)).command
+        except PendulumError:  # a law that the plant is none for, such as one for rigid plants alone
+            continue
         if any(np.allclose(commands, others, rtol=1e-6, atol=1e-9, equal_nan=True) for others in seen):
             continue
         seen.append(commands)
