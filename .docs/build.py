@@ -115,15 +115,15 @@ def _tables(tables: Mapping[str, tuple[str, list[str]]], shared: str) -> list[st
     head = markdown_table([])
     count = Counter(row for _, rows in tables.values() for row in rows)
     common = [row for row, tables_with_it in count.items() if tables_with_it > 1]
-    parts = [f"### {shared}\n\n{head}" + "\n".join(common) + "\n"] if common else []
-    link = re.sub(r"\W+", "-", shared.lower())
+    note = "What the sections below only name is described here."
+    parts = [f"### {shared}\n\n{note}\n\n{head}" + "\n".join(common) + "\n"] if common else []
     for heading, (sentence, rows) in tables.items():
         own = [row for row in rows if count[row] == 1]
         names = ", ".join(row.split(" ")[1].rstrip("*") for row in rows if count[row] > 1)
         parts.append(f"### {heading}\n")
         parts += [f"{sentence}.\n"] if sentence else []
         parts += [head + "\n".join(own) + "\n"] if own else []
-        parts += [f"{'Also' if own else 'Parameters'} ([{shared}](#{link})): {names}.\n"] if names else []
+        parts += [f"{'Also' if own else 'Parameters'}: {names}.\n"] if names else []
         parts += [] if rows else ["No parameters of its own.\n"]
     return parts
 
@@ -171,11 +171,12 @@ def reference() -> str:
         nodes[name] = ("", table_rows(spec for table in found for spec in getattr(table, "specs", table)))
     node = importlib.import_module("pendulum_lqr.nodes.controller_node").NODE_SPECS
     nodes["controller"] = ("", table_rows([*node, *COMMON_PARAMETERS]))
-    parts += _tables(nodes, "several nodes")
+    parts += _tables(nodes, "Shared by several nodes")
     classes = {name: controller_class(name) for name in controller_names()}
     parts.append("## Controllers\n")
     parts += _tables(
-        {name: (own.SUMMARY, table_rows(own.PARAMETERS)) for name, own in classes.items()}, "several controllers"
+        {name: (own.SUMMARY, table_rows(own.PARAMETERS)) for name, own in classes.items()},
+        "Shared by several controllers",
     )
     parts.append("## Controllers of several joints\n\nParameters as for the preset `cart_pole`.\n")
     mechanism = load_mechanism("cart_pole")
@@ -183,7 +184,7 @@ def reference() -> str:
     tables_of_joints = {
         f"{name}, several joints": (own.SUMMARY, table_rows(own.parameters(mechanism))) for name, own in joint.items()
     }
-    parts += _tables(tables_of_joints, "several controllers of joints")
+    parts += _tables(tables_of_joints, "Shared by several of these")
     parts.append("## Faults of the bridge\n\n| fault | meaning |\n|---|---|")
     parts += [f"| `{name}` | {meaning} |" for name, meaning in FAULTS.items()]
     parts += ["\n## Plant files\n", *_tables({"plant": ("", table_rows(PLANT_SPECS))}, "")]
