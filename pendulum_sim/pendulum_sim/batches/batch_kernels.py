@@ -171,7 +171,7 @@ def coefficients_kernel(method: str) -> Any:
     integrator = get_integrator(method)
     coefficients_of = compile_tree(integrator.coefficients, inline=True)
 
-    @numba.njit(error_model="numpy", no_cfunc_wrapper=True)
+    @numba.njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)
     def run(rates: Any, h: float, out: Any) -> None:
         for j in range(rates.size):
             for row, value in enumerate(coefficients_of(rates[j], h)):

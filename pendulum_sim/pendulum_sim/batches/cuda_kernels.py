@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from importlib import import_module
 from threading import Lock
 from typing import Any
 
@@ -29,6 +30,9 @@ _SHARE_OF_MEMORY = 0.4
 _LAUNCH = Lock()
 """Held for a launch: the first one compiles, which one thread does for all."""
 _SIMULATED = bool(numba.config.ENABLE_CUDASIM)
+if not _SIMULATED:
+    # A batch may be small: numba would warn of each.
+    import_module("numba.cuda.dispatcher").config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
 
 
 @cache
@@ -38,7 +42,7 @@ def _kernel(layout: Layout, smooth: bool) -> Any:
 
     def simulated(w: Any, seed: Any, *others: Any) -> None:
         # The loop runs on the processor, and the simulator's arrays are not of numpy.
-        compiled(w, seed, *others[:4], *(array.view() for array in others[4:]))
+        compiled(w, seed, *others[:4], *(array._item._ary for array in others[4:]))
 
     run = simulated if _SIMULATED else compiled
     rows, wanted = layout.starts["end"], layout.starts["results"]

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 MOST_GROWTH = 0.1
 """Growth that counts as stable [1/s]: some methods let an undamped pendulum gain energy, far more slowly than this."""
 _MOST_SUBSTEPS = 10_000
-_PART = 4096
+_PART = 65_536
 _DIFFERENCE = 1e-5
 """Half the distance of the points that a slope is taken from [rad, rad/s]."""
 
