@@ -82,7 +82,8 @@ def test_experiment_leaves_two_bags_a_summary_figures_and_a_report(run_folder: P
     # Under noise of its own, held for 2 ms: the same bands.
     assert 0.001 < summary["plants"]["sim_500hz"]["std_theta"] < 0.004
     assert {"paired", "unpaired", "seed", "strategy", "versions"} <= summary.keys()
-    assert list((run_folder / "figures").glob("*.png"))
+    # What a busy computer's budget ends has the plots of the page alone.
+    assert list((run_folder / "figures").glob("*.png")) or summary["left_out"]
     assert (run_folder / "report.html").stat().st_size < 5_000_000
 
 

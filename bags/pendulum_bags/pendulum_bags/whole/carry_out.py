@@ -64,8 +64,8 @@ _TEST_SEED_STEP = 2_000_000
 """Added to the seed for the noise under which an identified plant is tested: a fit has seen the other."""
 _SHARE = 0.4
 """Share of the budget for repeats of one plant, so that the other layers have time, too."""
-_WRITING = 10.0
-"""Processor time to end all programs and write the page [s]."""
+_WRITING = 5.0
+"""Processor time to end all programs and write the page without files of its figures [s]."""
 _OWN_LOAD = 2.0
 """Programs of this run that want to run at once: this one, and of the machine's one at a time."""
 _POLL = 0.2
@@ -161,12 +161,14 @@ class Findings:
         identified: The one that was identified; None for none.
         notes: What could not be done, a sentence each.
         interrupted: Whether the user ended it early.
+        spent: Whether the budget did.
     """
 
     given: Simulated
     identified: Simulated | None = None
     notes: list[str] = field(default_factory=list)
     interrupted: bool = False
+    spent: bool = False
 
     @property
     def plants(self) -> list[Simulated]:
@@ -199,8 +201,8 @@ def carry_out(folder: Path, order: Order, progress: PhaseProgress, on_first: Cal
         except KeyboardInterrupt:
             if not run.compared.is_set():
                 raise
-            run.found.interrupted = not spent.is_set()
-            if spent.is_set():
+            run.found.spent, run.found.interrupted = spent.is_set(), not spent.is_set()
+            if run.found.spent:
                 run.found.notes.append(
                     f"The budget of {order.budget:g} s was spent: “{run.now}” and what follows it was left out."
                 )
@@ -264,9 +266,10 @@ class _Run:
 
     def compare_given(self) -> None:
         """Compare the given plant with the machine."""
-        self._phase("comparing", 4.0)
         if self.machine.runs:
+            self._phase("repeat on the hardware", 2.0)
             self.machine.wait(self.machine.runs[0].bag)
+        self._phase("comparing", 2.0)
         share = 1.0 if set(self.order.steps) == {Layer.SAME_RUN.key} else _SHARE
         self._compare(self.found.given, 0.0 if self.order.alone else share * self.order.budget)
 

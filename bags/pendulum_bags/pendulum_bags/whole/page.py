@@ -54,6 +54,8 @@ def write_whole_report(
         answer=answer,
         certified=given.analysis,
         extend=extend,
+        # Files for paper take three times as long as the page: what ends early has its plots alone.
+        formats=() if found.interrupted or found.spent else ("png", "pdf"),
     )
 
 
