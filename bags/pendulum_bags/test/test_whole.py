@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_bags.comparison import Margins
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.machine import Machine, MachineRun
+from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.repeats import record_simulation
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
@@ -22,6 +24,8 @@ from pendulum_bags.whole.carry_out import Findings, Simulated
 from pendulum_bags.whole.contenders import contender_specs, place_of, simulate_contenders
 from pendulum_msgs_py.errors import BagError, FaultError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
+from pendulum_msgs_py.programs.terminal import make_console
+from pendulum_sim.exports.model_files import mjcf
 
 NOISE = {"kind": "uniform", "amplitude": 2.5, "hold_time": 0.01}
 
@@ -77,6 +81,22 @@ def test_recordings_are_made_one_after_the_other_and_a_failure_is_told_by_its_ow
         machine.discard()
     assert waits
     assert not (tmp_path / "a").exists()
+
+
+def test_two_simulations_are_not_repeated_in_advance_since_they_may_be_one(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    model = tmp_path / "own.xml"
+    model.write_text(mjcf(load_plant("thesis")), encoding="utf-8")
+    repeats = []
+    for hardware in ("emulator", str(model)):
+        settings = RegulationSettings(simulation=str(model), hardware=hardware)
+        order = carry_out.Order(settings, Margins.parse(), 60.0, carry_out.STEPS, 6)
+        with PhaseProgress(1.0, make_console()) as progress:
+            run = carry_out._Run(tmp_path, order, progress, lambda _: None)
+        bags = [str(one.bag.relative_to(tmp_path)) for one in run.machine.runs]
+        assert {"identified/hw", "frequency_response/hw", "ranking/lqr_seed1/hw/bag"} <= set(bags)
+        repeats.append("repeats/1/hw" in bags)
+    assert repeats == [True, False]
 
 
 def test_an_identified_plant_runs_under_the_controller_of_the_given_one(tmp_path: Path) -> None:
