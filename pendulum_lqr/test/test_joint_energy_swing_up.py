@@ -203,7 +203,7 @@ def test_a_period_that_is_measured_later_is_judged_without_another_design(
     monkeypatch.setattr(
         "pendulum_lqr.swing_up.mechanism_catch.sample_caught_region", lambda *_: pytest.fail("designed again")
     )
-    monkeypatch.setattr("pendulum_lqr.controllers.joint_lqr.output_lqr", lambda *_: pytest.fail("designed again"))
+    monkeypatch.setattr("pendulum_lqr.controllers.lqr.output_lqr", lambda *_: pytest.fail("designed again"))
     controller.check(0.01)
     with pytest.raises(ParameterError, match=rf"{name} asked every 0\.5 s does not settle on plant 'cart_pole'"):
         controller.check(0.5)

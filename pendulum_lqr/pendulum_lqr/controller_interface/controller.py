@@ -63,12 +63,12 @@ _ANY: tuple[str, ...] = ()
 _RIGID = (ONE_JOINT, RIGID)
 _HERE = "pendulum_lqr.controllers"
 CONTROLLERS: dict[str, Row] = {
-    "lqr": Row(f"{_HERE}.lqr:Lqr", several=f"{_HERE}.joint_lqr:JointLqr"),
-    "lqi": Row(f"{_HERE}.lqi:Lqi", several=f"{_HERE}.joint_lqi:JointLqi"),
-    "lqg": Row(f"{_HERE}.lqg:Lqg", several=f"{_HERE}.joint_lqg:JointLqg"),
+    "lqr": Row(f"{_HERE}.lqr:Lqr", _ANY),
+    "lqi": Row(f"{_HERE}.lqi:Lqi", _ANY),
+    "lqg": Row(f"{_HERE}.lqg:Lqg", _ANY),
     "lqr_friction": Row(f"{_HERE}.lqr_friction:LqrFriction"),
     "lqr_tracking": Row(f"{_HERE}.lqr_tracking:LqrTracking"),
-    "discrete_lqr": Row(f"{_HERE}.discrete_lqr:DiscreteLqr", several=f"{_HERE}.joint_discrete_lqr:JointDiscreteLqr"),
+    "discrete_lqr": Row(f"{_HERE}.discrete_lqr:DiscreteLqr", _ANY),
     "pid": Row(f"{_HERE}.pid:Pid"),
     "pd_gravity": Row(f"{_HERE}.pd_gravity:PdGravity"),
     "energy_swing_up": Row(
@@ -77,7 +77,7 @@ CONTROLLERS: dict[str, Row] = {
     "time_optimal": Row(f"{_HERE}.time_optimal:TimeOptimal", _RIGID),
     "tvlqr": Row(f"{_HERE}.tvlqr:Tvlqr", _RIGID, f"{_HERE}.joint_swing_up:JointSwingUp"),
     "ilqr": Row(f"{_HERE}.joint_ilqr:JointIlqr", (SEVERAL_JOINTS,)),
-    "mpc": Row(f"{_HERE}.mpc:LinearMpc", several=f"{_HERE}.joint_mpc:JointMpc"),
+    "mpc": Row(f"{_HERE}.mpc:LinearMpc", _ANY),
     "nmpc": Row(f"{_HERE}.nmpc:NonlinearMpc", _RIGID, f"{_HERE}.joint_nmpc:JointNmpc"),
     "sliding_mode": Row(f"{_HERE}.sliding_mode:SlidingMode", _RIGID),
     "playback": Row(f"{_HERE}.playback:Playback"),
@@ -155,10 +155,13 @@ class LawController(BaseController):
         memory: Its memory before the first state, at most ``MOST_MEMORY``.
 
     Attributes:
-        law: The function.
+        law: The function; None where a subclass has none for its plant.
         numbers: All of its numbers.
         memory: Its state.
     """
+
+    law: Law | None
+    numbers: tuple[float, ...]
 
     def __init__(
         self,
@@ -169,9 +172,13 @@ class LawController(BaseController):
         memory: Iterable[float] = (),
     ) -> None:
         super().__init__(effort_limit, set_point)
+        self._use(law, numbers, memory)
+
+    def _use(self, law: Law | None, numbers: Iterable[float], memory: Iterable[float] = ()) -> None:
+        """Set the law, its own numbers and its memory before the first state."""
         self.law = law
         # Plain floats: indexing an array of two on every state costs more than the law itself.
-        self.numbers = tuple(float(number) for number in (effort_limit, set_point, *numbers))
+        self.numbers = tuple(float(number) for number in (self.effort_limit, self.set_point, *numbers))
         self._at_first = [float(value) for value in memory]
         self.memory = list(self._at_first)
 
@@ -181,6 +188,8 @@ class LawController(BaseController):
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the torque [N m] that the law has for the state."""
+        if self.law is None:
+            return super().command(t, x)
         return self.law(t, x[0], x[1], self.memory, self.numbers)
 
 
@@ -311,7 +320,7 @@ def controller_parameters(name: str, plant: AnyPlant | None = None) -> tuple[Par
         plant: The plant that it is for, on which defaults may depend; None for any of one joint.
     """
     kind = controller_class(name, plant)
-    own = kind.PARAMETERS if plant is None else kind.parameters(plant)
+    own = kind.parameters(plant)
     common = (START_TIME,) if isinstance(plant, MechanismParameters) else COMMON_PARAMETERS
     names = {spec.name for spec in own}
     return (*(spec for spec in common if spec.name not in names), *own)

@@ -56,7 +56,7 @@ class Controller:
 
     @classmethod
     def parameters(cls, plant: Any) -> tuple[ParameterSpec, ...]:
-        """Return what can be set, with defaults for a plant; ``PARAMETERS`` by default."""
+        """Return what can be set, with defaults for a plant, None for any of one joint; ``PARAMETERS`` by default."""
         return cls.PARAMETERS
 
     @classmethod

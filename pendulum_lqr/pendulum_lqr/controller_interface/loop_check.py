@@ -17,6 +17,7 @@ from pendulum_lqr.linear.design import DesignError, Gain, output_lqr
 from pendulum_lqr.linear.model import RigidPlant, linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["growth", "require_settling", "require_stable", "settles", "settling_lqr"]
@@ -109,9 +110,14 @@ def require_stable(name: str, controller: Controller, plant: RigidPlant, period:
 
 
 def require_settling(
-    name: str, plant: RigidPlant | MechanismParameters, feedback: Feedback, period: float, remedy: str
+    name: str,
+    plant: RigidPlant | MechanismParameters,
+    feedback: Feedback,
+    period: float,
+    remedy: str,
+    position: Vector | None = None,
 ) -> None:
-    """Refuse a gain whose sampled loop with the plant about upright grows, lags and delay included.
+    """Refuse a gain whose sampled loop with the plant grows, lags and delay included.
 
     Args:
         name: Of the controller.
@@ -119,11 +125,12 @@ def require_settling(
         feedback: The gain.
         period: Sampling period [s].
         remedy: What helps.
+        position: About which; None for upright [rad or m].
 
     Raises:
         DesignError: The loop grows.
     """
-    radius = delayed_spectral_radius(linearise(plant), feedback.K, period, summed=feedback.summed)
+    radius = delayed_spectral_radius(linearise(plant, position), feedback.K, period, summed=feedback.summed)
     if radius >= 1.0:
         raise DesignError(
             f"{name} asked every {period:g} s does not settle on plant {getattr(plant, 'name', '')!r}: deviations grow "

@@ -1,24 +1,26 @@
-"""Discrete LQR for the sampled loop, with the inputs that are still on their way as states."""
+"""Discrete LQR of any number of joints for the sampled loop, with the efforts that are on their way as states."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, MutableSequence, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pendulum_lqr.controller_interface.controller import LawController
-from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.interface import AnyPlant, Controller
 from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
-from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, Q, R
-from pendulum_lqr.linear.design import DesignError, Gain
-from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.controllers.linear_feedback import LinearFeedback
+from pendulum_lqr.controllers.specs import DELAY
+from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.linear.observer import Observer
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
-from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["DiscreteLqr", "discrete_lqr_law"]
+__all__ = ["DiscreteLqr", "SampledFeedback", "discrete_lqr_law"]
+
+Array = NDArray[np.float64]
 
 _MOST_PENDING = 100
 _HOLD, _EQUILIBRIUM, _K0, _K1, _LAGS, _LAG_GAIN, _LAG_SHARE, _SENT_SHARE, _ON_THEIR_WAY, _PENDING_GAIN = range(
@@ -26,6 +28,58 @@ _HOLD, _EQUILIBRIUM, _K0, _K1, _LAGS, _LAG_GAIN, _LAG_SHARE, _SENT_SHARE, _ON_TH
 )
 _PENDING_SHARE = _PENDING_GAIN + _MOST_PENDING
 _LAGGED, _PENDING = range(2)
+
+
+class SampledFeedback(LinearFeedback):
+    """Feedback of the sampled model's state: of what is measured, of what is hidden, and of efforts on their way.
+
+    What is on its way, and what has come of it behind a lag, follows from what was sent, limits included.
+
+    Attributes:
+        observer: Estimates the state; None where it is measured, and nothing is on its way.
+    """
+
+    PREDICTS = True
+    SETTLES_BY = "the loop is predicted"
+    NOISE: ClassVar[Mapping[str, Any]] = {}
+    """What the estimate expects of noise, where no parameter says so; empty to take what is measured as it is."""
+
+    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
+        self.sampled = discretise(self.model, period, p["delay"])
+        self.cost = sampled_cost(self.model, p["q"], p["r"], period, p["delay"])
+        weights = (p["q"], p["r"]) if p.get("cost") == "sum" else self.cost
+        self.gain = discrete_lqr(self.sampled, *weights)
+        self.observer = self._make_observer(p)
+
+    def _make_observer(self, p: Mapping[str, Any]) -> Observer | None:
+        return Observer(self.model, self._plant.coordinates, self.period, {**p, **self.NOISE})
+
+    def reset(self) -> None:
+        """Forget the estimate."""
+        super().reset()
+        if self.observer is not None:
+            self.observer.reset()
+
+    def _answer(self, off: Vector, velocity: Vector) -> Vector:
+        if self.observer is None:
+            return self._within(self.hold + self._beyond(np.array([*off, *velocity]), self.hold))
+        state = self.observer.correct(off, velocity)
+        held = self.hold - self.observer.offsets
+        efforts = self._within(held + self._beyond(state, held))
+        self.observer.predict(efforts)
+        return efforts
+
+    def _beyond(self, state: Array, held: Array) -> Array:
+        """Return the efforts beyond those that hold, for a state of the sampled model, limits left out, shape (m,)."""
+        return -np.atleast_1d(self.gain.K @ state)
+
+    def take_over(self, previous: Controller) -> None:
+        """Take over the estimate, moved to the new set-point."""
+        if not isinstance(previous, SampledFeedback) or previous.period != self.period:
+            return
+        if self.observer is not None and previous.observer is not None:
+            self.observer.carry_over(previous.observer)
 
 
 def discrete_lqr_law(
@@ -57,59 +111,49 @@ def discrete_lqr_law(
     return effort
 
 
-class DiscreteLqr(LawController):
-    """Discrete LQR with delay compensation: u = u* - K [x - x*; lagged torque; torques on their way, oldest first]."""
+class DiscreteLqr(SampledFeedback):
+    """Discrete LQR with delay compensation: u = u* - K [x - x*; lagged; on their way, oldest first], held."""
 
-    PREDICTS = True
-    BALANCES = True
-    SUMMARY = "discrete LQR for zero-order hold, with compensation of a known delay"
-    PARAMETERS = (
-        Q,
-        R,
-        DELAY,
-        ParameterSpec(
-            "cost",
-            "sampled",
-            "",
-            "sampled: the continuous cost collected over each period; sum: the cost at the samples alone.",
-            choices=("sampled", "sum"),
-        ),
-        FEEDFORWARD,
-    )
+    SUMMARY = "discrete LQR for zero-order hold, with compensation of lag and delay"
 
-    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
-        linear = linearise(plant, UPRIGHT + p["set_point"])
-        if plant.drivetrain is not None:
+    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
+        if (motor := "motor_angle") in self.model.states:
             raise DesignError(
-                f"plant {plant.name!r} is series elastic, and {' and '.join(linear.hidden)} not measured; expected a "
-                "rigid plant: use lqg, which estimates them, or lqr, whose gain does without"
+                f"plant {plant.name!r} is series elastic, and {' and '.join(self.model.hidden)} not measured; expected "
+                f"a rigid plant, without {motor}: use lqg, which estimates them, or lqr, whose gain does without"
             )
-        delay = p["delay"] + plant.transport_delay
-        if delay > _MOST_PENDING * period:
-            raise DesignError(f"delay is {delay} s at a period of {period} s; expected at most {_MOST_PENDING} periods")
-        model = discretise(linear, period, p["delay"])
-        cost = sampled_cost(linear, p["q"], p["r"], period, p["delay"])
-        self.gain: Gain = discrete_lqr(model, *((p["q"], p["r"]) if p["cost"] == "sum" else cost))
-        K, pending = self.gain.K, model.pending
-        self.hold = linear.effort if p["feedforward"] else 0.0
-        lags = model.A.shape[0] - pending > 2
-        lag_gain, lag_share, sent_share = (K[2], model.A[2, 2], model.B[2, 0]) if lags else (0.0, 0.0, 0.0)
+        if len(self.position) > 1:
+            return
+        if self.sampled.pending > _MOST_PENDING:
+            raise DesignError(
+                f"delay is {self.sampled.delay} s at a period of {period} s; expected at most {_MOST_PENDING} periods"
+            )
+        A, B, K, pending = self.sampled.A, self.sampled.B, self.gain.K, self.sampled.pending
+        equilibrium = self.equilibrium[0]
+        lags = A.shape[0] - pending > 2
+        lag_gain, lag_share, sent_share = (K[2], A[2, 2], B[2, 0]) if lags else (0.0, 0.0, 0.0)
         unused = [0.0] * (_MOST_PENDING - pending)
-        shares = model.A[2, 3:] if lags else np.zeros(pending)
-        numbers = (self.hold, linear.effort, K[0], K[1], lags, lag_gain, lag_share, sent_share, pending)
+        shares = A[2, 3:] if lags else np.zeros(pending)
+        numbers = (self.hold[0], equilibrium, K[0], K[1], lags, lag_gain, lag_share, sent_share, pending)
         weights = (*K[len(K) - pending :], *unused, *shares, *unused)
         # No torque in the lag and none on its way.
-        at_first = [-linear.effort] * (1 + pending)
-        super().__init__(discrete_lqr_law, p["effort_limit"], p["set_point"], (*numbers, *weights), at_first)
+        self._be_law(discrete_lqr_law, (*numbers, *weights), [-equilibrium] * (1 + pending))
+
+    @classmethod
+    def own(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+        """Return delay and kind of cost."""
+        meaning = "sampled: the continuous cost collected over each period; sum: the cost at the samples alone."
+        return (DELAY, ParameterSpec("cost", "sampled", "", meaning, choices=("sampled", "sum")))
 
     def describe(self) -> str:
-        """Return the gain."""
-        gains = ", ".join(f"{value:.6f}" for value in self.gain.K)
-        return f"K = [{gains}], {len(self.memory) - _PENDING} torques on their way"
+        """Return gain and efforts on their way."""
+        return f"{super().describe()}, {self.sampled.pending} efforts on their way"
 
     def take_over(self, previous: Controller) -> None:
-        """Take over the torques on their way."""
-        if isinstance(previous, DiscreteLqr):
+        """Take over the efforts on their way."""
+        super().take_over(previous)
+        if isinstance(previous, DiscreteLqr) and self.law is not None is not previous.law:
             shift = previous.numbers[_EQUILIBRIUM] - self.numbers[_EQUILIBRIUM]
             lagged, *pending = (effort + shift for effort in previous.memory)
             self.memory[_LAGGED] = lagged

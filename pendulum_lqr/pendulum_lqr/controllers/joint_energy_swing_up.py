@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from pendulum_lqr.controller_interface.interface import Controller
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, require_catching
+from pendulum_lqr.controllers.linear_feedback import JOINT_LIMIT, joint_limits, require_catching
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.swing_up.energy_margin import EnergyMargin

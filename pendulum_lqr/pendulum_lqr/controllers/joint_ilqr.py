@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits
 from pendulum_lqr.controllers.joint_swing_up import JointSwingUp
+from pendulum_lqr.controllers.linear_feedback import JOINT_LIMIT, joint_limits
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, make_mechanism_catch
 from pendulum_lqr.swing_up.mechanism_ilqr import IlqrWeights
 from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory, SwingUpSearch, cheapest_swing_up

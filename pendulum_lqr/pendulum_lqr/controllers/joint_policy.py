@@ -15,7 +15,7 @@ from pendulum_lqr.controller_interface.policy_answers import (
     policy_specs,
     states_to_hold,
 )
-from pendulum_lqr.controllers.joint_lqr import JOINT_LIMIT, joint_limits, require_catching
+from pendulum_lqr.controllers.linear_feedback import JOINT_LIMIT, joint_limits, require_catching
 from pendulum_lqr.policies.policy import Policy, require_plant
 from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controller_interface.sampling import require_period
-from pendulum_lqr.controllers.joint_lqr import require_catching
+from pendulum_lqr.controllers.linear_feedback import require_catching
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
 from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
 from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory, load_trajectory

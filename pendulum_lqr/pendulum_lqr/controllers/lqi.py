@@ -1,20 +1,20 @@
-"""LQR with an integral of the angle: no offset under a constant torque."""
+"""LQR with integrals of the driven joints: no offset of theirs under a constant effort."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any
 
-from pendulum_lqr.controller_interface.controller import LawController
-from pendulum_lqr.controller_interface.interface import Controller
+import numpy as np
+
+from pendulum_lqr.controller_interface.interface import AnyPlant, Controller
 from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation, winds_up
-from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
+from pendulum_lqr.controllers.linear_feedback import LinearFeedback
 from pendulum_lqr.linear.analysis import Feedback
-from pendulum_lqr.linear.design import Gain, output_lqr, with_integrals
-from pendulum_lqr.linear.model import linearise
-from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_lqr.linear.design import output_lqr, with_integrals
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["Lqi", "lqi_law"]
 
@@ -38,40 +38,50 @@ def lqi_law(
     return effort
 
 
-class Lqi(LawController):
-    """LQI: u = u* - K [theta - theta*, theta_dot, integral of (theta - theta*)].
+class Lqi(LinearFeedback):
+    """LQI: u = u* - K [q - q*, v, integrals of the driven joints' q - q*].
 
-    The integral does not wind up at the torque limit: :func:`~pendulum_lqr.controller_interface.law.winds_up`.
+    As many outputs as there are efforts can be brought to where they belong, whatever constant effort disturbs: those
+    of the driven joints. None winds up while its joint's effort is at its limit:
+    :func:`~pendulum_lqr.controller_interface.law.winds_up`.
     """
 
-    BALANCES = True
-    SUMMARY = "LQR with an integral state: no offset under a constant torque"
-    PARAMETERS = (
-        Q,
-        ParameterSpec(
-            "q_integral",
-            100.0,
-            "1/(rad s)^2",
-            "Weight of the integral of the angle.",
-            minimum=0.0,
-            exclusive_minimum=True,
-        ),
-        R,
-        FEEDFORWARD,
-    )
+    SETTLES_BY = "it is integrated"
+    SUMMARY = "LQR with an integral of each driven joint: no offset of theirs under a constant effort"
 
-    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
-        model = linearise(plant, UPRIGHT + p["set_point"])
-        self.gain: Gain = output_lqr(with_integrals(model), [*p["q"], p["q_integral"]], p["r"])
-        self.feedback = Feedback(self.gain.K * (1.0, 1.0, period), (0,))
-        hold = model.effort if p["feedforward"] else 0.0
-        super().__init__(lqi_law, p["effort_limit"], p["set_point"], (hold, *self.gain.K, period), (0.0,))
+    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
+        self._driven = list(plant.coordinates.driven)
+        weights = [*p["q"], *(p["q_integral"],) * len(self._driven)]
+        self.gain = output_lqr(with_integrals(self.model, self._driven), weights, p["r"])
+        k = self.gain.rows.shape[1] - len(self._driven)
+        self._K, self._KI = self.gain.rows[:, :k], self.gain.rows[:, k:]
+        self.feedback = self._feedback(period)
+        numbers = (self.hold[0], *self.gain.rows[0, :2], self._KI[0, 0], period)
+        self._be_law(lqi_law, numbers, (0.0,) * len(self._driven))
 
-    def describe(self) -> str:
-        """Return the gain."""
-        return f"K = [{', '.join(f'{value:.6f}' for value in self.gain.K)}]"
+    @classmethod
+    def own(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+        """Return the weight of the integrals."""
+        several = isinstance(plant, MechanismParameters)
+        default, unit, whose = (10.0, "", "each driven joint's deviation") if several else (
+            100.0, "1/(rad s)^2", "the angle")  # fmt: skip
+        meaning = f"Weight of the integral of {whose}."
+        return (ParameterSpec("q_integral", default, unit, meaning, minimum=0.0, exclusive_minimum=True),)
+
+    def _feedback(self, period: float) -> Feedback:
+        return Feedback(np.hstack([self._K, period * self._KI]), tuple(self._driven))
+
+    def _answer(self, off: Vector, velocity: Vector) -> Vector:
+        error = np.array([off[joint] for joint in self._driven])
+        integral = np.array(self.memory) + self.period * error
+        wanted = self.hold - self._K @ [*off, *velocity] - self._KI @ integral
+        efforts = self._within(wanted)
+        stands = list(map(winds_up, -np.diag(self._KI) * error, wanted, efforts))
+        self.memory = np.where(stands, self.memory, integral).tolist()
+        return efforts
 
     def take_over(self, previous: Controller) -> None:
-        """Keep the torque that the integral stands for, though the gain on it has changed."""
+        """Keep the efforts that the integrals stand for, though the gain on them has changed."""
         if isinstance(previous, Lqi):
-            self.memory[_INTEGRAL] = previous.memory[_INTEGRAL] * previous.numbers[_KI] / self.numbers[_KI]
+            self.memory[:] = np.linalg.solve(self._KI, previous._KI @ previous.memory).tolist()

@@ -1,19 +1,16 @@
-"""Linear quadratic regulator: u = u* - K (x - x*)."""
+"""Linear quadratic regulator of any number of joints: u = u* - K (x - x*)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, MutableSequence, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
-from pendulum_lqr.controller_interface.controller import LawController
+from pendulum_lqr.controller_interface.interface import AnyPlant
 from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
-from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
+from pendulum_lqr.controllers.linear_feedback import LinearFeedback
 from pendulum_lqr.linear.analysis import Feedback
-from pendulum_lqr.linear.design import Gain, output_lqr
-from pendulum_lqr.linear.model import linearise
-from pendulum_msgs_py.contract.angles import UPRIGHT
-from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_lqr.linear.design import output_lqr
+from pendulum_msgs_py.contract.joints import Vector
 
 __all__ = ["Lqr", "lqr_law"]
 
@@ -28,25 +25,32 @@ def lqr_law(
     return clamped(numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity, numbers[EFFORT_LIMIT])
 
 
-class Lqr(LawController):
-    """Continuous LQR, sampled: the controller of the thesis.
+class Lqr(LinearFeedback):
+    """Continuous LQR, sampled: of one joint the controller of the thesis.
 
-    Where the plant has states that are not measured, K is the best gain on angle and velocity.
+    Where the plant has states that are not measured, K is the best gain on positions and velocities.
     """
 
     SAMPLED = False
-    BALANCES = True
     SUMMARY = "linear quadratic regulator of the thesis, u = u* - K (x - x*)"
-    PARAMETERS: ClassVar[tuple[ParameterSpec, ...]] = (Q, R, FEEDFORWARD)
 
-    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
-        model = linearise(plant, UPRIGHT + p["set_point"])
-        self.gain: Gain = output_lqr(model, p["q"], p["r"])
+    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+        super().__init__(plant, period, p)
+        self.gain = output_lqr(self.model, p["q"], p["r"])
         self.feedback = Feedback(self.gain.K)
-        hold = model.effort if p["feedforward"] else 0.0
-        super().__init__(lqr_law, p["effort_limit"], p["set_point"], (hold, *self.gain.K))
+        self._be_law(lqr_law, (self.hold[0], *self.gain.rows[0]))
+        # Plain floats: indexing an array on every state costs more than the law itself.
+        self._rows = tuple(tuple(map(float, row)) for row in self.gain.rows)
+        self._hold = tuple(map(float, self.hold))
+
+    def _answer(self, off: Vector, velocity: Vector) -> Vector:
+        x = off + velocity
+        return self._within(
+            hold - sum(k * value for k, value in zip(row, x, strict=True))
+            for row, hold in zip(self._rows, self._hold, strict=True)
+        )
 
     def describe(self) -> str:
         """Return gain and poles."""
         poles = ", ".join(f"{pole:.4g}" for pole in self.gain.poles)
-        return f"K = [{self.gain.K[0]:.6f}, {self.gain.K[1]:.6f}], poles {poles} 1/s"
+        return f"{super().describe()}, poles {poles} 1/s"

@@ -1,83 +1,147 @@
-"""Linear MPC: LQR under limits, as a quadratic program by OSQP."""
+"""Linear MPC: LQR under limits, as a quadratic program by OSQP; of any number of joints."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pendulum_lqr.controllers.lqg import Lqg
-from pendulum_lqr.controllers.specs import DELAY, FEEDFORWARD, OFFSET_NOISE, Q, R
+from pendulum_lqr.controller_interface.interface import AnyPlant
+from pendulum_lqr.controllers.discrete_lqr import SampledFeedback
+from pendulum_lqr.controllers.linear_feedback import gain_text
+from pendulum_lqr.controllers.specs import DELAY, OFFSET_NOISE
 from pendulum_lqr.linear.condensed_mpc import CondensedMpc
-from pendulum_lqr.linear.design import DesignError, Matrix
-from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.linear.observer import Observer
+from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
 __all__ = ["LinearMpc"]
 
+Array = NDArray[np.float64]
+
 _SLACK_WEIGHT = 1e4
-"""Cost high enough that angle and velocity stay within their limits wherever a torque can achieve that."""
-_NOISE = {"angle_noise": 2e-4, "velocity_noise": 1e-2, "torque_noise": 1.0}
-"""What the filter expects of encoder, velocity and unknown torque [rad, rad/s, N m]."""
+"""Cost high enough that an angle and its velocity stay within their limits wherever a torque can achieve that."""
+_DEAR = 10.0
+"""Cost of a position of several beyond its limit, in the largest weight of a deviation: a pole must not fall for a
+track's end."""
+_KEPT_CLEAR = 0.95
+"""Share of the way to an end stop that a plan may use."""
+_NOISE = {"position_noise": 2e-4, "velocity_noise": 1e-2, "effort_noise": 1.0}
+"""What the filter expects of encoder, velocity and unknown effort [rad, rad/s, N m]."""
 
 
-class LinearMpc(Lqg):
-    """Minimises the LQR's cost over N samples plus its cost to go, under limits of torque, angle and velocity.
+class LinearMpc(SampledFeedback):
+    """Minimises the LQR's cost over N samples plus its cost to go, under limits of efforts and states.
 
-    The prediction is that of the whole linear model, torques on their way included; what is not measured, and with
-    ``offset_noise`` a constant torque too, comes from a Kalman filter.
-    Without active limits the command is that of the discrete LQR. The torque limit is hard; angle and velocity limits
-    are soft (one slack each, at a high cost): a hard state limit is infeasible once a disturbance has broken it.
+    The prediction is that of the whole linear model, efforts on their way included. Of one joint what is not measured
+    comes from a Kalman filter, of several it is predicted; with ``offset_noise`` constant efforts are estimated, too.
+    Without active limits the command is that of the discrete LQR. Limits of efforts are hard; those of states are soft
+    (one slack each, at a high cost): a hard state limit is infeasible once a disturbance has broken it.
     """
 
-    SUMMARY = "linear MPC with limits of torque, angle and velocity (OSQP)"
-    PARAMETERS = (
-        Q,
-        R,
-        ParameterSpec("horizon", 20, "-", "Samples of the horizon.", minimum=1, maximum=200),
-        ParameterSpec("angle_limit", 0.5, "rad", "Largest deviation from the set-point; 0 for none.", minimum=0.0),
-        ParameterSpec("velocity_limit", 0.0, "rad/s", "Largest velocity; 0 for none.", minimum=0.0),
-        OFFSET_NOISE,
-        DELAY,
-        FEEDFORWARD,
-    )
+    SUMMARY = "linear MPC with limits of efforts and states (OSQP)"
 
-    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(plant, period, p)
-        self._failures = 0
-        if abs(self.hold) >= self.effort_limit:
-            raise DesignError(
-                f"holding set_point {self.set_point} rad takes {self.hold:.4g} N m; expected less than effort_limit "
-                f"= {self.effort_limit:g} N m"
+        self.failures = 0
+        for name, hold, limit in zip(plant.coordinates.driven_names, self.hold, self.effort_limits, strict=True):
+            if abs(hold) >= limit:
+                raise DesignError(
+                    f"holding set_point {self._offsets[0] if len(self._offsets) == 1 else list(self._offsets)} takes "
+                    f"{hold:.4g} N m at {name}; expected less than effort_limit = {limit:g} N m"
+                )
+        one = "position_limits" not in p
+        widths = [p["angle_limit"], p["velocity_limit"]] if one else p["position_limits"]
+        if not one and len(widths) != len(self.position):
+            raise ParameterError(
+                f"position_limits has {len(widths)} values; expected {len(self.position)}, for "
+                f"{', '.join(plant.coordinates.names)}"
             )
-        limits = {axis: p[name] for axis, name in enumerate(("angle_limit", "velocity_limit")) if p[name]}
+        self._widths = widths
+        limits = {axis: width for axis, width in enumerate(widths) if width}
+        slack = _SLACK_WEIGHT if one else _DEAR * max(p["q"])
         self._program = CondensedMpc(
-            self._sampled, self.gain, self._cost[1], int(p["horizon"]), limits, (self.effort_limit,), _SLACK_WEIGHT
+            self.sampled, self.gain, self.cost[1], int(p["horizon"]), limits, self.effort_limits, slack
+        )
+        self._enough = _enough_samples(self.sampled.A) if limits and not one else 0
+        self._warn()
+
+    def _make_observer(self, p: Mapping[str, Any]) -> Observer | None:
+        if isinstance(self._plant, MechanismParameters):
+            return super()._make_observer({**p, **_NOISE} if p["offset_noise"] > 0.0 else p)
+        # Measured states need no filter: what they show is then what counts.
+        needed = self.model.hidden or self.sampled.pending or p["offset_noise"] > 0.0
+        return super()._make_observer({**p, **_NOISE}) if needed else None
+
+    @classmethod
+    def own(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+        """Return horizon, limits of states, where the plant has end stops by default, and what is estimated."""
+        if not isinstance(plant, MechanismParameters):
+            return (
+                ParameterSpec("horizon", 20, "-", "Samples of the horizon.", minimum=1, maximum=200),
+                ParameterSpec("angle_limit", 0.5, "rad", "Largest deviation from the set-point; 0 for none.",
+                              minimum=0.0),
+                ParameterSpec("velocity_limit", 0.0, "rad/s", "Largest velocity; 0 for none.", minimum=0.0),
+                OFFSET_NOISE,
+                DELAY,
+            )  # fmt: skip
+        meaning = f"Largest deviations of {', '.join(plant.coordinates.names)} from the set-point; 0 for none."
+        return (
+            ParameterSpec("horizon", 50, "-", "Samples of the horizon.", minimum=1, maximum=200),
+            ParameterSpec("position_limits", _within_stops(plant), "", meaning, minimum=0.0),
+            OFFSET_NOISE,
+            DELAY,
         )
 
-    def _make_observer(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> Observer | None:
-        # Measured states need no filter: what they show is then what counts.
-        needed = model.hidden or self._sampled.pending or p["offset_noise"] > 0.0
-        return super()._make_observer(model, period, {**p, **_NOISE}) if needed else None
+    def _warn(self) -> None:
+        """Note that the horizon is too short, and how often the solver found no plan."""
+        notices = []
+        if self._program.horizon < self._enough:
+            notices.append(
+                f"it looks {self._program.horizon * self.period:g} s ahead, and to keep clear of a limit it may let "
+                f"fall what falls later; expected a horizon of {self._enough} samples or more, or a slower plant"
+            )
+        if self.failures:
+            notices.append(f"no plan for {self.failures} states: the LQR answered")
+        self.notice = "; ".join(notices)
 
     def reset(self) -> None:
         """Forget the estimate and the plan."""
         super().reset()
         self._program.reset()
 
-    def _beyond(self, state: Matrix, held: float) -> float:
-        """Return the first torque of the plan, beyond what holds; the LQR's where the solver finds none [N m]."""
-        plan = self._program.first(state, np.array([-self.effort_limit - held]), np.array([self.effort_limit - held]))
+    def _beyond(self, state: Array, held: Array) -> Array:
+        """Return the first efforts of the plan; the LQR's where the solver finds none."""
+        limits = np.array(self.effort_limits)
+        plan = self._program.first(state, -limits - held, limits - held)
         if plan is None:
-            self._failures += 1
-            self.notice = f"no plan for {self._failures} states: the LQR answered"
+            self.failures += 1
+            self._warn()
             return super()._beyond(state, held)
-        return float(plan[0])
+        return plan
 
     def describe(self) -> str:
-        """Return horizon and unlimited gain."""
-        gain = ", ".join(f"{value:.6f}" for value in self.gain.K)
-        return f"horizon {self._program.horizon}, K without limits [{gain}]"
+        """Return horizon, limits and unlimited gain."""
+        within = ", ".join(f"{width:g}" if width else "none" for width in self._widths)
+        limits = f"positions within [{within}], " if len(self.position) > 1 else ""
+        return f"horizon {self._program.horizon}, {limits}K without limits [{gain_text(self.gain.rows)}]"
+
+
+def _enough_samples(A: Array) -> int:
+    """Return the samples in which what falls grows by e: behind a shorter horizon no limit of an effort is seen."""
+    growth = float(np.max(np.abs(np.linalg.eigvals(A))))
+    return math.floor(1.0 / math.log(growth)) if growth > 1.0 else 0
+
+
+def _within_stops(plant: MechanismParameters) -> list[float]:
+    """Return how far each joint may go from upright to keep clear of its stops; 0 where it has none."""
+    widths = []
+    for goal, joint in zip(plant.coordinates.goal, plant.joints, strict=True):
+        ways = [abs(stop - goal) for stop in (joint.lower_stop, joint.upper_stop) if stop is not None]
+        widths.append(_KEPT_CLEAR * min(ways) if ways else 0.0)
+    return widths

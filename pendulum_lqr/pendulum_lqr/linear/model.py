@@ -84,7 +84,7 @@ class LinearModel:
         states: Names of the states: theta, theta_dot, then motor_angle and motor_velocity (at the output side of the
             gears) of a series-elastic plant, then torque, the lagged command, of a plant with a lag. Of a mechanism
             the joints, their velocities (``JOINT_dot``), then the lagged efforts (``JOINT_effort``).
-        position: The fixed point of a mechanism, one value for each joint [rad or m].
+        position: The fixed point, one value for each joint [rad or m].
         efforts: The m efforts that hold it [N m or N].
     """
 
@@ -187,10 +187,10 @@ def linearise(plant: RigidPlant | MechanismParameters, at: float | Sequence[floa
         position = _checked_position(plant, at)
         body, theta = _mechanism_body(plant, position), position[-1]
     else:
-        theta = UPRIGHT if at is None else float(at)  # type: ignore[arg-type]
+        theta = UPRIGHT if at is None else float(np.ravel(at)[0])
         if not math.isfinite(theta):
             raise ParameterError(f"theta of the fixed point is {theta} rad; expected a finite angle")
-        body = _pendulum_body(plant, theta)
+        body, position = _pendulum_body(plant, theta), (theta,)
     lagging = [index for index, lag in enumerate(body.lags) if lag > 0.0]
     size, m = len(body.states), len(body.efforts)
     n = size + len(lagging)

@@ -1,9 +1,11 @@
-"""Estimates of what is not measured: motor, spring and lag, and an unknown constant torque.
+"""Estimates of what is not measured: motor, spring and lags, and unknown constant efforts; of any number of joints.
 
-A stationary Kalman filter of the sampled linear model. Torques that are on their way are known, since they were sent;
-a constant torque d adds to the command and is modelled as a random walk (disturbance observer):
+A stationary Kalman filter of the sampled linear model. Efforts that are on their way are known, since they were sent;
+constant efforts d add to the commands and are modelled as random walks (disturbance observer):
 
-    x[k+1] = A x[k] + B (u - u* + d),   d[k+1] = d[k] + w,   y = [theta - theta*, theta_dot] + v
+    x[k+1] = A x[k] + B (u - u* + d) + E w[k],   d[k+1] = d[k] + w',   y = [q - q*, v] + noise
+
+with w an unknown effort on every joint, at a driven one added to the command, held for a period.
 """
 
 from __future__ import annotations
@@ -19,114 +21,139 @@ from numpy.typing import NDArray
 from pendulum_lqr.linear.design import kalman_gain
 from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.linear.sampled_design import discretise
-from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.contract.joints import Coordinates, Vector
 
 __all__ = ["Observer"]
 
 Array = NDArray[np.float64]
 
+_FOLLOWS = {"motor_angle": 0, "motor_velocity": 1}
+"""Measured state that a hidden one of a plant at ease follows."""
+
 
 class Observer:
-    """Estimate of deviations from a fixed point: states, torques on their way, constant torque.
+    """Estimate of deviations from a fixed point: states, efforts on their way, constant efforts.
 
     Args:
         model: Linear model at the fixed point.
+        coordinates: Joints, and which of them are driven.
         period: Sampling period [s].
-        p: Checked parameters: standard deviations ``angle_noise`` [rad], ``velocity_noise`` [rad/s], 0 where velocities
-            are not used, and ``torque_noise`` of the unknown torque, held for a period [N m]; ``offset_noise``, how
-            fast the constant torque may wander, 0 for no such torque [N m/s^0.5]; ``delay`` beyond the model's own [s].
+        p: Standard deviations ``position_noise`` [rad or m], ``velocity_noise`` [rad/s or m/s], 0 where velocities are
+            not used, and ``effort_noise`` of the unknown effort on every joint [N m or N]; ``offset_noise``, how fast
+            constant efforts may wander, 0 for none [N m/s^0.5]; ``delay`` beyond the model's own [s]. Without
+            ``position_noise`` what is measured is taken as it is, and the rest is predicted.
+
+    Attributes:
+        gain: L; None where what is measured is taken as it is.
     """
 
-    def __init__(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, model: LinearModel, coordinates: Coordinates, period: float, p: Mapping[str, Any]) -> None:
         sampled = discretise(model, period, p["delay"])
         n = model.A.shape[0]
-        self.model = model
-        self.pending = sampled.pending
-        self._n = n
-        self._hold = model.effort
-        wide = n + (1 if p["offset_noise"] > 0.0 else 0)
-        drive = discretise(replace(model, delay=0.0), period).B[:, 0]
-        A = np.eye(wide)
-        A[:n, :n] = sampled.A[:n, :n]
-        noise = np.zeros((wide, wide))
-        noise[:n, :n] = p["torque_noise"] ** 2 * np.outer(drive, drive)
-        if wide > n:
-            A[:n, n] = drive
-            noise[n, n] = p["offset_noise"] ** 2 * period
-        rows = 1 if p["velocity_noise"] == 0.0 else 2
-        C = np.eye(rows, wide)
-        variances = np.diag([p["angle_noise"] ** 2, p["velocity_noise"] ** 2][:rows])
-        self.gain = kalman_gain(A, C, noise, variances)
-        self._A = A
-        self._on_their_way = sampled.A[:n, n:]
-        self._B = sampled.B[:n, 0]
-        self._rows = rows
-        self._sent: deque[float] = deque(maxlen=self.pending)
+        self.model, self.pending, self._coordinates = model, sampled.pending, coordinates
+        self._n, self._joints = n, len(coordinates.joints)
+        self._hold = np.array(model.efforts)
+        self._A, self._on_their_way, self._B = sampled.A[:n, :n], sampled.A[:n, n:], sampled.B[:n]
+        self._rows = 2 * self._joints
+        self.gain: Array | None = None
+        if p.get("position_noise"):
+            self._filter(model, period, p)
+        self._sent: deque[Array] = deque(maxlen=self.pending)
         self.reset()
 
+    def _filter(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> None:
+        n, m = model.B.shape
+        driven = list(self._coordinates.driven)
+        wide = n + (m if p["offset_noise"] > 0.0 else 0)
+        entry = model.E.copy()
+        entry[:, driven] = model.B
+        unknown = discretise(replace(model, B=entry, delay=0.0), period).B
+        A = np.eye(wide)
+        A[:n, :n] = self._A
+        noise = np.zeros((wide, wide))
+        noise[:n, :n] = p["effort_noise"] ** 2 * sum(np.outer(column, column) for column in unknown.T)
+        if wide > n:
+            A[:n, n:] = unknown[:, driven]
+            noise[n:, n:] = p["offset_noise"] ** 2 * period * np.eye(m)
+        if p["velocity_noise"] == 0.0:
+            self._rows = self._joints
+        variances = np.repeat([p["position_noise"] ** 2, p["velocity_noise"] ** 2], self._joints)[: self._rows]
+        self.gain = kalman_gain(A, np.eye(self._rows, wide), noise, np.diag(variances)).L
+        self._A = A
+
     def reset(self) -> None:
-        """Forget everything: no torque is on its way."""
+        """Forget everything: no effort is on its way."""
         self._estimate: Array | None = None
-        self._sent.extend([0.0] * self.pending)
+        self._sent.extend([np.zeros(len(self._hold))] * self.pending)
 
     @property
-    def offset(self) -> float:
-        """Estimate of the constant torque [N m]."""
-        return 0.0 if self._estimate is None or self._estimate.size == self._n else float(self._estimate[-1])
+    def offsets(self) -> Array:
+        """Estimates of the m constant efforts [N m or N]."""
+        if self._estimate is None or self._estimate.size == self._n:
+            return np.zeros(len(self._hold))
+        return self._estimate[self._n :]
 
-    def correct(self, angle: float, velocity: float) -> Array:
-        """Take a measurement and return [x; torques on their way], as the gain of a design needs it, shape (n + m,).
+    def correct(self, off: Vector, velocity: Vector) -> Array:
+        """Take a measurement and return [x; efforts on their way], as the gain of a design needs it, shape (n + p m,).
 
-        Torques are relative: the deviation from the holding torque, the constant torque included.
+        Efforts are relative: the deviation from those that hold, the constant ones included.
 
         Args:
-            angle: Measured deviation from the fixed point [rad].
-            velocity: Measured velocity [rad/s]; the first one is always used.
+            off: Measured deviations from the fixed point [rad or m].
+            velocity: Measured velocities [rad/s or m/s]; the first ones are always used.
         """
+        measured = np.array([*off, *velocity])
         if self._estimate is None:
-            estimate = np.zeros(self._A.shape[0])
-            follows = {"theta": angle, "theta_dot": velocity, "motor_angle": angle, "motor_velocity": velocity}
-            estimate[: self._n] = [follows.get(name, -self._hold) for name in self.model.states]
+            estimate = np.zeros(len(self._A))
+            estimate[: measured.size] = measured
+            for index, name in enumerate(self.model.hidden, start=measured.size):
+                estimate[index] = measured[_FOLLOWS[name]] if name in _FOLLOWS else -self._held_by(name)
+        elif self.gain is None:
+            estimate = self._estimate.copy()
+            estimate[: measured.size] = measured
         else:
-            innovation = np.array([wrap(angle - float(self._estimate[0])), velocity - float(self._estimate[1])])
-            estimate = self._estimate + self.gain.L @ innovation[: self._rows]
+            innovation = measured - self._estimate[: measured.size]
+            before = self._estimate[: self._joints].tolist()
+            innovation[: self._joints] = self._coordinates.deviation(off, before)
+            estimate = self._estimate + self.gain @ innovation[: self._rows]
         self._estimate = estimate
-        moving = np.array(self._sent) - self._hold + self.offset
+        moving = (np.array(self._sent).reshape(-1, len(self._hold)) - self._hold + self.offsets).ravel()
         return np.concatenate([estimate[: self._n], moving])
 
-    def predict(self, effort: float) -> None:
-        """Move on by a period in which a torque was sent [N m]."""
+    def predict(self, efforts: Vector) -> None:
+        """Move on by a period in which m efforts were sent [N m or N]."""
         assert self._estimate is not None
+        sent = np.array(efforts)
         estimate = self._A @ self._estimate
-        estimate[: self._n] += self._on_their_way @ (np.array(self._sent) - self._hold) + self._B * (
-            effort - self._hold
-        )
-        self._estimate = estimate
-        self._sent.append(effort)
+        moving = (np.array(self._sent).reshape(-1, len(self._hold)) - self._hold).ravel()
+        estimate[: self._n] += self._on_their_way @ moving + self._B @ (sent - self._hold)
+        # What was measured beyond all bounds once must not be remembered for ever.
+        self._estimate = estimate if np.isfinite(estimate).all() else None
+        self._sent.append(sent)
 
-    def carry_over(self, previous: Observer, shift: float) -> None:
-        """Take over the estimate of another observer of the same plant.
-
-        Args:
-            previous: The other.
-            shift: How far this fixed point lies from that one [rad].
-        """
+    def carry_over(self, previous: Observer) -> None:
+        """Take over the estimate of another observer of the same plant, about its own fixed point."""
         if previous._estimate is None or previous._n != self._n:
             return
-        estimate = np.zeros(self._A.shape[0])
+        estimate = np.zeros(len(self._A))
         estimate[: self._n] = previous._estimate[: self._n]
-        for index, name in enumerate(self.model.states):
-            if name in {"theta", "motor_angle"}:
-                estimate[index] -= shift
-            elif name == "torque":
-                estimate[index] += previous._hold - self._hold
-        estimate[0] = wrap(estimate[0])
+        here, there = self.model.position, previous.model.position
+        estimate[: self._joints] = self._coordinates.deviation(
+            tuple(one + was for one, was in zip(estimate[: self._joints].tolist(), there, strict=True)), here
+        )
+        for index, name in enumerate(self.model.hidden, start=2 * self._joints):
+            if name == "motor_angle":
+                estimate[index] -= here[0] - there[0]
+            elif name not in _FOLLOWS:
+                estimate[index] += previous._held_by(name) - self._held_by(name)
         if estimate.size > self._n:
-            estimate[-1] = previous.offset
+            estimate[self._n :] = previous.offsets
         self._estimate = estimate
-        self._sent.extend([0.0] * self.pending + list(previous._sent))
+        nothing = np.zeros(len(self._hold))
+        self._sent.extend([nothing] * self.pending + list(previous._sent))
 
-    def describe(self) -> str:
-        """Return the filter's gain."""
-        rows = "; ".join(", ".join(f"{value:.6f}" for value in row) for row in self.gain.L.T)
-        return f"L = [{rows}]"
+    def _held_by(self, lagged: str) -> float:
+        """Return the effort that holds at the actuator whose lagged effort is a state of this name [N m or N]."""
+        names = self._coordinates.driven_names
+        joint = lagged.removesuffix("_effort")
+        return float(self._hold[names.index(joint) if joint in names else 0])

@@ -68,16 +68,16 @@ class CompiledController:
         self._answering = answering
         alone = None if controller is None else unwrapped(controller)
         own = law_of(alone)
-        self._law = None if own is None else own.law
+        law = self._law = None if own is None else own.law
         self._lent: LawController | None = None
         self.refusal = refusal
         self.kind: LoopKind | None = None
         if refusal:
             return
-        if own is None:
+        if law is None:
             self.refusal = f"{type(alone or controller).__name__} is no law of numbers"
         else:
-            choice = (f"{own.law.__module__}:{own.law.__name__}",)
+            choice = (f"{law.__module__}:{law.__name__}",)
             self.kind = LoopKind(ANSWERING, "pendulum_lqr.nodes.controller_kernel:law_loop", choice)
 
     def lend(self, own: Any) -> bool:
@@ -136,7 +136,11 @@ class CompiledController:
 
 def law_of(controller: object) -> LawController | None:
     """Return a controller that is its law, and nothing else; None for any other."""
-    if not isinstance(controller, LawController) or type(controller).command is not LawController.command:
+    if (
+        not isinstance(controller, LawController)
+        or controller.law is None
+        or type(controller).command is not LawController.command
+    ):
         return None
     fits = len(controller.numbers) <= MOST_NUMBERS and len(controller.memory) <= MOST_MEMORY
     return controller if fits else None

@@ -1,0 +1,162 @@
+"""Linear feedback about a fixed point, of any number of joints: what LQR, LQI, discrete LQR, LQG and MPC share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_lqr.controller_interface.controller import LawController
+from pendulum_lqr.controller_interface.interface import AnyPlant, Controller
+from pendulum_lqr.controller_interface.law import Law, deviation, within_limits
+from pendulum_lqr.controller_interface.loop_check import require_settling
+from pendulum_lqr.controller_interface.sampling import require_period
+from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
+from pendulum_lqr.linear.analysis import Feedback
+from pendulum_lqr.linear.design import Gain
+from pendulum_lqr.linear.model import linearise
+from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
+from pendulum_msgs_py.contract.joints import Vector
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+
+__all__ = ["JOINT_LIMIT", "LinearFeedback", "gain_text", "joint_limits", "require_catching"]
+
+Array = NDArray[np.float64]
+
+JOINT_LIMIT = ParameterSpec(
+    "effort_limit", 0.0, "N m", "Largest effort of each driven joint; 0 for the plant's own.", minimum=0.0
+)
+"""A limit for all driven joints, in addition to their own."""
+_SMALLER_Q = "a faster plant, or a smaller q"
+
+
+def joint_limits(plant: AnyPlant, limit: float) -> Vector:
+    """Return the largest effort of each driven joint: its own, and the controller's where that is not 0 [N m or N]."""
+    return tuple(min(limit or math.inf, own) for own in plant.effort_limits)
+
+
+def require_catching(controller: str, catch: MechanismCatch, period: float) -> None:
+    """Refuse an LQR that would not hold the plant upright at a period [s], lag and delay included.
+
+    Raises:
+        DesignError: It does not settle.
+    """
+    require_settling(controller, catch.plant, Feedback(catch.gain.K), period, "a faster plant")
+
+
+def gain_text(rows: Array | Iterable[Iterable[float]], digits: str = ".6f") -> str:
+    """Return the rows of a gain for a line of text."""
+    return "; ".join(", ".join(f"{value:{digits}}" for value in row) for row in np.atleast_2d(np.asarray(rows)))
+
+
+class LinearFeedback(LawController):
+    """Feedback of all deviations from a fixed point that the driven joints hold, by the linear model there.
+
+    With one joint it may be a law, which runs compiled; with several it is matrices.
+
+    Args:
+        plant: The plant.
+        period: Sampling period [s].
+        p: Checked parameters.
+
+    Attributes:
+        gain: The gain, which a subclass designs.
+        model: Linear model at the fixed point.
+        hold: The m efforts that are fed forward [N m or N].
+        position: The fixed point, n values [rad or m].
+    """
+
+    BALANCES = True
+    SETTLES_BY: ClassVar[str] = ""
+    """What is done at every state, in refusals of another period; empty where the gain alone must settle."""
+
+    gain: Gain
+
+    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+        Controller.__init__(self, joint_limits(plant, p["effort_limit"]))
+        self._plant, self.period = plant, period
+        self._offsets = tuple(map(float, np.ravel(p["set_point"])))
+        joints = plant.coordinates.joints
+        self.position = tuple(joint.goal + offset for joint, offset in zip(joints, self._offsets, strict=True))
+        self.effort_limit, self.set_point = self.effort_limits[0], self._offsets[0]
+        self.model = linearise(plant, self.position)
+        self.equilibrium = np.array(self.model.efforts)
+        self.hold = self.equilibrium if p["feedforward"] else np.zeros(len(self.equilibrium))
+        self._use(None, ())
+
+    @classmethod
+    def own(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+        """Return the parameters of this controller beyond weights, feed-forward, set-point and limit."""
+        return ()
+
+    @classmethod
+    def parameters(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+        """Return weights, with those of the plant as defaults, what is its own, feed-forward, set-point and limit."""
+        if not isinstance(plant, MechanismParameters):
+            return (Q, R, *cls.own(plant), FEEDFORWARD)
+        q, r = plant.mechanism.weights
+        names = ", ".join(plant.coordinates.names)
+        rest, diagonal = [0.0] * len(plant.joints), f"Diagonal of Q: weights of {names}, then of their velocities."
+        return (
+            ParameterSpec("q", list(q), "", diagonal, minimum=0.0),
+            ParameterSpec("r", r, "", "Weight of each effort, R.", minimum=0.0, exclusive_minimum=True),
+            *cls.own(plant),
+            replace(FEEDFORWARD, description="Whether the efforts that hold the set-point against gravity are added."),
+            ParameterSpec("set_point", rest, "", f"Place to hold, from upright: {plant.coordinates.with_units}."),
+            JOINT_LIMIT,
+        )
+
+    def check(self, period: float) -> None:
+        """Refuse another period than that of the design [s], and one at which the gain does not settle.
+
+        A plant of one joint is judged with all that stands around the controller, by who makes it.
+        """
+        if not isinstance(self._plant, MechanismParameters):
+            return
+        if self.SETTLES_BY:
+            require_period(self.SETTLES_BY, self.period, period)
+        if self.feedback is not None:
+            # Sums of a sample count by the period.
+            name = type(self).__name__.lower()
+            require_settling(name, self._plant, self._feedback(period), period, _SMALLER_Q, self.position)
+
+    def _feedback(self, period: float) -> Feedback:
+        """Return what it is as a gain at a period [s]."""
+        assert self.feedback is not None
+        return self.feedback
+
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return m efforts [N m or N]."""
+        if self.law is not None:
+            return super().efforts(t, position, velocity)
+        return self._answer(self.deviation(position), velocity)
+
+    def deviation(self, position: Vector) -> Vector:
+        """Return n deviations from the fixed point; only what turns is wrapped [rad or m]."""
+        coordinates = self._plant.coordinates
+        return tuple(
+            deviation(one, offset) if joint.turns else one - offset
+            for joint, one, offset in zip(
+                coordinates.joints, coordinates.deviation(position), self._offsets, strict=True
+            )
+        )
+
+    def _answer(self, off: Vector, velocity: Vector) -> Vector:
+        """Return the efforts for n deviations and n velocities, where no law does [N m or N]."""
+        raise NotImplementedError(f"{type(self).__name__}._answer")
+
+    def _within(self, wanted: Iterable[float]) -> Vector:
+        return within_limits(wanted, self.effort_limits)
+
+    def _be_law(self, law: Law, numbers: Iterable[float], memory: Iterable[float] = ()) -> None:
+        """Be a law where the plant has one joint; its memory is that of the matrices, too."""
+        self._use(law if len(self._offsets) == 1 else None, numbers, memory)
+
+    def describe(self) -> str:
+        """Return the gain."""
+        return f"K = [{gain_text(self.gain.rows)}]"
