@@ -175,7 +175,7 @@ def reference() -> str:
     classes = {name: controller_class(name) for name in controller_names()}
     parts.append("## Controllers\n")
     parts += _tables(
-        {name: (own.SUMMARY, table_rows(own.PARAMETERS)) for name, own in classes.items()},
+        {name: (own.SUMMARY, table_rows(own.parameters(None))) for name, own in classes.items()},
         "Shared by several controllers",
     )
     parts.append("## Controllers of several joints\n\nParameters as for the preset `cart_pole`.\n")

@@ -56,7 +56,7 @@ def test_playback_refuses_an_angle_to_hold(playback_file):
 @pytest.mark.parametrize("name", controller_names())
 def test_every_controller_answers_within_its_limit_and_repeats_itself_after_a_reset(name, playback_file):
     controller = design(name, DFKI, playback_file, effort_limit=1.2)
-    assert controller.effort_limit == 1.2
+    assert controller.effort_limits == (1.2,)
     rng = np.random.default_rng(3)
     states = rng.uniform([-math.pi, -8.0], [math.pi, 8.0], (6, 2))
     states[0] = (-math.pi, 0.0)
@@ -316,7 +316,7 @@ def test_playback_without_a_file_is_refused():
         (
             "mpc",
             {"set_point": 1.5, "effort_limit": 1.0},
-            r"holding set_point 1\.5 rad takes .* N m; expected less",
+            r"holding set_point 1\.5 takes .* N m at pendulum_joint; expected less",
         ),
     ],
 )

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.policy import LearnedPolicy
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.policies.policy import Network, fingerprint
@@ -208,7 +209,7 @@ def test_a_network_that_overflows_gives_up_and_never_answers_nan(tmp_path):
     out = np.array([[1.0, -1.0] * 4], dtype=np.float32)
     network = Network((weight, out), (np.zeros(8, dtype=np.float32), np.zeros(1, dtype=np.float32)), "relu", "tanh")
     policy = random_policy(DFKI, history=1)
-    learned = LearnedPolicy(type(policy)(**{**policy.__dict__, "network": network}), 1, 1.5)
+    learned = LearnedPolicy(type(policy)(**{**policy.__dict__, "network": network}), 1, (1.5,))
     assert learned.command(0.0, (0.3, 2.0)) == 0.0
     assert "its network answered" in learned.notice
     with pytest.raises(DataError, match="test vectors come out wrong"):
@@ -221,7 +222,7 @@ def test_a_network_that_overflows_gives_up_and_never_answers_nan(tmp_path):
 )
 @settings(deadline=None, max_examples=50)
 def test_whatever_the_states_the_answer_is_a_torque_within_the_limit(states, seed):
-    learned = LearnedPolicy(random_policy(DFKI, seed=seed, effort_rate=(20.0,)), 1, 1.0)
+    learned = LearnedPolicy(random_policy(DFKI, seed=seed, effort_rate=(20.0,)), 1, (1.0,))
     for k, x in enumerate(states):
         effort = learned.command(0.01 * k, x)
         assert isinstance(effort, float)
@@ -242,9 +243,9 @@ def test_a_change_while_it_runs_does_not_forget_the_past(tmp_path):
 
 def test_a_lower_limit_holds_for_the_answer_that_is_taken_over_too():
     policy = linear_policy(DFKI, 1000.0, 0.0)
-    strong = LearnedPolicy(policy, 5, DFKI.effort_limit, start_time=0.0)
+    strong = LearnedPolicy(policy, 5, DFKI.effort_limits, start_time=0.0)
     assert strong.command(0.0, (1.0, 0.0)) == -DFKI.effort_limit
-    weak, quick = LearnedPolicy(policy, 5, 0.3, start_time=0.0), LearnedPolicy(policy, 1, 1.5, start_time=0.0)
+    weak, quick = LearnedPolicy(policy, 5, (0.3,), start_time=0.0), LearnedPolicy(policy, 1, (1.5,), start_time=0.0)
     for each in (weak, quick):
         each.carry_over(strong)
     assert weak.command(0.002, (1.0, 0.0)) == -0.3
@@ -254,7 +255,7 @@ def test_a_lower_limit_holds_for_the_answer_that_is_taken_over_too():
 
 
 def test_a_fallback_is_reset_and_taken_over_with_its_policy():
-    class Fallback:
+    class Fallback(Controller):
         heard: list[object]
 
         def reset(self):
@@ -263,7 +264,7 @@ def test_a_fallback_is_reset_and_taken_over_with_its_policy():
         def carry_over(self, previous):
             self.heard = [previous]
 
-    first, second = (LearnedPolicy(random_policy(DFKI), 1, 1.5, Fallback()) for _ in range(2))
+    first, second = (LearnedPolicy(random_policy(DFKI), 1, (1.5,), Fallback((1.5,))) for _ in range(2))
     first.reset()
     second.carry_over(first)
     assert first.fallback.heard == ["reset"]
@@ -307,7 +308,7 @@ def test_another_plant_is_refused_with_what_differs(tmp_path, changes, message):
         controller(tmp_path, policy, DFKI.with_values(**changes))
     # Within what was trained, and with a stronger motor, it is the same policy, which keeps its own limit.
     near = controller(tmp_path, policy, DFKI.with_values(gravity=2.3, effort_limit=5.0))
-    assert near.effort_limit == 1.5
+    assert near.effort_limits == (1.5,)
 
 
 @pytest.mark.parametrize(
@@ -363,7 +364,7 @@ _KEYS = sorted(json.loads(np.load(io.BytesIO(entries(GOOD)["header.npy"])).tobyt
 @settings(deadline=None, max_examples=80)
 def test_any_value_in_the_header_is_taken_or_refused_in_a_sentence(key, value):
     back = taken(with_header(GOOD, **{key: value}))
-    assert back is None or math.isfinite(LearnedPolicy(back, 1, 1.5).command(0.0, (0.1, 0.2)))
+    assert back is None or math.isfinite(LearnedPolicy(back, 1, (1.5,)).command(0.0, (0.1, 0.2)))
 
 
 def test_hostile_archives_are_refused_before_they_take_memory():

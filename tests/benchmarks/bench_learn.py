@@ -112,7 +112,7 @@ def _swing_up(out: Path) -> Iterator[Row]:
         for trial in trials[:12]
     )
     yield measured("dfki: largest deviation in 60 s upright, 12 plants off by up to 25 %", worst, "rad", at_most=0.3)
-    controller = LearnedPolicy(policy, 1, policy.effort_limit[0])
+    controller = LearnedPolicy(policy, 1, policy.effort_limit)
     times = np.empty(5000)
     for k in range(times.size):
         x = (0.1 * np.sin(0.1 * k), 0.5 * np.cos(0.1 * k))

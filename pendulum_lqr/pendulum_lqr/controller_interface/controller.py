@@ -81,7 +81,7 @@ CONTROLLERS: dict[str, Row] = {
     "nmpc": Row(f"{_HERE}.nmpc:NonlinearMpc", _RIGID, f"{_HERE}.joint_nmpc:JointNmpc"),
     "sliding_mode": Row(f"{_HERE}.sliding_mode:SlidingMode", _RIGID),
     "playback": Row(f"{_HERE}.playback:Playback"),
-    "policy": Row(f"{_HERE}.policy:LearnedPolicy", several=f"{_HERE}.joint_policy:JointPolicy"),
+    "policy": Row(f"{_HERE}.policy:LearnedPolicy", _ANY),
 }
 """The controllers by name."""
 

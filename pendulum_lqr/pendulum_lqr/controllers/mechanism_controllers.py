@@ -7,8 +7,8 @@ from typing import Any
 
 from pendulum_lqr.controller_interface.interface import Controller, unwrapped
 from pendulum_lqr.controller_interface.policy_answers import check_policy_period, states_to_hold
-from pendulum_lqr.controllers.joint_policy import JointPolicy
 from pendulum_lqr.controllers.linear_feedback import require_catching
+from pendulum_lqr.controllers.policy import LearnedPolicy
 from pendulum_lqr.policies.policy import require_plant
 from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy
 from pendulum_lqr.swing_up.mechanism_catch import make_mechanism_catch
@@ -98,7 +98,7 @@ def make_mechanism_controller(name: str, plant: MechanismParameters, period: flo
         catch = make_mechanism_catch(plant, *CALM_WEIGHTS) if file != name else None
         hold = states_to_hold(policy, period)
         # It has all of its effort from the start.
-        inner = JointPolicy(policy, hold, plant.effort_limits, start_time=0.0, catch=catch)
+        inner = LearnedPolicy(policy, hold, plant.effort_limits, start_time=0.0, catch=catch)
         inner.check(period)
         return inner
     if name not in _CONTROLLERS:

@@ -52,8 +52,8 @@ class LinearMpc(SampledFeedback):
         for name, hold, limit in zip(plant.coordinates.driven_names, self.hold, self.effort_limits, strict=True):
             if abs(hold) >= limit:
                 raise DesignError(
-                    f"holding set_point {self._offsets[0] if len(self._offsets) == 1 else list(self._offsets)} takes "
-                    f"{hold:.4g} N m at {name}; expected less than effort_limit = {limit:g} N m"
+                    f"holding set_point {p['set_point']} takes {hold:.4g} N m at {name}; expected less than "
+                    f"effort_limit = {limit:g} N m"
                 )
         one = "position_limits" not in p
         widths = [p["angle_limit"], p["velocity_limit"]] if one else p["position_limits"]

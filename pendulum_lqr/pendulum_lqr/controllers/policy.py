@@ -1,12 +1,12 @@
-"""A learned policy from a file, with a fallback where it was never trained."""
+"""A learned policy from a file, for a plant of any number of joints, with a fallback where it was never trained."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-from pendulum_lqr.controller_interface.controller import BaseController, make_controller
-from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.controller import make_controller
+from pendulum_lqr.controller_interface.interface import AnyPlant, Controller
 from pendulum_lqr.controller_interface.loop_check import require_stable
 from pendulum_lqr.controller_interface.policy_answers import (
     START_TIME,
@@ -16,77 +16,97 @@ from pendulum_lqr.controller_interface.policy_answers import (
     policy_specs,
     states_to_hold,
 )
+from pendulum_lqr.controllers.linear_feedback import JOINT_LIMIT, joint_limits, require_catching
 from pendulum_lqr.policies.policy import Policy, require_plant
 from pendulum_lqr.policies.policy_file import load_policy
+from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["START_TIME", "LearnedPolicy"]
 
+_LQR = (ZERO, "lqr")
 
-class LearnedPolicy(BaseController):
+
+class LearnedPolicy(Controller):
     """Runs the network of a policy file, at the policy's own period.
 
     Where states come a whole number of times as often as the policy was trained for, each of its commands holds for as
     many states. Outside of the box of states that training visited, or where the network's output is not finite, it
     gives up: the fallback commands from then on, until the next start.
 
-    Its torque, and its fallback's, begins at zero and may reach the limit after ``start_time``: a swing-up from hanging
+    Its efforts, and its fallback's, begin at zero and may reach the limit after ``start_time``: a swing-up from hanging
     needs much at once, which a plant refuses at the start (``start_effort_limit``, arming, position control).
 
     Args:
-        policy: The policy, of one joint.
+        policy: The policy.
         hold: States for which a command holds.
-        effort_limit: Largest torque [N m].
-        fallback: Controller that takes over after it gave up; None for zero torque.
-        start_time: Time from the first state until it has all of its torque [s].
+        effort_limits: Largest effort of each driven joint [N m or N].
+        fallback: Controller that takes over after it gave up; None for no effort.
+        start_time: Time from the first state until it has all of its effort [s].
+        catch: LQR that takes over near upright, of a plant of several joints; None for none.
+        plant: The plant that the fallback is checked with; None for that of the policy.
     """
 
-    STARTS_SOFTLY = True  # it observes its own last torque, so it applies the limit itself
+    STARTS_SOFTLY = True  # it observes its own last effort, so it applies the limit itself
     FEEDBACK = False  # the linear model does not apply: it is checked by what it visited in training
     SUMMARY = "learned policy from a file, with a fallback outside of what it was trained for"
-    PARAMETERS = policy_specs((ZERO, "lqr", "pd_gravity", "energy_swing_up"))
 
     def __init__(
         self,
         policy: Policy,
         hold: int,
-        effort_limit: float,
+        effort_limits: Vector,
         fallback: Controller | None = None,
         *,
         start_time: float = START_TIME,
-        plant: PlantParameters | None = None,
+        catch: MechanismCatch | None = None,
+        plant: AnyPlant | None = None,
     ) -> None:
-        self._answers = PolicyAnswers(policy, hold, (effort_limit,), start_time)
-        super().__init__(self._answers.limits[0])
-        self.policy = policy
-        self.fallback = fallback
-        self.plant: Any = plant or policy.plant
+        self._answers = PolicyAnswers(policy, hold, effort_limits, start_time)
+        super().__init__(self._answers.limits)
+        self.policy, self.fallback, self.catch = policy, fallback, catch
+        self.plant = plant or policy.plant
+        self._deviation = policy.coordinates.deviation
 
     @classmethod
-    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LearnedPolicy:
-        """Return the controller of the parameter ``policy``."""
+    def parameters(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+        """Return the file and the fallback; of several joints also the catching controller, and the limit."""
+        if not isinstance(plant, MechanismParameters):
+            return policy_specs((*_LQR, "pd_gravity", "energy_swing_up"))
+        meaning = "Who takes over near upright, in the region from which it catches: zero for nobody, or lqr."
+        return (*policy_specs(_LQR), ParameterSpec("catch", ZERO, "", meaning, choices=_LQR), JOINT_LIMIT)
+
+    @classmethod
+    def design(cls, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> LearnedPolicy:
+        """Return the controller of the parameter ``policy``.
+
+        Raises:
+            ParameterError: There is no file, or the policy is for another plant or period.
+            DataError: The file is refused.
+        """
         if not p["policy"]:
             raise ParameterError("policy is empty; expected the path of a policy file (.npz)")
-        if p["set_point"] != 0.0:
+        if p.get("set_point", 0.0) != 0.0:
             raise ParameterError(f"set_point is {p['set_point']:g} rad; a policy holds upright alone, expected 0 rad")
         policy = load_policy(p["policy"])
-        if len(policy.joints) != 1:
+        if isinstance(plant, PlantParameters) and len(policy.joints) != 1:
             raise ParameterError(f"policy {policy.name!r} is for joints {', '.join(policy.joints)}; expected one joint")
         require_plant(policy, plant)
         fallback = None
         if p["fallback"] != ZERO:
             values = {"effort_limit": p["effort_limit"]}
             fallback = make_controller(p["fallback"], plant, period, values, checked=False)
-        return cls(
-            policy, states_to_hold(policy, period), p["effort_limit"], fallback, start_time=p["start_time"], plant=plant
-        )
-
-    def check(self, period: float) -> None:
-        """Refuse a period that the policy's is no whole multiple of, and a fallback that is unstable at it."""
-        check_policy_period(self.policy, period)
-        if self.fallback is not None:
-            require_stable("the fallback", self.fallback, self.plant, period)
+        own = joint_limits(plant, p["effort_limit"])
+        limits = tuple(min(both) for both in zip(own, policy.effort_limit, strict=True))
+        catch = None
+        if isinstance(plant, MechanismParameters) and p["catch"] != ZERO:
+            catch = make_mechanism_catch(plant, *plant.mechanism.weights, limits)
+        hold = states_to_hold(policy, period)
+        return cls(policy, hold, limits, fallback, start_time=p["start_time"], catch=catch, plant=plant)
 
     @property
     def notice(self) -> str:
@@ -97,28 +117,51 @@ class LearnedPolicy(BaseController):
     def notice(self, text: str) -> None:
         self._answers.notice = text
 
+    def check(self, period: float) -> None:
+        """Refuse a period that the policy's is no multiple of, and at which catch or fallback do not settle [s]."""
+        check_policy_period(self.policy, period)
+        if self.catch is not None:
+            require_catching("policy", self.catch, period)
+        if self.fallback is not None:
+            self.fallback.check(period)
+            if isinstance(self.plant, PlantParameters):
+                require_stable("the fallback", self.fallback, self.plant, period)
+
     def reset(self) -> None:
         """Forget the past, and that it gave up."""
         self._answers.reset()
+        if self.catch is not None:
+            self.catch.active = False
         if self.fallback is not None:
             self.fallback.reset()
 
-    def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the policy's torque, or the fallback's after it gave up [N m]."""
-        efforts = self._answers.answer(t, (x[0],), (x[1],))
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return the policy's efforts, the catch's near upright, or the fallback's after it gave up [N m or N]."""
+        efforts = self._answers.answer(t, self._deviation(position), velocity)
         if efforts is None:
             fallback = self.fallback
-            efforts = self._answers.fall_back(t, x, None if fallback is None else lambda: (fallback.command(t, x),))
-        return efforts[0]
+            ask = None if fallback is None else lambda: fallback.efforts(t, position, velocity)
+            efforts = self._answers.fall_back(t, position + velocity, ask)
+        elif self.catch is not None:
+            x = deviation_of(self.policy.coordinates, position + velocity)
+            if self.catch.holds(x):
+                # The network's samples hold the efforts that act: it may have to continue from here.
+                efforts = self._answers.begun(t, self.catch.command(x))
+                self._answers.follow(efforts)
+        return efforts
 
     def describe(self) -> str:
-        """Return which policy it is, and whether it gave up."""
-        return self._answers.describe("zero torque" if self.fallback is None else self.fallback.describe())
+        """Return which policy it is, what catches, and whether it gave up."""
+        nothing = "zero torque" if isinstance(self.plant, PlantParameters) else "no effort"
+        text = self._answers.describe(nothing if self.fallback is None else self.fallback.describe())
+        return text if self.catch is None else f"{text}; LQR within {self.catch.region.describe()}"
 
     def take_over(self, previous: Controller) -> None:
-        """Take over samples and torque from the same kind of policy, and that it gave up."""
+        """Take over samples and efforts from the same kind of policy, and that it gave up."""
         if not isinstance(previous, LearnedPolicy):
             return
         self._answers.take_over(previous._answers)
+        if self.catch is not None and previous.catch is not None:
+            self.catch.active = previous.catch.active
         if self.fallback is not None and previous.fallback is not None:
             self.fallback.carry_over(previous.fallback)

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from pendulum_bags.learning.body import can_exist, kicks_of, start_spread
 from pendulum_bags.learning.task import SwingUpTask, value_of
 from pendulum_lqr.controller_interface.policy_answers import START_TIME
-from pendulum_lqr.controllers.joint_policy import JointPolicy
 from pendulum_lqr.controllers.policy import LearnedPolicy
 from pendulum_lqr.policies.policy import Policy
-from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -130,22 +128,13 @@ def run_trial(policy: Policy, trial: Trial, start_time: float = START_TIME) -> t
         n deviations from upright, n velocities and m efforts, shape (2 n + m, steps); and its notice.
     """
     coordinates, plant = policy.coordinates, plant_of(trial.plant, policy.period)
-    controller: LearnedPolicy | JointPolicy
-    if isinstance(policy.plant, MechanismParameters):
-        controller = JointPolicy(policy, 1, policy.effort_limit, start_time=start_time)
-    else:
-        controller = LearnedPolicy(policy, 1, policy.effort_limit[0], start_time=start_time)
+    controller = LearnedPolicy(policy, 1, policy.effort_limit, start_time=start_time)
     state = plant.reset(trial.position, trial.velocity)
     rows = np.empty((2 * len(policy.joints) + len(coordinates.driven), len(trial.kicks)))
     for k, kick in enumerate(trial.kicks.tolist()):
         t, position, velocity = k * policy.period, state.position, state.velocity
-        if isinstance(controller, JointPolicy):
-            x: Vector = coordinates.deviation(position)
-            effort = controller.efforts(t, position, velocity)
-        else:
-            x = (from_upright(position[0]),)
-            effort = (controller.command(t, (x[0], velocity[0])),)
-        rows[:, k] = *x, *velocity, *effort
+        effort = controller.efforts(t, position, velocity)
+        rows[:, k] = *coordinates.deviation(position), *velocity, *effort
         state = plant.step(effort, tuple(kick))
     return rows, controller.notice
 
