@@ -224,12 +224,12 @@ def test_what_is_on_its_way_counts() -> None:
     after = make_controller("mpc", plant, PERIOD, {"q": [20.0, 10.0, 1.0, 1.0]})
     assert isinstance(after, LinearMpc)
     after.carry_over(controller)
-    assert [effort for (effort,) in after.observer._sent] == pytest.approx(sent)
+    assert list(after.observer._sent) == pytest.approx(sent)
     # At another period it is another time that they take.
     slower = make_controller("mpc", plant, 0.02)
     assert isinstance(slower, LinearMpc)
     slower.carry_over(controller)
-    assert [effort for (effort,) in slower.observer._sent] == [0.0]
+    assert list(slower.observer._sent) == [0.0]
     controller.reset()
     assert controller.efforts(0.0, near_upright(plant, *x[:2]), tuple(x[2:]))[0] == pytest.approx(
         -float(gain.K @ [*x, 0.0, 0.0]), rel=1e-3, abs=1e-4

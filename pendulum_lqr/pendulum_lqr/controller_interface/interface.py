@@ -9,13 +9,8 @@ from pendulum_lqr.linear.analysis import Feedback
 from pendulum_msgs_py.contract.angles import UPRIGHT, deviation_from_upright
 from pendulum_msgs_py.contract.values import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["AnyPlant", "Controller", "unwrapped"]
-
-AnyPlant = PlantParameters | MechanismParameters
-"""A plant of one joint, or of several."""
+__all__ = ["Controller", "unwrapped"]
 
 
 class Controller:

@@ -45,7 +45,7 @@ def clamped(effort: float, limit: float) -> float:
 
 def within_limits(wanted: Iterable[float], limits: Vector) -> Vector:
     """Return efforts within limits either way [N m or N]; NaN stays NaN, which the sender refuses."""
-    return tuple(top if u > top else max(float(u), -top) for u, top in zip(wanted, limits, strict=True))
+    return tuple([top if u > top else max(float(u), -top) for u, top in zip(wanted, limits, strict=True)])
 
 
 def deviation(angle: float, set_point: float) -> float:

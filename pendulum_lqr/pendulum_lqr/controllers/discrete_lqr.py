@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.controller_interface.interface import AnyPlant, Controller
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.controllers.linear_feedback import LinearFeedback
 from pendulum_lqr.controllers.specs import DELAY
@@ -17,6 +17,7 @@ from pendulum_lqr.linear.observer import Observer
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 
 __all__ = ["DiscreteLqr", "SampledFeedback", "discrete_lqr_law"]
 
@@ -63,16 +64,16 @@ class SampledFeedback(LinearFeedback):
 
     def _answer(self, off: Vector, velocity: Vector) -> Vector:
         if self.observer is None:
-            return self._within(self.hold + self._beyond(np.array([*off, *velocity]), self.hold))
+            return self._within((self.hold + self._beyond(np.array([*off, *velocity]), self.hold)).tolist())
         state = self.observer.correct(off, velocity)
         held = self.hold - self.observer.offsets
-        efforts = self._within(held + self._beyond(state, held))
+        efforts = self._within((held + self._beyond(state, held)).tolist())
         self.observer.predict(efforts)
         return efforts
 
     def _beyond(self, state: Array, held: Array) -> Array:
         """Return the efforts beyond those that hold, for a state of the sampled model, limits left out, shape (m,)."""
-        return -np.atleast_1d(self.gain.K @ state)
+        return np.asarray(-(self.gain.K @ state))
 
     def take_over(self, previous: Controller) -> None:
         """Take over the estimate, moved to the new set-point."""

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_lqr.controller_interface.controller import LawController
-from pendulum_lqr.controller_interface.interface import AnyPlant, Controller
-from pendulum_lqr.controller_interface.law import Law, deviation, within_limits
+from pendulum_lqr.controller_interface.interface import Controller
+from pendulum_lqr.controller_interface.law import Law, within_limits
 from pendulum_lqr.controller_interface.loop_check import require_settling
 from pendulum_lqr.controller_interface.sampling import require_period
 from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
@@ -20,9 +20,11 @@ from pendulum_lqr.linear.analysis import Feedback
 from pendulum_lqr.linear.design import Gain
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
+from pendulum_msgs_py.contract.angles import UPRIGHT, wrap_angle
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 
 __all__ = ["JOINT_LIMIT", "LinearFeedback", "gain_text", "joint_limits", "require_catching"]
 
@@ -83,6 +85,7 @@ class LinearFeedback(LawController):
         self._offsets = tuple(map(float, np.ravel(p["set_point"])))
         joints = plant.coordinates.joints
         self.position = tuple(joint.goal + offset for joint, offset in zip(joints, self._offsets, strict=True))
+        self._origin = tuple((joint.turns, joint.goal, off) for joint, off in zip(joints, self._offsets, strict=True))
         self.effort_limit, self.set_point = self.effort_limits[0], self._offsets[0]
         self.model = linearise(plant, self.position)
         self.equilibrium = np.array(self.model.efforts)
@@ -132,18 +135,20 @@ class LinearFeedback(LawController):
 
     def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return m efforts [N m or N]."""
+        if self._direct is not None:  # as in LawController, without a call more
+            return (self._direct(t, wrap_angle(position[0] - UPRIGHT), velocity[0], self.memory, self.numbers),)
         if self.law is not None:
             return super().efforts(t, position, velocity)
         return self._answer(self.deviation(position), velocity)
 
     def deviation(self, position: Vector) -> Vector:
         """Return n deviations from the fixed point; only what turns is wrapped [rad or m]."""
-        coordinates = self._plant.coordinates
+        # A list is twice as fast as a generator.
         return tuple(
-            deviation(one, offset) if joint.turns else one - offset
-            for joint, one, offset in zip(
-                coordinates.joints, coordinates.deviation(position), self._offsets, strict=True
-            )
+            [
+                wrap_angle(wrap_angle(q - goal) - offset) if turns else q - goal - offset
+                for q, (turns, goal, offset) in zip(position, self._origin, strict=True)
+            ]
         )
 
     def _answer(self, off: Vector, velocity: Vector) -> Vector:

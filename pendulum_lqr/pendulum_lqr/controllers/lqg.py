@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pendulum_lqr.controller_interface.interface import AnyPlant
 from pendulum_lqr.controllers.discrete_lqr import SampledFeedback
 from pendulum_lqr.controllers.linear_feedback import gain_text
 from pendulum_lqr.controllers.specs import DELAY, OFFSET_NOISE
 from pendulum_lqr.linear.observer import Observer
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 
 __all__ = ["Lqg"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_lqr.controller_interface.interface import AnyPlant, Controller
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation, winds_up
 from pendulum_lqr.controllers.linear_feedback import LinearFeedback
 from pendulum_lqr.linear.analysis import Feedback
@@ -15,6 +15,7 @@ from pendulum_lqr.linear.design import output_lqr, with_integrals
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 
 __all__ = ["Lqi", "lqi_law"]
 

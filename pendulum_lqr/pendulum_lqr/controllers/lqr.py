@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, MutableSequence, Sequence
 from typing import Any
 
-from pendulum_lqr.controller_interface.interface import AnyPlant
 from pendulum_lqr.controller_interface.law import EFFORT_LIMIT, OWN, SET_POINT, clamped, deviation
 from pendulum_lqr.controllers.linear_feedback import LinearFeedback
 from pendulum_lqr.linear.analysis import Feedback
 from pendulum_lqr.linear.design import output_lqr
 from pendulum_msgs_py.contract.joints import Vector
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 
 __all__ = ["Lqr", "lqr_law"]
 
@@ -46,8 +46,10 @@ class Lqr(LinearFeedback):
     def _answer(self, off: Vector, velocity: Vector) -> Vector:
         x = off + velocity
         return self._within(
-            hold - sum(k * value for k, value in zip(row, x, strict=True))
-            for row, hold in zip(self._rows, self._hold, strict=True)
+            [
+                hold - sum([k * value for k, value in zip(row, x, strict=True)])
+                for row, hold in zip(self._rows, self._hold, strict=True)
+            ]
         )
 
     def describe(self) -> str:

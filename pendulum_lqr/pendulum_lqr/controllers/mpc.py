@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.controller_interface.interface import AnyPlant
 from pendulum_lqr.controllers.discrete_lqr import SampledFeedback
 from pendulum_lqr.controllers.linear_feedback import gain_text
 from pendulum_lqr.controllers.specs import DELAY, OFFSET_NOISE
@@ -19,6 +18,7 @@ from pendulum_lqr.linear.observer import Observer
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 
 __all__ = ["LinearMpc"]
 
@@ -62,7 +62,7 @@ class LinearMpc(SampledFeedback):
                 f"position_limits has {len(widths)} values; expected {len(self.position)}, for "
                 f"{', '.join(plant.coordinates.names)}"
             )
-        self._widths = widths
+        self._widths, self._limits = widths, np.array(self.effort_limits)
         limits = {axis: width for axis, width in enumerate(widths) if width}
         slack = _SLACK_WEIGHT if one else _DEAR * max(p["q"])
         self._program = CondensedMpc(
@@ -117,8 +117,7 @@ class LinearMpc(SampledFeedback):
 
     def _beyond(self, state: Array, held: Array) -> Array:
         """Return the first efforts of the plan; the LQR's where the solver finds none."""
-        limits = np.array(self.effort_limits)
-        plan = self._program.first(state, -limits - held, limits - held)
+        plan = self._program.first(state, -self._limits - held, self._limits - held)
         if plan is None:
             self.failures += 1
             self._warn()

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pendulum_lqr.controller_interface.controller import make_controller
-from pendulum_lqr.controller_interface.interface import AnyPlant, Controller
+from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controller_interface.loop_check import require_stable
 from pendulum_lqr.controller_interface.policy_answers import (
     START_TIME,
@@ -24,6 +24,7 @@ from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["START_TIME", "LearnedPolicy"]

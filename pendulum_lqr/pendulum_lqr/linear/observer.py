@@ -10,6 +10,7 @@ with w an unknown effort on every joint, at a driven one added to the command, h
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from pendulum_lqr.linear.design import kalman_gain
 from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.linear.sampled_design import discretise
+from pendulum_msgs_py.contract.angles import wrap_angle
 from pendulum_msgs_py.contract.joints import Coordinates, Vector
 
 __all__ = ["Observer"]
@@ -49,7 +51,7 @@ class Observer:
 
     def __init__(self, model: LinearModel, coordinates: Coordinates, period: float, p: Mapping[str, Any]) -> None:
         sampled = discretise(model, period, p["delay"])
-        n = model.A.shape[0]
+        n, m = model.B.shape
         self.model, self.pending, self._coordinates = model, sampled.pending, coordinates
         self._n, self._joints = n, len(coordinates.joints)
         self._hold = np.array(model.efforts)
@@ -58,7 +60,9 @@ class Observer:
         self.gain: Array | None = None
         if p.get("position_noise"):
             self._filter(model, period, p)
-        self._sent: deque[Array] = deque(maxlen=self.pending)
+        self._hold_of_all, self._none = np.tile(self._hold, self.pending), np.zeros(m)
+        self._turns = tuple(joint.turns for joint in coordinates.joints)
+        self._sent: deque[float] = deque(maxlen=self.pending * m)
         self.reset()
 
     def _filter(self, model: LinearModel, period: float, p: Mapping[str, Any]) -> None:
@@ -84,13 +88,13 @@ class Observer:
     def reset(self) -> None:
         """Forget everything: no effort is on its way."""
         self._estimate: Array | None = None
-        self._sent.extend([np.zeros(len(self._hold))] * self.pending)
+        self._sent.extend([0.0] * (self.pending * len(self._hold)))
 
     @property
     def offsets(self) -> Array:
         """Estimates of the m constant efforts [N m or N]."""
-        if self._estimate is None or self._estimate.size == self._n:
-            return np.zeros(len(self._hold))
+        if self._estimate is None or len(self._A) == self._n:
+            return self._none
         return self._estimate[self._n :]
 
     def correct(self, off: Vector, velocity: Vector) -> Array:
@@ -113,23 +117,29 @@ class Observer:
             estimate[: measured.size] = measured
         else:
             innovation = measured - self._estimate[: measured.size]
-            before = self._estimate[: self._joints].tolist()
-            innovation[: self._joints] = self._coordinates.deviation(off, before)
+            for joint, turns in enumerate(self._turns):
+                if turns:
+                    innovation[joint] = wrap_angle(float(innovation[joint]))
             estimate = self._estimate + self.gain @ innovation[: self._rows]
         self._estimate = estimate
-        moving = (np.array(self._sent).reshape(-1, len(self._hold)) - self._hold + self.offsets).ravel()
+        if not self.pending:
+            return estimate[: self._n]
+        moving = np.array(self._sent) - self._hold_of_all
+        if len(self._A) > self._n:
+            moving += np.tile(self.offsets, self.pending)
         return np.concatenate([estimate[: self._n], moving])
 
     def predict(self, efforts: Vector) -> None:
         """Move on by a period in which m efforts were sent [N m or N]."""
         assert self._estimate is not None
-        sent = np.array(efforts)
         estimate = self._A @ self._estimate
-        moving = (np.array(self._sent).reshape(-1, len(self._hold)) - self._hold).ravel()
-        estimate[: self._n] += self._on_their_way @ moving + self._B @ (sent - self._hold)
+        change = self._B @ (np.array(efforts) - self._hold)
+        if self.pending:
+            change = self._on_their_way @ (np.array(self._sent) - self._hold_of_all) + change
+        estimate[: self._n] += change
         # What was measured beyond all bounds once must not be remembered for ever.
-        self._estimate = estimate if np.isfinite(estimate).all() else None
-        self._sent.append(sent)
+        self._estimate = estimate if math.isfinite(estimate @ estimate) else None
+        self._sent.extend(efforts)
 
     def carry_over(self, previous: Observer) -> None:
         """Take over the estimate of another observer of the same plant, about its own fixed point."""
@@ -149,8 +159,7 @@ class Observer:
         if estimate.size > self._n:
             estimate[self._n :] = previous.offsets
         self._estimate = estimate
-        nothing = np.zeros(len(self._hold))
-        self._sent.extend([nothing] * self.pending + list(previous._sent))
+        self._sent.extend([0.0] * (self.pending * len(self._hold)) + list(previous._sent))
 
     def _held_by(self, lagged: str) -> float:
         """Return the effort that holds at the actuator whose lagged effort is a state of this name [N m or N]."""

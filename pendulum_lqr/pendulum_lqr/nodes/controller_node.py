@@ -25,7 +25,7 @@ from pendulum_lqr.controller_interface.controller import (
     controller_parameters,
     make_controller,
 )
-from pendulum_lqr.controller_interface.interface import AnyPlant, Controller, unwrapped
+from pendulum_lqr.controller_interface.interface import Controller, unwrapped
 from pendulum_lqr.controller_interface.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem
 from pendulum_lqr.nodes.answering import AnswerLoop
 from pendulum_lqr.nodes.compiled_controller import CompiledController
@@ -37,6 +37,7 @@ from pendulum_msgs_py.contract.values import JointSample, Vector
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import (
     MECHANISM_PRESETS,
     PRESET_NAMES,

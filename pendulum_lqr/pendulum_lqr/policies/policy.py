@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates, Joint
+from pendulum_msgs_py.contract.joints import Coordinates, Joint
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_differences import AnyPlant, describe_plants
@@ -38,7 +38,6 @@ __all__ = [
     "SIGNALS",
     "Network",
     "Policy",
-    "coordinates_of",
     "default_signals",
     "fingerprint",
     "model_of",
@@ -201,7 +200,7 @@ class Policy:
     @property
     def coordinates(self) -> Coordinates:
         """Joints of the plant, and which of them are driven."""
-        return coordinates_of(self.plant)
+        return self.plant.coordinates
 
     @property
     def layout(self) -> tuple[tuple[str, int], ...]:
@@ -212,11 +211,6 @@ class Policy:
     def observation_size(self) -> int:
         """Values that the network sees."""
         return self.history * len(self.layout)
-
-
-def coordinates_of(plant: AnyPlant) -> Coordinates:
-    """Return the joints of a plant, and which of them are driven."""
-    return plant.coordinates if isinstance(plant, MechanismParameters) else ONE_JOINT
 
 
 def model_of(plant: AnyPlant) -> str:

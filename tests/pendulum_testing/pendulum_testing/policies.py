@@ -14,7 +14,6 @@ from pendulum_lqr.policies.policy import (
     DEFAULT_SIGNALS,
     Network,
     Policy,
-    coordinates_of,
     default_signals,
     sample_layout,
 )
@@ -29,7 +28,7 @@ def random_policy(
     plant: AnyPlant, *, hidden: tuple[int, ...] = (8, 8), history: int = 3, seed: int = 0, **changes: Any
 ) -> Policy:
     """Return a policy of random weights for a plant."""
-    coordinates = coordinates_of(plant)
+    coordinates = plant.coordinates
     changes.setdefault("signals", default_signals(coordinates))
     layout = sample_layout(changes["signals"], coordinates)
     sizes = (history * len(layout), *hidden, len(coordinates.driven))
@@ -74,7 +73,7 @@ def _network(sizes: tuple[int, ...], seed: int, activation: str, output: str) ->
 
 
 def _policy(plant: AnyPlant, network: Network, **changes: Any) -> Policy:
-    coordinates = coordinates_of(plant)
+    coordinates = plant.coordinates
     n, m = len(coordinates.joints), len(coordinates.driven)
     limits = plant.effort_limits if isinstance(plant, MechanismParameters) else (plant.effort_limit,)
     values: dict[str, Any] = {

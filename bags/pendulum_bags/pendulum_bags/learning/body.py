@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.learning.task import VARIED
-from pendulum_lqr.policies.policy import coordinates_of
 from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.joint_steps import (
@@ -124,7 +123,7 @@ def travel_of(plant: AnyPlant, travel: float) -> tuple[float, ...]:
     stops = plant.stops if isinstance(plant, MechanismParameters) else ((-math.inf, math.inf),)
     return tuple(
         math.pi if joint.turns else min(BEYOND * travel, joint.goal - low, high - joint.goal)
-        for joint, (low, high) in zip(coordinates_of(plant).joints, stops, strict=True)
+        for joint, (low, high) in zip(plant.coordinates.joints, stops, strict=True)
     )
 
 
@@ -142,7 +141,7 @@ def start_spread(plant: AnyPlant, travel: float, scales: Sequence[float]) -> tup
         travel: Largest deviation of joints that slide [m].
         scales: Of :func:`velocity_scales`.
     """
-    turns = np.array([joint.turns for joint in coordinates_of(plant).joints])
+    turns = np.array([joint.turns for joint in plant.coordinates.joints])
     furthest = np.where(turns, math.pi, _START_TRAVEL * np.array(travel_of(plant, travel)))
     return furthest, np.where(turns, _START_SPEED, _START_SLIDE) * np.array(scales)
 
@@ -234,7 +233,7 @@ def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]])
         return np.where(above[:, None], x, math.pi - x)
 
     return Body(
-        coordinates=coordinates_of(plant),
+        coordinates=plant.coordinates,
         limits=np.array([limit]),
         kicks=kicks_of(plant),
         row=np.array(pack(plant), dtype=np.float64),

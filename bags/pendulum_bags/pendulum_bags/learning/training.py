@@ -24,7 +24,7 @@ from pendulum_bags.learning.ppo import Ppo, PpoSettings
 from pendulum_bags.learning.task import SwingUpTask, ranges_of
 from pendulum_bags.learning.teacher import Teacher
 from pendulum_bags.runs.run_folder import provenance
-from pendulum_lqr.policies.policy import Network, Policy, coordinates_of, default_signals
+from pendulum_lqr.policies.policy import Network, Policy, default_signals
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
@@ -101,7 +101,7 @@ class Training:
     def to_json(self) -> dict[str, Any]:
         """Return the settings as JSON values."""
         swing_up = asdict(self.swing_up) if self.task == "swing_up" else {}
-        if all(joint.turns for joint in coordinates_of(self.plant).joints):
+        if all(joint.turns for joint in self.plant.coordinates.joints):
             swing_up.pop("travel", None)
         return {
             "task": self.task, "plant": json.loads(describe_plants([self.plant]))[0], "ranges": self.ranges,
@@ -150,7 +150,7 @@ def train(
         learner = _learner(settings, environment, generator)
         curves: list[list[float]] = []
         checkpoint = checkpoint_path(out)
-        fastest = np.zeros(len(coordinates_of(settings.plant).joints))
+        fastest = np.zeros(len(settings.plant.coordinates.joints))
         if checkpoint.exists():
             curves, fastest = _restore(checkpoint, settings, learner, generator)
             if on_update is not None:
@@ -211,7 +211,7 @@ def _policy(
     }  # fmt: skip
     plant, task = settings.plant, settings.swing_up
     limits = plant.effort_limits if isinstance(plant, MechanismParameters) else (plant.effort_limit,)
-    coordinates = coordinates_of(plant)
+    coordinates = plant.coordinates
     common: dict[str, Any] = {
         "network": network, "task": settings.task, "joints": coordinates.names, "plant": plant,
         "ranges": settings.ranges, "effort_limit": limits, "provenance": origin,
@@ -291,7 +291,7 @@ def _restore(
                     f"checkpoint {path} is of a training with other settings; expected the same ones, another --out, "
                     "or the checkpoint removed"
                 )
-            joints = len(coordinates_of(settings.plant).joints)
+            joints = len(settings.plant.coordinates.joints)
             _check_arrays(path, kept, learner, joints, settings.updates)
             learner.restore({key[8:]: kept[key] for key in kept.files if key.startswith("learner/")})
             learner.environment.restore({key[12:]: kept[key] for key in kept.files if key.startswith("environment/")})
