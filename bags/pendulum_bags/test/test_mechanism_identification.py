@@ -1,21 +1,24 @@
 """Mechanisms of several joints are identified from recordings of all their joints, or refused in a sentence."""
 
+import itertools
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from pendulum_bags.identification import identify_cli
 from pendulum_bags.identification.joint_recordings import FORMAT, JointRecording, read_joints
 from pendulum_bags.identification.mechanism_fit import fit, prepare_windows, scores, window_length
-from pendulum_bags.identification.mechanism_model import MechanismModel, tellable
+from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel, tellable
 from pendulum_bags.identification.mechanism_result import identify_mechanism
 from pendulum_bags.replay import replay_cli
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, load_mechanism_file, write_mechanism
 from pendulum_rosbag.storage import BagWriter
+from pendulum_testing.balanced_machine import run_balanced
 from pendulum_testing.mechanism_recordings import NOISE, OFF, PERIOD, motion, truth
 
 
@@ -39,7 +42,8 @@ def record(path, recording, plant, *, joints=None, push=0.0):
         for k, t in enumerate(recording.time):
             stamp = 10**18 + round(t * 1e9)
             q, u = recording.position[k], recording.effort[k]
-            state = encode_joints(stamp, "plant", joints or names, tuple(q), tuple(0.0 * q), tuple(0.0 * u))
+            v = 0.0 * q if recording.velocity is None else recording.velocity[k]
+            state = encode_joints(stamp, "plant", joints or names, tuple(q), tuple(v), tuple(0.0 * u))
             bag.write("/plant/joint_states", stamp, state)
             efforts = tuple(float(u[i]) for i in columns)
             bag.write("/plant/applied_effort", stamp, encode_joints(stamp, "plant", driven, effort=efforts))
@@ -75,27 +79,69 @@ def test_two_driven_joints_are_found_from_a_start_that_is_off_and_a_held_out_run
     assert "mass_2" in " ".join(result.sentences())
 
 
-def test_sensitivities_are_the_derivatives_of_the_simulated_motion(both_driven):
-    from pendulum_bags.identification.mechanism_fit import _Simulator
-
-    # Without dry friction: where a joint turns round, its smoothed step is as short as a few steps of the simulation.
-    model = MechanismModel.of(
-        truth("double_pendulum").with_values({f"{j}.coulomb_friction": 0.0 for j in ("shoulder", "elbow")})
+def test_the_simulated_motion_is_that_of_scipy_under_an_input_that_comes_late_and_lags(both_driven):
+    plant = truth("double_pendulum").with_values({f"{j}.coulomb_friction": 0.0 for j in ("shoulder", "elbow")})
+    names, delay, lag = ("shoulder.effort_offset", "elbow.angle_offset", DELAY, LAG), 0.0123, 0.03
+    start = MechanismModel.of(plant)
+    values = start.values.copy()
+    values[start.index(names)] = 0.05, 0.1, delay, lag
+    period, held = 0.01, np.random.default_rng(4).uniform(-1.0, 1.0, (60, 2))
+    one = both_driven[0]
+    recording = replace(
+        one, time=period * np.arange(60), position=one.position[:60], effort=held, hold=("zero", "zero")
     )
-    free = model.fitted(offsets=True, zeros=True, delay=True)
-    data = prepare_windows(both_driven[0], 0.4).subset([0, 3])
-    simulator = _Simulator(model, free)
-    path = simulator.motion(model, data, data.states)
-    sensitivity = simulator.sensitivity(model, data, path)
-    for column, name in enumerate(free):
-        if name.endswith("coulomb_friction"):
-            continue
-        step = 1e-4 * model.size(name)
-        values = model.values.copy()
-        values[model.index([name])] += step
-        moved = simulator.motion(model.with_values(values), data, data.states)
-        difference = (moved - path)[..., : simulator.count] / step
-        assert np.max(np.abs(difference - sensitivity[..., column])) < 0.005 * np.max(np.abs(difference)) + 1e-6, name
+    data = prepare_windows(recording, 0.4).subset([0])
+    found = fit(start.with_values(values), [data], (), np.ones(2), states=[data.states], most=0)
+    path = found.errors[0][0, :, :2] + data.position[0]
+
+    def rate(t, x):
+        q, v, torque = x[:2], x[2:4], x[4:]
+        # Before the recording the input was as at its start, and the lag had settled.
+        command = held[max(int(np.floor((t - delay) / period + 1e-9)), 0)]
+        a = plant.acceleration((q[0], q[1] - 0.1), tuple(v), (torque[0] + 0.05, torque[1]))
+        return (*v, *a, *((command - torque) / lag))
+
+    x, when = np.concatenate((np.zeros(4), held[0])), 0.0
+    x[:4] = data.states[0]
+    inside = data.time[0]
+    for t in np.arange(0.0, inside[0] - 1e-9, 1e-4):
+        # The lag alone runs before the window starts.
+        x[4:] += 1e-4 * (held[max(int(np.floor((t + 5e-5 - delay) / period)), 0)] - x[4:]) / lag
+    when = inside[0]
+    for k in range(1, inside.size):
+        edges = [when, *(e for e in delay + period * np.arange(60) if when + 1e-9 < e < inside[k] - 1e-9), inside[k]]
+        for low, high in itertools.pairwise(edges):
+            x = solve_ivp(rate, (low + 1e-12, high - 1e-12), x, rtol=1e-9, atol=1e-11).y[:, -1]
+        when = inside[k]
+        if data.inside[0, k]:
+            np.testing.assert_allclose(path[k], x[:2], atol=5e-4)
+
+
+@pytest.mark.parametrize(("preset", "window"), [("furuta", (0.1, 0.3)), ("pendubot", (0.1, 0.4))])
+def test_intervals_from_a_run_held_upright_hold_the_values_of_a_machine_that_is_off(preset, window):
+    plant, run = load_mechanism(preset), run_balanced(preset, 3, 8.0)
+    time = 0.002 * np.arange(len(run.position))
+    recording = JointRecording("hw", time, run.position, run.effort, ("zero", "zero"), velocity=run.velocity)
+    result = identify_mechanism(plant, [recording])
+    assert not result.refused, result.refusal
+    assert window[0] <= result.window <= window[1]
+    held = {n: i.low <= run.truth.get(n, 0.0) <= i.high for n, i in result.intervals.items()}
+    assert sum(not inside for inside in held.values()) <= 1, [n for n, inside in held.items() if not inside]
+    for name in ("pendulum_inertia", "inertia_2"):
+        if name in held:
+            interval = result.intervals[name]
+            assert interval.high - interval.low < 0.1 * run.truth[name]
+    (actuator,) = result.plant().actuators
+    assert actuator.transport_delay == pytest.approx(run.truth["delay"], abs=2e-4)
+    assert actuator.time_constant == pytest.approx(run.truth["time_constant"], abs=2e-4)
+
+
+def test_a_velocity_that_contradicts_the_positions_is_not_used(tmp_path):
+    plant, one = truth("cart_pole"), motion(truth("cart_pole"), 3)
+    rate = np.gradient(one.position, one.time, axis=0)
+    for name, velocity, used in (("right", rate, True), ("zero", 0.0 * rate, False), ("negated", -rate, False)):
+        read = read_joints(record(tmp_path / name, replace(one, velocity=velocity), plant), plant.coordinates)
+        assert (read.velocity is not None) == used, name
 
 
 def test_what_a_recording_cannot_be_is_refused_in_a_sentence(both_driven, tmp_path):

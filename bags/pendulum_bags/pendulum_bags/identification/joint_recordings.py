@@ -39,6 +39,9 @@ __all__ = ["FORMAT", "JointRecording", "read_joints"]
 
 FORMAT = "pendulum_joint_columns/1"
 
+_FOLLOWED = 0.1
+"""Time over which a velocity has to lead to the position [s]."""
+
 _STILL = 1e-3
 """Travel below which a joint counts as not moving [rad or m]."""
 
@@ -54,6 +57,7 @@ class JointRecording:
         effort: What drives each joint, 0 where nothing does, shape (s, n) [N m or N].
         hold: ``zero`` or ``linear``, per joint.
         source: Where it was read.
+        velocity: Shape (s, n) [rad/s or m/s]; None where it was not measured, or is made of the positions.
         left_out: Rows with a NaN or a repeated stamp that were left out.
         passive_effort: Joints without an actuator in the plant at which an effort was recorded all the same.
     """
@@ -66,6 +70,7 @@ class JointRecording:
     source: str = ""
     left_out: int = 0
     passive_effort: tuple[str, ...] = ()
+    velocity: Array | None = None
 
     def __post_init__(self) -> None:
         """Check that the arrays fit together."""
@@ -102,8 +107,8 @@ class JointRecording:
 def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path | None = None) -> JointRecording:
     """Read a bag, or a CSV file with the columns of every joint.
 
-    Of a bag, the input is what the plant says it applied (topic ``applied_effort``, held until the next state), or
-    else the effort measured with the states.
+    Of a bag, velocities are read too, unless they contradict the positions. The input is what the plant says it applied
+    (topic ``applied_effort``, held until the next state), or else the effort measured with the states.
 
     Args:
         path: The bag or file.
@@ -212,7 +217,20 @@ def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
         str(source),
         int(states.stamp_ns.size - stamps.size),
         _passive(coordinates, np.any(effort, axis=0).tolist()),
+        _tracks_position((stamps - stamps[0]) * 1e-9, position, states.velocity[first][:, columns]),
     )
+
+
+def _tracks_position(time: Array, position: Array, velocity: Array) -> Array | None:
+    """Return the velocity where its integral over a tenth of a second follows every position; else None."""
+    if not np.isfinite(velocity).all():
+        return None
+    stride = max(5, round(_FOLLOWED / float(np.median(np.diff(time)))))
+    steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time)[:, None]
+    way = np.concatenate((np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)))
+    moved = np.diff(position[::stride], axis=0)
+    left = np.sum((np.diff(way[::stride], axis=0) - moved) ** 2, axis=0)
+    return velocity if np.all(left < 0.25 * np.sum(moved**2, axis=0)) else None
 
 
 _SLIDING = {"m": "rad", "m/s": "rad/s", "N": "N m"}

@@ -11,15 +11,19 @@ from pendulum_bags.identification.mechanism_fit import MechanismFit, Windows, fi
 from pendulum_bags.identification.mechanism_model import MechanismModel
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["EXTRAS", "choose"]
+__all__ = ["ALL_EXTRAS", "EXTRAS", "choose"]
 
 EXTRAS: Mapping[str, Mapping[str, bool]] = {
     "friction": {},
     "friction, offsets": {"offsets": True},
     "friction, delay": {"delay": True},
     "friction, offsets, delay": {"offsets": True, "delay": True},
+    "friction, offsets, delay, lag": {"offsets": True, "delay": True, "lag": True},
 }
 """Candidates: what is fitted beside masses and friction."""
+
+ALL_EXTRAS = "friction, offsets, delay, lag"
+"""The last of them, which is fitted where it is named: most recordings tell no lag from a delay."""
 
 _WORTH = 0.98
 """A candidate with more parameters must bring the held-out error below this share of that of one with fewer."""
@@ -33,7 +37,7 @@ def choose(
     Args:
         start: The model to start from.
         data: Windows of the recordings.
-        weights: Of each joint, shape (n,).
+        weights: As for :func:`~pendulum_bags.identification.mechanism_fit.fit`.
         extras: The one candidate of ``EXTRAS`` to fit; None to choose.
 
     Returns:
@@ -47,7 +51,7 @@ def choose(
     model, states = start, None
     for name, wanted in EXTRAS.items():
         free = start.fitted(**wanted)
-        if (extras is not None and name != extras) or free in [b[1].free for b in ([best] if best else [])]:
+        if (name != extras if extras else name == ALL_EXTRAS) or free in [b[1].free for b in ([best] if best else [])]:
             continue
         found = fit(model, data, free, weights, states=states)
         if extras is not None:

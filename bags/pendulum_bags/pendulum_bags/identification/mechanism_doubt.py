@@ -10,14 +10,21 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED
-from pendulum_bags.identification.mechanism_fit import MechanismFit, Windows, fit, line_errors, rms_by_joint
+from pendulum_bags.identification.mechanism_fit import (
+    MechanismFit,
+    Windows,
+    first_weights,
+    fit,
+    line_errors,
+    rms_by_joint,
+)
 from pendulum_bags.identification.mechanism_model import MechanismModel, tellable
 from pendulum_bags.identification.problem import sensor_noise
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["Score", "better_reading", "refusal"]
+__all__ = ["Score", "better_reading", "noise_of", "refusal"]
 
 _BETTER = 0.5
 """Another reading of the recording explains better where it misses less than this share of what the fit misses."""
@@ -39,10 +46,17 @@ class Score:
     Attributes:
         rms: Of each joint, shape (n,) [rad or m].
         lines: What straight lines through the windows would leave, shape (n,).
+        noise: Of the sensors, which no model explains, shape (n,).
     """
 
     rms: Array
     lines: Array
+    noise: Array | float = 0.0
+
+    @classmethod
+    def of(cls, errors: Array, data: Windows) -> Score:
+        """Return the score of position errors, shape (w, l, n)."""
+        return cls(rms_by_joint(errors, data), line_errors(data), noise_of(data.recording.position))
 
     @property
     def total(self) -> float:
@@ -55,13 +69,21 @@ class Score:
         return float(np.max(self.shares()))
 
     def shares(self, least: Array | float = 1e-12) -> Array:
-        """Return error over that of straight lines, by joint, shape (n,).
+        """Return the error beyond the sensors' noise over that of straight lines, by joint, shape (n,).
 
         Args:
             least: Below which straight lines count as missing nothing, by joint: a joint that hardly moves shows
                 its noise alone [rad or m].
         """
-        return np.asarray(self.rms / np.maximum(self.lines, least))
+        left = np.sqrt(np.maximum(self.rms**2 - np.square(self.noise), 0.0))
+        return np.asarray(left / np.maximum(self.lines, least))
+
+
+def noise_of(position: Array) -> Array:
+    """Return the noise of positions, or of rounding to their encoders' steps where that is more, shape (n,)."""
+    apart = np.abs(np.diff(position, axis=0))
+    step = np.min(np.where(apart > 1e-9, apart, np.inf), axis=0)
+    return np.maximum(sensor_noise(position), np.where(np.isfinite(step), step, 0.0) / math.sqrt(12.0))
 
 
 @dataclass(frozen=True)
@@ -85,6 +107,7 @@ class _Reading:
             data,
             recording=read,
             position=data.position @ self.position.T + self.shift,
+            velocity=None if data.velocity is None else data.velocity @ self.position.T,
             states=states,
             area=data.area @ self.effort.T,
         )
@@ -151,7 +174,7 @@ def refusal(
         better = better_reading(plant, data, found)
         if better is not None:
             return f"{REFUSED}: {better}"
-    noise = 6.0 * np.max([sensor_noise(part.recording.position) for part in data], axis=0)
+    noise = 6.0 * np.max([noise_of(part.recording.position) for part in data], axis=0)
     # What the fit misses in its own data is no fault of a recording in which a joint hardly moves.
     usual = np.sqrt(np.mean([score.rms**2 for score in training.values()], axis=0))
     for name, score, least in (
@@ -226,10 +249,9 @@ def better_reading(
 def _fits(plant: MechanismParameters, reading: _Reading, data: Sequence[Windows]) -> float:
     """Return the share that a quick fit under a reading misses, inf where it ends far from the start."""
     others = [reading.of(part) for part in data]
-    weights = 1.0 / np.maximum(np.mean([line_errors(part) for part in others], axis=0), 1e-9)
     model = MechanismModel.of(plant)
     try:
-        quick = fit(model, others, model.fitted(), weights, most=15, tolerance=1e-3)
+        quick = fit(model, others, model.fitted(), first_weights(others), most=15, tolerance=1e-3)
     except (DataError, np.linalg.LinAlgError):
         return math.inf
     if _far_off(plant, quick) is not None:
@@ -238,4 +260,4 @@ def _fits(plant: MechanismParameters, reading: _Reading, data: Sequence[Windows]
 
 
 def _share(errors: Array, data: Windows) -> float:
-    return Score(rms_by_joint(errors, data), line_errors(data)).share
+    return Score.of(errors, data).share

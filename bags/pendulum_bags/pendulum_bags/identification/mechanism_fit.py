@@ -1,8 +1,10 @@
 """Output error for a mechanism: windows of free run, the state at the start of each fitted, by Levenberg-Marquardt.
 
 As for one joint (:mod:`~pendulum_bags.identification.solver`), parameters and start states make an arrowhead, and the
-states are eliminated window by window. Sensitivities go along the simulated motion: the equation's derivatives in the
-middle of each step, and the exponential series of the step to third order.
+states are eliminated window by window. Sensitivities are differences of compiled simulations.
+
+A window's motion depends on its start and on the recorded efforts alone, not on what was measured inside it. So a
+controller that feeds noise back biases nothing, and an unstable plant only bounds the length of a window.
 """
 
 from __future__ import annotations
@@ -10,21 +12,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.joint_recordings import JointRecording
-from pendulum_bags.identification.mechanism_model import MechanismModel, step_functions
+from pendulum_bags.identification.mechanism_kernel import lagged, motion_kernel
+from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel
 from pendulum_bags.identification.problem import cut_windows, off_line
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [
     "Blocks",
     "MechanismFit",
+    "Prior",
     "Windows",
+    "error_weights",
+    "first_weights",
     "fit",
     "line_errors",
     "prepare_windows",
@@ -34,12 +39,22 @@ __all__ = [
 ]
 
 
-_APART = 30.0
-"""Growth of a small difference over a window up to which the window's start determines its end."""
+_APART, _APART_BY_VELOCITY = 30.0, 3.0
+"""Growth of a small difference over a window up to which the window's start determines its end, and a growth that is
+enough where velocities were measured too: the start of a short window is known then, and its cost has one minimum."""
 
 _LONGEST = 0.006
 """Longest step; between samples that lie further apart the motion is simulated in several equal ones [s]."""
 
+_FINE = 0.0005
+"""The same where velocities were measured [s]: to their noise, it counts when within a step the effort changed."""
+
+
+_BEFORE = 0.02
+"""Longest delay after which an effort from before the recording may still act [s]."""
+
+_DIFFERENCE = 1e-6
+"""Step of the differences, in the size of a parameter, and in rad, m, rad/s or m/s of a start."""
 
 _AWAY = "the starting plant's motion leaves all bounds within a window; expected a plant that is near"
 
@@ -53,6 +68,7 @@ class Windows:
         time: Instants of the simulation, shape (w, l); padding repeats the last one [s].
         inside: Which of them are samples, neither between two nor padding, shape (w, l).
         position: Shape (w, l, n) [rad or m].
+        velocity: The same, or None where it was not measured [rad/s or m/s].
         states: First guess of the start states, shape (w, 2 n).
         area: Integral of the effort up to each sample of the recording, shape (s, n).
     """
@@ -61,16 +77,20 @@ class Windows:
     time: Array
     inside: NDArray[np.bool_]
     position: Array
+    velocity: Array | None
     states: Array
     area: Array
 
     def subset(self, chosen: Sequence[int] | NDArray[np.int64]) -> Windows:
         """Return some of the windows."""
         at = np.asarray(chosen, dtype=int)
-        return Windows(self.recording, self.time[at], self.inside[at], self.position[at], self.states[at], self.area)
+        velocity = None if self.velocity is None else self.velocity[at]
+        return Windows(
+            self.recording, self.time[at], self.inside[at], self.position[at], velocity, self.states[at], self.area
+        )
 
-    def input(self, delay: float) -> tuple[Array, Array, Array]:
-        """Return mean effort of each step and its derivative by the delay, shape (n, w, l - 1), and the steps [s]."""
+    def input(self, delay: float, lag: float) -> Array:
+        """Return the mean effort of each step, delayed and lagging, shape (w, l - 1, n)."""
         r = self.recording
         wanted = self.time - delay
         at = np.clip(wanted, r.time[0], r.time[-1])
@@ -83,10 +103,16 @@ class Windows:
         # Before the first sample and after the last the effort stays as it is there.
         beyond = (wanted - at)[..., None]
         area = area + beyond * np.where(beyond < 0.0, r.effort[0], r.effort[-1])
+        if lag > 0.0:
+            # Of lag y' + y = u the integral: that of y is that of u, less lag times the rise of y.
+            steps = np.diff(r.time)
+            slope = np.where(linear, np.diff(r.effort, axis=0) / steps[:, None], 0.0)
+            settled = slope[k] * lag
+            start = lagged(r.effort, slope, steps, lag)[k]
+            late = level - settled + (start - r.effort[k] + settled) * np.exp(-since / lag)
+            area = area - lag * late
         steps = np.diff(self.time, axis=1)
-        length = np.where(steps > 0.0, steps, 1.0)[..., None]
-        mean, slope = np.diff(area, axis=1) / length, -np.diff(level, axis=1) / length
-        return mean.transpose(2, 0, 1), slope.transpose(2, 0, 1), steps
+        return np.diff(area, axis=1) / np.where(steps > 0.0, steps, 1.0)[..., None]
 
 
 def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1) -> Windows:
@@ -97,7 +123,9 @@ def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1
         window: Length [s].
         stride: Take every so manieth sample; the effort between them is not lost, its mean drives the step.
     """
-    cuts = cut_windows(recording.time, window)
+    # What was commanded before the recording acts on in its first moments.
+    begin = int(np.searchsorted(recording.time, recording.time[0] + _BEFORE))
+    cuts = begin + cut_windows(recording.time[begin:], window)
     parts = [np.arange(first, stop, stride) for first, stop in cuts]
     # No window reaches across a gap.
     period = float(np.median(np.diff(recording.time)))
@@ -109,23 +137,32 @@ def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1
             f"{recording.name} has no window of {window} s with 8 samples and no gap; expected a longer recording or a "
             "higher rate"
         )
-    several = max(1, math.ceil(stride * period / _LONGEST - 1e-6))
+    longest = _LONGEST if recording.velocity is None else _FINE
+    several = max(1, math.ceil(stride * period / longest - 1e-6))
     size = (max(part.size for part in parts) - 1) * several + 1
     time, inside = np.empty((len(parts), size)), np.zeros((len(parts), size), dtype=bool)
     position = np.zeros((len(parts), size, recording.position.shape[1]))
+    velocity = None if recording.velocity is None else np.zeros_like(position)
     for w, part in enumerate(parts):
         at = np.minimum(np.arange(size) / several, part.size - 1.0)
         time[w] = np.interp(at, np.arange(part.size), recording.time[part])
         inside[w, : part.size * several : several] = True
         position[w, inside[w]] = recording.position[part]
+        if velocity is not None and recording.velocity is not None:
+            velocity[w, inside[w]] = recording.velocity[part]
+    states = np.array([_first_state(recording, int(part[0])) for part in parts])
+    return Windows(recording, time, inside, position, velocity, states, _area(recording))
+
+
+def _area(recording: JointRecording) -> Array:
+    """Return the integral of the effort up to each sample, shape (s, n)."""
     mean = np.where(
         [hold == "linear" for hold in recording.hold],
         0.5 * (recording.effort[1:] + recording.effort[:-1]),
         recording.effort[:-1],
     )
-    area = np.concatenate((np.zeros((1, mean.shape[1])), np.cumsum(mean * steps[:, None], axis=0)))
-    states = np.array([_first_state(recording, int(part[0])) for part in parts])
-    return Windows(recording, time, inside, position, states, area)
+    rise = np.cumsum(mean * np.diff(recording.time)[:, None], axis=0)
+    return np.concatenate((np.zeros((1, mean.shape[1])), rise))
 
 
 def _first_state(recording: JointRecording, first: int) -> Array:
@@ -133,7 +170,36 @@ def _first_state(recording: JointRecording, first: int) -> Array:
     t = recording.time[low:high] - recording.time[first]
     scale = float(np.max(np.abs(t)))
     found = np.polynomial.polynomial.polyfit(t / scale, recording.position[low:high], 2)
-    return np.concatenate((found[0], found[1] / scale))
+    rate = found[1] / scale if recording.velocity is None else recording.velocity[low:high].mean(axis=0)
+    return np.concatenate((found[0], rate))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What the plant file knows of the parameters of a fit.
+
+    Attributes:
+        values: Of the plant file, shape (k,).
+        weights: One over the variance of each, 0 where it does not count, shape (k,).
+    """
+
+    values: Array
+    weights: Array
+
+    @classmethod
+    def of(cls, model: MechanismModel, free: Sequence[str]) -> Prior:
+        """Return that of some parameters."""
+        start = MechanismModel.of(model.plant)
+        weights = np.array([model.spread(name) for name in free]) ** -2.0
+        return cls(np.array([start[name] for name in free]), weights)
+
+    def cost(self, values: Array) -> float:
+        """Return what it adds to the sum of squares."""
+        return float(self.weights @ (values - self.values) ** 2)
+
+    def gradient(self, values: Array) -> Array:
+        """Return half of the derivative of the cost."""
+        return np.asarray(self.weights * (values - self.values))
 
 
 @dataclass(frozen=True)
@@ -161,7 +227,8 @@ class MechanismFit:
         states: Start states by recording, shape (w, 2 n).
         cost: Weighted sum of squares.
         blocks: Normal equations by recording, at the minimum.
-        residuals: Simulated minus measured positions by recording, shape (w, l, n), 0 in the padding.
+        errors: Simulated minus measured by recording, positions before velocities, shape (w, l, 2 n), 0 in the padding
+            and where no velocity was measured.
     """
 
     model: MechanismModel
@@ -169,68 +236,45 @@ class MechanismFit:
     states: list[Array]
     cost: float
     blocks: list[Blocks]
-    residuals: list[Array]
+    errors: list[Array]
+
+    @property
+    def residuals(self) -> list[Array]:
+        """Errors of the positions by recording, shape (w, l, n)."""
+        return [each[..., : each.shape[-1] // 2] for each in self.errors]
 
 
-class _Simulator:
-    """The compiled steps of one set of free parameters, over windows of any number and length."""
+def _motions(model: MechanismModel, values: Array, data: Windows, states: Array) -> Array:
+    """Return the motions of c sets of parameter values and start states, shape (c, w, l, 2 n).
 
-    def __init__(self, model: MechanismModel, free: Sequence[str]) -> None:
-        self.count = len(model.plant.joints)
-        self.forward, self.derivative = step_functions(model.plant, tuple(free))
-        self.free = len(free)
-        self.made: dict[tuple[str, int, int], Any] = {}
+    Args:
+        model: Names the parameters.
+        values: Shape (c, parameters).
+        data: The windows.
+        states: Shape (c, w, 2 n).
+    """
+    pairs, which = np.unique(values[:, model.index((DELAY, LAG))], axis=0, return_inverse=True)
+    drive = np.array([data.input(*pair) for pair in pairs])
+    path = np.empty((len(values), *data.time.shape, states.shape[-1]))
+    steps, starts = np.diff(data.time, axis=1), np.ascontiguousarray(states)
+    run = motion_kernel(model.plant.mechanism.name)
+    run(*model.tables(values), drive, which.reshape(-1), steps, starts, path)
+    return path
 
-    def _made(self, name: str, windows: int, steps: int) -> Any:
-        """Return the memory of a function over so many windows of so many steps each, and what evaluates it."""
-        key = (name, windows, steps)
-        if key not in self.made:
-            runs = name == "runs"
-            one = self.forward.mapaccum("run", steps) if runs else self.derivative
-            self.made[key] = one.map(windows if runs else windows * steps).buffer()
-        return self.made[key]
 
-    def _evaluate(
-        self, name: str, windows: int, steps: int, arguments: Sequence[Array], results: Sequence[Array]
-    ) -> None:
-        """Evaluate from arrays into arrays, whose rows are casadi's columns: its own matrices are slow to fill."""
-        buffer, start = self._made(name, windows, steps)
-        kept = [np.ascontiguousarray(array) for array in arguments]
-        for i, array in enumerate(kept):
-            buffer.set_arg(i, array.data)
-        for i, array in enumerate(results):
-            buffer.set_res(i, array.data)
-        start()
-
-    def motion(self, model: MechanismModel, data: Windows, states: Array) -> Array:
-        """Return the states at each sample, shape (w, l, 2 n)."""
-        n, (w, size) = self.count, data.time.shape
-        mean, _, h = data.input(model["delay"])
-        p = np.tile(model.values, (w * (size - 1), 1))
-        later = np.empty((w, size - 1, 2 * n))
-        self._evaluate("runs", w, size - 1, (states, mean.reshape(n, -1).T, h, p), (later,))
-        return np.concatenate((states[:, None], later), axis=1)
-
-    def sensitivity(self, model: MechanismModel, data: Windows, path: Array) -> Array:
-        """Return those of the positions of a motion to parameters and start states, shape (w, l, n, k + 2 n)."""
-        n, (w, size) = self.count, data.time.shape
-        mean, slope, h = data.input(model["delay"])
-        p = np.tile(model.values, (w * (size - 1), 1))
-        middle = 0.5 * (path[:, :-1] + path[:, 1:])
-        by_x, by_p = np.empty((w, size - 1, 2 * n, 2 * n)), np.empty((w, size - 1, self.free, 2 * n))
-        drive = (mean.reshape(n, -1).T, slope.reshape(n, -1).T)
-        self._evaluate("derivatives", w, size - 1, (middle, *drive, p), (by_x, by_p))
-        step = h[:, :, None, None]
-        a, b = (np.multiply(found.swapaxes(2, 3), step, order="C") for found in (by_x, by_p))
-        unit = np.eye(2 * n)
-        square = a @ a
-        gain, b = unit + a + 0.5 * square + (square @ a) / 6.0, (unit + 0.5 * a + square / 6.0) @ b
-        result = np.zeros((w, size, 2 * n, self.free + 2 * n))
-        result[:, 0, :, self.free :] = unit
-        for i in range(size - 1):
-            result[:, i + 1] = gain[:, i] @ result[:, i]
-            result[:, i + 1, :, : self.free] += b[:, i]
-        return result[:, :, :n]
+def _sensitivity(model: MechanismModel, free: Sequence[str], data: Windows, states: Array, path: Array) -> Array:
+    """Return those of a motion to parameters and start states, shape (w, l, 2 n, k + 2 n)."""
+    index, width = model.index(free), states.shape[1]
+    steps = np.array([*(_DIFFERENCE * model.size(name) for name in free), *[_DIFFERENCE] * width])
+    values = np.tile(model.values, (steps.size, 1))
+    starts = np.tile(states, (steps.size, 1, 1))
+    for c, step in enumerate(steps):
+        if c < len(index):
+            values[c, index[c]] += step
+        else:
+            starts[c, :, c - len(index)] += step
+    found = (_motions(model, values, data, starts) - path) / steps[:, None, None, None]
+    return np.moveaxis(found, 0, -1)
 
 
 # Far along an unstable motion sensitivities overflow; what is not finite is refused.
@@ -251,34 +295,39 @@ def fit(
         model: Start.
         data: Windows of each recording.
         free: Names of what to fit; none fits the start states alone.
-        weights: Of each joint's error, shape (n,).
+        weights: Of each joint's error, shape (n,), or of its position and its velocity, shape (2 n,).
         states: Start of the start states; by default the windows' first guesses.
         most: Most steps to try.
         tolerance: Relative decrease of the cost below which the fit ends.
     """
-    simulator = _Simulator(model, free)
     index = model.index(free)
+    count = len(model.plant.joints)
+    if weights.size == count:
+        weights = np.concatenate((weights, np.zeros(count)))
+    prior = Prior.of(model, free)
     size = np.array([model.size(name) for name in free])
     low = np.array([model.lowest(name) for name in free])
     values = model.values.copy()
     values[index] = np.maximum(values[index], low)
     best, x = model.with_values(values), [np.array(s) for s in (states or [part.states for part in data])]
     damping, k = 1e-4, len(index)
-    cost, paths = _simulate(simulator, best, data, x, weights)
+    cost, paths = _simulate(best, data, x, weights)
+    cost += prior.cost(values[index])
     if not np.isfinite(cost):
         raise DataError(_AWAY)
-    normal, errors = _linearise(simulator, best, data, paths, weights)
+    normal, errors = _linearise(best, free, data, x, paths, weights)
     if not all(np.isfinite(matrix).all() for matrix in normal[0]):
         raise DataError(_AWAY)
     for _ in range(most):
-        step = _step(normal, values[index], size, low, damping)
+        step = _step(normal, prior, values[index], size, low, damping)
         trial = values.copy()
         trial[index] = np.maximum(values[index] + step[0], low)
         candidate = best.with_values(trial)
         moved = [a + b for a, b in zip(x, step[1], strict=True)]
-        new, paths = _simulate(simulator, candidate, data, moved, weights)
+        new, paths = _simulate(candidate, data, moved, weights)
+        new += prior.cost(trial[index])
         if new < cost:
-            following = _linearise(simulator, candidate, data, paths, weights)
+            following = _linearise(candidate, free, data, moved, paths, weights)
             if not all(np.isfinite(matrix).all() for matrix in following[0][0]):
                 # So far along an unstable motion the derivatives have no size: a smaller step.
                 damping *= 8.0
@@ -299,38 +348,45 @@ def fit(
         solved = np.linalg.pinv(own, hermitian=True) @ coupling.transpose(0, 2, 1)
         reduced = matrix[:, :k, :k] - coupling @ solved
         along = gradient[:, :k] - np.einsum("wxk,wx->wk", solved, gradient[:, k:])
-        blocks.append(Blocks(reduced, along, int(part.inside.sum()) * simulator.count))
+        blocks.append(Blocks(reduced, along, int(part.inside.sum()) * int(np.count_nonzero(weights))))
     return MechanismFit(best, tuple(free), x, cost, blocks, errors)
 
 
 def _simulate(
-    simulator: _Simulator, model: MechanismModel, data: Sequence[Windows], states: Sequence[Array], weights: Array
+    model: MechanismModel, data: Sequence[Windows], states: Sequence[Array], weights: Array
 ) -> tuple[float, list[Array]]:
     """Return the cost, inf where a motion leaves all bounds, and the motions of each recording."""
     total, paths = 0.0, []
     for part, x in zip(data, states, strict=True):
-        path = simulator.motion(model, part, x)
+        path = _motions(model, model.values[None], part, x[None])[0]
         paths.append(path)
         if not np.isfinite(path).all():
             return np.inf, paths
-        error = _errors(simulator, part, path) * weights
-        total += float(np.sum(error**2))
+        total += float(np.sum((_errors(part, path) * weights) ** 2))
     return total, paths
 
 
-def _errors(simulator: _Simulator, part: Windows, path: Array) -> Array:
-    errors: Array = (path[..., : simulator.count] - part.position) * part.inside[..., None]
+def _errors(part: Windows, path: Array) -> Array:
+    n = part.position.shape[-1]
+    measured = np.concatenate((part.position, path[..., n:] if part.velocity is None else part.velocity), axis=-1)
+    errors: Array = (path - measured) * part.inside[..., None]
     return errors
 
 
 def _linearise(
-    simulator: _Simulator, model: MechanismModel, data: Sequence[Windows], paths: Sequence[Array], weights: Array
+    model: MechanismModel,
+    free: Sequence[str],
+    data: Sequence[Windows],
+    states: Sequence[Array],
+    paths: Sequence[Array],
+    weights: Array,
 ) -> tuple[tuple[list[Array], list[Array]], list[Array]]:
     """Return the normal equations about the motions, and their errors."""
     matrices, gradients, errors = [], [], []
-    for part, path in zip(data, paths, strict=True):
-        plain = _errors(simulator, part, path)
-        scaled = simulator.sensitivity(model, part, path) * (part.inside[..., None] * weights)[..., None]
+    for part, x, path in zip(data, states, paths, strict=True):
+        plain = _errors(part, path)
+        own = weights * np.repeat([1.0, float(part.velocity is not None)], part.position.shape[-1])
+        scaled = _sensitivity(model, free, part, x, path) * (part.inside[..., None] * own)[..., None]
         flat = scaled.reshape(len(path), -1, scaled.shape[-1])
         matrices.append(flat.transpose(0, 2, 1) @ flat)
         gradients.append(np.einsum("wia,wi->wa", flat, (plain * weights).reshape(len(path), -1)))
@@ -339,11 +395,11 @@ def _linearise(
 
 
 def _step(
-    normal: tuple[list[Array], list[Array]], values: Array, size: Array, low: Array, damping: float
+    normal: tuple[list[Array], list[Array]], prior: Prior, values: Array, size: Array, low: Array, damping: float
 ) -> tuple[Array, list[Array]]:
     """Return the damped step of parameters and start states; what would leave its domain stops at the edge."""
     k = values.size
-    reduced, gradient, solved = np.zeros((k, k)), np.zeros(k), []
+    reduced, gradient, solved = np.diag(prior.weights), prior.gradient(values), []
     for matrix, own_gradient in zip(*normal, strict=True):
         states = matrix[:, k:, k:].copy()
         # A start that a wrong model's motion hardly shows must not stop the search.
@@ -394,41 +450,68 @@ def scores(model: MechanismModel, data: Sequence[Windows], weights: Array | None
 def window_length(model: MechanismModel, recordings: Sequence[JointRecording], longest: float) -> float:
     """Return the longest window over which motions that begin close to each other stay near, up to ``longest`` [s].
 
-    Along the measured motion the linearised equation carries a small difference on. Where it grows by more than a
-    factor of 30 the start of a window does not determine its end, and a fit to it has many minima: chaotic motion, and
-    motion about an unstable equilibrium.
+    Along the measured motion the equation, linearised and without dry friction (which hides an unstable equilibrium as
+    long as a joint rests), carries a small difference on. Where it grows by more than a factor of 30 (3 where
+    velocities were measured) the start of a window does not determine its end, and a fit to it has many minima: chaotic
+    motion, and motion about an unstable equilibrium.
 
     Args:
         model: The start of the fit.
         recordings: The data.
         longest: Largest length [s].
     """
-    derivative = step_functions(model.plant, ())[1]
     n, lengths = len(model.plant.joints), []
+    smooth = model.values.copy()
+    smooth[model.index([f"{joint}.coulomb_friction" for joint in model.plant.coordinates.names])] = 0.0
     for recording in recordings:
         stride = max(1, round(_LONGEST / float(np.median(np.diff(recording.time)))))
         time, q = recording.time[::stride], recording.position[::stride]
         if time.size < 4:
             continue
-        v, h = np.gradient(q, time, axis=0), np.diff(time)
+        v = np.gradient(q, time, axis=0) if recording.velocity is None else recording.velocity[::stride]
         scale = np.maximum(np.std(q, axis=0), 1e-9)
-        states, drive = np.hstack((q, v))[:-1], recording.effort[::stride][:-1]
-        by_x = derivative.map(h.size)(states.T, drive.T, 0.0 * drive.T, np.tile(model.values, (h.size, 1)).T)[0]
-        a = np.array(by_x).reshape(2 * n, h.size, 2 * n).transpose(1, 0, 2) * h[:, None, None]
-        gain = np.eye(2 * n) + a + 0.5 * a @ a + a @ a @ a / 6.0
-        for first in range(0, h.size, max(1, h.size // 12)):
+        # Each step is a window.
+        steps = np.stack((time[:-1], time[1:]), axis=1)
+        states = np.hstack((q, v))[:-1]
+        data = Windows(recording, steps, steps > 0.0, np.stack((q[:-1], q[1:]), axis=1), None, states, _area(recording))
+        starts = np.tile(states, (2 * n + 1, 1, 1))
+        starts[np.arange(1, 2 * n + 1), :, np.arange(2 * n)] += _DIFFERENCE
+        path = _motions(model, np.tile(smooth, (2 * n + 1, 1)), data, starts)[:, :, 1]
+        gain = np.moveaxis((path[1:] - path[0]) / _DIFFERENCE, 0, -1)
+        most = _APART if recording.velocity is None else _APART_BY_VELOCITY
+        for first in range(0, len(gain), max(1, len(gain) // 12)):
             product, end = np.eye(2 * n), first
-            while end < h.size and time[end] - time[first] < longest:
+            while end < len(gain) and time[end] - time[first] < longest:
                 product = gain[end] @ product
                 end += 1
-                if not np.max(np.abs(product[:n, :n] * scale / scale[:, None])) < _APART:
+                if not np.max(np.abs(product[:n, :n] * scale / scale[:, None])) < most:
                     lengths.append(float(time[end] - time[first]))
                     break
             else:
                 # A rest of the recording shows no length.
-                if time[min(end, h.size)] - time[first] >= longest:
+                if time[min(end, len(gain))] - time[first] >= longest:
                     lengths.append(longest)
     return float(np.quantile(lengths, 0.25)) if lengths else longest
+
+
+def first_weights(data: Sequence[Windows]) -> Array:
+    """Return weights of positions and velocities before a fit: one over what windows' own lines and means miss."""
+    lines = [line_errors(part) for part in data]
+    rates = [
+        np.full(len(line), np.inf)
+        if part.velocity is None
+        else rms_by_joint(part.velocity - part.velocity.mean(axis=1, keepdims=True), part)
+        for line, part in zip(lines, data, strict=True)
+    ]
+    size = np.sqrt(np.mean(np.square([np.concatenate(pair) for pair in zip(lines, rates, strict=True)]), axis=0))
+    return 1.0 / np.maximum(size, 1e-9)
+
+
+def error_weights(found: MechanismFit, data: Sequence[Windows]) -> Array:
+    """Return weights of positions and velocities by the errors of a fit, 0 for what was not measured."""
+    squares = np.mean([rms_by_joint(e, part) ** 2 for e, part in zip(found.errors, data, strict=True)], axis=0)
+    measured = np.repeat([True, all(part.velocity is not None for part in data)], squares.size // 2)
+    return np.asarray(np.where(measured, 1.0 / np.maximum(np.sqrt(squares), 1e-9), 0.0))
 
 
 def line_errors(data: Windows) -> Array:

@@ -2,34 +2,34 @@
 
 In measured coordinates (q as the encoders say, u as recorded), for each joint i::
 
-    M(q) q'' + c(q, v) + g(q) + D v = torque,   torque_i = u_i(t - d) + o_i - F_i tanh(v_i / w)
+    M(q) q'' + c(q, v) + g(q) + D v = torque,   torque_i = u_i(t - d) + o_i - F_i sgn(v_i)
 
-with the delay d common to all motors, F_i the Coulomb friction and w = 0.05 rad/s (or m/s), which smooths it inside the
-fit alone. One step is the classical Runge-Kutta method under the mean of the input over the step; derivatives of the
-equation are those of casadi's expressions.
+with u after a first-order lag, delay d and lag common to all motors, and F_i the Coulomb friction with true stiction.
 """
 
 from __future__ import annotations
 
+import cmath
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
-import casadi
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, pack_joints
 
-__all__ = ["DELAY", "MechanismModel", "tellable"]
+__all__ = ["DELAY", "LAG", "MechanismModel", "tellable"]
 
 DELAY = "delay"
 """Time from the recorded effort to its effect, negative where the effort is recorded late [s]."""
 
-_SMOOTH = 0.05
-"""Velocity over which the smoothed Coulomb friction changes sign [rad/s or m/s]."""
+LAG = "time_constant"
+"""First-order lag of the actuators [s]."""
+
+_RULER = 0.03
+"""Standard deviation of a length in the plant file, as a share of it: the fit weighs it against the motion."""
 
 _ORDER = ("kg m^2", "m", "kg")
 """Which of two parameters that the motion cannot tell apart is fitted: that of the unit that comes first here."""
@@ -55,13 +55,13 @@ class MechanismModel:
         """Names: the mechanism's own, dampings, then Coulomb frictions, torque offsets, angle offsets and the delay."""
         joints = self.plant.coordinates.names
         extra = [f"{joint}.{key}" for key in ("coulomb_friction", "effort_offset", "angle_offset") for joint in joints]
-        return (*self.plant.mechanism.parameter_names, *extra, DELAY)
+        return (*self.plant.mechanism.parameter_names, *extra, DELAY, LAG)
 
     @classmethod
     def of(cls, plant: MechanismParameters) -> MechanismModel:
         """Return the model that a plant file makes."""
         joints = plant.joints
-        zeros = [0.0] * (2 * len(joints) + 1)
+        zeros = [0.0] * (2 * len(joints) + 2)
         return cls(plant, np.array([*plant.packed, *(joint.coulomb_friction for joint in joints), *zeros]))
 
     def index(self, names: Sequence[str]) -> list[int]:
@@ -82,7 +82,7 @@ class MechanismModel:
         for spec in self.plant.mechanism.parameters:
             if spec.name == name:
                 return spec.unit
-        if name == DELAY:
+        if name in {DELAY, LAG}:
             return "s"
         joint, _, key = name.partition(".")
         own = self.plant.coordinates.joints[self.plant.coordinates.names.index(joint)]
@@ -93,16 +93,22 @@ class MechanismModel:
         for spec in self.plant.mechanism.parameters:
             if spec.name == name:
                 return 0.02 * self.plant.value(name) if spec.exclusive_minimum else 0.0
-        return 0.0 if name.endswith(("damping", "coulomb_friction")) else -np.inf
+        return 0.0 if name.endswith(("damping", "coulomb_friction", LAG)) else -np.inf
+
+    def spread(self, name: str) -> float:
+        """Return the standard deviation with which the plant file knows a parameter; inf where it does not count."""
+        return _RULER * self.plant.value(name) if _is_length(name) else np.inf
 
     def size(self, name: str) -> float:
         """Return a scale of a parameter, in its unit, so that steps and ranks do not depend on units."""
         value = abs(float(MechanismModel.of(self.plant)[name]))
         if value > 0.0:
             return value
-        return {DELAY: 0.01}.get(name, 0.01 if name.endswith("offset") else 1e-3)
+        return {DELAY: 0.01, LAG: 1e-3}.get(name, 0.01 if name.endswith("offset") else 1e-3)
 
-    def fitted(self, *, offsets: bool = False, zeros: bool = False, delay: bool = False) -> tuple[str, ...]:
+    def fitted(
+        self, *, offsets: bool = False, zeros: bool = False, delay: bool = False, lag: bool = False
+    ) -> tuple[str, ...]:
         """Return the names that are free, of those that the motion can tell apart."""
         joints = self.plant.coordinates
         names = [*tellable(self.plant), *(f"{joint}.damping" for joint in joints.names)]
@@ -111,7 +117,24 @@ class MechanismModel:
             names += [f"{joint}.effort_offset" for joint in joints.driven_names]
         if zeros:
             names += [f"{joint.name}.angle_offset" for joint in joints.joints if joint.turns]
-        return (*names, DELAY) if delay and joints.driven else tuple(names)
+        if joints.driven:
+            names += [name for name, wanted in ((DELAY, delay), (LAG, lag)) if wanted]
+        return tuple(names)
+
+    def tables(self, values: Array) -> tuple[Array, Array, Array, Array]:
+        """Return what :func:`~pendulum_bags.identification.mechanism_kernel.motion_kernel` takes of c sets of values.
+
+        Args:
+            values: Shape (c, parameters).
+        """
+        n, own = len(self.plant.joints), len(self.plant.mechanism.parameter_names)
+        friction, offset, zero = (values[:, own + i * n : own + (i + 1) * n] for i in range(3))
+        table = np.tile(np.array(pack_joints(self.plant)), (len(values), 1, 1))
+        # In the fit breakaway is the friction while sliding, and the lag has been applied to the input.
+        table[:, 0] = table[:, 1] = friction
+        table[:, 5] = 0.0
+        arrays = (values[:, :own], table, offset, zero)
+        return tuple(np.ascontiguousarray(array) for array in arrays)  # type: ignore[return-value]
 
 
 @lru_cache(maxsize=16)
@@ -119,29 +142,26 @@ def tellable(plant: MechanismParameters) -> tuple[str, ...]:
     """Return the mechanism's own parameters that any motion under known efforts tells apart; the others are held.
 
     The acceleration's derivatives at random states show which parameters do the same. Of those, an inertia is fitted
-    rather than a centre of mass, and that rather than a mass. What a ruler tells (lengths of links, gravity, gears) is
-    held.
+    rather than a centre of mass, that rather than a mass, and that rather than a length. Gravity and gears are held.
 
     Source:
         Gautier and Khalil, Direct calculation of minimum set of inertial parameters of serial robots, IEEE Trans.
         Robotics and Automation 6(3), 1990 (base parameters; by random states: Gautier 1991).
     """
     model = MechanismModel.of(plant)
-    own = [spec for spec in plant.mechanism.parameters if _free(spec.name, spec.unit)]
-    names = [spec.name for spec in sorted(own, key=lambda spec: _ORDER.index(spec.unit))]
+    own = [spec for spec in plant.mechanism.parameters if spec.unit in _ORDER and not spec.name.startswith("rotor")]
+    names = [spec.name for spec in sorted(own, key=lambda spec: (_is_length(spec.name), _ORDER.index(spec.unit)))]
     damping = list(plant.mechanism.parameter_names[len(plant.mechanism.parameters) :])
     count = len(plant.joints)
-    x, u, p = casadi.SX.sym("x", 2 * count), casadi.SX.sym("u", count), casadi.SX.sym("p", len(model.names))
-    found = casadi.jacobian(_rate(model, x, u, p)[count:], p)
-    rows = casadi.Function("rows", [x, u, p], [casadi.densify(found)])
+    forward = in_arithmetic(plant.mechanism.forward, cmath)
     rng = np.random.default_rng(0)
     largest = float(np.max(plant.effort_limits)) if plant.actuators else 1.0
     samples = []
     for _ in range(80):
-        state = np.concatenate((rng.uniform(-3.0, 3.0, count), rng.normal(0.0, 5.0, count)))
+        q, v = tuple(rng.uniform(-3.0, 3.0, count)), tuple(rng.normal(0.0, 5.0, count))
         drive = np.zeros(count)
         drive[list(plant.coordinates.driven)] = rng.normal(0.0, largest, len(plant.actuators))
-        values = rows(state, drive, model.values).full()
+        values = np.array(complex_step(lambda *p, q=q, v=v, u=tuple(drive): forward(q, v, u, p), plant.packed))
         samples.append(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12))
     table = np.concatenate(samples)
     kept: list[str] = []
@@ -156,43 +176,5 @@ def tellable(plant: MechanismParameters) -> tuple[str, ...]:
     return tuple(spec.name for spec in plant.mechanism.parameters if spec.name in kept)
 
 
-def _free(name: str, unit: str) -> bool:
-    return unit in _ORDER and not name.startswith("rotor") and not (unit == "m" and "centre" not in name)
-
-
-def _rate(model: MechanismModel, x: Any, u: Any, p: Any) -> Any:
-    """Return the time derivative of (q, v) as casadi's expression."""
-    plant = model.plant
-    count = len(plant.joints)
-    at = {name: p[i] for i, name in enumerate(model.names)}
-    joints = plant.coordinates.names
-    q = [x[i] - at[f"{joint}.angle_offset"] for i, joint in enumerate(joints)]
-    v = [x[count + i] for i in range(count)]
-    torque = [
-        u[i] + at[f"{joint}.effort_offset"] - at[f"{joint}.coulomb_friction"] * casadi.tanh(v[i] / _SMOOTH)
-        for i, joint in enumerate(joints)
-    ]
-    forward = in_arithmetic(plant.mechanism.forward, casadi)
-    own = [p[i] for i in range(len(plant.mechanism.parameter_names))]
-    return casadi.vertcat(*v, *forward(q, v, torque, own))
-
-
-@lru_cache(maxsize=16)
-def step_functions(plant: MechanismParameters, free: tuple[str, ...]) -> tuple[Any, Any]:
-    """Return (x, u, h, p) -> next state, and (x, u, slope, p) -> d rate / d(x, free) with slope = du/d delay."""
-    model = MechanismModel.of(plant)
-    count = len(plant.joints)
-    x, u, h = casadi.SX.sym("x", 2 * count), casadi.SX.sym("u", count), casadi.SX.sym("h")
-    slope, p = casadi.SX.sym("slope", count), casadi.SX.sym("p", len(model.names))
-    at = x
-    first = _rate(model, at, u, p)
-    second = _rate(model, at + 0.5 * h * first, u, p)
-    third = _rate(model, at + 0.5 * h * second, u, p)
-    fourth = _rate(model, at + h * third, u, p)
-    following = at + h / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
-    by_x, by_u, by_p = (casadi.jacobian(first, symbol) for symbol in (x, u, p))
-    by_p[:, model.names.index(DELAY)] = by_u @ slope
-    columns = by_p[:, model.index(free)] if free else casadi.SX(2 * count, 0)
-    forward = casadi.Function("forward", [x, u, h, p], [following])
-    derivative = casadi.Function("derivative", [x, u, slope, p], [casadi.densify(by_x), casadi.densify(columns)])
-    return forward, derivative
+def _is_length(name: str) -> bool:
+    return "length" in name

@@ -15,19 +15,21 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED
 from pendulum_bags.identification.joint_recordings import JointRecording
-from pendulum_bags.identification.mechanism_choice import choose
-from pendulum_bags.identification.mechanism_doubt import Score, better_reading, refusal
+from pendulum_bags.identification.mechanism_choice import ALL_EXTRAS, choose
+from pendulum_bags.identification.mechanism_doubt import Score, better_reading, noise_of, refusal
 from pendulum_bags.identification.mechanism_fit import (
     MechanismFit,
+    Prior,
     Windows,
+    error_weights,
+    first_weights,
     fit,
     line_errors,
     prepare_windows,
-    rms_by_joint,
     scores,
     window_length,
 )
-from pendulum_bags.identification.mechanism_model import DELAY, MechanismModel, tellable
+from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel, tellable
 from pendulum_bags.identification.mechanism_notes import notes_of
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_bags.identification.wording import Interval
@@ -44,8 +46,11 @@ _WINDOW = (0.5, 5.0)
 """Shortest and longest window by default [s], where neighbouring motions stay together. Each window's start takes up
 two numbers per joint: parameters from long windows predict short ones better than those from short ones."""
 
-_SHORTEST = 0.2
-"""Shortest window by default, however fast neighbouring motions part [s]."""
+_SHORTEST, _SHORTEST_BY_VELOCITY = 0.2, 0.1
+"""Shortest window by default, however fast neighbouring motions part, and where velocities were measured [s]."""
+
+_FAST = 0.005
+"""Longest sampling period from which a lag of the actuators can be told from a delay [s]."""
 
 _POOR = 0.25
 """Share of what straight lines miss from which on a fit is tried again by way of shorter windows."""
@@ -126,8 +131,11 @@ class MechanismResult:
         delay = max(model[DELAY], 0.0) if DELAY in self.fit.free else None
         joints = tuple(replace(joint, static_friction=None) for joint in start.joints)
         plant = replace(start, joints=joints, name=name)
-        if delay is not None:
-            changes.update({f"{joint}.transport_delay": delay for joint in plant.coordinates.driven_names})
+        for joint in plant.coordinates.driven_names:
+            if delay is not None:
+                changes[f"{joint}.transport_delay"] = delay
+            if LAG in self.fit.free:
+                changes[f"{joint}.{LAG}"] = model[LAG]
         return plant.with_values(changes)
 
     def to_dict(self) -> dict[str, Any]:
@@ -177,14 +185,14 @@ class MechanismResult:
             raise DataError(f"plant file is {target.name!r}; expected a name that ends in .yaml")
         plant = self.plant(name)
         intervals = {
-            key: (max(found.low, self.model.lowest(key)), found.high)
+            key: (found.low, found.high)
             for key, found in self.intervals.items()
-            if key != DELAY and not key.endswith("_offset") and found.low < found.high
+            if key not in {DELAY, LAG} and not key.endswith("_offset") and found.low < found.high
         }
         left_out = {
             f"{key} [{self.model.unit(key)}]": self.model[key]
             for key in self.fit.free
-            if key == DELAY or key.endswith("_offset")
+            if key in {DELAY, LAG} or key.endswith("_offset")
         }
         provenance = {
             "method": "output error, multiple shooting",
@@ -230,23 +238,25 @@ def identify_mechanism(
     start = MechanismModel.of(plant)
     seconds = sum(float(recording.time[-1] - recording.time[0]) for recording in recordings)
     longest = window or float(np.clip(seconds / 6.0, *_WINDOW))
-    length = window or max(window_length(start, recordings, longest), _SHORTEST)
+    measured = all(recording.velocity is not None for recording in recordings)
+    shortest = _SHORTEST_BY_VELOCITY if measured else _SHORTEST
+    length = window or max(window_length(start, recordings, longest), shortest)
+    if extras is None and measured and all(np.median(np.diff(r.time)) * stride <= _FAST for r in recordings):
+        # Measured to their velocity, the recordings show these: left out, they would bias what is left.
+        extras = ALL_EXTRAS
     search = _Search(plant, recordings, extras, stride)
     found, chosen, candidates, data, length = search.best(length, fixed=window is not None)
     found, data, pushed = _without_pushes(found, data)
-    # Now that the errors are known, each joint counts by its own.
-    errors = [rms_by_joint(left, part) for left, part in zip(found.residuals, data, strict=True)]
-    weights = 1.0 / np.maximum(np.sqrt(np.mean([each**2 for each in errors], axis=0)), 1e-9)
-    found = fit(found.model, data, found.free, weights, states=found.states)
+    # Now that the errors are known, each measurement counts by its own.
+    for _ in range(2 if measured else 1):
+        weights = error_weights(found, data)
+        found = fit(found.model, data, found.free, weights, states=found.states)
     found, held = _hold_undetermined(start, found, data, weights)
     names = _names([*recordings, *held_out])
-    training = {
-        name: Score(rms_by_joint(left, part), line_errors(part))
-        for name, left, part in zip(names, found.residuals, data, strict=False)
-    }
+    training = {name: Score.of(left, part) for name, left, part in zip(names, found.residuals, data, strict=False)}
     others = [prepare_windows(recording, length, stride=stride) for recording in held_out]
     outside = {
-        n: Score(s, line_errors(p))
+        n: Score(s, line_errors(p), noise_of(p.recording.position))
         for n, s, p in zip(names[len(data) :], scores(found.model, others, weights), others, strict=True)
     }
     intervals = _intervals(found)
@@ -329,9 +339,8 @@ class _Search:
         length: float,
         tried: list[tuple[float, MechanismFit, str, dict[str, float], list[Windows], float]],
     ) -> DataError | None:
-        lines = np.sqrt(np.mean([line_errors(part) ** 2 for part in data], axis=0))
         try:
-            found, chosen, candidates = choose(start, data, 1.0 / np.maximum(lines, 1e-9), self.extras)
+            found, chosen, candidates = choose(start, data, first_weights(data), self.extras)
         except DataError as error:
             return error
         tried.append((_worst(found, data), found, chosen, candidates, data, length))
@@ -340,10 +349,7 @@ class _Search:
 
 def _worst(found: MechanismFit, data: Sequence[Windows]) -> float:
     """Return what a fit misses over what straight lines miss, of the joint and recording where it is worst."""
-    return max(
-        Score(rms_by_joint(left, part), line_errors(part)).share
-        for left, part in zip(found.residuals, data, strict=True)
-    )
+    return max(Score.of(left, part).share for left, part in zip(found.residuals, data, strict=True))
 
 
 def _without_pushes(
@@ -425,7 +431,7 @@ def _check_distinct(recordings: Sequence[JointRecording], held_out: Sequence[Joi
 
 
 def _intervals(found: MechanismFit) -> dict[str, Interval]:
-    """Return 95 % intervals that coloured residuals and differences between recordings widen.
+    """Return 95 % intervals that coloured residuals and differences between recordings widen, cut at the domain's edge.
 
     The largest of three errors counts: white residuals; windows as clusters (a sandwich), since within a window the
     residuals are coloured; recordings as clusters, where there are three or more.
@@ -434,7 +440,9 @@ def _intervals(found: MechanismFit) -> dict[str, Interval]:
     if not free:
         return {}
     size = np.array([found.model.size(name) for name in free])
+    prior = np.diag(Prior.of(found.model, free).weights * size**2)
     matrix = sum((b.matrices.sum(axis=0) for b in found.blocks), np.zeros((len(free),) * 2)) * np.outer(size, size)
+    matrix = matrix + prior
     level, axes = np.linalg.eigh(matrix)
     # A direction that the data do not see has a wide interval, not none.
     inverse = (axes / np.maximum(level, 1e-12 * max(float(level[-1]), 1e-300))) @ axes.T
@@ -449,14 +457,18 @@ def _intervals(found: MechanismFit) -> dict[str, Interval]:
         groups.append(np.array([b.gradients.sum(axis=0) for b in found.blocks]) * size)
     for group in groups:
         count = len(group)
-        spread = (group.T @ group) * count / (count - 1)
+        spread = (group.T @ group) * count / (count - 1) + prior
         errors.append(np.diag(inverse @ spread @ inverse))
     largest = np.sqrt(np.maximum(np.max(errors, axis=0), 0.0)) * size
     white = np.sqrt(np.maximum(errors[0], 0.0)) * size
     factor = float(student_quantile(0.975, max(windows - len(free), 3)))
     return {
         name: Interval(
-            found.model[name], found.model[name] - factor * e, found.model[name] + factor * e, float(e), float(w)
+            found.model[name],
+            max(found.model[name] - factor * e, found.model.lowest(name)),
+            found.model[name] + factor * e,
+            float(e),
+            float(w),
         )
         for name, e, w in zip(free, largest, white, strict=True)
     }

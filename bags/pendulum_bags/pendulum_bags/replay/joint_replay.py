@@ -14,8 +14,8 @@ from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.identification.explained import LARGEST_SHARE
 from pendulum_bags.identification.joint_recordings import read_joints
 from pendulum_bags.identification.mechanism_doubt import Score
-from pendulum_bags.identification.mechanism_fit import fit, line_errors, prepare_windows, rms_by_joint
-from pendulum_bags.identification.mechanism_model import DELAY, MechanismModel
+from pendulum_bags.identification.mechanism_fit import fit, line_errors, prepare_windows
+from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel
 from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, load_mechanism
@@ -120,10 +120,10 @@ def replay_joints(
     recording.check(own.coordinates)
     model = MechanismModel.of(own)
     values = model.values.copy()
-    values[model.index([DELAY])] = common_delay(own)
+    values[model.index([DELAY, LAG])] = common_delay(own), max((a.time_constant for a in own.actuators), default=0.0)
     data = prepare_windows(recording, window)
-    lines = line_errors(data)
-    found = fit(model.with_values(values), [data], (), 1.0 / np.maximum(lines, 1e-9), most=12, tolerance=1e-6)
+    weights = 1.0 / np.maximum(line_errors(data), 1e-9)
+    found = fit(model.with_values(values), [data], (), weights, most=12, tolerance=1e-6)
     inside = data.inside
     measured = data.position[inside]
     return JointReplay(
@@ -131,7 +131,7 @@ def replay_joints(
         own.name,
         own.coordinates.joints,
         window,
-        Score(rms_by_joint(found.residuals[0], data), lines),
+        Score.of(found.residuals[0], data),
         data.time[inside] - recording.time[0],
         measured,
         measured + found.residuals[0][inside],

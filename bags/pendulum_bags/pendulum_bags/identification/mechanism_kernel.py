@@ -1,0 +1,85 @@
+"""Compiled motion of a mechanism over many windows, for several sets of parameters at a time.
+
+The steps are the plant's own (:func:`pendulum_msgs_py.dynamics.joint_steps.advance_joints`): true stiction, end stops,
+Runge-Kutta of order four between events. A step has the mean of the input over it.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numba
+
+from pendulum_bags.arrays import Array
+from pendulum_msgs_py.dynamics.joint_steps import advance_joints, joint_functions
+from pendulum_msgs_py.loops.trees import compile_tree, tuple_loader
+from pendulum_msgs_py.mechanisms import MECHANISMS
+from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+
+__all__ = ["lagged", "motion_kernel"]
+
+
+@numba.njit(cache=True)
+def lagged(effort: Array, rise: Array, steps: Array, lag: float) -> Array:
+    """Return a first-order lag of an input of straight pieces at each stamp, at rest before, shape (s, n).
+
+    Args:
+        effort: At the start of each piece, shape (s, n).
+        rise: Its slope in each piece, shape (s - 1, n).
+        steps: Lengths of the pieces, shape (s - 1,) [s].
+        lag: Time constant, > 0 [s].
+    """
+    found = effort.copy()
+    for k in range(steps.size):
+        decay = math.exp(-steps[k] / lag)
+        for i in range(effort.shape[1]):
+            settled = rise[k, i] * lag
+            end = effort[k, i] + rise[k, i] * steps[k]
+            found[k + 1, i] = end - settled + (found[k, i] - effort[k, i] + settled) * decay
+    return found
+
+
+@cache
+def motion_kernel(name: str) -> Any:
+    """Return the compiled motion of a mechanism.
+
+    It is called as (p, table, push, shift, drive, which, h, states, path), for c sets of w windows of l instants and n
+    joints: parameters (c, .), rows of joints (c, 6, n), efforts on the joints (c, n), positions of the encoders' zeros
+    (c, n), mean inputs (d, w, l - 1, n) and which of them each set has (c,), steps (w, l - 1) [s], starts (c, w, 2 n)
+    and the motion that it writes, (c, w, l, 2 n).
+    """
+    mechanism = MECHANISMS[name]
+    n, size = len(mechanism.joints), len(mechanism.parameter_names)
+    forward = compile_tree(mechanism.forward, inline=True)
+    along, put, lag = (compile_tree(function, inline=True) for function in joint_functions(n))
+    advance = compile_tree(advance_joints, inline=True)
+    load, load_p = tuple_loader(n, 1), tuple_loader(size, 1)
+
+    @numba.njit(error_model="numpy", fastmath={"contract"})
+    def run(p: Any, table: Any, push: Any, shift: Any, drive: Any, which: Any, h: Any, states: Any, path: Any) -> None:
+        for c in range(p.shape[0]):
+            own = load_p(p[c], 0)
+            rows = (
+                load(table[c, 0], 0),
+                load(table[c, 1], 0),
+                load(table[c, 2], 0),
+                load(table[c, 3], 0),
+                load(table[c, 4], 0),
+                load(table[c, 5], 0),
+            )
+            pushed, zero = load(push[c], 0), load(shift[c], 0)
+            for w in range(h.shape[0]):
+                q, v = along(load(states[c, w], 0), -1.0, zero), load(states[c, w], n)
+                for i in range(2 * n):
+                    path[c, w, 0, i] = states[c, w, i]
+                for k in range(h.shape[1]):
+                    if h[w, k] > 0.0:
+                        torque = load(drive[which[c], w, k], 0)
+                        q, v = advance(forward, along, put, lag, q, v, torque, torque, pushed, h[w, k], own, rows)
+                    for i in range(n):
+                        path[c, w, k + 1, i] = q[i] + zero[i]
+                        path[c, w, k + 1, n + i] = v[i]
+
+    return keep_kernel(run, "motion_kernel", mechanism.forward)
