@@ -179,7 +179,10 @@ def run_balanced(preset: str, seed: int, duration: float = 20.0) -> BalancedRun:
     blur = 2e-3 * scale * rng.standard_normal((steps, 2))
     values = np.array(list(true.values()))
     found = _run(kind, values[:own], values[own:], np.array(driven), gain, goal, noise, limit, step, blur)
-    return BalancedRun(*found, {**_as_fitted(kind, nominal, true), "delay": DELAY + LEAD, "time_constant": LAG})
+    position, velocity, effort = found
+    return BalancedRun(
+        position, velocity, effort, {**_as_fitted(kind, nominal, true), "delay": DELAY + LEAD, "time_constant": LAG}
+    )
 
 
 def _as_fitted(kind: int, nominal: dict[str, float], true: dict[str, float]) -> dict[str, float]:

@@ -46,8 +46,9 @@ enough where velocities were measured too: the start of a short window is known 
 _LONGEST = 0.006
 """Longest step; between samples that lie further apart the motion is simulated in several equal ones [s]."""
 
-_FINE = 0.0005
-"""The same where velocities were measured [s]: to their noise, it counts when within a step the effort changed."""
+_FINE, _STICKING = 0.0005, 0.00025
+"""The same where velocities were measured, without and with dry friction [s]: to their noise, it counts when within a
+step the effort changes, and that a joint at rest breaks away at the start of a step only."""
 
 
 _BEFORE = 0.02
@@ -90,7 +91,7 @@ class Windows:
         )
 
     def input(self, delay: float, lag: float) -> Array:
-        """Return the mean effort of each step, delayed and lagging, shape (w, l - 1, n)."""
+        """Return straight lines for the effort in each step, delayed and lagging: start and slope, (w, l - 1, 2 n)."""
         r = self.recording
         wanted = self.time - delay
         at = np.clip(wanted, r.time[0], r.time[-1])
@@ -110,18 +111,21 @@ class Windows:
             settled = slope[k] * lag
             start = lagged(r.effort, slope, steps, lag)[k]
             late = level - settled + (start - r.effort[k] + settled) * np.exp(-since / lag)
-            area = area - lag * late
+            area, level = area - lag * late, late
         steps = np.diff(self.time, axis=1)
-        return np.diff(area, axis=1) / np.where(steps > 0.0, steps, 1.0)[..., None]
+        length = np.where(steps > 0.0, steps, 1.0)[..., None]
+        mean, half = np.diff(area, axis=1) / length, 0.5 * np.diff(level, axis=1)
+        return np.concatenate((mean - half, 2.0 * half / length), axis=2)
 
 
-def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1) -> Windows:
+def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1, sticking: bool = False) -> Windows:
     """Cut a recording into windows.
 
     Args:
         recording: The data.
         window: Length [s].
         stride: Take every so manieth sample; the effort between them is not lost, its mean drives the step.
+        sticking: Whether joints have dry friction.
     """
     # What was commanded before the recording acts on in its first moments.
     begin = int(np.searchsorted(recording.time, recording.time[0] + _BEFORE))
@@ -137,7 +141,7 @@ def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1
             f"{recording.name} has no window of {window} s with 8 samples and no gap; expected a longer recording or a "
             "higher rate"
         )
-    longest = _LONGEST if recording.velocity is None else _FINE
+    longest = _LONGEST if recording.velocity is None else _STICKING if sticking else _FINE
     several = max(1, math.ceil(stride * period / longest - 1e-6))
     size = (max(part.size for part in parts) - 1) * several + 1
     time, inside = np.empty((len(parts), size)), np.zeros((len(parts), size), dtype=bool)

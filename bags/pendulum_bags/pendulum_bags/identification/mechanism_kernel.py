@@ -1,7 +1,7 @@
 """Compiled motion of a mechanism over many windows, for several sets of parameters at a time.
 
 The steps are the plant's own (:func:`pendulum_msgs_py.dynamics.joint_steps.advance_joints`): true stiction, end stops,
-Runge-Kutta of order four between events. A step has the mean of the input over it.
+Runge-Kutta of order four between events. Within a step the input is a straight line with the input's own mean.
 """
 
 from __future__ import annotations
@@ -41,19 +41,30 @@ def lagged(effort: Array, rise: Array, steps: Array, lag: float) -> Array:
     return found
 
 
+def ramp_1(torque: Any, rise: Any, elapsed: float, _constants: Any) -> Any:
+    """Return a rising effort after some time, of one joint, in the place of an actuator's lag."""
+    return (torque[0] + elapsed * rise[0],)
+
+
+def ramp_2(torque: Any, rise: Any, elapsed: float, _constants: Any) -> Any:
+    """Return the same of two joints."""
+    return torque[0] + elapsed * rise[0], torque[1] + elapsed * rise[1]
+
+
 @cache
 def motion_kernel(name: str) -> Any:
     """Return the compiled motion of a mechanism.
 
     It is called as (p, table, push, shift, drive, which, h, states, path), for c sets of w windows of l instants and n
     joints: parameters (c, .), rows of joints (c, 6, n), efforts on the joints (c, n), positions of the encoders' zeros
-    (c, n), mean inputs (d, w, l - 1, n) and which of them each set has (c,), steps (w, l - 1) [s], starts (c, w, 2 n)
-    and the motion that it writes, (c, w, l, 2 n).
+    (c, n), inputs at the start of each step and their slopes (d, w, l - 1, 2 n) and which of them each set has (c,),
+    steps (w, l - 1) [s], starts (c, w, 2 n) and the motion that it writes, (c, w, l, 2 n).
     """
     mechanism = MECHANISMS[name]
     n, size = len(mechanism.joints), len(mechanism.parameter_names)
     forward = compile_tree(mechanism.forward, inline=True)
-    along, put, lag = (compile_tree(function, inline=True) for function in joint_functions(n))
+    along, put, _ = (compile_tree(function, inline=True) for function in joint_functions(n))
+    ramp = compile_tree({1: ramp_1, 2: ramp_2}[n], inline=True)
     advance = compile_tree(advance_joints, inline=True)
     load, load_p = tuple_loader(n, 1), tuple_loader(size, 1)
 
@@ -76,8 +87,21 @@ def motion_kernel(name: str) -> Any:
                     path[c, w, 0, i] = states[c, w, i]
                 for k in range(h.shape[1]):
                     if h[w, k] > 0.0:
-                        torque = load(drive[which[c], w, k], 0)
-                        q, v = advance(forward, along, put, lag, q, v, torque, torque, pushed, h[w, k], own, rows)
+                        effort = drive[which[c], w, k]
+                        q, v = advance(
+                            forward,
+                            along,
+                            put,
+                            ramp,
+                            q,
+                            v,
+                            load(effort, 0),
+                            load(effort, n),
+                            pushed,
+                            h[w, k],
+                            own,
+                            rows,
+                        )
                     for i in range(n):
                         path[c, w, k + 1, i] = q[i] + zero[i]
                         path[c, w, k + 1, n + i] = v[i]

@@ -323,7 +323,10 @@ class _Search:
         return best[1:]
 
     def _windows(self, length: float) -> list[Windows]:
-        data = [prepare_windows(recording, length, stride=self.stride) for recording in self.recordings]
+        sticking = any(joint.coulomb_friction > 0.0 for joint in self.plant.joints)
+        data = [
+            prepare_windows(recording, length, stride=self.stride, sticking=sticking) for recording in self.recordings
+        ]
         total = sum(len(part.time) for part in data)
         if total < _FEWEST:
             raise DataError(
