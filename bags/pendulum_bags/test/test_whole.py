@@ -22,7 +22,7 @@ from pendulum_bags.verdict import Answer, Layer, LayerResult, Mark
 from pendulum_bags.whole import carry_out, words
 from pendulum_bags.whole.carry_out import Findings, Simulated
 from pendulum_bags.whole.contenders import contender_specs, place_of, simulate_contenders
-from pendulum_msgs_py.errors import BagError, FaultError
+from pendulum_msgs_py.errors import BagError, DataError, FaultError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_msgs_py.programs.terminal import make_console
 from pendulum_sim.exports.model_files import mjcf
@@ -96,6 +96,17 @@ def test_two_simulations_are_not_repeated_in_advance_since_they_may_be_one(tmp_p
         bags = [str(one.bag.relative_to(tmp_path)) for one in run.machine.runs]
         assert {"identified/hw", "frequency_response/hw", "ranking/lqr_seed1/hw/bag"} <= set(bags)
         repeats.append("repeats/1/hw" in bags)
+
+    def fails() -> None:
+        raise DataError("they hold one and the same recording")
+
+    run.now = "undecided"
+    with pytest.raises(DataError):
+        run.carry_out(fails)
+    run.compared.set()
+    # There is an answer, which must not be lost.
+    run.carry_out(fails)
+    assert run.found.notes == ["Undecided failed: they hold one and the same recording."]
     assert repeats == [True, False]
 
 

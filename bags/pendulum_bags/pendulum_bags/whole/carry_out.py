@@ -195,7 +195,7 @@ def carry_out(folder: Path, order: Order, progress: PhaseProgress, on_first: Cal
         spent = threading.Event()
         try:
             with _ends_with_budget(order.budget, run.compared, spent):
-                run.compare_given()
+                run.carry_out(run.compare_given)
                 for step in run.steps():
                     run.carry_out(step)
         except KeyboardInterrupt:
@@ -299,10 +299,12 @@ class _Run:
         )
 
     def carry_out(self, step: Callable[[], None]) -> None:
-        """Carry out a step; one that fails leaves a note, and the others go on."""
+        """Carry out a step; one that fails once there is an answer leaves a note, and the others go on."""
         try:
             step()
         except PendulumError as error:
+            if not self.compared.is_set():
+                raise
             self.found.notes.append(f"{self.now[0].upper()}{self.now[1:]} failed: {error}".rstrip(".") + ".")
 
     def steps(self) -> Iterator[Callable[[], None]]:
