@@ -216,6 +216,7 @@ def test_ctrl_c_behind_the_first_layer_gives_the_answer_so_far(
     output = " ".join(program.output.split())
     assert summary["answer"]["mark"] == "no"
     assert summary["answer"]["sentence"] in output
+    assert summary["left_out"] == ["The run was interrupted: “identifying the plant” and what follows it was left out."]
     assert f"what was recorded is in {folder}" in output
     assert (folder / "report.html").is_file()
     assert processes.leftovers() == []

@@ -34,8 +34,8 @@ def test_one_layer_that_says_no_makes_it_no_and_what_another_certifies_is_still_
     assert answer.mark is Mark.NO
     assert answer.sentence == (
         "No: the emulated hardware moves 31 % less. "
-        "About the stability of a design “which controllers” decides, about how closely it moves as simulated "
-        "“same run”. What holds: designs with a margin above 0.21 stabilise the emulated hardware."
+        "For the stability of a design, test 3 (which controllers) decides; for how closely the motion matches, test 1 "
+        "(same run). What holds: designs with a margin above 0.21 stabilise the emulated hardware."
     )
     assert [one.layer for one in answer.layers] == list(Layer)
     assert answer.next_steps[0] == "mend same run"

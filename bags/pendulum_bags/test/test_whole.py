@@ -70,8 +70,7 @@ def test_recordings_are_made_one_after_the_other_and_a_failure_is_told_by_its_ow
     first, second, third = (RunSpec(disturbance=NOISE, duration=0.2, seed=seed) for seed in (1, 2, 3))
     runs = [MachineRun(tmp_path / name, spec) for name, spec in (("a", first), ("b", second), ("c", third))]
     record_simulation(tmp_path / "b", first)
-    waits: list[int] = []
-    with Machine(tmp_path, runs, lambda: waits.append(1)) as machine:
+    with Machine(tmp_path, runs) as machine:
         with pytest.raises(FaultError, match="was not recorded"):
             machine.wait(tmp_path / "a")
         machine.start()
@@ -79,7 +78,6 @@ def test_recordings_are_made_one_after_the_other_and_a_failure_is_told_by_its_ow
         with pytest.raises((FaultError, BagError), match=r"exists|not recorded"):
             machine.wait(tmp_path / "b")
         machine.discard()
-    assert waits
     assert not (tmp_path / "a").exists()
 
 
@@ -108,6 +106,12 @@ def test_two_simulations_are_not_repeated_in_advance_since_they_may_be_one(tmp_p
     run.carry_out(fails)
     assert run.found.notes == ["Undecided failed: they hold one and the same recording."]
     assert repeats == [True, False]
+    # The identified plant runs as a simulator of ours, under the controller of the given one and under other noise.
+    file = write_plant(tmp_path / "plant.yaml", load_plant("thesis").with_values(inertia=0.2))
+    spec, given = (lockstep_spec(one, side="sim") for one in (run.tested_with(file), settings))
+    assert (spec.plant, spec.simulation) == (str(file), "")
+    assert spec.design_plant == given.design_plant == "thesis"
+    assert spec.seed != given.seed
 
 
 def test_an_identified_plant_runs_under_the_controller_of_the_given_one(tmp_path: Path) -> None:
@@ -148,7 +152,8 @@ def test_what_ends_before_its_budget_is_not_interrupted() -> None:
 
 def _answer(mark: Mark, choice: Mark) -> Answer:
     layers = [LayerResult(layer, mark, "A sentence.", reason="a reason") for layer in list(Layer)[:3]]
-    text = f"{mark.value.capitalize()}: a reason."
+    missing = " Not measured: “same choice”." if (mark, choice) == (Mark.YES, Mark.NOT_MEASURED) else ""
+    text = f"{mark.value.capitalize()}: a reason.{missing}"
     return Answer(mark, text, [*layers, LayerResult(Layer.SAME_CHOICE, choice, "Another.")], ("the next step",))
 
 
@@ -175,7 +180,10 @@ def _answer(mark: Mark, choice: Mark) -> Answer:
         (
             (Mark.NO, Mark.YES),
             (Mark.NOT_MEASURED, Mark.NOT_MEASURED),
-            "No with thesis, the plant that you had: a reason. Yes with plant.yaml, which this run found.",
+            (
+                "No with thesis, the plant that you had: a reason. Yes with plant.yaml, which this run found. "
+                "Not measured: “same choice”."
+            ),
         ),
     ],
 )

@@ -35,9 +35,8 @@ def decide(
     budget: Budget,
     *,
     on_look: Callable[[int, float], None] = lambda number, duration: None,
-    on_wait: Callable[[], None] = lambda: None,
     on_comparison: Callable[[Comparison], None] = lambda found: None,
-    record: Callable[..., None] = record_repeat,
+    record: Callable[[Path, RegulationSettings, int], None] = record_repeat,
 ) -> Comparison:
     """Compare a run folder, and record repeats into it until the comparison is decided.
 
@@ -50,7 +49,6 @@ def decide(
         margins: What difference does not matter.
         budget: Limit of the repeats.
         on_look: Called with the number of a repeat and its duration of noise [s] before it is recorded.
-        on_wait: Called while waiting.
         on_comparison: Called with the comparison after each analysis.
         record: Records what a repeat lacks.
     """
@@ -62,7 +60,7 @@ def decide(
     number = 0
     while repeat_folder(folder, number + 1).is_dir():
         number += 1
-        record(folder, settings, number, on_wait=on_wait)
+        record(folder, settings, number)
     look = 1
     slowest = 0.0
     while True:
@@ -78,5 +76,5 @@ def decide(
         look += 1
         before = budget.clock()
         on_look(number, repeat_settings(settings, number).noise.duration)
-        record(folder, settings, number, on_wait=on_wait)
+        record(folder, settings, number)
         slowest = budget.clock() - before

@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -218,6 +219,7 @@ def thesis(
     with (
         confirmed(settings.machine, settings.bridge_program(), _plan(settings), yes=yes),
         new_run(out, "thesis", console) as folder,
+        ExitStack() as leaving,
     ):
         if foreign is not None:
             equation = foreign.write_equation(folder)
@@ -225,19 +227,17 @@ def thesis(
         started = time.monotonic()
         order = Order(settings, margins, budget, steps, contenders, domain)
         with PhaseProgress(order.expected_wall_time, console) as progress:
-            found = carry_out(folder, order, progress, partial(_print_first, console, json_output=json_output))
-            progress.phase("writing the report", 6.0)
+            found = carry_out(folder, order, progress, leaving, partial(_print_first, console, json_output=json_output))
             answer, answers = whole_answer(found)
             summary = _summary(settings, found, answer, answers)
             write_json(folder / "summary.json", summary)
-            if found.interrupted:
-                console.print(answer.sentence, highlight=False, markup=False)
-                console.print("Writing the page; Ctrl-C once more leaves it.")
+            # Before the page, which takes seconds: Ctrl-C then loses no answer.
+            if json_output:
+                print(json_text(summary), flush=True)
+            else:
+                _print_whole(console, found, answer, answers)
+            progress.phase("writing the report", 6.0)
             write_whole_report(folder, summary, found, answer, answers)
-        if json_output:
-            print(json_text(summary))
-        else:
-            _print_whole(console, found, answer, answers)
         elapsed = time.monotonic() - started
         console.print(
             f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",

@@ -307,7 +307,6 @@ def record_joints(
     excitation: Mapping[str, Any] | None = None,
     hosts: HostPool | None = None,
     on_side: Callable[[str], None] = lambda side: None,
-    on_wait: Callable[[], None] = lambda: None,
 ) -> None:
     """Record both sides over DDS, in lockstep, as the bags ``sim`` and ``hw`` of a run folder.
 
@@ -320,7 +319,6 @@ def record_joints(
         excitation: Parameters of the disturbance that differ from those of the noise.
         hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
         on_side: Called with each side's name when it starts.
-        on_wait: Called while waiting.
 
     Raises:
         BagError: A bag exists, or cannot be written.
@@ -337,7 +335,7 @@ def record_joints(
         stopped = ""
         try:
             run = JointRun(settings, side, runs, design, excitation=excitation or {})
-            record_run(folder / side, run, on_wait=on_wait, hosts=hosts)
+            record_run(folder / side, run, hosts=hosts)
         except PlantStoppedError as error:
             stopped = f"went to {error.mode} ({error.reason})"
         ends[words] = _end_of(folder / side, f"/{side}", plant, stopped)

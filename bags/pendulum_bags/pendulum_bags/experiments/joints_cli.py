@@ -156,7 +156,6 @@ def joints(
                 made,
                 hosts=hosts,
                 on_side=lambda side: progress.phase(side, expected),
-                on_wait=progress.refresh,
             )
             if measured:
                 try:
@@ -168,7 +167,6 @@ def joints(
                         hosts=hosts,
                         on_side=lambda side: progress.phase(f"{side}, multisine", longer),
                         on_analysis=lambda what: progress.phase(what, 0.5 * _ANALYSING),
-                        on_wait=progress.refresh,
                     )
                 except (FaultError, DataError) as error:
                     # The comparison under noise stays valid.
@@ -182,7 +180,6 @@ def joints(
                     range(seed, seed + rank_seeds),
                     hosts=hosts,
                     on_run=lambda what: progress.phase(what, each),
-                    on_wait=progress.refresh,
                 )
                 words = Words("--rank-seeds 10", f"experiment joints --plant {plant} --periods 40", COST)
                 case = Case(*map(plant_identity, (simulated, drawn)))

@@ -6,7 +6,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -39,12 +39,10 @@ class Machine:
     Args:
         folder: The run's folder.
         runs: The recordings.
-        on_wait: Called while waiting for one.
     """
 
-    def __init__(self, folder: Path, runs: Sequence[MachineRun], on_wait: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, folder: Path, runs: Sequence[MachineRun]) -> None:
         self.runs = runs
-        self._on_wait = on_wait
         self._processes = ProcessSet(folder / "logs" / "machine", {})
         self._child: Child | None = None
 
@@ -90,7 +88,6 @@ class Machine:
             self._processes.check()
             if self._child.process.poll() is not None and self._ended(run.bag) is None:
                 raise FaultError(f"bag {bag} was not recorded: {self._child.last_words() or 'its program has ended'}")
-            self._on_wait()
             time.sleep(_POLL)
         stopped, reason = ended
         if stopped:

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -163,13 +163,12 @@ class ProcessSet:
             self.children.remove(child)
         return code
 
-    def wait(self, child: Child, timeout: float, *, on_wait: Callable[[], None] = lambda: None) -> None:
+    def wait(self, child: Child, timeout: float) -> None:
         """Wait for a program that ends by itself.
 
         Args:
             child: The program.
             timeout: Longest time to wait [s].
-            on_wait: Called while waiting, to show progress.
 
         Raises:
             FaultError: It ends with an error, or not in time.
@@ -179,7 +178,6 @@ class ProcessSet:
             if time.monotonic() > deadline:
                 words = child.last_words() or "none"
                 raise FaultError(f"{child.name} still runs after {timeout:g} s; its last output: {words}")
-            on_wait()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.process.wait(0.1)
         self.check()

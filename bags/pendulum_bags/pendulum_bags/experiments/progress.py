@@ -11,8 +11,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 __all__ = ["PhaseProgress"]
 
-_LONGEST_SILENCE = 4.0
-"""Time between two signs of life [s]."""
+_SILENCE = 4.0
+"""Time between two lines of a phase where the output is no terminal [s]."""
+_TICK = 0.25
+"""Time between two moves of the bar [s]."""
 
 
 class PhaseProgress:
@@ -38,7 +40,7 @@ class PhaseProgress:
         self._done = 0.0
         self._length = 0.0
         self._name = ""
-        self._started = time.monotonic()
+        self._started = self._printed = time.monotonic()
         self._ended = threading.Event()
         self._ticker = threading.Thread(target=self._tick, daemon=True)
 
@@ -60,27 +62,23 @@ class PhaseProgress:
         """Begin a phase of an expected length [s]; the one before counts as done."""
         self._done += self._length
         self._name, self._length = name, expected
-        self._started = time.monotonic()
+        self._started = self._printed = time.monotonic()
         self._bar.update(self._task, description=name, completed=self._done)
         if not self._console.is_terminal:
             self._console.print(f"{name} ({expected:.0f} s)", highlight=False)
 
     def _tick(self) -> None:
         """Show that a phase goes on, also while nothing else in this process can."""
-        while not self._ended.wait(_LONGEST_SILENCE):
-            self.refresh()
-            if self._name and not self._console.is_terminal:
-                elapsed = time.monotonic() - self._started
-                if elapsed > 0.9 * _LONGEST_SILENCE:
-                    self._console.print(f"  {self._name}: {elapsed:.0f} of {self._length:.0f} s", highlight=False)
+        while not self._ended.wait(_TICK):
+            elapsed = time.monotonic() - self._started
+            # Never past the end of the phase.
+            self._bar.update(self._task, completed=self._done + min(elapsed, self._length))
+            if self._name and not self._console.is_terminal and time.monotonic() - self._printed > _SILENCE:
+                self._console.print(f"  {self._name}: {elapsed:.0f} of {self._length:.0f} s", highlight=False)
+                self._printed = time.monotonic()
 
     def start_again(self, why: str) -> None:
         """Restart, and print the reason."""
         self._console.print(why, style="yellow", highlight=False, markup=False, soft_wrap=True)
         self._done = self._length = 0.0
         self._bar.reset(self._task)
-
-    def refresh(self) -> None:
-        """Move the bar with time, never past the end of the phase."""
-        elapsed = min(time.monotonic() - self._started, self._length)
-        self._bar.update(self._task, completed=self._done + elapsed)

@@ -7,7 +7,6 @@ its nodes to the last bit in a tenth of the time; both are stored as bags.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,16 +48,13 @@ def repeat_settings(settings: RegulationSettings, number: int) -> RegulationSett
     return replace(settings, noise=replace(noise, seed=noise.seed + SEED_STEP * number, duration=duration))
 
 
-def record_repeat(
-    folder: Path, settings: RegulationSettings, number: int, *, on_wait: Callable[[], None] = lambda: None
-) -> None:
+def record_repeat(folder: Path, settings: RegulationSettings, number: int) -> None:
     """Record what a repeat lacks of its two bags.
 
     Args:
         folder: Folder of the run.
         settings: Settings of the run.
         number: Of the repeat, from 1.
-        on_wait: Called while waiting.
 
     Raises:
         BagError: A bag cannot be written.
@@ -68,26 +64,23 @@ def record_repeat(
     place = repeat_folder(folder, number)
     for side in ("hw", "sim"):
         if not (place / side).exists():
-            record_spec(place / side, lockstep_spec(chosen, side=side), on_wait=on_wait)
+            record_spec(place / side, lockstep_spec(chosen, side=side))
 
 
-def record_spec(
-    bag: Path, spec: RunSpec, *, hosts: HostPool | None = None, on_wait: Callable[[], None] = lambda: None
-) -> Path:
+def record_spec(bag: Path, spec: RunSpec, *, hosts: HostPool | None = None) -> Path:
     """Record a run in lockstep: a simulation in this process, the emulated hardware over DDS; return the bag.
 
     Args:
         bag: Folder of the bag.
         spec: The run.
         hosts: As of :func:`record_run`.
-        on_wait: Called while waiting.
 
     Raises:
         BagError: The bag exists, or cannot be written.
         FaultError: A program ended or did not respond, or the plant faulted.
     """
     if spec.has_bridge:
-        return record_run(bag, spec, hosts=hosts, on_wait=on_wait)
+        return record_run(bag, spec, hosts=hosts)
     return record_simulation(bag, spec)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,6 +41,7 @@ def run_thesis(
     settings: RegulationSettings,
     domain: int | None,
     progress: PhaseProgress,
+    leaving: ExitStack,
     *,
     on_idle: Callable[[], None] = lambda: None,
 ) -> None:
@@ -50,15 +52,15 @@ def run_thesis(
         settings: What to run.
         domain: ROS domain, or None for any free one.
         progress: Shows where it is.
+        leaving: Leaves the graph of a run that succeeded, in which the middleware can hang for good: close it when
+            everything is written.
         on_idle: Called when the ramp down begins, which leaves the computer idle.
 
     Raises:
         FaultError: A program ended, a plant refused or faulted; everything is at rest again when this is raised.
     """
-    with (
-        reserve_domain(domain) as main_domain,
-        conduct(folder / "logs", main_domain, progress.refresh) as session,
-    ):
+    with ExitStack() as stack:
+        session = stack.enter_context(conduct(folder / "logs", stack.enter_context(reserve_domain(domain))))
         progress.phase("starting", 6.0)
         _refuse_occupied_domain(session.conductor, settings)
         plants, recorders = _start(session, folder, settings)
@@ -73,6 +75,7 @@ def run_thesis(
         session.processes.stop()
         if settings.running("sim") is None:
             _simulate_own_protocol(folder, settings)
+        leaving.push(stack.pop_all())
 
 
 def _start(

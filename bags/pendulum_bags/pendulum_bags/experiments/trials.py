@@ -184,9 +184,7 @@ def run_trials(
     with reserve_domain(domain) as reserved, open_pool() as hosts:
         for trial in range(1, settings.trials + 1):
             progress.phase(f"trial {trial} of {settings.trials}", settings.expected_wall_time)
-            bags.append(
-                _run_trial(folder, settings, trial, reserved, hosts if settings.lockstep else None, progress, ask)
-            )
+            bags.append(_run_trial(folder, settings, trial, reserved, hosts if settings.lockstep else None, ask))
     return bags
 
 
@@ -196,12 +194,11 @@ def _run_trial(
     trial: int,
     domain: int,
     hosts: HostPool | None,
-    progress: PhaseProgress,
     ask: Callable[[str], None],
 ) -> Path:
     bag = folder / f"trial_{trial}"
     lockstep = settings.lockstep
-    with conduct(folder / "logs" / bag.name, domain, progress.refresh, hosts=hosts) as session:
+    with conduct(folder / "logs" / bag.name, domain, hosts=hosts) as session:
         conductor = session.conductor
         recorder = session.record(bag, "/hw", _metadata(settings, trial), settings.storage, simulated=lockstep)
         start_loop(session.processes, settings.procedure_program(trial), ANSWER_PRIORITY, simulated=lockstep)

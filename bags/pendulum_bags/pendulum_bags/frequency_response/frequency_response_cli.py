@@ -180,7 +180,7 @@ def experiment(
         for spec, length in zip(specs, expected, strict=True):
             progress.phase("simulation" if spec.side == "sim" else "hardware", length)
             if spec.has_bridge or realtime:
-                record_run(folder / spec.side, spec, domain=domain, on_wait=progress.refresh, hosts=hosts)
+                record_run(folder / spec.side, spec, domain=domain, hosts=hosts)
             else:
                 record_simulation(folder / spec.side, spec)
         progress.phase("analysing", 12.0)

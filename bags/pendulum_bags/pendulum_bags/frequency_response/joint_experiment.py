@@ -64,7 +64,6 @@ def measure_joints(
     hosts: HostPool | None = None,
     on_side: Callable[[str], None] = lambda side: None,
     on_analysis: Callable[[str], None] = lambda what: None,
-    on_wait: Callable[[], None] = lambda: None,
 ) -> Analysis:
     """Record both sides under the multisine, and store the analysis: two layers of the run folder's answer.
 
@@ -76,7 +75,6 @@ def measure_joints(
         hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
         on_side: Called with each side's name when it starts.
         on_analysis: Called with the next step's text afterwards.
-        on_wait: Called while waiting.
 
     Raises:
         BagError: A bag exists, or cannot be written.
@@ -93,7 +91,6 @@ def measure_joints(
         excitation=multisine.excitation,
         hosts=hosts,
         on_side=on_side,
-        on_wait=on_wait,
     )
     on_analysis("analysing")
     responses, plant, _ = read_responses([place])

@@ -86,7 +86,6 @@ def rank_joints(
     *,
     hosts: HostPool | None = None,
     on_run: Callable[[str], None] = lambda what: None,
-    on_wait: Callable[[], None] = lambda: None,
 ) -> Ranking:
     """Record every design on both sides under every seed, and return the ranking of their costs.
 
@@ -98,7 +97,6 @@ def rank_joints(
         seeds: Of the noise; one alone gives no interval.
         hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
         on_run: Called with the text of each run that starts.
-        on_wait: Called while waiting.
 
     Raises:
         BagError: A bag exists, or cannot be written.
@@ -120,7 +118,7 @@ def rank_joints(
                 bag = folder / f"design_{number}_seed_{seed}" / side
                 run = JointRun(own, side, runs, linearised, tuning=tuning)
                 try:
-                    record_run(bag, run, on_wait=on_wait, hosts=hosts)
+                    record_run(bag, run, hosts=hosts)
                 except PlantStoppedError:
                     rows[side].append((seed, None))
                 else:

@@ -22,6 +22,7 @@ from pendulum_msgs_py.json_values import without_nan
 
 __all__ = [
     "HOW",
+    "NOT_MEASURED",
     "WHAT_HOLDS",
     "Answer",
     "Evidence",
@@ -35,6 +36,8 @@ __all__ = [
 
 WHAT_HOLDS = " What holds: "
 """Begins the part of the answer's text that stays true where it is not yes."""
+NOT_MEASURED = " Not measured: "
+"""Begins the part of a yes that names the layers without a result."""
 FOLDER = "layers"
 """Folder within a run folder in which layers are stored, each in a file ``<key>.json``."""
 
@@ -258,14 +261,14 @@ def sum_up(
         Mark.NO,
     }:
         text += (
-            f" About the stability of a design “{Layer.WHICH_CONTROLLERS.title}” decides, about how closely it moves "
-            f"as simulated “{Layer.SAME_RUN.title}”."
+            f" For the stability of a design, test 3 ({Layer.WHICH_CONTROLLERS.title}) decides; for how closely the "
+            f"motion matches, test 1 ({Layer.SAME_RUN.title})."
         )
     if holds and mark is not Mark.YES:
         text += f"{WHAT_HOLDS}{'; '.join(holds)}."
     if mark is Mark.YES and by_mark[Mark.NOT_MEASURED]:
         missing = _listed([f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED]])
-        text += f" Not measured: {missing}."
+        text += f"{NOT_MEASURED}{missing}."
     # Steps that mend a no come first, then those that decide, then those for missing layers.
     order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES])
     steps = dict.fromkeys(step for result in order for step in result.next_steps)

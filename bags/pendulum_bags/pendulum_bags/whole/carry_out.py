@@ -11,7 +11,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from pendulum_bags.experiments.decide import Budget, decide
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.machine import Machine, MachineRun
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.repeats import SHORTEST, record_simulation, repeat_folder, repeat_settings
+from pendulum_bags.experiments.repeats import SHORTEST, record_repeat, record_simulation, repeat_folder, repeat_settings
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.experiments.simulation import recorded_difference
@@ -176,13 +176,16 @@ class Findings:
         return [one for one in (self.given, self.identified) if one is not None and one.comparison is not None]
 
 
-def carry_out(folder: Path, order: Order, progress: PhaseProgress, on_first: Callable[[Simulated], None]) -> Findings:
+def carry_out(
+    folder: Path, order: Order, progress: PhaseProgress, leaving: ExitStack, on_first: Callable[[Simulated], None]
+) -> Findings:
     """Record, identify and compare; what is found when the budget ends or the user interrupts is returned.
 
     Args:
         folder: The run's folder.
         order: What is wanted.
         progress: Shows where it is.
+        leaving: As of :func:`run_thesis`.
         on_first: Called with the given plant when its first layer is there.
 
     Raises:
@@ -190,22 +193,21 @@ def carry_out(folder: Path, order: Order, progress: PhaseProgress, on_first: Cal
         KeyboardInterrupt: The user interrupted it before the first layer.
     """
     run = _Run(folder, order, progress, on_first)
-    with run.machine:
-        run.measure()
-        spent = threading.Event()
-        try:
+    spent = threading.Event()
+    try:
+        # Inside: a second Ctrl-C while the machine's program ends does not lose what was found.
+        with run.machine:
+            run.measure(leaving)
             with _ends_with_budget(order.budget, run.compared, spent):
                 run.carry_out(run.compare_given)
                 for step in run.steps():
                     run.carry_out(step)
-        except KeyboardInterrupt:
-            if not run.compared.is_set():
-                raise
-            run.found.spent, run.found.interrupted = spent.is_set(), not spent.is_set()
-            if run.found.spent:
-                run.found.notes.append(
-                    f"The budget of {order.budget:g} s was spent: “{run.now}” and what follows it was left out."
-                )
+    except KeyboardInterrupt:
+        if not run.compared.is_set():
+            raise
+        run.found.spent, run.found.interrupted = spent.is_set(), not spent.is_set()
+        why = f"The budget of {order.budget:g} s was spent" if run.found.spent else "The run was interrupted"
+        run.found.notes.append(f"{why}: “{run.now}” and what follows it was left out.")
     return run.found
 
 
@@ -247,19 +249,19 @@ class _Run:
                     for name, specs in self.contenders.items()
                     for _, machine in specs
                 ]
-        self.machine = Machine(folder, runs, progress.refresh)
+        self.machine = Machine(folder, runs)
 
     @staticmethod
     def _recorded(bag: Path, settings: RegulationSettings) -> MachineRun:
         return MachineRun(bag, lockstep_spec(settings, side="hw"))
 
-    def measure(self) -> None:
+    def measure(self, leaving: ExitStack) -> None:
         """Carry out the run in real time, from ramp to ramp."""
         settings = self.order.settings
 
         def run() -> None:
             try:
-                run_thesis(self.folder, settings, self.order.domain, self.progress, on_idle=self.machine.start)
+                run_thesis(self.folder, settings, self.order.domain, self.progress, leaving, on_idle=self.machine.start)
             except FaultError:
                 self.machine.discard()
                 raise
@@ -294,9 +296,19 @@ class _Run:
             self.order.margins,
             Budget(seconds),
             on_look=lambda number, duration: self._phase(f"undecided: {duration:.0f} s more", 4.0 + 0.25 * duration),
-            on_wait=self.progress.refresh,
             on_comparison=take,
+            record=self._repeat,
         )
+
+    def _repeat(self, folder: Path, settings: RegulationSettings, number: int) -> None:
+        """Record a repeat; the hardware's in a program of its own, so that this one has a graph once only."""
+        bag = repeat_folder(folder, number) / "hw"
+        run = self._recorded(bag, repeat_settings(settings, number))
+        if run.spec.has_bridge and not bag.exists():
+            with Machine(bag.parent, [run]) as machine:
+                machine.start()
+                machine.wait(bag)
+        record_repeat(folder, settings, number)
 
     def carry_out(self, step: Callable[[], None]) -> None:
         """Carry out a step; one that fails once there is an answer leaves a note, and the others go on."""
@@ -341,10 +353,15 @@ class _Run:
         self._phase(f"comparing {PLANT_FILE}", 4.0)
         place = self.folder / IDENTIFIED
         self.machine.wait(place / "hw")
-        settings = replace(self.tested, plant=str(file), design=given.settings.design_plant, simulation="", mapping="")
+        settings = self.tested_with(file)
         record_simulation(place / "sim", lockstep_spec(settings, side="sim"))
         self.found.identified = Simulated(PLANT_FILE, settings, place, given.budget)
         self._compare(self.found.identified, _SHARE * self.order.budget)
+
+    def tested_with(self, file: Path) -> RegulationSettings:
+        """Return the settings that test a plant file under the controller that was designed on the given plant."""
+        design = self.order.settings.design_plant
+        return replace(self.tested, plant=str(file), design=design, simulation="", mapping="")
 
     def _frequencies(self, plant: Simulated) -> None:
         """Compare a plant with the machine in frequency, and certify designs on it."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pendulum_bags.verdict import Answer, Layer, Mark
-from pendulum_bags.verdict.layers import WHAT_HOLDS
+from pendulum_bags.verdict.layers import NOT_MEASURED, WHAT_HOLDS
 from pendulum_bags.whole.carry_out import Findings, Simulated
 
 __all__ = ["whole_answer"]
@@ -27,7 +27,10 @@ def whole_answer(found: Findings) -> tuple[Answer, list[Answer]]:
     head, holds, rest = given.sentence.partition(WHAT_HOLDS)
     sentence = head.replace(": ", f" with {found.given.name}, the plant that you had: ", 1)
     sentence += f" {identified.mark.value.capitalize()} with {name}, which this run found"
-    sentence += "." if identified.mark is Mark.YES else f":{identified.sentence.partition(':')[2]}"
+    if identified.mark is Mark.YES:
+        sentence += f".{''.join(identified.sentence.partition(NOT_MEASURED)[1:])}"
+    else:
+        sentence += f":{identified.sentence.partition(':')[2]}"
     sentence += _choice(found.plants, answers) + ("" if identified.mark is Mark.YES else holds + rest)
     steps: Sequence[str] = identified.next_steps
     if identified.mark is Mark.YES:
