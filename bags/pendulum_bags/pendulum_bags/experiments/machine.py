@@ -85,9 +85,10 @@ class Machine:
         while (ended := self._ended(run.bag)) is None:
             if self._child is None or time.monotonic() > deadline:
                 raise FaultError(f"bag {bag} was not recorded in time")
-            self._processes.check()
-            if self._child.process.poll() is not None and self._ended(run.bag) is None:
-                raise FaultError(f"bag {bag} was not recorded: {self._child.last_words() or 'its program has ended'}")
+            if (code := self._child.process.poll()) is not None and self._ended(run.bag) is None:
+                words = self._child.last_words(1)
+                output = "" if words.startswith(_ENDED) or not words else f"; its last output: {words}"
+                raise FaultError(f"bag {bag} was not recorded: its program ended with code {code}{output}")
             time.sleep(_POLL)
         stopped, reason = ended
         if stopped:
