@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from pendulum_lqr.disturbances.disturbance import make_disturbance
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.contract.cdr import decode_joint_state, encode_joint_state
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_msgs_py.programs.realtime import may_run_in_real_time
 from pendulum_msgs_py.ros import qos
 from pendulum_testing.graph_peer import GraphPeer
@@ -258,6 +258,24 @@ def test_the_period_is_taken_from_the_states_or_refused_where_the_loop_would_be_
     )
     request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE))
     assert not plant.call(ChangeState, "controller/change_state", request).success
+
+
+def test_a_continuous_design_is_judged_at_the_rate_of_the_states(plant, processes, tmp_path):
+    late = write_plant(tmp_path / "late.yaml", load_plant("dfki").with_values(transport_delay=0.06))
+    program = processes.start("pendulum_lqr", "controller", *ros(f"plant:={late}", "use_sim_time:=true"))
+    plant.connect()
+
+    def publish(stamp_ns: int, seen: Callable[[], object], what: str) -> None:
+        def repeated() -> object:  # as a plant in lockstep does; it is no interval
+            plant.publish(stamp_ns, position=math.pi + 0.01, velocity=0.0)
+            plant.spin(0.02)
+            return seen()
+
+        plant.until(repeated, what)
+
+    publish(10**9, lambda: plant.commands, "the reply before the rate is known")
+    publish(10**9 + 2_000_000, lambda: "not answering" in program.output or len(plant.commands) > 9, "the refusal")
+    program.wait_for_output(r"not answering: states come every 0\.002 s: lqr makes the loop unstable", 10)
 
 
 def test_a_policy_answers_at_its_own_period_and_says_when_it_gives_up(plant, processes, tmp_path):

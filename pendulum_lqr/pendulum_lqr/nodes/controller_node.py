@@ -279,16 +279,18 @@ class ControllerNode(LifecycleNode, PollingNode):
         return make_controller(values["controller"], self._plant, self._period, own, checked=known)
 
     def _design_for(self, period: float) -> None:
-        """Take another period, and redesign where that makes a difference."""
+        """Take another period, judge the design at it, and use a new one where that makes a difference."""
         before, self._period = self._period, period
-        if self._loop is None or not self._uses_period():
+        if self._loop is None or (self._kind.DESIGNING and not self._uses_period()):
             return
         try:
-            self._loop.replace(self._design(self._settings.values))
+            designed = self._design(self._settings.values)
         except PendulumError:
             self._period = before
             raise
-        self.get_logger().info(f"designed for states every {period:g} s: {self._loop.controller.describe()}")
+        if self._uses_period():
+            self._loop.replace(designed)
+            self.get_logger().info(f"designed for states every {period:g} s: {self._loop.controller.describe()}")
 
     def _uses_period(self) -> bool:
         return self._kind.SAMPLED or self._settings.values.get("velocity", "measured") != "measured"
@@ -317,7 +319,7 @@ class ControllerNode(LifecycleNode, PollingNode):
             self._period_measured = True
             if not values["period"] and abs(measured / self._period - 1.0) > _SAME_PERIOD:
                 self._design_for(measured)
-            elif not values["period"] and self._uses_period() and not self._kind.DESIGNING:
+            elif not values["period"] and not self._kind.DESIGNING:
                 # Not a slow design, which may take longer than the gap that counts as a plant's restart.
                 self._design(values)
             if self._loop is not None:
