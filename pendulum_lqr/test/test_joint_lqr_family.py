@@ -264,3 +264,53 @@ def test_a_covariance_of_few_causes_is_taken_and_a_negative_one_refused() -> Non
     for bad in (np.diag([1.0, -1e-3]), np.diag([1.0, math.nan])):
         with pytest.raises(DesignError, match=r"process noise covariance is .*; expected finite, not negative"):
             kalman_gain(np.eye(2), np.eye(2), bad, np.eye(2))
+
+
+FAMILY = ("lqr", "lqi", "discrete_lqr", "lqg", "mpc")
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_a_set_point_is_held_by_its_own_efforts_and_judged_there(name: str) -> None:
+    plant, offsets = load_mechanism("double_pendulum"), [1.5, 0.0]
+    # About upright the gain of this set-point would not settle.
+    position = tuple(goal + off for goal, off in zip(plant.coordinates.goal, offsets, strict=True))
+    for feedforward in (True, False):
+        values = {"set_point": offsets, "feedforward": feedforward}
+        controller = make_controller(name, plant, 0.02, values)
+        efforts = controller.efforts(0.0, position, (0.0, 0.0))
+        expected = linearise(plant, position).efforts if feedforward else (0.0, 0.0)
+        assert efforts == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["discrete_lqr", "lqg", "mpc"])
+def test_a_delay_that_is_given_counts_as_the_plants_own(name: str) -> None:
+    late, plant = delayed_plant("cart_pole", 0.013), load_mechanism("cart_pole")
+    made = [
+        make_controller(name, late, PERIOD),
+        *(make_controller(name, plant, PERIOD, {"delay": d}) for d in (0.013, 0.0)),
+    ]
+    for k in range(4):
+        state = (near_upright(plant, 0.001, 0.002 + 0.001 * k), (0.0, 0.1))
+        own, given, prompt = (controller.efforts(k * PERIOD, *state) for controller in made)
+        assert given == pytest.approx(own, rel=1e-9)
+    assert prompt != pytest.approx(own, rel=0.01)
+
+
+@pytest.mark.parametrize("cost", ["sum", "sampled"])
+def test_the_discrete_lqr_has_the_gain_of_python_control_for_the_sum_of_samples_alone(cost: str) -> None:
+    plant, period = load_mechanism("double_pendulum"), 0.02
+    sampled, (q, r) = discretise(linearise(plant), period), plant.mechanism.weights
+    K, _, _ = control.dlqr(sampled.A, sampled.B, np.diag(q), r * np.eye(2))
+    gain = make_controller("discrete_lqr", plant, period, {"cost": cost}).gain.rows
+    assert (gain == pytest.approx(K, rel=1e-6)) == (cost == "sum")
+
+
+@pytest.mark.parametrize("name", ["lqg", "mpc"])
+def test_a_constant_effort_that_is_estimated_leaves_no_offset(name: str) -> None:
+    plant = load_mechanism("cart_pole")
+    push = 0.05 * plant.effort_limits[0]
+    without, with_it = (
+        _Run(plant, make_controller(name, plant, PERIOD, {"offset_noise": noise}), push=push).deviations[-1, 0]
+        for noise in (0.0, 1.0)
+    )
+    assert abs(with_it) < 0.002 < 0.01 < abs(without)

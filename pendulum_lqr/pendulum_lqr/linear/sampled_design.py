@@ -209,7 +209,7 @@ def _on_their_way(period: float, delay: float) -> tuple[int, float]:
 def _padded_cost(q: ArrayLike, r: float | Matrix, size: int, m: int) -> tuple[Matrix, Matrix]:
     """Return Q (size, size), zero beyond the states that q names, and R (m, m)."""
     given, inputs = np.asarray(q, dtype=np.float64), np.asarray(r, dtype=np.float64)
-    Q2, _ = cost_matrices(q, float(inputs.flat[0]), given.shape[0] if given.ndim == 2 else 2)
+    Q2, _ = cost_matrices(q, float(inputs.flat[0]), len(given))
     Q = np.zeros((size, size))
     Q[: Q2.shape[0], : Q2.shape[1]] = Q2
     return Q, inputs * np.eye(m) if inputs.ndim == 0 else inputs
