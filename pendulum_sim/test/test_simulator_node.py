@@ -150,7 +150,7 @@ def test_bad_parameters_end_with_one_sentence(domain_id: int) -> None:
 def test_the_viewer_writes_picture_and_animation_without_a_screen(processes, domain_id: int, tmp_path: Path) -> None:
     from PIL import Image
 
-    _start(processes, "rate_hz:=100.0", "initial_theta:=2.0")
+    _start(processes, "rate_hz:=100.0", "initial_position:=[2.0]")
     viewer = processes.start(
         "pendulum_sim", "viewer", "--ros-args", "-p", "window:=true", "-p", "duration:=1.0", "-p", "width:=240",
         "-p", "height:=240", "-p", f"png:={tmp_path / 'view.png'}", "-p", f"gif:={tmp_path / 'view.gif'}",

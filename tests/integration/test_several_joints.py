@@ -230,11 +230,11 @@ REFUSED: list[Refused] = [
         ("plant:=acrobot", "initial_position:=[1.0, 2.0, 3.0]"),
         "initial_position has 3 values; expected 2, for shoulder [rad], elbow [rad], or one for all",
     ),
-    (SIMULATOR, ("initial_position:=[1.0]",), "expected initial_theta and initial_theta_dot"),
+    (SIMULATOR, ("initial_position:=[1.0]", "initial_theta:=1.0"), "expected initial_position and initial_velocity"),
     (
         CONTROLLER,
         ("plant:=acrobot", "controller:=pid"),
-        "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected lqr, discrete_lqr, lqi,",
+        "pid is for plants of one joint, and plant 'acrobot' has shoulder, elbow; expected one of lqr, lqi,",
     ),
     (
         CONTROLLER,

@@ -197,13 +197,6 @@ OWN = Engine(
             minimum=0,
             read_only=True,
         ),
-        ParameterSpec(
-            "initial_position",
-            [0.0],
-            "rad or m",
-            "Several joints: position of each at a given start; one value for all.",
-        ),
-        ParameterSpec("initial_velocity", [0.0], "rad/s or m/s", "Several joints: velocity of each at a given start."),
     ),
     make=_make_own,
     foreign=False,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -51,7 +50,6 @@ from pendulum_sim.stepping.servo import PositionServo
 __all__ = ["SPECS", "SimulatorNode", "main", "run_engine"]
 
 _SENSOR_PREFIX = "sensor."
-_ONE_FOR_ALL = [0.0]
 _LONGEST_COMPILED = 0.005
 """Longest period that is worth compiling, and that stopping the plant may wait for [s]."""
 _LEAST_PERIODS = 2.0
@@ -65,8 +63,15 @@ _SHARED_SPECS: tuple[ParameterSpec, ...] = (
         "Where the pendulum starts, and restarts on reset.",
         choices=("given", "bottom", "top", "random"),
     ),
-    ParameterSpec("initial_theta", 0.0, "rad", "Angle at a given start; 0 hangs down, pi is upright."),
-    ParameterSpec("initial_theta_dot", 0.0, "rad/s", "Velocity at a given start."),
+    ParameterSpec(
+        "initial_position",
+        [0.0],
+        "rad or m",
+        "Where each joint is at a given start; 0 hangs down, pi is upright; one value stands for all.",
+    ),
+    ParameterSpec("initial_velocity", [0.0], "rad/s or m/s", "How fast each joint is at a given start."),
+    ParameterSpec("initial_theta", 0.0, "rad", "Former name of initial_position, for one joint."),
+    ParameterSpec("initial_theta_dot", 0.0, "rad/s", "Former name of initial_velocity, for one joint."),
     ParameterSpec("seed", 0, "-", "Seed of random starts and of the sensors.", minimum=0, read_only=True),
     ParameterSpec("armed_at_start", True, "", "Arm at the start; nothing real moves here.", read_only=True),
     ParameterSpec("paused", False, "", "Start paused, until ~/pause or ~/step.", read_only=True),
@@ -89,7 +94,7 @@ class SimulatorNode(PollingNode):
 
     def __init__(self, stop: Callable[[], None], engine: Engine = OWN) -> None:
         super().__init__("simulator", enable_logger_service=True)
-        self._settings = NodeParameters(self, self._specs(engine), self._check_start)
+        self._settings = NodeParameters(self, self._specs(engine), self._given_start)
         values = self._settings.values
         self._simulation = engine.make(values)
         # Before the first reset, which undoes the steps of the check.
@@ -154,7 +159,6 @@ class SimulatorNode(PollingNode):
             self._stamp_ns = wall()
         self._loop.compiled, self._told_loop = self._compile(period_ns)
         self._loop.paused = values["paused"]
-        self._check_start(values)
         self._restart(*self._start_state(values))
         if values["armed_at_start"]:
             refusal = self._supervisor.arm(self._stamp_ns, self._interface.sample)
@@ -297,30 +301,28 @@ class SimulatorNode(PollingNode):
             return coordinates.goal, still
         if start == "random":
             return random_start(self._plant, self._starts)
-        if len(still) == 1:
-            return (values["initial_theta"],), (values["initial_theta_dot"],)
-        return self._given("initial_position", values), self._given("initial_velocity", values)
+        return self._given_start(values)
 
-    def _given(self, name: str, values: Mapping[str, Any]) -> Vector:
-        return self._coordinates.for_each(name, values.get(name, _ONE_FOR_ALL))
+    def _given_start(self, values: Mapping[str, Any]) -> tuple[Vector, Vector]:
+        """Return position and velocity of a given start, by their names or, of one joint, by their former ones.
 
-    def _check_start(self, values: Mapping[str, Any]) -> None:
-        for name in ("initial_theta", "initial_theta_dot"):
-            if not math.isfinite(values[name]):
-                raise ParameterError(f"{name} is {values[name]}; expected a finite number")
-        if len(self._coordinates.joints) > 1:
-            if values["initial_theta"] or values["initial_theta_dot"]:
-                raise ParameterError(
-                    f"initial_theta and initial_theta_dot are for one joint, and plant {self._plant.name!r} has "
-                    f"{', '.join(self._coordinates.names)}; expected initial_position and initial_velocity"
-                )
-            self._given("initial_position", values)
-            self._given("initial_velocity", values)
-        elif any(values.get(name, _ONE_FOR_ALL) != _ONE_FOR_ALL for name in ("initial_position", "initial_velocity")):
+        Raises:
+            ParameterError: A number is not finite, there are too few or too many, or both names are used.
+        """
+        for name in ("initial_position", "initial_velocity", "initial_theta", "initial_theta_dot"):
+            if not np.isfinite(values[name]).all():
+                raise ParameterError(f"{name} is {values[name]}; expected finite numbers")
+        named = ("initial_position", "initial_velocity")
+        position, velocity = (self._coordinates.for_each(name, values[name]) for name in named)
+        former = (values["initial_theta"],), (values["initial_theta_dot"],)
+        if former == ((0.0,), (0.0,)):
+            return position, velocity
+        if len(position) > 1 or any(position + velocity):
             raise ParameterError(
-                f"initial_position and initial_velocity are for several joints, and plant {self._plant.name!r} has "
-                "one; expected initial_theta and initial_theta_dot"
+                f"initial_theta is {former[0][0]} rad, initial_theta_dot {former[1][0]} rad/s: former names, for one "
+                f"joint alone; expected initial_position and initial_velocity, of {self._coordinates.with_units}"
             )
+        return former
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         refusal = self._reset(*self._start_state(self._settings.values))
