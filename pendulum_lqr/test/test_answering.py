@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pendulum_lqr.controller_interface.controller import BaseController, make_controller
-from pendulum_lqr.nodes.answering import AnswerLoop, StateRefusal
+from pendulum_lqr.nodes.answering import ControlLoop, StateRefusal
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
@@ -18,7 +18,7 @@ START = 1_000 * SECOND
 
 
 def loop(**options):
-    return AnswerLoop(make_controller("lqr", THESIS, 0.01), 0.05, **options)
+    return ControlLoop(make_controller("lqr", THESIS, 0.01), 0.05, **options)
 
 
 def sample(stamp_ns, angle=0.1, velocity=0.2):
@@ -48,7 +48,7 @@ def test_a_state_without_a_command_is_not_the_one_that_was_answered_last():
         def command(self, t, x):
             return math.nan if t else 1.0
 
-    answering = AnswerLoop(Fails(2.0), 0.05)
+    answering = ControlLoop(Fails(2.0), 0.05)
     assert answering.answered_ns is None
     assert answering.answer(sample(START), START) == (1.0,)
     assert answering.answer(sample(START + MS), START + MS) is None
@@ -117,12 +117,12 @@ def test_simulated_time_has_no_age_and_a_repeated_state_gets_the_same_answer():
 @settings(deadline=None, max_examples=30)
 def test_a_simulation_that_begins_anew_is_answered_as_by_a_new_controller(first_steps, start_step, angle):
     """However short the run before, and wherever in time the new one starts, also at its very first stamp."""
-    answering = AnswerLoop(make_controller("lqi", THESIS, 0.002), 0.05, simulated_time=True)
+    answering = ControlLoop(make_controller("lqi", THESIS, 0.002), 0.05, simulated_time=True)
     for k in range(min(first_steps, 50)):
         answering.answer(sample(SECOND + (first_steps + k) * 2 * MS, 0.02), START)
     newest = answering.newest_stamp_ns
     begin = min(SECOND + start_step * 2 * MS, newest)
-    fresh = AnswerLoop(make_controller("lqi", THESIS, 0.002), 0.05, simulated_time=True)
+    fresh = ControlLoop(make_controller("lqi", THESIS, 0.002), 0.05, simulated_time=True)
     for k in range(5):
         state = sample(begin + k * 2 * MS, 0.3 + angle)
         assert answering.answer(state, START) == fresh.answer(state, START) is not None
@@ -146,7 +146,7 @@ def test_a_controller_that_fails_or_answers_nonsense_gives_no_answer_and_a_reaso
                 return math.nan
             raise ZeroDivisionError("division by zero")
 
-    answering = AnswerLoop(Broken(1.0), 0.05)
+    answering = ControlLoop(Broken(1.0), 0.05)
     assert answering.answer(sample(START), START) is None
     assert "ZeroDivisionError: division by zero" in answering.last_reason
     assert answering.answer(sample(START + MS), START) is None
@@ -158,7 +158,7 @@ def test_a_repeated_state_that_had_no_answer_gets_none_and_not_that_of_the_state
         def command(self, t, x):
             return 0.7 if t == 0.0 else math.nan
 
-    answering = AnswerLoop(GivesUp(1.0), 0.05, simulated_time=True)
+    answering = ControlLoop(GivesUp(1.0), 0.05, simulated_time=True)
     assert answering.answer(sample(START), START) == (0.7,)
     for _ in range(2):
         assert answering.answer(sample(START + MS), START) is None
@@ -173,7 +173,7 @@ def test_time_counts_from_the_first_state():
             times.append(t)
             return 0.0
 
-    answering = AnswerLoop(Watch(1.0), 0.05)
+    answering = ControlLoop(Watch(1.0), 0.05)
     for k in range(3):
         answering.answer(sample(START + k * 10 * MS), START + k * 10 * MS)
     answering.restart()
@@ -195,7 +195,7 @@ def test_diagnostics_tell_rate_saturation_age_and_compute_time():
 
 
 def test_a_new_controller_takes_over_between_two_states():
-    answering = AnswerLoop(make_controller("lqi", THESIS, 0.01), 0.05)
+    answering = ControlLoop(make_controller("lqi", THESIS, 0.01), 0.05)
     for k in range(100):
         answering.answer(sample(START + k * 10 * MS, 0.01, 0.0), START + k * 10 * MS)
     before = answering.last_effort

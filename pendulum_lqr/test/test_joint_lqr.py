@@ -13,7 +13,7 @@ from pendulum_lqr.controller_interface.controller import controller_class, make_
 from pendulum_lqr.linear.design import DesignError, output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discretise
-from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
@@ -36,7 +36,7 @@ def test_it_answers_with_the_law_within_each_limit_whatever_turns_were_made(name
     turned = [goal + dq + 2.0 * math.pi * joint.turns for joint, goal, dq in upright]
     limits = np.array(plant.effort_limits)
     expected = np.clip(np.array(model.efforts) - K @ x, -limits, limits)
-    loop = AnswerLoop(controller, math.inf, simulated_time=True)
+    loop = ControlLoop(controller, math.inf, simulated_time=True)
     assert loop.answer(JointSample(1, tuple(turned), (3e-3, 1e-3), (0.0, 0.0)), 1) == pytest.approx(expected, rel=1e-6)
     far = loop.answer(JointSample(2, (2.0, 1.0), (50.0, 50.0), (0.0, 0.0)), 2)
     assert np.all(np.abs(far) <= limits)
@@ -99,7 +99,7 @@ def test_a_swing_up_wants_a_plant_for_which_one_is_stored_and_the_period_of_its_
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_state_that_is_not_finite_at_any_joint_is_not_answered(bad: float) -> None:
-    loop = AnswerLoop(make_controller("lqr", load_mechanism("cart_pole"), 0.01, checked=False), math.inf)
+    loop = ControlLoop(make_controller("lqr", load_mechanism("cart_pole"), 0.01, checked=False), math.inf)
     assert loop.answer(JointSample(1, (0.0, bad), (0.0, 0.0), (0.0, 0.0)), 1) is None
     assert loop.answer(JointSample(1, (0.0, 0.0), (bad, 0.0), (0.0, 0.0)), 1) is None
     assert loop.answered == 0
@@ -125,7 +125,7 @@ def test_a_model_of_two_inputs_is_sampled_as_two_models_of_one(delay: float) -> 
 
 def test_no_effort_is_made_of_a_law_that_has_no_number() -> None:
     controller = make_controller("lqr", load_mechanism("cart_pole"), 0.01, checked=False)
-    answering = AnswerLoop(controller, math.inf)
+    answering = ControlLoop(controller, math.inf)
     # Finite velocities whose terms are inf and -inf.
     first, second = (math.copysign(1e308, float(k)) for k in controller.gain.K[2:])
     assert answering.answer(JointSample(1, (0.0, 0.0), (first, -second), (0.0, 0.0)), 1) is None

@@ -16,7 +16,7 @@ from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.controllers.mpc import LinearMpc
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
-from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
@@ -285,7 +285,7 @@ def test_what_a_solver_cannot_tell_the_lqr_answers_with_its_signs() -> None:
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_state_that_is_not_finite_is_not_answered(bad: float) -> None:
-    loop = AnswerLoop(make_controller("mpc", load_mechanism("furuta"), PERIOD), math.inf)
+    loop = ControlLoop(make_controller("mpc", load_mechanism("furuta"), PERIOD), math.inf)
     assert loop.answer(JointSample(1, (0.0, bad), (0.0, 0.0), (0.0, 0.0)), 1) is None
     assert loop.answered == 0
 

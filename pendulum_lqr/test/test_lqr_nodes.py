@@ -278,7 +278,7 @@ def test_a_continuous_design_is_judged_at_the_rate_of_the_states(plant, processe
     program.wait_for_output(r"not answering: states come every 0\.002 s: lqr makes the loop unstable", 10)
 
 
-def test_a_policy_answers_at_its_own_period_and_says_when_it_gives_up(plant, processes, tmp_path):
+def test_a_policy_runner_at_its_own_period_and_says_when_it_gives_up(plant, processes, tmp_path):
     thesis = load_plant("thesis")
     path = write_policy(tmp_path / "policy.npz", linear_policy(thesis, 20.0, 1.0, velocity_box=(8.0,)))
 

@@ -83,7 +83,7 @@ def refused(tmp_path, content, words):
 
 
 @pytest.mark.parametrize("name", ["ppo", "sac", "tqc"])
-def test_a_converted_policy_answers_as_the_library_that_trained_it(tmp_path, name):
+def test_a_converted_policy_runner_as_the_library_that_trained_it(tmp_path, name):
     path = write_policy(tmp_path / "policy.npz", imported(name))
     controller = make_controller("policy", PLANTS[name], 0.05, {"policy": str(path), "start_time": 0.0})
     with np.load(IMPORTED / f"{name}_answers.npz") as answers:

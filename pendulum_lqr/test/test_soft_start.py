@@ -7,7 +7,7 @@ import pytest
 
 from pendulum_lqr.controller_interface.controller import controller_names, controller_parameters, make_controller
 from pendulum_lqr.controller_interface.interface import unwrapped
-from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
@@ -23,7 +23,7 @@ def swing_up(controller, duration):
     """Return angles from upright, torques and the supervisor after a run from hanging with a small first torque."""
     limits = validate(LIMIT_SPECS, {"start_effort_limit": 2.0})
     supervisor = PlantSupervisor(limits_from_parameters(limits, (THESIS.effort_limit,), lockstep=False))
-    loop = AnswerLoop(controller, math.inf, simulated_time=True)
+    loop = ControlLoop(controller, math.inf, simulated_time=True)
     plant = make_plant(THESIS, PERIOD)
     state = plant.reset(0.0, 0.0)
     now = NANOSECONDS

@@ -12,7 +12,7 @@ from pendulum_lqr.linear.design import DesignError, output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.reference import SHAPES, Reference
 from pendulum_lqr.linear.scheduling import Schedule, scheduled_margins
-from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
@@ -297,7 +297,7 @@ def test_a_loop_that_is_stable_at_rest_everywhere_and_not_along_the_reference_is
 
 def test_time_is_that_of_the_stamps_and_a_simulation_that_begins_anew_is_followed_anew():
     controller = tracking(SMOOTH)
-    loop = AnswerLoop(controller, math.inf, simulated_time=True)
+    loop = ControlLoop(controller, math.inf, simulated_time=True)
 
     def answers(begin_ns):
         return [

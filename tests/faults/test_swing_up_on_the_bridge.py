@@ -10,7 +10,7 @@ import numpy as np
 
 from pendulum_hw_bridge.bridge.node_specs import SPECS
 from pendulum_lqr.controller_interface.controller import make_controller
-from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_msgs_py.contract.supervisor import Mode
 from pendulum_msgs_py.contract.values import JointCommand
 from pendulum_msgs_py.plants.plant_parameters import load_plant
@@ -26,7 +26,7 @@ def swing_up(kind: str, start_time: float, duration: float) -> Rig:
     first = float(SHIPPED["start_effort_limit"])
     rig.supervisor.limits = replace(rig.supervisor.limits, start_effort=first, starvation=1.0)
     plant = load_plant("thesis")
-    law = AnswerLoop(make_controller(kind, plant, rig.period, {"start_time": start_time}), math.inf)
+    law = ControlLoop(make_controller(kind, plant, rig.period, {"start_time": start_time}), math.inf)
 
     def answer() -> None:
         sample = rig.bridge.sample

@@ -20,7 +20,7 @@ from pendulum_hw_bridge.emulation.firmware import CONTROL_PERIOD, Array, control
 from pendulum_msgs_py.loops.machine_code import Loop, NoMachineCodeError, load_loop
 from pendulum_msgs_py.loops.records import structure_of
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_friction
-from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 
 __all__ = ["CONSTANTS", "LAYOUT", "STATES", "STEP", "STEPS_PER_CYCLE", "STEP_NS", "Actuator", "advance"]
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pendulum_lqr.controller_interface.interface import Controller, unwrapped
-from pendulum_lqr.controller_interface.policy_answers import check_policy_period, states_to_hold
+from pendulum_lqr.controller_interface.policy_runner import check_policy_period, states_to_hold
 from pendulum_lqr.controllers.linear_feedback import require_catching
 from pendulum_lqr.controllers.policy import LearnedPolicy
 from pendulum_lqr.policies.policy import require_plant

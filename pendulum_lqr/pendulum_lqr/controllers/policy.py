@@ -8,10 +8,10 @@ from typing import Any
 from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controller_interface.loop_check import require_stable
-from pendulum_lqr.controller_interface.policy_answers import (
+from pendulum_lqr.controller_interface.policy_runner import (
     START_TIME,
     ZERO,
-    PolicyAnswers,
+    PolicyRunner,
     check_policy_period,
     policy_specs,
     states_to_hold,
@@ -67,7 +67,7 @@ class LearnedPolicy(Controller):
         catch: MechanismCatch | None = None,
         plant: AnyPlant | None = None,
     ) -> None:
-        self._answers = PolicyAnswers(policy, hold, effort_limits, start_time)
+        self._answers = PolicyRunner(policy, hold, effort_limits, start_time)
         super().__init__(self._answers.limits)
         self.policy, self.fallback, self.catch = policy, fallback, catch
         self.plant = plant or policy.plant

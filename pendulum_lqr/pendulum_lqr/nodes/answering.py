@@ -23,7 +23,7 @@ from pendulum_msgs_py.contract.rules import NEVER
 from pendulum_msgs_py.contract.timing import RingOfTimes
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample, Vector, written
 
-__all__ = ["AnswerLoop", "StateRefusal"]
+__all__ = ["ControlLoop", "StateRefusal"]
 
 
 class StateRefusal(str, Enum):
@@ -46,7 +46,7 @@ _REFUSALS = {
 }
 
 
-class AnswerLoop:
+class ControlLoop:
     """Replies to each new state once, and counts.
 
     Args:

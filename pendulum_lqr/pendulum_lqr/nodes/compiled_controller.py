@@ -11,7 +11,7 @@ from pendulum_lqr.controller_interface.controller import LawController
 from pendulum_lqr.controller_interface.interface import Controller, unwrapped
 from pendulum_lqr.controller_interface.law import MOST_MEMORY, MOST_NUMBERS
 from pendulum_lqr.controller_interface.sampling import PeriodWatch
-from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.loops.answer_record import LoopKind
 
@@ -61,7 +61,7 @@ class CompiledController:
         self,
         controller: Controller | None,
         watch: PeriodWatch,
-        answering: Callable[[], AnswerLoop | None],
+        answering: Callable[[], ControlLoop | None],
         refusal: str = "",
     ) -> None:
         self._watch = watch

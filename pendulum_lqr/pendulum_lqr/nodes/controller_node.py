@@ -27,7 +27,7 @@ from pendulum_lqr.controller_interface.controller import (
 )
 from pendulum_lqr.controller_interface.interface import Controller, unwrapped
 from pendulum_lqr.controller_interface.sampling import ASSUMED_PERIOD, PeriodWatch, differs, rate_problem
-from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_lqr.nodes.compiled_controller import CompiledController
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joints
@@ -115,7 +115,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         super().__init__("controller", enable_logger_service=True)
         self.exit_code = 0
         self._active = False
-        self._loop: AnswerLoop | None = None
+        self._loop: ControlLoop | None = None
         kind, plant = self._choose("controller"), self._choose("plant")
         self._own = {spec.name for spec in NODE_SPECS}
         self._plant: AnyPlant = load_mechanism(plant) if is_mechanism(plant) else load_plant(plant)
@@ -177,7 +177,7 @@ class ControllerNode(LifecycleNode, PollingNode):
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._pending = None
-        self._loop = AnswerLoop(
+        self._loop = ControlLoop(
             controller, self._settings["state_timeout"], simulated_time=self._simulated_time, send=self._send
         )
         self.get_logger().info(
@@ -217,7 +217,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         wait_until_heard(self._command_publisher)
         self._publish_diagnostics()
 
-    def _may_lend(self) -> AnswerLoop | None:
+    def _may_lend(self) -> ControlLoop | None:
         """Return the answer loop, where nothing is left to be done before a reply; else None."""
         ready = self._active and self._period_known and (self._first_answer.gone or not self._simulated_time)
         return self._loop if ready else None

@@ -32,7 +32,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.loops.trees import WITHIN
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 
 __all__ = ["IlqrPlan", "IlqrProblem", "IlqrWeights"]
 

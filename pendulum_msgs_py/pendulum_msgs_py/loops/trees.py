@@ -12,9 +12,9 @@ from functools import cache
 from types import FunctionType, ModuleType
 from typing import Any
 
-from pendulum_msgs_py.programs.kept_kernels import name_symbols_apart
+from pendulum_msgs_py.programs.kernel_cache import name_symbols_apart
 
-__all__ = ["WITHIN", "compile_to_tell", "compile_tree", "tuple_loader"]
+__all__ = ["WITHIN", "compile_by_type", "compile_tree", "tuple_loader"]
 
 # Simulator and control, which compile, install it; this package needs it nowhere else.
 numba = importlib.import_module("numba")
@@ -66,7 +66,7 @@ def compile_tree(
     return _cache[key]
 
 
-def compile_to_tell(function: Callable[..., Any]) -> Any:
+def compile_by_type(function: Callable[..., Any]) -> Any:
     """Return a function, compiled by :func:`compile_tree`, for compiled functions to call or to take as an argument.
 
     Numba passes a compiled function by its address in this process, and machine code with addresses cannot be cached on
@@ -74,12 +74,12 @@ def compile_to_tell(function: Callable[..., Any]) -> Any:
     """
     compiled = compile_tree(function)
 
-    def told(*arguments: Any) -> Any:
+    def by_type(*arguments: Any) -> Any:
         return function(*arguments)
 
     options = {key: compiled.targetoptions[key] for key in ("fastmath", "error_model")}
-    numba.extending.overload(told, jit_options=options, strict=False)(lambda *_: compiled.py_func)
-    return told
+    numba.extending.overload(by_type, jit_options=options, strict=False)(lambda *_: compiled.py_func)
+    return by_type
 
 
 @cache

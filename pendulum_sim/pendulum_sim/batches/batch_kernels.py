@@ -21,7 +21,7 @@ from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.dynamics.joint_steps import JOINT_ROWS, LAG, advance_joints, joint_functions
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.mechanisms import MECHANISMS
-from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 from pendulum_sim.batches import vector_math
 from pendulum_sim.batches.compiling import WITHIN, compile_tree, tuple_loader
 from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_friction, is_dry

@@ -11,11 +11,11 @@ from typing import Any
 import numba
 import numpy as np
 
-from pendulum_msgs_py.loops.trees import WITHIN, compile_to_tell, tuple_loader
+from pendulum_msgs_py.loops.trees import WITHIN, compile_by_type, tuple_loader
 from pendulum_msgs_py.loops.trees import compile_tree as _compile_tree
 from pendulum_sim.batches import vector_math
 
-__all__ = ["WITHIN", "compile_to_tell", "compile_tree", "tuple_loader"]
+__all__ = ["WITHIN", "compile_by_type", "compile_tree", "tuple_loader"]
 
 
 def compile_tree(function: Callable[..., Any], *, vector: bool = False, inline: bool = False, gpu: bool = False) -> Any:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 from pendulum_sim.batches import vector_math
 from pendulum_sim.batches.compiling import compile_tree, tuple_loader
 from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_friction, is_dry

@@ -13,7 +13,7 @@ from pendulum_bags.runs.series import Series, Signal
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 from pendulum_sim.batches.compiling import compile_tree
 from pendulum_sim.stepping.dry_friction import acceleration_with_friction, advance_dry, is_dry
 from pendulum_sim.stepping.integrators import get_integrator

@@ -25,7 +25,7 @@ from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
 from pendulum_lqr.disturbances.disturbing import DisturbanceLoop
-from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, limits_from_parameters
@@ -212,7 +212,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
         loop = LockstepLoop(interface, step, period_ns, [Input.EFFORT_COMMAND, Input.DISTURBANCE], publish_clock=False)
         interface.publish_state(JointSample.of_one(LOCKSTEP_EPOCH_NS, UPRIGHT, 0.0, 0.0))
         supervisor.arm(LOCKSTEP_EPOCH_NS, interface.sample)
-        controller = AnswerLoop(
+        controller = ControlLoop(
             make_controller("lqr", parameters, period_ns / NANOSECONDS, {}), math.inf, simulated_time=True
         )
         disturbance = DisturbanceLoop(make_disturbance(dict(validate(DISTURBANCE_SPECS, {"hold_time": 0.02}))))
@@ -242,7 +242,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
 def _judge_day(
     loop: LockstepLoop,
     supervisor: PlantSupervisor,
-    controller: AnswerLoop,
+    controller: ControlLoop,
     disturbance: DisturbanceLoop,
     positions: np.ndarray,
     period_ns: int,

@@ -28,7 +28,7 @@ from sensor_msgs.msg import JointState
 
 from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.controller_interface.sampling import PeriodWatch
-from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_lqr.nodes.compiled_controller import CompiledController
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.cdr import encode_joint_state
@@ -73,7 +73,7 @@ class _Answers:
         rclpy.init(context=self.context, signal_handler_options=SignalHandlerOptions.NO)
         self.node = PollingNode("answers", context=self.context, start_parameter_services=False)
         controller = make_controller("lqr", load_plant("thesis"), 0.002)
-        self.loop = AnswerLoop(controller, 1.0, send=lambda sample, effort: None)
+        self.loop = ControlLoop(controller, 1.0, send=lambda sample, effort: None)
         self.watch = PeriodWatch()
         self.publisher = self.node.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
         source = self.node.create_waited_input(JointState, names.JOINT_STATES, qos.NEWEST_STATE, self._receive)

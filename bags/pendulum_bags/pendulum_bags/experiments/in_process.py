@@ -13,7 +13,7 @@ from pendulum_bags.experiments.run_spec import BEGINS_ANYWHERE, RunSpec
 from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
 from pendulum_lqr.disturbances.disturbing import DisturbanceLoop
-from pendulum_lqr.nodes.answering import AnswerLoop
+from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, LOCKSTEP_EPOCH_NS, limits_from_parameters
 from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
@@ -82,7 +82,7 @@ def _simulate(spec: RunSpec, plant: Plant, sensors: Sensors) -> RunArrays:
     supervisor = PlantSupervisor(limits_from_parameters(limits, (parameters.effort_limit,), lockstep=True))
     values = {**spec.controller_parameters, "set_point": spec.set_point}
     design = load_plant(spec.design_plant)
-    controller = AnswerLoop(
+    controller = ControlLoop(
         make_controller(spec.controller, design, spec.period, values), float("inf"), simulated_time=True
     )
     chosen = spec.disturbance_parameters()

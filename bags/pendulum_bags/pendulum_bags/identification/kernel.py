@@ -33,7 +33,7 @@ from pendulum_bags.arrays import Array
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.plants import friction_terms
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_friction
-from pendulum_msgs_py.programs.kept_kernels import drop_stale_code
+from pendulum_msgs_py.programs.kernel_cache import drop_stale_code
 
 __all__ = ["PARAMETER_NAMES", "cumulative_input", "normal_blocks", "simulate_windows"]
 

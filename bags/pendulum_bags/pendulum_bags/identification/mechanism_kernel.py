@@ -16,7 +16,7 @@ from pendulum_bags.arrays import Array
 from pendulum_msgs_py.dynamics.joint_steps import advance_joints, joint_functions
 from pendulum_msgs_py.loops.trees import compile_tree, tuple_loader
 from pendulum_msgs_py.mechanisms import MECHANISMS
-from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 
 __all__ = ["lagged", "motion_kernel"]
 

@@ -36,8 +36,8 @@ from pendulum_msgs_py.mechanisms import Mechanism
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
 from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_msgs_py.programs.kept_kernels import keep_kernel
-from pendulum_sim.batches.compiling import WITHIN, compile_to_tell, compile_tree, tuple_loader
+from pendulum_msgs_py.programs.kernel_cache import keep_kernel
+from pendulum_sim.batches.compiling import WITHIN, compile_by_type, compile_tree, tuple_loader
 from pendulum_sim.stepping.dry_friction import LAG as LAG_OF_ONE
 from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_friction, advance_dry
 from pendulum_sim.stepping.integrators import get_integrator
@@ -363,7 +363,7 @@ def _mechanism_kernel(name: str, goal: tuple[float, ...]) -> Any:
 
     mechanism = MECHANISMS[name]
     n, width = len(mechanism.joints), len(mechanism.parameter_names)
-    equation, along, put, lag = (compile_to_tell(each) for each in (mechanism.forward, *joint_functions(n)))
+    equation, along, put, lag = (compile_by_type(each) for each in (mechanism.forward, *joint_functions(n)))
     advance = compile_tree(advance_joints)
     load, load_p = tuple_loader(n, 1), tuple_loader(width, 1)
     last = width + len(JOINT_ROWS) * n

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.learning.body import can_exist, kicks_of, start_spread
 from pendulum_bags.learning.task import SwingUpTask, value_of
-from pendulum_lqr.controller_interface.policy_answers import START_TIME
+from pendulum_lqr.controller_interface.policy_runner import START_TIME
 from pendulum_lqr.controllers.policy import LearnedPolicy
 from pendulum_lqr.policies.policy import Policy
 from pendulum_msgs_py.contract.joints import Vector

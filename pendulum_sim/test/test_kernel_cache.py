@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_msgs_py.programs import kept_kernels
-from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+from pendulum_msgs_py.programs import kernel_cache
+from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 from pendulum_sim.batches import batch_kernels
 from pendulum_sim.batches.batch import simulate_batch
 
@@ -50,7 +50,7 @@ TWO_OF_ONE_NAME = (
 import math
 import sys
 import numba
-from pendulum_msgs_py.programs.kept_kernels import keep_kernel
+from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 
 def kernel(factor):
     @numba.njit
@@ -127,7 +127,7 @@ def test_a_symbol_that_another_process_may_have_as_well_is_not_kept(
 
 def test_nothing_is_taken_that_other_source_was_compiled_to(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kernel(double)(2.0)
-    monkeypatch.setattr(kept_kernels, "_source_of", lambda package: "changed")
+    monkeypatch.setattr(kernel_cache, "_source_of", lambda package: "changed")
     changed, after = kernel(double), kernel(double)
     assert (changed(2.0), taken(changed)) == (5.0, False)
     assert (after(2.0), taken(after)) == (5.0, True)
@@ -142,7 +142,7 @@ def test_what_another_version_kept_is_not_read_where_its_modules_are_gone(
     head, _, _ = file.read_bytes().partition(b"\n")
     content = b"cpendulum_msgs_py.no_longer_there\nkernel\n."
     file.write_bytes(head.split()[0] + b" " + hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
-    monkeypatch.setattr(kept_kernels, "_source_of", lambda package: "of another version")
+    monkeypatch.setattr(kernel_cache, "_source_of", lambda package: "of another version")
     changed = kernel(double)
     assert (changed(2.0), taken(changed)) == (5.0, False)
 
@@ -161,7 +161,7 @@ def test_functions_that_differ_in_a_name_or_in_what_they_keep_are_not_the_same()
     )
     cosine.__qualname__ = sine.__qualname__
     assert cosine(0.0) == 1.0
-    words = kept_kernels._words
+    words = kernel_cache._words
     assert words(sine) != words(cosine)
     assert words(scaled(2.0)) != words(scaled(3.0))
     assert words(scaled(2.0)) == words(scaled(2.0))
@@ -176,7 +176,7 @@ def test_a_module_of_somebody_else_is_known_by_its_source(
     theirs = importlib.import_module("their_law")
     kernel(theirs.law)(2.0)
     (tmp_path / "their_law.py").write_text(THEIRS.format(factor=30.0), encoding="utf-8")
-    kept_kernels._source_of.cache_clear()
+    kernel_cache._source_of.cache_clear()
     importlib.invalidate_caches()
     changed = kernel(importlib.reload(theirs).law)
     assert (changed(2.0), taken(changed)) == (61.0, False)

@@ -19,7 +19,7 @@ from pendulum_lqr.policies.policy import Policy
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 
-__all__ = ["START_TIME", "ZERO", "PolicyAnswers", "check_policy_period", "policy_specs", "states_to_hold"]
+__all__ = ["START_TIME", "ZERO", "PolicyRunner", "check_policy_period", "policy_specs", "states_to_hold"]
 
 START_TIME = 0.2
 """Time from the first state until a policy has all of its effort, by default [s]."""
@@ -61,7 +61,7 @@ def check_policy_period(policy: Policy, period: float) -> None:
         )
 
 
-class PolicyAnswers:
+class PolicyRunner:
     """The commands of a policy for states of n joints, m efforts each, until it gives up.
 
     Args:
@@ -159,7 +159,7 @@ class PolicyAnswers:
         text = f"{policy.name} ({policy.task}, {sizes}) every {policy.period:g} s, fallback {after}"
         return f"{text}; {self.notice}" if self.notice else text
 
-    def take_over(self, previous: PolicyAnswers) -> None:
+    def take_over(self, previous: PolicyRunner) -> None:
         """Take over samples and efforts from another run of the same kind of policy, and whether it gave up."""
         self.notice = previous.notice
         own, other = self.policy, previous.policy
