@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -24,6 +26,8 @@ __all__ = ["Machine", "MachineRun", "record_listed"]
 _ENDED = "ended: "
 """Begins the line that the program prints when a run has ended: its bag, and why it failed, as JSON."""
 _POLL = 0.05
+_ENDING = 25.0
+"""Time that the program has to end its own, in two waves [s]."""
 
 
 class MachineRun(NamedTuple):
@@ -45,6 +49,7 @@ class Machine:
         self.runs = runs
         self._processes = ProcessSet(folder / "logs" / "machine", {})
         self._child: Child | None = None
+        self._interrupted = False
 
     def __enter__(self) -> Machine:
         return self
@@ -52,7 +57,19 @@ class Machine:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.interrupt()
+        if self._child is not None:
+            # It ends programs of its own, which a kill would leave behind.
+            with suppress(FaultError):
+                self._processes.wait(self._child, _ENDING)
         self._processes.stop()
+
+    def interrupt(self) -> None:
+        """Ask the program to end; leaving the context waits for that."""
+        # Once: a second signal would interrupt its end.
+        if self._child is not None and not self._interrupted:
+            self._interrupted = True
+            self._child.process.send_signal(signal.SIGINT)
 
     def start(self) -> None:
         """Start to record, behind all other programs of this computer."""

@@ -185,7 +185,7 @@ def carry_out(
         folder: The run's folder.
         order: What is wanted.
         progress: Shows where it is.
-        leaving: As of :func:`run_thesis`.
+        leaving: Ends the machine's program and leaves the graph; close it when everything is written.
         on_first: Called with the given plant when its first layer is there.
 
     Raises:
@@ -193,18 +193,18 @@ def carry_out(
         KeyboardInterrupt: The user interrupted it before the first layer.
     """
     run = _Run(folder, order, progress, on_first)
+    leaving.enter_context(run.machine)
     spent = threading.Event()
     try:
-        # Inside: a second Ctrl-C while the machine's program ends does not lose what was found.
-        with run.machine:
-            run.measure(leaving)
-            with _ends_with_budget(order.budget, run.compared, spent):
-                run.carry_out(run.compare_given)
-                for step in run.steps():
-                    run.carry_out(step)
+        run.measure(leaving)
+        with _ends_with_budget(order.budget, run.compared, spent):
+            run.carry_out(run.compare_given)
+            for step in run.steps():
+                run.carry_out(step)
     except KeyboardInterrupt:
         if not run.compared.is_set():
             raise
+        run.machine.interrupt()
         run.found.spent, run.found.interrupted = spent.is_set(), not spent.is_set()
         why = f"The budget of {order.budget:g} s was spent" if run.found.spent else "The run was interrupted"
         run.found.notes.append(f"{why}: “{run.now}” and what follows it was left out.")
