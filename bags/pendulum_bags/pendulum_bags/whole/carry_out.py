@@ -243,6 +243,7 @@ class _Run:
                 self.multisine, machine = Multisine().specs(sim, hw)
                 runs.append(MachineRun(folder / MULTISINE / "hw", machine))
             if order.wants(Layer.SAME_CHOICE):
+                self._phase("choosing controllers", 0.1 * order.contenders)
                 self.contenders = contender_specs(sim, hw, order.contenders, settings.noise.seed)
                 runs += [
                     MachineRun(place_of(folder / RANKING, name, machine) / "bag", machine)
