@@ -96,6 +96,7 @@ def test_one_run_answers_for_the_given_plant_and_for_the_one_that_it_identifies(
         return
     assert load_plant(found["plant"]).inertia > 2.0 * load_plant("thesis").inertia
     assert found["answer"]["layers"][0]["mark"] == "yes"
+    assert '<th scope="col">plant.yaml</th>' in (run_folder / "report.html").read_text(encoding="utf-8")
     for answer in (summary["answer"], found["answer"]):
         missing = [layer["layer"] for layer in answer["layers"] if layer["mark"] == "not measured"]
         assert not missing or summary["left_out"]

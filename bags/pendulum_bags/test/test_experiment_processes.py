@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from pendulum_bags.experiments import progress
 from pendulum_bags.experiments.processes import ProcessSet
 from pendulum_msgs_py.errors import FaultError
 from pendulum_testing.fixtures import wait_for
@@ -89,3 +92,11 @@ def test_programs_end_but_those_that_are_to_go_on(tmp_path: Path) -> None:
         # Those that were ended have not died.
         processes.check()
     assert kept.process.poll() is not None
+
+
+def test_a_long_phase_is_reported_repeatedly_where_the_output_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "_SILENCE", 0.0)
+    output = io.StringIO()
+    with progress.PhaseProgress(10.0, Console(file=output)) as shown:
+        shown.phase("noise", 5.0)
+        wait_for(lambda: output.getvalue().count("  noise: ") >= 2, 20.0, "two lines of one phase")
