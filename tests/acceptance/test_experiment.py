@@ -261,6 +261,7 @@ def _command_line(process: psutil.Process) -> set[str]:
         (["--out", "."], "exists and is not empty"),
         (["--out", "/proc/run"], "cannot be made"),
         (["--only", "everything"], "--only is everything; expected one of same_run, identified, same_plant"),
+        (["--only", "identified", "--budget", "0"], "--only identified needs time after the run; expected --budget"),
         (["--domain", "400"], "ROS domain is 400; expected 0 to 100"),
     ],
 )

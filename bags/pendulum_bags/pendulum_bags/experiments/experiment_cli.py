@@ -210,6 +210,8 @@ def thesis(
     steps = only or STEPS
     if unknown := set(steps) - set(STEPS):
         raise ParameterError(f"--only is {min(unknown)}; expected one of {', '.join(STEPS)}")
+    if budget <= 0.0 and (further := set(only or ()) - set(STEPS[:1])):
+        raise ParameterError(f"--only {min(further)} needs time after the run; expected --budget above 0 s")
     domain = check_domain(domain)
     if (foreign := settings.foreign) is not None and plant is None and not accept_differences:
         foreign.require_equation()
