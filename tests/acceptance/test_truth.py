@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.benchmarks.bench_truth import margins_on, misses, on_the_margin
+from tests.truth_loops import certificates
 from tests.truth_plants import PAIRS
 
 
@@ -25,3 +26,18 @@ def test_a_spread_on_its_margin_is_seldom_called_equivalent() -> None:
     # 5 % are meant; 6 of 24 or more happen once in 1 000. 47 % said yes while the spread was biased.
     assert max(found["angle equivalent"], found["velocity equivalent"], found["torque equivalent"]) <= 5
     assert found["any different"] <= 5
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "refusal"),
+    [
+        ("pendulum", 0, ""),
+        ("cart-pole, cart stiffness -0.3 to -1 1/s^2", 0, "refused for poles"),
+        ("Furuta pendulum, resonance between lines", 25, "refused for a resonance"),
+    ],
+)
+def test_no_certified_controller_falls_on_the_machine_that_was_measured(name: str, seed: int, refusal: str) -> None:
+    found = certificates(name, seed, 60)
+    # Of the last pair one fell while a resonance between lines was only a premise.
+    assert found["failing"] == 0
+    assert found[refusal] > 0 if refusal else 2 * found["robust certified"] > found["robust"] > 10

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -16,6 +16,7 @@ from pendulum_bags.comparison.long_run import Disturbance
 from pendulum_bags.comparison.same_run import paired_tests
 from pendulum_bags.runs.series import Series, Signal
 from tests.benchmarks import Row, counted
+from tests.truth_loops import FAMILIES, certificates
 from tests.truth_plants import HOLD, PAIRS, PlantPair
 
 DURATIONS = (5.0, 25.0, 125.0)
@@ -85,10 +86,34 @@ def on_the_margin(seeds: range, pair: PlantPair, stated: dict[str, str]) -> Coun
     return count
 
 
+def certificate_rows(pool: Executor) -> Iterator[Row]:
+    """Yield the certified controllers that fall on the machine, and the share of robust ones that are certified."""
+    for name in FAMILIES:
+        hard = "," in name
+        total: Counter[str] = Counter()
+        for count in pool.map(partial(certificates, name, cases=20), range(60 if hard else 20)):
+            total.update(count)
+        note = ", ".join(f"{number} {what}" for what, number in total.items())
+        yield counted(
+            f"{name}: certified, but unstable on the machine",
+            total["failing"],
+            total["certified"],
+            at_most=0.0,
+            note=note,
+        )
+        yield counted(
+            f"{name}: certified, of those with 6 dB and 30 degrees",
+            total["robust certified"],
+            total["robust"],
+            at_least=None if hard else 50.0,
+        )
+
+
 def rows() -> Iterator[Row]:
     """Yield the misses of each side of each interval, and the false answers on the margin."""
     blocks = [range(first, first + _AT_ONCE) for first in range(0, TRIALS, _AT_ONCE)]
     with ProcessPoolExecutor(os.cpu_count()) as pool:
+        yield from certificate_rows(pool)
         for name, pair in PAIRS.items():
             truth = pair.truth()
             for duration in DURATIONS:

@@ -308,3 +308,11 @@ def test_figures_have_a_row_for_each_joint_with_its_units() -> None:
     labels = [panel.y_label for panel in figures["bode"].panels]
     assert labels == ["cart per effort\n[m/N]", "pole per effort\n[rad/N]", "phase of cart\n[deg]"]
     assert "0.316 m of cart" in figures["gap"].sentence
+
+
+def test_an_error_far_too_large_is_not_answered_by_measuring_longer() -> None:
+    plant, model = load_mechanism("cart_pole"), _model("cart_pole")
+    exact = _exact(model, plant, "hw", 0.1)
+    layer = analyse_responses([replace(exact, deviation=20.0 * np.abs(exact.response))], "cart_pole").layers[0]
+    assert layer.mark is Mark.UNDECIDED
+    assert [step.partition(" about")[0] for step in layer.next_steps] == ["measuring longer decides nothing"]

@@ -100,3 +100,22 @@ def test_runs_of_two_plants_on_one_side_are_no_case() -> None:
     assert Case.of([one, {}, one], [two]) == Case("a (1)", "b (2)")
     with pytest.raises(DataError, match=r"hardware is a \(1\) in one run and b \(2\) in another; expected one plant"):
         Case.of([one], [two, one])
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "third", "says"),
+    [
+        (Mark.NO, Mark.YES, Mark.YES, True),
+        (Mark.YES, Mark.YES, Mark.NO, True),
+        (Mark.YES, Mark.NO, Mark.YES, True),
+        (Mark.NO, Mark.NO, Mark.NO, False),
+        (Mark.YES, Mark.NO, Mark.UNDECIDED, False),
+        (Mark.YES, Mark.YES, Mark.YES, False),
+    ],
+)
+def test_where_layers_disagree_one_sentence_names_the_one_that_decides(
+    first: Mark, second: Mark, third: Mark, says: bool
+) -> None:
+    layers = (Layer.SAME_RUN, Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS)
+    answer = sum_up(LayerResult(layer, mark, "s") for layer, mark in zip(layers, (first, second, third), strict=True))
+    assert ("For the stability of a design, test 3 (which controllers) decides" in answer.sentence) is says

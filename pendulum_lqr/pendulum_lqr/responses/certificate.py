@@ -5,10 +5,15 @@ Two certificates, both by Vinnicombe's theorem and both with the upper confidenc
 ``gap``        one number for the machine (the nu-gap in the task's units) below one number for the design, b(P, K)
 ``frequency``  at each frequency, with the weights that certify most (:func:`.gap_metric.loop_distance`)
 
-They presume that the machine has as many unstable poles as the model, a pendulum upright one, and no resonance
-narrower than the distance of two lines. Poles below the lowest line cannot be counted: of one joint the stiffness is
-continued to 0 with its error; of several, where the model has such poles, no loop with a mode below that line is
-certified.
+They presume that the machine has as many unstable poles as the model, a pendulum upright one. Poles below the lowest
+line cannot be counted: of one joint the stiffness is continued to 0 with its error; of several, where the model has
+such poles, no loop with a mode below that line is certified. A stiffness that was overlooked, kappa [1/s^2], moves the
+response at the line omega by about kappa / omega^2, so one that no line shows is smaller than omega^2 and cannot tip a
+loop whose modes are all faster.
+
+They presume no resonance damped by less than :data:`.machine_response.LEAST_DAMPING`. A sharp one between two lines
+shows at both: what they deviate from a smooth plant is read as such a resonance, and a loop that it may bring to -1 is
+undecided. One that the measurement's error hides tips a loop only below the damping that each certificate names.
 
 Both concern the linear machine, on a grid dense enough for lightly damped loops
 (:mod:`pendulum_lqr.responses.machine_response` defines how it is made of measured lines). From the highest line to the
@@ -33,13 +38,15 @@ from pendulum_lqr.responses.gap_metric import (
     nu_gap,
     pointwise_margin,
 )
-from pendulum_lqr.responses.machine_response import Machine
+from pendulum_lqr.responses.machine_response import LEAST_DAMPING, Machine
 from pendulum_lqr.responses.sampled_response import model_response
 
 __all__ = ["Certificate", "Certifier", "GapProfile", "compare_machine", "is_stable"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+_FAR = 10.0
+"""Loop distance from which no measurement of practical length decides."""
 _FASTEST = 1e-6
 """Smallest eigenvalue of a sampled loop that counts as a mode."""
 
@@ -137,6 +144,8 @@ class Certificate:
         possible: Whether at each frequency some plant within the confidence disc has a loop distance below 1.
         unseen: Frequency from which a measurement would have to begin to show what moves the model's slow poles [Hz];
             0 where it began there, or no such pole matters.
+        resonance: Frequency near which a resonance that the lines show may tip the loop [Hz]; 0 for none.
+        hidden_damping: Damping ratio from which a resonance that the measurement's error hides cannot tip it [-].
     """
 
     stable_on_model: bool
@@ -148,6 +157,8 @@ class Certificate:
     worst_modulus: float
     possible: bool = False
     unseen: float = 0.0
+    resonance: float = 0.0
+    hidden_damping: float = 0.0
 
     @property
     def undecided(self) -> bool:
@@ -155,9 +166,14 @@ class Certificate:
         return self.possible and not self.certified
 
     @property
+    def far(self) -> bool:
+        """Whether the error alone is so large that no measurement decides: ten times less takes a hundred as long."""
+        return self.undecided and not (self.unseen or self.resonance) and self.distance >= _FAR
+
+    @property
     def certified(self) -> bool:
         """Whether either certificate holds."""
-        return (self.by_gap or self.by_frequency) and not self.unseen
+        return (self.by_gap or self.by_frequency) and not (self.unseen or self.resonance)
 
 
 def is_stable(sampled: DiscreteModel, K: ArrayLike) -> bool:
@@ -226,18 +242,26 @@ class Certifier:
         margin = float(np.min(pointwise_margin(plant, self.scaling.controller(K)))) if stable else 0.0
         # Where much lies beyond the highest line, only a small loop is known to stay away from -1 there.
         settled = machine.up_to_nyquist or bool((np.abs(second[-1]) + radius[-1] < 1.0) and (np.abs(first[-1]) < 1.0))
+        room = np.maximum(np.abs(1.0 + second) - radius, 1e-300)
+        ringing = np.zeros((2, *machine.radius.shape)) if machine.ringing is None else machine.ringing
+        shown, hidden = np.sum(np.abs(K) * ringing, axis=1) / room
+        tips = int(np.argmax(shown))
         nearest = np.maximum(np.abs(second - first) - radius, 0.0) / np.maximum(np.abs(1.0 + first), 1e-300)
         nearest = np.minimum(nearest, loop_distance(first, second))
+        by_gap = stable and self.profile.value_upper < margin
         alike = stable and settled and _same_winding(first, second)
+        by_frequency = alike and bool(distance[at] < 1.0)
         return Certificate(
             stable,
             margin,
-            stable and self.profile.value_upper < margin,
-            alike and bool(distance[at] < 1.0),
+            by_gap,
+            by_frequency,
             float(distance[at]),
             float(machine.frequency[at]),
             float(max(0.0, np.min(np.abs(1.0 + second) - radius))),
             stable and bool(np.max(nearest) < 1.0),
+            resonance=float(machine.frequency[tips]) if (by_gap or by_frequency) and shown[tips] >= 1.0 else 0.0,
+            hidden_damping=float(np.max(hidden)) * LEAST_DAMPING,
         )
 
 

@@ -20,7 +20,10 @@ from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.responses.measured_response import MeasuredResponse
 from pendulum_lqr.responses.sampled_response import model_response
 
-__all__ = ["Machine"]
+__all__ = ["LEAST_DAMPING", "Machine"]
+
+LEAST_DAMPING = 0.001
+"""Damping ratio of the sharpest resonance between two lines that is looked for; a steel frame's is 0.001 to 0.005."""
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -36,6 +39,8 @@ _NEAR_NYQUIST = 0.9
 """Share of the Nyquist frequency above which a highest line counts as reaching it."""
 _RATIO = 1.012
 """Largest ratio of neighbouring frequencies of the grid."""
+_NARROW = 0.25
+"""Largest relative distance of two lines between which a resonance is looked for: wider apart, smooth plants bend."""
 _LEFT_OUT = 0.25
 """Share of the error at lines left out that is counted at points between lines, half as far from their neighbours: a
 cubic spline errs by the fourth power of the distance, so a sixteenth would do for a smooth plant."""
@@ -52,6 +57,10 @@ class Machine:
         period: Sampling period [s].
         lowest: Lowest measured line [Hz].
         confidence: Of the discs.
+        ringing: How much a resonance of the least damping between two lines may add to the response: by what these
+            lines deviate from a smooth plant in opposite directions, and by what their error may hide, shape
+            (2, outputs, n). In the middle its peak is half the distance of the lines over damping times frequency as
+            large as what it adds to each of them.
     """
 
     frequency: Array
@@ -60,6 +69,7 @@ class Machine:
     period: float
     lowest: float
     confidence: float = 0.95
+    ringing: Array | None = None
 
     @property
     def up_to_nyquist(self) -> bool:
@@ -71,7 +81,8 @@ class Machine:
         """Return the machine of a measurement."""
         radius = measured.radius()
         lines = measured.frequency
-        inside, response, discs = _between(measured, radius)
+        inside, response, discs, apart = _between(measured, radius)
+        ringing = _ringing(lines, apart, measured.response, radius, inside)
         low = lines[0] * _BELOW
         near = np.flatnonzero(lines <= _FIT_UP_TO * lines[0])
         if near.size < _LEAST_FIT:
@@ -88,7 +99,8 @@ class Machine:
             # At low frequency the measured velocity is the derivative of the angle, but for the hold.
             response = np.hstack([np.vstack([angle, 1j * omega * angle]), response])
             discs = np.hstack([np.vstack([disc, omega * (disc + hold)]), discs])
-        return cls(inside, response, discs, measured.period, float(lines[0]))
+            ringing = np.concatenate([np.zeros((*ringing.shape[:2], low.size)), ringing], axis=2)
+        return cls(inside, response, discs, measured.period, float(lines[0]), ringing=ringing)
 
     @classmethod
     def beside(cls, measured: MeasuredResponse, model: LinearModel) -> Machine:
@@ -110,23 +122,42 @@ class Machine:
         weights = np.abs(scipy.interpolate.CubicSpline(mirrored, np.eye(mirrored.size))(whole))
         # Towards 0, where friction begins to count, half the distance does not make the error that much smaller.
         near_zero = np.where(whole < lines[1], 1.0 / _LEFT_OUT, 1.0)
-        rows, discs = [], []
+        rows, discs, errors = [], [], []
         for curve, radius in zip(ratio, spread, strict=True):
             values, error = _splined(mirrored, np.concatenate([np.conj(curve[::-1]), curve]), whole)
-            between = np.abs(values) * near_zero * _larger_neighbour(mirrored, error, whole)
+            between = np.abs(values) * near_zero * _larger_neighbour(mirrored, _LEFT_OUT * np.abs(error), whole)
             disc = weights @ np.concatenate([radius[::-1], radius]) + np.where(on_line, 0.0, between)
             values[on_line], disc[on_line] = curve, radius
             rows.append(values)
             discs.append(disc)
+            errors.append(error[lines.size :])
         on_grid = model_response(model, whole, period)
-        return cls(whole, np.array(rows) * on_grid, np.array(discs) * np.abs(on_grid), period, float(lines[0]))
+        ringing = _ringing(lines, np.array(errors), measured.response, measured.radius(), whole)
+        return cls(
+            whole, np.array(rows) * on_grid, np.array(discs) * np.abs(on_grid), period, float(lines[0]), ringing=ringing
+        )
 
 
-def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex, Array]:
-    """Return grid, response and discs from the lowest to the highest line."""
+def _ringing(lines: Array, error: Complex, response: Complex, radius: Array, grid: Array) -> Array:
+    """Return what :attr:`Machine.ringing` is, from the relative error of leaving out each line."""
+    if lines.size < 2:
+        return np.zeros((2, error.shape[0], grid.size))
+    right = np.clip(np.searchsorted(lines, grid, side="left"), 1, lines.size - 1)
+    a, b = lines[right - 1], lines[right]
+    peak = np.where((b - a <= _NARROW * a) & (grid >= lines[0]), 0.5 * (b - a) / np.sqrt(a * b) / LEAST_DAMPING, 0.0)
+    # A resonance pushes the lines on either side of it in opposite directions, a smooth bend in the same one. A value
+    # at a line and that of the spline through the others both have an error.
+    size = 0.5 * (np.abs(response[:, right]) + np.abs(response[:, right - 1]))
+    apart = 0.5 * np.abs(error[:, right] - error[:, right - 1]) * size
+    noise = np.array([_larger_neighbour(lines, row, grid) for row in radius])
+    return peak * np.array([np.maximum(apart - 2.0 * noise, 0.0), noise])
+
+
+def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex, Array, Complex]:
+    """Return grid, response, discs, from the lowest line to the highest, and relative errors of leaving one out."""
     lines = measured.frequency
     if lines.size < 5:
-        return lines, measured.response, radius
+        return lines, measured.response, radius, np.zeros_like(measured.response)
     grid = _grid(lines)
     inverse = 1.0 / measured.response[0]
     ratio = measured.response[1] / measured.response[0]
@@ -139,12 +170,12 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
     on_line = np.isin(grid, lines)
     angle = 1.0 / values[0]
     response = np.vstack([angle, values[1] * angle])
-    bend = [_larger_neighbour(lines, error, grid) for error in errors]
+    bend = [_larger_neighbour(lines, _LEFT_OUT * np.abs(error), grid) for error in errors]
     share = np.vstack([bend[0], bend[0] + bend[1]])
     noise = np.vstack([_larger_neighbour(lines, row, grid) for row in relative])
     discs = np.abs(response) * (noise + np.where(on_line, 0.0, share))
     response[:, on_line], discs[:, on_line] = measured.response, radius
-    return grid, response, discs
+    return grid, response, discs, np.vstack([-errors[0], errors[1] - errors[0]])
 
 
 def _grid(lines: Array) -> Array:
@@ -155,17 +186,17 @@ def _grid(lines: Array) -> Array:
     return np.concatenate([*pieces, lines[-1:]])
 
 
-def _splined(lines: Array, curve: Complex, grid: Array) -> tuple[Complex, Array]:
-    """Return a curve on the grid, and its relative error between lines, by leaving one line out at a time.
+def _splined(lines: Array, curve: Complex, grid: Array) -> tuple[Complex, Complex]:
+    """Return a curve on the grid, and the relative error of leaving out each line, shape (lines,).
 
     Of lines that are mirrored at 0 the mirror image is left out with its line: it is no measurement of its own.
     """
-    left_out = np.zeros(lines.size)
+    left_out = np.zeros(lines.size, dtype=np.complex128)
     for i in range(1, lines.size - 1):
         others = np.flatnonzero(np.abs(lines) != abs(lines[i]))
-        left_out[i] = abs(scipy.interpolate.CubicSpline(lines[others], curve[others])(lines[i]) / curve[i] - 1.0)
+        left_out[i] = scipy.interpolate.CubicSpline(lines[others], curve[others])(lines[i]) / curve[i] - 1.0
     left_out[0], left_out[-1] = left_out[1], left_out[-2]
-    return np.asarray(scipy.interpolate.CubicSpline(lines, curve)(grid)), _LEFT_OUT * left_out
+    return np.asarray(scipy.interpolate.CubicSpline(lines, curve)(grid)), left_out
 
 
 def _larger_neighbour(lines: Array, values: Array, grid: Array) -> Array:

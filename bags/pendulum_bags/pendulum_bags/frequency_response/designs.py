@@ -76,6 +76,8 @@ class DesignResult:
             "loop_distance_at_hz": found.at,
             "stable_on_model": found.stable_on_model,
             "unseen_from_hz": found.unseen,
+            "resonance_at_hz": found.resonance,
+            "hidden_damping": found.hidden_damping,
             "modulus_on_hardware": found.worst_modulus,
         }
 
@@ -117,7 +119,9 @@ def design_rows(designs: Sequence[DesignResult]) -> list[tuple[str, ...]]:
             continue
         how = "by its margin" if found.by_gap else "by frequency" if found.by_frequency else "no"
         if found.undecided:
-            how = "undecided: measure longer"
+            how = "undecided: error far too large" if found.far else "undecided: measure longer"
+        if found.resonance and found.undecided:
+            how = f"undecided: resonance near {found.resonance:.2g} Hz"
         if found.unseen:
             how = f"undecided: measure from {found.unseen:.2g} Hz"
         rows.append(

@@ -11,6 +11,7 @@ from pendulum_bags.frequency_response.compare import SMALLEST, Difference
 from pendulum_bags.frequency_response.designs import DesignResult
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark
 from pendulum_lqr.responses.certificate import Certifier
+from pendulum_lqr.responses.machine_response import LEAST_DAMPING
 from pendulum_lqr.responses.measured_response import MeasuredResponse
 
 __all__ = ["GAP_MARGIN", "LONGER", "same_plant", "which_controllers"]
@@ -111,6 +112,7 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
     profile = certifier.profile
     unstable = int(np.sum(np.linalg.eigvals(certifier.plant.A).real > _UNSTABLE))
     good = [design for design in designs if design.certified]
+    damping = max(LEAST_DAMPING, *(design.certificate.hidden_damping for design in good), 0.0)
     bad = [design for design in designs if not design.certified]
     unsure = bool(bad) and all(design.undecided for design in bad)
     mark = Mark.YES if designs and not bad else Mark.UNDECIDED if unsure else Mark.NO
@@ -154,16 +156,26 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
     )
     # Not a matter of the measurement's error, but of where it begins.
     slow = [design.certificate.unseen for design in bad if design.certificate.undecided and design.certificate.unseen]
-    if any(design.undecided and not (design.unknown or design.certificate.unseen) for design in bad):
+    open_ = [design for design in bad if design.certificate.undecided and not design.unknown]
+    if any(not (one.certificate.far or one.certificate.unseen or one.certificate.resonance) for one in open_):
         steps += (f"measure longer: {longer}",)
+    steps += tuple(
+        f"find out what resonates near {one.certificate.resonance:.2g} Hz, or choose less gain there than {one.name}"
+        for one in open_
+        if one.certificate.resonance
+    )
+    far = [one.name for one in open_ if one.certificate.far]
+    if far:
+        nothing = f"measuring longer decides nothing about {', '.join(far)}: the error would have to be a tenth at most"
+        steps += (f"{nothing}; identify the hardware, and design with more margin",)
     if slow:
         steps += (f"measure from lower frequencies: {longer} --signal-period {math.ceil(1.0 / min(slow))}",)
     return LayerResult(
         Layer.WHICH_CONTROLLERS,
         mark,
         f"Certified for the hardware: {verdict}; {limit}. It presumes as many unstable poles as the model has, "
-        f"{unstable}, and no resonance between two measured frequencies; torque limits and friction at rest are "
-        "outside it.",
+        f"{unstable}, and no resonance between two frequencies that is damped by less than "
+        f"{math.ceil(1e3 * damping) / 10.0:g} %; torque limits and friction at rest are outside it.",
         tuple(evidence),
         steps,
         limit if mark is Mark.YES else f"{', '.join(d.name for d in bad)} not certified for the hardware",
@@ -187,6 +199,8 @@ def _row(design: DesignResult, limit: float) -> Evidence:
             f"the model has poles below the lowest frequency, and the loop a mode at {found.unseen:.2g} Hz: what moves "
             "these poles cannot be seen"
         )
+    elif found.resonance and found.undecided:
+        how = f"what the lines near {found.resonance:.2g} Hz show may be a resonance that tips this loop"
     elif found.by_gap:
         how = "certified by its margin"
     elif found.by_frequency:

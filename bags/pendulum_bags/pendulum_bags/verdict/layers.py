@@ -256,10 +256,9 @@ def sum_up(
         mark = Mark.YES
         text = f"Yes: {_reasons(by_mark[mark])}."
     holds = [result.holds for result in layers if result.holds]
-    if {given[layer].mark for layer in (Layer.SAME_RUN, Layer.WHICH_CONTROLLERS) if layer in given} == {
-        Mark.YES,
-        Mark.NO,
-    }:
+    certified = given[Layer.WHICH_CONTROLLERS].mark if Layer.WHICH_CONTROLLERS in given else Mark.NOT_MEASURED
+    others = {given[layer].mark for layer in (Layer.SAME_RUN, Layer.SAME_PLANT) if layer in given}
+    if (certified is Mark.YES and Mark.NO in others) or (certified is Mark.NO and Mark.YES in others):
         text += (
             f" For the stability of a design, test 3 ({Layer.WHICH_CONTROLLERS.title}) decides; for how closely the "
             f"motion matches, test 1 ({Layer.SAME_RUN.title})."
