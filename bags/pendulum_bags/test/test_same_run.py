@@ -214,6 +214,9 @@ def test_one_run_or_one_seed_twice_and_unlike_runs_are_not_pooled(tmp_path: Path
     loud = tuple(told(run, disturbance={**noise, "amplitude": 5}) for run in second)
     with pytest.raises(DataError, match=r"different disturbances, in amplitude cannot be pooled: 2\.5"):
         compare([quiet, loud])  # type: ignore[list-item]
+    waiting = tuple(told(run, clock="lockstep") for run in first)
+    with pytest.raises(DataError, match=r"different clocks cannot be pooled: lockstep in .*, real time in"):
+        compare([waiting, second])  # type: ignore[list-item]
     # Lists and tuples, whole and broken numbers are one in JSON.
     assert compare([ones, tuple(told(run, controller={"kind": "lqr", "q": (100, 0.01)}) for run in second)])  # type: ignore[list-item]
 

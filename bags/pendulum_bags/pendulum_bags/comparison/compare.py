@@ -12,13 +12,21 @@ from typing import Any, TypeAlias
 
 from pendulum_bags.comparison.band import common_band
 from pendulum_bags.comparison.equivalence import Outcome, Verdict, conclude
-from pendulum_bags.comparison.independence import check_pairs
+from pendulum_bags.comparison.independence import check_clocks, check_pairs
 from pendulum_bags.comparison.long_run import Disturbance
 from pendulum_bags.comparison.margins import MarginArgument, Margins
 from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
 from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
-from pendulum_bags.runs.run_data import OpenBag, RunData, is_emulated, noise_hold_time, plant_summary, read_run
+from pendulum_bags.runs.run_data import (
+    OpenBag,
+    RunData,
+    is_emulated,
+    is_in_lockstep,
+    noise_hold_time,
+    plant_summary,
+    read_run,
+)
 from pendulum_bags.runs.run_folder import pair_folders, read_looks, read_stalls
 from pendulum_bags.runs.run_record import DIFFERENCE, STAND_IN, run_record
 from pendulum_msgs_py.errors import BagError, DataError
@@ -75,6 +83,18 @@ class Comparison:
     def is_emulated(self) -> bool:
         """Whether the hardware was emulated, in all runs."""
         return all(is_emulated(pair.hardware) for pair in self.pairs)
+
+    @property
+    def what_of(self) -> str:
+        """Of what runs the intervals are, where runs may differ by more than their seeds, as text; else empty."""
+        if all(is_emulated(pair.hardware) and is_in_lockstep(pair.hardware) for pair in self.tested):
+            return ""
+        if len(self.tested) == 1:
+            return "The intervals are of this run only, with the phase that its loops happened to have. "
+        return (
+            "The intervals are of the mean over runs, by Student's t of what the runs show, since each has a phase; "
+            "those of distances with the delay left in are of these runs only. "
+        )
 
     @property
     def hardware_name(self) -> str:
@@ -214,9 +234,11 @@ def compare(
     tested = [pair for index, pair in enumerate(compared) if index not in shown]
     simulations = list(own) or [pair.simulation for pair in tested]
     hardware_runs = [pair.hardware for pair in tested]
+    check_clocks(hardware_runs)
     # Lockstep repeats of an emulator differ by their seeds alone; those of a machine may differ by anything.
-    differ = not all(is_emulated(run) for run in hardware_runs)
-    names = "simulation", "hardware" if differ else "emulated hardware"
+    emulated = all(map(is_emulated, hardware_runs))
+    differ = not (emulated and all(map(is_in_lockstep, hardware_runs)))
+    names = "simulation", "emulated hardware" if emulated else "hardware"
     ones, others = ([run.window for run in runs] for runs in (simulations, hardware_runs))
     noises = [_noise(run) for run in simulations], [_noise(run) for run in hardware_runs]
     unpaired = conclude(

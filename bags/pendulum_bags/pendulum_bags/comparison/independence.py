@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.runs.run_data import RunData
+from pendulum_bags.runs.run_data import RunData, is_in_lockstep
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import describe_plants
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
-__all__ = ["check_pairs"]
+__all__ = ["check_clocks", "check_pairs"]
 
 _MUST_AGREE: tuple[tuple[str, str], ...] = (
     ("controller", "controllers"),
@@ -48,6 +48,14 @@ def check_pairs(pairs: Sequence[tuple[RunData, RunData]]) -> None:
             for other in runs[:i]:
                 _check_two(other, run)
     _check_seeds([pair[1] for pair in pairs])
+
+
+def check_clocks(runs: Sequence[RunData]) -> None:
+    """Refuse to pool runs in lockstep with runs in real time, where each has a phase of its own between its loops."""
+    clocks = ["lockstep" if is_in_lockstep(run) else "real time" for run in runs]
+    for clock, run in zip(clocks, runs, strict=True):
+        if clock != clocks[0]:
+            _refuse("clocks", clocks[0], clock, runs[0], run)
 
 
 def _check_sides(simulation: RunData, hardware: RunData) -> None:

@@ -73,10 +73,9 @@ class Disturbance:
         statistic = size * (size + 2.0) * float((rho**2 / (size - np.arange(1, 1 + rho.size))).sum())
         return None if chi_square_tail(statistic, rho.size) < _CHANCE else cls(t, value, hold)
 
-    @property
-    def variance(self) -> float:
-        """Mean square of the values."""
-        return float(np.mean(self.value**2))
+    def held_at(self, times: Array) -> Array:
+        """Return the values at some times [s]."""
+        return np.asarray(self.value[np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, None)])
 
     def mean_over(self, edges: Array) -> Array:
         """Return the mean over each interval between neighbouring edges, shape (len(edges) - 1,)."""
@@ -92,16 +91,19 @@ class Moments:
     Args:
         products: Of the constant, the modes and the motions, shape (blocks, q, q).
         sizes: Samples of each block, shape (blocks,).
-        gram: Long-run covariance of constant and modes, shape (p, p).
+        gram: Long-run covariance of constant and modes under noise with a mean square of 1, shape (p, p).
+        noise: Sums of squares of the noise over the blocks, shape (blocks,).
         known: Whether the disturbance explains the motion; else p is 1.
-        samples: Independent samples that the motions have, for the bias of a mean; shape (q - p,).
+        short: Correction of the motions for the bias of the window's own mean, from the independent samples that they
+            have; shape (q - p,).
     """
 
     products: Array
     sizes: Array
     gram: Array
+    noise: Array
     known: bool
-    samples: Array
+    short: Array
 
 
 def moments(clock: SlowClock, motions: Array, disturbance: Disturbance | None, blocks: int) -> Moments:
@@ -114,20 +116,23 @@ def moments(clock: SlowClock, motions: Array, disturbance: Disturbance | None, b
         blocks: Into how many blocks of equal length it is divided.
     """
     size = len(motions)
-    modes, gram = np.empty((size, 0)), np.empty((0, 0))
+    modes, gram, squares = np.empty((size, 0)), np.empty((0, 0)), np.zeros(size)
     if disturbance is not None:
+        squares = disturbance.held_at(clock.even_times) ** 2
         modes, gram = _responses(clock, motions, disturbance)
     columns = np.concatenate((np.ones((size, 1)), modes, motions), axis=1)
     edges = np.linspace(0, size, blocks + 1).astype(int)
     parts = [columns[first:last] for first, last in pairwise(edges)]
     whole = np.zeros((1 + len(gram),) * 2)
     whole[1:, 1:] = gram
+    sizes = np.array([effective_size(column) for column in motions.T])
     return Moments(
         np.stack([part.T @ part for part in parts]),
         np.diff(edges).astype(float),
         whole,
+        np.array([float(part.sum()) for part in np.split(squares, edges[1:-1])]),
         disturbance is not None,
-        np.array([effective_size(column) for column in motions.T]),
+        np.sqrt(1.0 / np.maximum(1.0 - 1.0 / np.maximum(sizes, 2.0), 0.5)),
     )
 
 
@@ -155,7 +160,7 @@ def _responses(clock: SlowClock, motions: Array, disturbance: Disturbance) -> tu
         pulse = np.clip(grid[1:] - first, 0.0, disturbance.hold) - np.clip(grid[:-1] - first, 0.0, disturbance.hold)
         one = clock.filtered_even(_modal(pulse / period, poles))
         gram += one.T @ one
-    return responses, gram * disturbance.variance / (ratio * phases)
+    return responses, gram / (ratio * phases)
 
 
 def _modal(inputs: Array, poles: Array) -> Array:
@@ -196,12 +201,13 @@ def _poles(clock: SlowClock, motions: Array, inputs: Array, slowest: float) -> A
     return np.concatenate((real.astype(complex), np.array(distinct, dtype=complex) ** (1.0 / skip)))
 
 
-def covariance(products: Array, sizes: Array, moment: Moments) -> tuple[Array, Array]:
+def covariance(products: Array, sizes: Array, noise: Array, moment: Moments) -> tuple[Array, Array]:
     """Return the long-run covariance of the motions, shape (..., m, m), and their means, shape (..., m).
 
     Args:
         products: Sums of products over samples, shape (..., q, q).
         sizes: Number of samples, shape (...).
+        noise: Sums of squares of the noise over them, shape (...).
         moment: Of the run, for what does not depend on the samples.
     """
     p = len(moment.gram)
@@ -214,6 +220,6 @@ def covariance(products: Array, sizes: Array, moment: Moments) -> tuple[Array, A
     rest = means[..., p:, p:] - transposed @ means[..., :p, p:]
     if not moment.known:
         # About the window's own mean, which is estimated from these samples only.
-        short = np.sqrt(1.0 / np.maximum(1.0 - 1.0 / np.maximum(moment.samples, 2.0), 0.5))
-        rest = rest * short[:, None] * short[None, :]
-    return transposed @ moment.gram @ weights + rest, weights[..., 0, :]
+        rest = rest * moment.short[:, None] * moment.short[None, :]
+    gram = moment.gram * (noise / sizes)[..., None, None]
+    return transposed @ gram @ weights + rest, weights[..., 0, :]

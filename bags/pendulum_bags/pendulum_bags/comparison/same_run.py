@@ -3,12 +3,12 @@
 Estimands, each over a run without end under the same noise, both motions at the slower plant's sampling times and
 below one band: the difference of the means; the ratio of the standard deviations; the delay at which the simulation's
 velocity is nearest to the hardware's; the rms distance per standard deviation of the hardware, as it is and less that
-delay.
+delay. Where runs differ by more than their seeds, as in real time, where each has a phase of its own between its loops,
+it is the mean over runs; of a single run, and for distances with the delay left in, it is that of these runs.
 
 The long-run variances are estimated by :mod:`pendulum_bags.comparison.long_run`, all intervals by a jackknife
-over blocks of time. "Equivalent" needs each test's interval inside its margin, which errs with alpha at most whatever
-the number of tests (Berger, Technometrics 24, 1982); one test suffices for "not equivalent", so each has its share of
-alpha (Bonferroni).
+over blocks of time, with what is no matter of chance beside it: half a millisecond of the delay, and the
+correction for the window's own mean where the noise is not known. What the answers may err is in :class:`Looks`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -36,14 +35,22 @@ LONGEST_DELAY = 0.1
 """Largest delay of the search [s]."""
 LEAST_LIKENESS = 0.5
 """Correlation of the velocities from which a peak is a delay: 0.92 with 1 N m of dry friction, 0.13 by chance."""
+RESOLUTION = 1e-3
+"""No interval is narrower on either side, as a share of a standard deviation: neither integration nor the recording of
+a motion is more exact."""
 LAG_STEP = 0.001
 """Resolution of the lags near the delay; between two of them the slope of the distance is interpolated [s]."""
+DEFINITION = 0.5 * LAG_STEP
+"""Where two motions are most alike, where they are nearest and where they begin differ by up to 0.25 ms in loops whose
+plants differ by 15 %: what a delay is, is a matter of definition to about twice that [s]."""
+_NEAR = 1.5 * DEFINITION
+"""By how much the delay may be another where it is taken out: a velocity's spread has a kink at whole periods [s]."""
 _AHEAD = LAG_STEP * np.array([1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0])
 _LAGS = np.concatenate((-_AHEAD[::-1], [0.0], _AHEAD))
 _QUANTITIES = ("angle", "velocity", "torque")
 _TESTS = 9
 """Tests that may each result in "not equivalent"."""
-_BLOCKS = (6, 20)
+_BLOCKS = (5, 20)
 """Fewest and most blocks of a run: fewer make wide intervals, and those of short blocks are not independent."""
 _BLOCK_TIME = 2.0
 """Length of a block between those bounds [s]."""
@@ -61,6 +68,10 @@ class Looks:
     before, so that the wider intervals cost little: Student's quantile grows with the root of k, the error halves with
     every second analysis.
 
+    "Equivalent" needs each test's interval inside its margin, which errs with alpha at most whatever the number of
+    tests (Berger, Technometrics 24, 1982). One test suffices for "not equivalent", so each of nine has its share of
+    alpha (Bonferroni). Other layers of the verdict have errors of their own.
+
     Args:
         number: 1 for the first analysis; 0 where data are analysed once, and never added to.
         alpha: Probability of an error on one side of a margin over all analyses.
@@ -74,9 +85,20 @@ class Looks:
         """Probability of the interval of this analysis, which is two one-sided tests."""
         return 1.0 - 2.0 * self.alpha * 0.5**self.number
 
-    def level_of_each(self, tests: int) -> float:
-        """Return the probability of the interval that shows a difference, where any of all tests may."""
-        return 1.0 - (1.0 - self.level) / tests
+    @property
+    def level_of_each(self) -> float:
+        """Probability of the interval that shows a difference, where any of all tests may."""
+        return 1.0 - (1.0 - self.level) / _TESTS
+
+    @property
+    def sentence(self) -> str:
+        """How often the answers err, as text."""
+        share = f"{100.0 * self.alpha:.3g} %"
+        return (
+            f"\u201cEquivalent\u201d needs all tests at {share} on a side, \u201cnot equivalent\u201d one of "
+            f"{_TESTS} at {share} / {_TESTS}: each errs in at most {share} of experiments on a margin, over all "
+            "interim analyses."
+        )
 
 
 @dataclass(frozen=True)
@@ -148,22 +170,26 @@ def paired_tests(
     """
     band = min(common_band(margins.band.si, *pair) for pair in pairs)
     seen = [_Seen(*pair, band) for pair in pairs]
-    # The delay is where the distance is smallest: to first order, its error does not change the distances that are
-    # left, so they may be counted as if it were known.
-    centre = _find_delay(seen)
-    noises = noises or (None,) * len(pairs)
-    runs = [_Run.of(one.clock, one.motions(centre or 0.0), noise) for one, noise in zip(seen, noises, strict=True)]
     kind = _Kind.of([one for pair in pairs for one in pair], margins, looks, len(pairs), runs_differ)
+    centre = _find_delay(seen)
+    delay, own = (None, [0.0] * len(seen)) if centre is None else _delay(seen, centre, kind)
+    noises = noises or (None,) * len(pairs)
+    runs = [
+        _Run.of(one.clock, one.motions((late, late - _NEAR, late + _NEAR)), noise)
+        for one, late, noise in zip(seen, own, noises, strict=True)
+    ]
     later = len(_QUANTITIES)
     tests = [_mean_test([runs], _LATE, _LATE + later, margins, kind)]
     tests += _spread_tests([runs], _LATE, _LATE + later, margins, kind)
-    tests.append(_no_delay(margins, kind) if centre is None else _delay_test(seen, centre, margins, kind))
+    tests.append(_within(delay, "delay", margins.delay, kind, DEFINITION) if delay else _no_delay(margins, kind))
     for first, note in ((0, ""), (_LATE, " less the delay")):
-        if centre is None and first:
+        if delay is None and first:
             continue  # nothing was taken out
         step = 2 if first == 0 else later
+        # With the delay left in, it grows so steeply with the phase that few runs do not show the mean over runs.
+        kept = kind if first else replace(kind, runs_differ=False)
         for index, (what, margin) in enumerate((("angle", margins.path_angle), ("velocity", margins.path_velocity))):
-            tests.append(_path_test(runs, (first + index, first + index + step), f"{what}{note}", margin, kind))
+            tests.append(_path_test(runs, (first + index, first + index + step), f"{what}{note}", margin, kept))
     return tests
 
 
@@ -193,7 +219,7 @@ def unpaired_tests(
         runs = []
         for one, noise in zip(series, known or (None,) * len(series), strict=True):
             clock = SlowClock(uniform_times(float(one.t[0]), float(one.t[-1]), period), band)
-            runs.append(_Run.of(clock, clock.filtered(_values(one.interpolated(clock.times))), noise))
+            runs.append(_Run.of(clock, [clock.filtered(_values(one.interpolated(clock.times)))], noise))
         sides.append(runs)
     kind = _Kind.of([*simulations, *hardware], margins, looks, min(map(len, sides)), runs_differ)
     return [_mean_test(sides, 0, 0, margins, kind), *_spread_tests(sides, 0, 0, margins, kind)]
@@ -231,12 +257,12 @@ class _Seen:
         )
         return first, second
 
-    def motions(self, delay: float) -> Array:
-        """Return angle and velocity of both sides, then all three with the delay taken out, shape (n, 10)."""
-        now, late = self._both(0.0), self._both(delay)
-        return np.concatenate((now[0][:, :2], now[1][:, :2], *late), axis=1)
+    def motions(self, delays: Sequence[float]) -> list[Array]:
+        """Return angle and velocity of both sides, then all three with a delay taken out, shape (n, 10), for each."""
+        now = [one[:, :2] for one in self._both(0.0)]
+        return [np.concatenate((*now, *self._both(delay)), axis=1) for delay in delays]
 
-    def lagged(self, lags: Array) -> tuple[Array, Array, Array]:
+    def lagged(self, lags: Array, *, sloped: bool = True) -> tuple[Array, Array, Array]:
         """Return the simulation's velocity earlier by each lag and its slope, shape (n, len(lags)), and the hardware's.
 
         Where the simulation is the slower one, it is the hardware's that moves, the other way; the sides are exchanged.
@@ -246,34 +272,45 @@ class _Seen:
         moving, still = (self.hardware, self.simulation) if self.is_slower else (self.simulation, self.hardware)
         curve = scipy.interpolate.CubicSpline(moving.t, moving.velocity)
         grid = times[:, None] + (1.0 if self.is_slower else -1.0) * lags[None, :]
-        values, before = (
-            self.clock.filtered(curve(np.clip(at, moving.t[0], moving.t[-1]))) for at in (grid, grid - moving.period)
-        )
+        values = self.clock.filtered(curve(np.clip(grid, moving.t[0], moving.t[-1])))
+        before = values
+        if sloped:
+            before = self.clock.filtered(curve(np.clip(grid - moving.period, moving.t[0], moving.t[-1])))
         own = scipy.interpolate.CubicSpline(still.t, still.velocity)(times)[:, None]
         return values, values - before, self.clock.filtered(own)
 
 
-class _Run(NamedTuple):
+@dataclass(frozen=True)
+class _Run:
     """The statistics of one run.
 
     Args:
         spread: Long-run covariance of the motions; of all samples, then without each block, shape (1 + g, m, m).
         mean: Means of the motions, shape (1 + g, m).
         sizes: Samples of each of these, shape (1 + g,).
+        near: Covariance and mean within the window, with the delay as it is and as it might be too, shape (k, m, m)
+            and (k, m).
+        short: Largest correction for the window's own mean, as a share of a spread.
     """
 
     spread: Array
     mean: Array
     sizes: Array
+    near: tuple[Array, Array]
+    short: float
 
     @classmethod
-    def of(cls, clock: SlowClock, motions: Array, noise: Disturbance | None) -> _Run:
-        found = moments(clock, motions, noise, _blocks(clock))
-        products = np.concatenate((np.zeros_like(found.products[:1]), found.products))
-        sizes = np.concatenate(([0.0], found.sizes))
-        left = sizes.sum() - sizes
-        spread, mean = covariance(found.products.sum(axis=0) - products, left, found)
-        return cls(spread, mean, left)
+    def of(cls, clock: SlowClock, near: Sequence[Array], noise: Disturbance | None) -> _Run:
+        """Return them of motions with the delay as it is, then as it might be too, shape (n, m) each."""
+        found = moments(clock, near[0], noise, _blocks(clock))
+        products, left, power = (
+            one.sum(axis=0) - np.concatenate((np.zeros_like(one[:1]), one))
+            for one in (found.products, found.sizes, found.noise)
+        )
+        spread, mean = covariance(products, left, power, found)
+        within = np.stack([np.cov(one.T, bias=True) for one in near]), np.stack([one.mean(axis=0) for one in near])
+        short = 0.0 if found.known else float(np.log(found.short.max()))
+        return cls(spread, mean, left, within, short)
 
 
 def _blocks(clock: SlowClock) -> int:
@@ -283,22 +320,27 @@ def _blocks(clock: SlowClock) -> int:
 
 def _jackknife(runs: Sequence[_Run], statistic: Statistic, kind: _Kind) -> Jackknife:
     """Return a statistic of all runs together; a run counts by its samples."""
-    sizes = [run.sizes[0] for run in runs]
-    whole = [sum(size * run[i][0] for size, run in zip(sizes, runs, strict=True)) for i in range(2)]
-    without: list[list[Array]] = [[], []]
-    total = []
-    for size, run in zip(sizes, runs, strict=True):
-        left = run.sizes[1:]
-        total.append(sum(sizes) - size + left)
-        for i in range(2):
-            shape = (-1, *(1,) * (run[i].ndim - 1))
-            without[i].append(whole[i] - size * run[i][0] + left.reshape(shape) * run[i][1:])
-    counts = np.concatenate(total)
-    parts = [np.concatenate(one) / counts.reshape((-1, *(1,) * (one[0].ndim - 1))) for one in without]
-    alone = None
-    if kind.runs_differ:
-        alone = np.array([float(statistic(run.spread[0], run.mean[0])) for run in runs])
-    return Jackknife.of(float(statistic(whole[0] / sum(sizes), whole[1] / sum(sizes))), statistic(*parts), alone)
+    m = runs[0].mean.shape[-1]
+    sums = [
+        np.column_stack((run.spread.reshape(-1, m * m), run.mean, np.ones_like(run.sizes))) * run.sizes[:, None]
+        for run in runs
+    ]
+    whole = np.sum([one[0] for one in sums], axis=0)
+    parts = np.concatenate((whole[None], *(whole - one[0] + one[1:] for one in sums)))
+    parts /= parts[:, -1:]
+    values = statistic(parts[:, : m * m].reshape(-1, m, m), parts[:, m * m : -1])
+    found = Jackknife.of(float(values[0]), values[1:])
+    if not kind.runs_differ:
+        return found
+    alone = np.array([float(statistic(run.spread[0], run.mean[0])) for run in runs])
+    return found.of_runs(alone, [run.sizes[0] for run in runs])
+
+
+def _beside(runs: Sequence[_Run], statistic: Statistic, size: float) -> float:
+    """Return the error that is no matter of chance; ``size`` is what shares are of, 1 for a logarithm."""
+    values = [statistic(*run.near) for run in runs]
+    late = float(np.mean([np.abs(one - one[0]).max() for one in values]))
+    return late + size * (RESOLUTION + max(run.short for run in runs))
 
 
 # -- the delay ---------------------------------------------------------------------------------------------------
@@ -312,18 +354,29 @@ def _find_delay(seen: Sequence[_Seen]) -> float | None:
         hardly alike even there: for a delay beyond the range, the noise has small peaks.
     """
     reach = LONGEST_DELAY - float(_LAGS[-1])
-    lags = np.arange(-reach, reach + 0.5 * LAG_STEP, LAG_STEP)
+    # Below its band, a velocity changes little within a coarse step.
+    coarse = int(np.clip(0.1 / (seen[0].clock.band * LAG_STEP), 1.0, 10.0))
+    end = round(reach / LAG_STEP)
+    steps = np.append(np.arange(0, end, coarse), end)
+    lags = LAG_STEP * np.concatenate((-steps[:0:-1], steps))
+    best = int(np.argmax(_likenesses(seen, lags)[0]))
+    fine = np.arange(lags[max(best - 1, 0)], lags[min(best + 1, lags.size - 1)] + 0.5 * LAG_STEP, LAG_STEP)
+    likeness, power = _likenesses(seen, fine)
+    best = int(np.argmax(likeness))
+    alike = float(likeness[best]) >= LEAST_LIKENESS * math.sqrt(power)
+    return float(fine[best]) if alike and abs(fine[best]) < reach - 0.5 * LAG_STEP else None
+
+
+def _likenesses(seen: Sequence[_Seen], lags: Array) -> tuple[Array, float]:
+    """Return the likeness of all runs at each lag [s], and the squares of what does not move."""
     products = squares = np.zeros(lags.size)
     power = 0.0
     for one in seen:
-        moving, _, still = one.lagged(lags)
+        moving, _, still = one.lagged(lags, sloped=False)
         products = products + (moving * still).sum(axis=0)
         squares = squares + (moving**2).sum(axis=0)
         power += float((still**2).sum())
-    likeness = _likeness(products, squares)
-    best = int(np.argmax(likeness))
-    alike = float(likeness[best]) >= LEAST_LIKENESS * math.sqrt(power)
-    return float(lags[best]) if alike and 0 < best < lags.size - 1 else None
+    return _likeness(products, squares), power
 
 
 def _likeness(products: Array, squares: Array) -> Array:
@@ -356,8 +409,9 @@ def _lag(sums: Array) -> Array:
     return np.asarray(left + np.clip(share, 0.0, 1.0) * (right - left))
 
 
-def _delay_test(seen: Sequence[_Seen], centre: float, margins: Margins, kind: _Kind) -> EquivalenceTest:
-    parts, alone = [], []
+def _delay(seen: Sequence[_Seen], centre: float, kind: _Kind) -> tuple[Jackknife, list[float]]:
+    """Return the delay and what is taken out of each run [s]: where runs differ, its own, phase included."""
+    parts, alone, sizes = [], [], []
     for one in seen:
         moving, slope, still = one.lagged(centre + _LAGS)
         columns = np.stack((moving * still, moving**2, slope * still, slope * moving), axis=1)
@@ -365,14 +419,13 @@ def _delay_test(seen: Sequence[_Seen], centre: float, margins: Margins, kind: _K
         blocks = np.add.reduceat(columns, edges[:-1], axis=0)
         parts.append(blocks)
         alone.append(float(_lag(blocks.sum(axis=0))))
+        sizes.append(len(columns))
     blocks = np.concatenate(parts)
     whole = blocks.sum(axis=0)
-    found = Jackknife.of(
-        centre + float(_lag(whole)),
-        centre + _lag(whole - blocks),
-        centre + np.array(alone) if kind.runs_differ else None,
-    )
-    return _within(found, "delay", margins.delay, kind)
+    found = Jackknife.of(centre + float(_lag(whole)), centre + _lag(whole - blocks))
+    if not kind.runs_differ:
+        return found, [found.estimate] * len(seen)
+    return found.of_runs(centre + np.array(alone), sizes), [centre + one for one in alone]
 
 
 def _no_delay(margins: Margins, kind: _Kind) -> EquivalenceTest:
@@ -392,21 +445,30 @@ def _mean_test(
     sides: Sequence[Sequence[_Run]], below: int, above: int, margins: Margins, kind: _Kind
 ) -> EquivalenceTest:
     margin = margins.mean_position if kind.slides else margins.mean_angle
-    found = _difference(sides, lambda _, mean: mean[..., below], lambda _, mean: mean[..., above], kind)
-    return _within(found, f"mean {kind.name('angle')} difference", margin, kind)
+    spread = max(float(_spread(above)(*run.near)[0]) for run in sides[-1])
+    found, beside = _difference(sides, lambda _, mean: mean[..., below], lambda _, mean: mean[..., above], kind, spread)
+    return _within(found, f"mean {kind.name('angle')} difference", margin, kind, beside)
 
 
-def _difference(sides: Sequence[Sequence[_Run]], below: Statistic, above: Statistic, kind: _Kind) -> Jackknife:
-    """Return what the hardware has more than the simulation: of pairs together, of two sides each by itself."""
+def _difference(
+    sides: Sequence[Sequence[_Run]], below: Statistic, above: Statistic, kind: _Kind, size: float = 1.0
+) -> tuple[Jackknife, float]:
+    """Return what the hardware has more than the simulation, of pairs or of two sides, and the error beside chance."""
     if len(sides) == 1:
-        return _jackknife(sides[0], lambda spread, mean: above(spread, mean) - below(spread, mean), kind)
+
+        def both(spread: Array, mean: Array) -> Array:
+            return np.asarray(above(spread, mean) - below(spread, mean))
+
+        return _jackknife(sides[0], both, kind), _beside(sides[0], both, size)
     first, second = (_jackknife(runs, one, kind) for runs, one in zip(sides, (below, above), strict=True))
-    return second.less(first)
+    besides = [_beside(runs, one, size) for runs, one in zip(sides, (below, above), strict=True)]
+    return second.less(first), max(besides)
 
 
-def _within(found: Jackknife, name: str, margin: Margin, kind: _Kind) -> EquivalenceTest:
-    """Test a statistic in SI units against a margin on both sides."""
-    return _test(found, name, margin.unit, (-margin.value, margin.value), kind, lambda value: margin.per_si * value)
+def _within(found: Jackknife, name: str, margin: Margin, kind: _Kind, beside: float = 0.0) -> EquivalenceTest:
+    """Test a statistic in SI units against a margin on both sides; it has an error ``beside`` that of chance."""
+    ends = -margin.value, margin.value
+    return _test(found, name, margin.unit, ends, kind, lambda value: margin.per_si * value, beside=beside)
 
 
 def _test(
@@ -418,8 +480,10 @@ def _test(
     scale: Callable[[float], float],
     *,
     ratio: bool = False,
+    beside: float = 0.0,
 ) -> EquivalenceTest:
-    inside, outside = (found.interval(level, scale) for level in (kind.looks.level, kind.looks.level_of_each(_TESTS)))
+    levels = kind.looks.level, kind.looks.level_of_each
+    inside, outside = (found.interval(level, scale, beside=beside) for level in levels)
     return equivalence_test(name, unit, inside, *ends, outside=outside, runs=kind.runs, ratio=ratio)
 
 
@@ -441,13 +505,14 @@ def _spread_tests(
             continue
         margin: Margin = getattr(margins, f"spread_{what}")
         size = _log_spread if margin.is_share else _spread
-        found = _difference(sides, size(simulation + index), size(hardware + index), kind)
+        share = 1.0 if margin.is_share else max(float(_spread(hardware + index)(*run.near)[0]) for run in sides[-1])
+        found, beside = _difference(sides, size(simulation + index), size(hardware + index), kind, share)
         if margin.is_share:
             top = 1.0 + margin.si
             name = f"spread of {kind.name(what)} (ratio)"
-            tests.append(_test(found, name, "-", (1.0 / top, top), kind, math.exp, ratio=True))
+            tests.append(_test(found, name, "-", (1.0 / top, top), kind, math.exp, ratio=True, beside=beside))
         else:
-            tests.append(_within(found, f"spread of {kind.name(what)} difference", margin, kind))
+            tests.append(_within(found, f"spread of {kind.name(what)} difference", margin, kind, beside))
     return tests
 
 
@@ -466,4 +531,7 @@ def _path_test(
     name = f"distance of {'velocities' if quantity == 'velocity' else kind.name('angles')} {note}".rstrip()
     factor = 100.0 if margin.is_share else margin.per_si
     found = _jackknife(runs, distance, kind)
-    return _test(found, name, margin.unit, (-math.inf, margin.value), kind, lambda value: factor * max(value, 0.0))
+    size = 1.0 if margin.is_share else max(float(_spread(b)(*run.near)[0]) for run in runs)
+    beside = _beside(runs, distance, size)
+    ends = -math.inf, margin.value
+    return _test(found, name, margin.unit, ends, kind, lambda value: factor * max(value, 0.0), beside=beside)

@@ -193,6 +193,7 @@ class JointRun:
         return {
             RUN_RECORD: {
                 "experiment": "joints",
+                "clock": "lockstep",
                 "namespace": self.namespace,
                 "side": self.side,
                 "plant": self.plant if self.side == "sim" else "another plant file",

@@ -318,6 +318,7 @@ class RegulationSettings:
         return {
             RUN_RECORD: {
                 "experiment": experiment,
+                "clock": "realtime",
                 "strategy": self.strategy,
                 "seed": self.noise.seed,
                 IDENTITY: self.identity(side),

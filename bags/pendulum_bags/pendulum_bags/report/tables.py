@@ -104,8 +104,8 @@ def tests_table(comparison: Comparison) -> Table:
     )
     verdict = comparison.verdict
     sentence = (
-        "Two one-sided tests each, of long-run values, intervals by block jackknife. A difference needs an interval "
-        "at a ninth of the error, since one test suffices for it. Ratios are hardware per simulation; "
+        f"Two one-sided tests each, of long-run values, intervals by block jackknife. {comparison.looks.sentence} "
+        f"{comparison.what_of}Ratios are hardware per simulation; "
         "distances are root mean "
         f"squares, per standard deviation of the hardware's motion where they are in %. Compared with "
         f"{verdict.margins.whose}."
@@ -114,7 +114,7 @@ def tests_table(comparison: Comparison) -> Table:
         often = "once" if looks == 1 else f"{looks} times"
         sentence += (
             f" The experiment tested the data {often}, and could have tested more data after that. The intervals are "
-            "wider for this, so that all tests together are no more often wrong than a single one."
+            "wider for this."
         )
     return Table("Tests against the margins", sentence, head, rows, "Verdict")
 

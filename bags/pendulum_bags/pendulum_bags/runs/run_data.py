@@ -32,6 +32,7 @@ __all__ = [
     "RunData",
     "find_prefix",
     "is_emulated",
+    "is_in_lockstep",
     "joints_of",
     "missed_periods",
     "missed_share",
@@ -291,6 +292,12 @@ def plant_summary(run: RunData) -> dict[str, Any]:
 def is_emulated(run: RunData) -> bool:
     """Return whether the run says that an emulator, or a second simulation, stood in for the hardware."""
     return stands_in(run_record(run.metadata))
+
+
+def is_in_lockstep(run: RunData) -> bool:
+    """Return whether plant, controller and disturbance waited for each other, so that their phase was fixed."""
+    record = run_record(run.metadata)
+    return record.get("clock", "lockstep" if record.get("experiment") == "joints" else "") == "lockstep"
 
 
 def stand_in_of(run: RunData) -> str:
