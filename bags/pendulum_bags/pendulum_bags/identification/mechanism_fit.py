@@ -24,6 +24,7 @@ from pendulum_bags.identification.problem import cut_windows, off_line
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [
+    "MOST",
     "Blocks",
     "MechanismFit",
     "Prior",
@@ -46,10 +47,11 @@ enough where velocities were measured too: the start of a short window is known 
 _LONGEST = 0.006
 """Longest step; between samples that lie further apart the motion is simulated in several equal ones [s]."""
 
-_FINE, _STICKING = 0.0005, 0.00025
-"""The same where velocities were measured, without and with dry friction [s]: to their noise, it counts when within a
-step the effort changes, and that a joint at rest breaks away at the start of a step only."""
+_FINE = 0.0005
+"""The same where velocities were measured [s]: to their noise, it counts when within a step the effort changes."""
 
+MOST = 100
+"""Most steps of a search; one that has not ended by then is no result."""
 
 _BEFORE = 0.02
 """Longest delay after which an effort from before the recording may still act [s]."""
@@ -118,14 +120,13 @@ class Windows:
         return np.concatenate((mean - half, 2.0 * half / length), axis=2)
 
 
-def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1, sticking: bool = False) -> Windows:
+def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1) -> Windows:
     """Cut a recording into windows.
 
     Args:
         recording: The data.
         window: Length [s].
         stride: Take every so manieth sample; the effort between them is not lost, its mean drives the step.
-        sticking: Whether joints have dry friction.
     """
     # What was commanded before the recording acts on in its first moments.
     begin = int(np.searchsorted(recording.time, recording.time[0] + _BEFORE))
@@ -141,7 +142,7 @@ def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1
             f"{recording.name} has no window of {window} s with 8 samples and no gap; expected a longer recording or a "
             "higher rate"
         )
-    longest = _LONGEST if recording.velocity is None else _STICKING if sticking else _FINE
+    longest = _LONGEST if recording.velocity is None else _FINE
     several = max(1, math.ceil(stride * period / longest - 1e-6))
     size = (max(part.size for part in parts) - 1) * several + 1
     time, inside = np.empty((len(parts), size)), np.zeros((len(parts), size), dtype=bool)
@@ -233,6 +234,7 @@ class MechanismFit:
         blocks: Normal equations by recording, at the minimum.
         errors: Simulated minus measured by recording, positions before velocities, shape (w, l, 2 n), 0 in the padding
             and where no velocity was measured.
+        converged: Whether the search ended before its most steps.
     """
 
     model: MechanismModel
@@ -241,6 +243,7 @@ class MechanismFit:
     cost: float
     blocks: list[Blocks]
     errors: list[Array]
+    converged: bool
 
     @property
     def residuals(self) -> list[Array]:
@@ -290,8 +293,8 @@ def fit(
     weights: Array,
     *,
     states: Sequence[Array] | None = None,
-    most: int = 30,
-    tolerance: float = 1e-5,
+    most: int = MOST,
+    tolerance: float = 1e-6,
 ) -> MechanismFit:
     """Minimise the weighted squares of the position errors over free parameters and start states.
 
@@ -314,7 +317,7 @@ def fit(
     values = model.values.copy()
     values[index] = np.maximum(values[index], low)
     best, x = model.with_values(values), [np.array(s) for s in (states or [part.states for part in data])]
-    damping, k = 1e-4, len(index)
+    damping, k, converged = 1e-4, len(index), True
     cost, paths = _simulate(best, data, x, weights)
     cost += prior.cost(values[index])
     if not np.isfinite(cost):
@@ -346,6 +349,8 @@ def fit(
             damping *= 8.0
             if damping > 1e8:
                 break
+    else:
+        converged = False
     blocks = []
     for matrix, gradient, part in zip(normal[0], normal[1], data, strict=True):
         coupling, own = matrix[:, :k, k:], matrix[:, k:, k:]
@@ -353,7 +358,7 @@ def fit(
         reduced = matrix[:, :k, :k] - coupling @ solved
         along = gradient[:, :k] - np.einsum("wxk,wx->wk", solved, gradient[:, k:])
         blocks.append(Blocks(reduced, along, int(part.inside.sum()) * int(np.count_nonzero(weights))))
-    return MechanismFit(best, tuple(free), x, cost, blocks, errors)
+    return MechanismFit(best, tuple(free), x, cost, blocks, errors, converged)
 
 
 def _simulate(
@@ -419,7 +424,8 @@ def _step(
     if k:
         # In shares of the parameters' scales. The little that is added keeps what the data do not see where it is.
         system = reduced * np.outer(size, size)
-        system += np.diag(damping * np.diag(system) + 1e-10 * np.trace(system) / k)
+        own = np.diag(system)
+        system += np.diag((damping + 1e-10) * own + np.where(own > 0.0, 0.0, 1.0))
         active = np.zeros(k, dtype=bool)
         for _ in range(k):
             idle = np.flatnonzero(~active)

@@ -21,6 +21,10 @@ from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 __all__ = ["lagged", "motion_kernel"]
 
 
+AT_REST = 6e-5
+"""Longest step of a joint at rest [s]."""
+
+
 @numba.njit(cache=True)
 def lagged(effort: Array, rise: Array, steps: Array, lag: float) -> Array:
     """Return a first-order lag of an input of straight pieces at each stamp, at rest before, shape (s, n).
@@ -88,20 +92,16 @@ def motion_kernel(name: str) -> Any:
                 for k in range(h.shape[1]):
                     if h[w, k] > 0.0:
                         effort = drive[which[c], w, k]
-                        q, v = advance(
-                            forward,
-                            along,
-                            put,
-                            ramp,
-                            q,
-                            v,
-                            load(effort, 0),
-                            load(effort, n),
-                            pushed,
-                            h[w, k],
-                            own,
-                            rows,
-                        )
+                        rise = load(effort, n)
+                        # A joint at rest breaks away at the start of a step only: such steps are short.
+                        parts = 1
+                        for i in range(n):
+                            if v[i] == 0.0 and table[c, 0, i] > 0.0:
+                                parts = max(parts, math.ceil(h[w, k] / AT_REST - 1e-6))
+                        part = h[w, k] / parts
+                        for j in range(parts):
+                            begun = along(load(effort, 0), j * part, rise)
+                            q, v = advance(forward, along, put, ramp, q, v, begun, rise, pushed, part, own, rows)
                     for i in range(n):
                         path[c, w, k + 1, i] = q[i] + zero[i]
                         path[c, w, k + 1, n + i] = v[i]

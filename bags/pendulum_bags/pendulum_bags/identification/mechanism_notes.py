@@ -65,13 +65,14 @@ def notes_of(
             f"{INCOMPLETE}: the model misses up to {100.0 * worst:.0f} % of what straight lines miss: something acts "
             "on the machine that it has no word for."
         )
-    edges = [n for n in found.free if model[n] <= model.lowest(n)]
-    if edges:
-        notes.append(f"At the edge of what it can be: {', '.join(edges)}; its interval is one-sided.")
+    none = [n for n in found.free if model.lowest(n) == 0.0 and intervals[n].low <= 0.0]
+    if none:
+        listing = ", ".join(f"{n} (up to {intervals[n].high:.3g} {model.unit(n)})" for n in none)
+        notes.append(f"Not determined, may be 0: {listing}.")
     loose = [
         n
         for n in found.free
-        if n not in edges and n != DELAY and not n.endswith("_offset") and intervals[n].relative > _WIDE
+        if n not in none and n != DELAY and not n.endswith("_offset") and intervals[n].relative > _WIDE
     ]
     if loose:
         listing = ", ".join(f"{n} (+-{100.0 * min(intervals[n].relative, 99.0):.0f} %)" for n in loose)

@@ -18,6 +18,7 @@ from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_choice import ALL_EXTRAS, choose
 from pendulum_bags.identification.mechanism_doubt import Score, better_reading, noise_of, refusal
 from pendulum_bags.identification.mechanism_fit import (
+    MOST,
     MechanismFit,
     Prior,
     Windows,
@@ -261,6 +262,8 @@ def identify_mechanism(
     }
     intervals = _intervals(found)
     refused = refusal(plant, found, data, training, outside)
+    if refused is None and not found.converged:
+        refused = f"{REFUSED}: the search had not ended after {MOST} steps; expected a start nearer to the machine"
     notes = notes_of(plant, found, recordings, intervals, training, held=held, pushed=pushed)
     if window is None and length < longest:
         notes.append(f"Windows of {length:.2g} s: over longer ones neighbouring motions part (chaos, or no balance).")
@@ -323,10 +326,7 @@ class _Search:
         return best[1:]
 
     def _windows(self, length: float) -> list[Windows]:
-        sticking = any(joint.coulomb_friction > 0.0 for joint in self.plant.joints)
-        data = [
-            prepare_windows(recording, length, stride=self.stride, sticking=sticking) for recording in self.recordings
-        ]
+        data = [prepare_windows(recording, length, stride=self.stride) for recording in self.recordings]
         total = sum(len(part.time) for part in data)
         if total < _FEWEST:
             raise DataError(
@@ -442,10 +442,13 @@ def _intervals(found: MechanismFit) -> dict[str, Interval]:
     free = found.free
     if not free:
         return {}
+    matrix = np.diag(Prior.of(found.model, free).weights) + sum(b.matrices.sum(axis=0) for b in found.blocks)
+    # Each in its own error, were the others known: what the data hardly see is no rounding of what they see well.
     size = np.array([found.model.size(name) for name in free])
+    own = np.diag(matrix)
+    size = np.where(own > 0.0, 1.0 / np.sqrt(np.where(own > 0.0, own, 1.0)), size)
     prior = np.diag(Prior.of(found.model, free).weights * size**2)
-    matrix = sum((b.matrices.sum(axis=0) for b in found.blocks), np.zeros((len(free),) * 2)) * np.outer(size, size)
-    matrix = matrix + prior
+    matrix = matrix * np.outer(size, size)
     level, axes = np.linalg.eigh(matrix)
     # A direction that the data do not see has a wide interval, not none.
     inverse = (axes / np.maximum(level, 1e-12 * max(float(level[-1]), 1e-300))) @ axes.T
