@@ -16,7 +16,11 @@ from pendulum_bags.comparison import Looks, Margins, Outcome
 from pendulum_bags.comparison.equivalence import EquivalenceTest, conclude
 from pendulum_bags.comparison.long_run import Disturbance
 from pendulum_bags.comparison.same_run import paired_tests, unpaired_tests
+from pendulum_bags.identification.joint_recordings import JointRecording
+from pendulum_bags.identification.mechanism_result import identify_mechanism
 from pendulum_bags.runs.series import Series, Signal
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_testing.balanced_machine import PRESETS, run_balanced
 from tests.benchmarks import Row, counted
 from tests.truth_loops import FAMILIES, certificates
 from tests.truth_plants import COLOURED, HOLD, OTHER, PAIRS, POWER, REAL_TIME, PlantPair
@@ -28,6 +32,8 @@ INTERIM = (5.0, 10.0, 20.0)
 """Lengths of the runs behind each interim analysis of a machine on the margin [s]."""
 DEFAULT = (25.0, 40.0, 60.0)
 """The same of a default run."""
+MACHINES = range(500, 520)
+"""Seeds of the machines of several joints that are identified."""
 _AT_ONCE = 10
 """Trials of one task."""
 _APART = 10**6
@@ -176,6 +182,30 @@ def certificate_rows(pool: Executor) -> Iterator[Row]:
         )
 
 
+def identified(seed: int, preset: str) -> tuple[int, int]:
+    """Return how many intervals of a machine held upright miss its values, and their number; (0, 0) if refused."""
+    run = run_balanced(preset, seed)
+    time = 0.002 * np.arange(len(run.position))
+    recording = JointRecording("run", time, run.position, run.effort, ("zero", "zero"), velocity=run.velocity)
+    result = identify_mechanism(load_mechanism(preset), [recording])
+    held = [] if result.refused else [i.low <= run.truth.get(n, 0.0) <= i.high for n, i in result.intervals.items()]
+    return len(held) - sum(held), len(held)
+
+
+def identification_rows(pool: Executor) -> Iterator[Row]:
+    """Yield the misses of the intervals of each preset of several joints."""
+    for preset in PRESETS:
+        pairs = np.array(list(pool.map(partial(identified, preset=preset), MACHINES)))
+        missed, intervals = (int(number) for number in pairs.sum(axis=0))
+        yield counted(
+            f"{preset} held upright for 20 s: values outside 95 % intervals",
+            missed,
+            max(intervals, 1),
+            at_most=10.0,
+            note=f"{np.sum(pairs[:, 1] == 0)} of {len(pairs)} runs refused",
+        )
+
+
 def settings() -> Iterator[tuple[str, Setting]]:
     """Yield what is counted, with a name."""
     for name, pair in {**PAIRS, **COLOURED}.items():
@@ -198,6 +228,7 @@ def rows() -> Iterator[Row]:
     blocks = [range(first, first + _AT_ONCE) for first in range(0, TRIALS, _AT_ONCE)]
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         yield from certificate_rows(pool)
+        yield from identification_rows(pool)
         wanted = list(settings())
         keys = list(dict.fromkeys((setting.pair, setting.apart) for _, setting in wanted))
         truths = dict(zip(keys, pool.map(_truth, keys), strict=True))

@@ -22,7 +22,9 @@ __all__ = ["lagged", "motion_kernel"]
 
 
 AT_REST = 6e-5
-"""Longest step of a joint at rest [s]."""
+"""Longest step of a joint with dry friction that is slow [s]."""
+SLOW = 0.05
+"""Speed below which it may come to rest within a step [rad/s or m/s]."""
 
 
 @numba.njit(cache=True)
@@ -96,7 +98,7 @@ def motion_kernel(name: str) -> Any:
                         # A joint at rest breaks away at the start of a step only: such steps are short.
                         parts = 1
                         for i in range(n):
-                            if v[i] == 0.0 and table[c, 0, i] > 0.0:
+                            if abs(v[i]) < SLOW and table[c, 0, i] > 0.0:
                                 parts = max(parts, math.ceil(h[w, k] / AT_REST - 1e-6))
                         part = h[w, k] / parts
                         for j in range(parts):
