@@ -77,6 +77,11 @@ def notes_of(
     if loose:
         listing = ", ".join(f"{n} (+-{100.0 * min(intervals[n].relative, 99.0):.0f} %)" for n in loose)
         notes.append(f"The recordings do not determine {listing}.")
+    if any(n.endswith("coulomb_friction") and intervals[n].low > 0.0 for n in found.free):
+        notes.append(
+            "The plant has dry friction: in trials with such plants, held upright, 72 to 92 % of the values lay in "
+            "their 95 % intervals, fewest of lengths, inertias, delay and lag."
+        )
     notes.extend(_ridge(found))
     own = [spec.name for spec in plant.mechanism.parameters]
     held = [name for name in own if name not in found.free]
