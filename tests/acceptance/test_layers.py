@@ -104,7 +104,8 @@ def test_a_wheel_names_every_library_that_its_modules_import_and_no_other(packag
     # One module may come in several parts, of which a wheel names the one that brings the others.
     of_module = distributions_of_modules()
     used = [{canonicalize_name(name) for name in of_module[module]} for module in imported(package)]
-    others = {"ros", "rviz", "test"}
+    # The module of `cuda` is numba's, whose part for GPUs it replaces.
+    others = {"ros", "rviz", "test", "cuda"}
     named = set().union(*(names for extra, names in of_package(package).items() if extra not in others))
     of_others = {name for name in named if not name.startswith("pendulum-")}
     through_ours = [{"gymnasium"}] if package == "pendulum_bags" else []
@@ -118,6 +119,9 @@ def test_the_first_layer_has_what_the_wheels_always_need_and_the_second_all_thei
     layers = {"": first, "emulator": first, "test": first | test}
     for package in FOLDERS:
         for extra, names in of_package(package).items():
+            if extra == "cuda":
+                # Libraries of some gigabytes, for computers with a GPU.
+                continue
             of_others = {name for name in names if not name.startswith("pendulum-")}
             assert of_others <= layers.get(extra, first | extras), (package, extra)
 
