@@ -345,7 +345,7 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, bench: B
 
     # A plant of several joints is offered what can hold it; what is started waits until it is activated.
     robot.get_by_role("combobox").click()
-    fitting = ["lqr", "discrete_lqr", "lqi", "lqg", "energy_swing_up", "tvlqr", "ilqr", "mpc", "nmpc"]
+    fitting = ["lqr", "lqi", "lqg", "discrete_lqr", "energy_swing_up", "tvlqr", "ilqr", "mpc", "nmpc"]
     wait_for(lambda: page.locator(".q-menu [role=option]").all_inner_texts() == fitting, 60, "the controllers")
     page.locator(".q-menu [role=option]").first.click()
     page.get_by_role("button", name="Start controller /robot").click()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import os
@@ -18,7 +19,10 @@ import pytest
 import yaml
 
 from pendulum_bags.live.foxglove_cli import LAYOUT
+from pendulum_lqr.controller_interface.controller import CONTROLLERS, Row, make_controller
+from pendulum_lqr.linear.design import DesignError
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_testing.fixtures import PROJECT
 from pendulum_testing.processes import ProcessGroup, RunningProgram
 
@@ -206,3 +210,16 @@ def test_python_of_a_page_runs_as_it_stands(page: Path, code: str, tmp_path: Pat
     command = [sys.executable, "-c", textwrap.dedent(code)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200, check=False)
     assert done.returncode == 0, f"{page}\n{code}\n{done.stderr}"
+
+
+def test_the_example_of_a_new_controller_runs_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = PROJECT / "pendulum_msgs_py/docs/bring_your_own.md"
+    (block,) = re.findall(r"^   ```python\n(.*?)^   ```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    (tmp_path / "mine_of_the_page.py").write_text(textwrap.dedent(block), encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    importlib.import_module("mine_of_the_page")
+    monkeypatch.setitem(CONTROLLERS, "mine", Row("mine_of_the_page:Mine"))
+    controller = make_controller("mine", load_plant("thesis"), period=0.01, values={"kp": 20.0})
+    assert controller.command(0.0, (0.1, 0.0)) == pytest.approx(-2.0)
+    with pytest.raises(DesignError, match="mine makes the loop unstable"):
+        make_controller("mine", load_plant("thesis"), period=0.01, values={"kp": -1.0})
