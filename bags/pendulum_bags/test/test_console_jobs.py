@@ -85,9 +85,9 @@ def test_controllers_are_offered_that_fit_the_plant_and_need_no_file(tmp_path: P
 
     assert offered("acrobot") == [
         "lqr",
-        "discrete_lqr",
         "lqi",
         "lqg",
+        "discrete_lqr",
         "energy_swing_up",
         "tvlqr",
         "ilqr",

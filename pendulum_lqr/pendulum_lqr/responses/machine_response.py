@@ -163,10 +163,14 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
     ratio = measured.response[1] / measured.response[0]
     relative = radius / np.abs(measured.response)
     values, errors = [], []
-    for curve in (inverse, ratio):
+    # A delay turns the response from line to line; what deviates from a smooth plant is sought without that turn.
+    turn = np.exp(-1j * lines * np.median(np.diff(np.unwrap(np.angle(inverse))) / np.diff(lines)))
+    apart = []
+    for curve, still in ((inverse, inverse * turn), (ratio, ratio)):
         spline, error = _splined(lines, curve, grid)
         values.append(spline)
         errors.append(error)
+        apart.append(_splined(lines, still, lines)[1])
     on_line = np.isin(grid, lines)
     angle = 1.0 / values[0]
     response = np.vstack([angle, values[1] * angle])
@@ -175,7 +179,7 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
     noise = np.vstack([_larger_neighbour(lines, row, grid) for row in relative])
     discs = np.abs(response) * (noise + np.where(on_line, 0.0, share))
     response[:, on_line], discs[:, on_line] = measured.response, radius
-    return grid, response, discs, np.vstack([-errors[0], errors[1] - errors[0]])
+    return grid, response, discs, np.vstack([-apart[0], apart[1] - apart[0]])
 
 
 def _grid(lines: Array) -> Array:
