@@ -132,39 +132,43 @@ class Machine:
             discs.append(disc)
             errors.append(error[lines.size :])
         on_grid = model_response(model, whole, period)
-        ringing = _ringing(lines, np.array(errors), measured.response, measured.radius(), whole)
+        ringing = _ringing(lines, np.array([errors]), measured.response, measured.radius(), whole)
         return cls(
             whole, np.array(rows) * on_grid, np.array(discs) * np.abs(on_grid), period, float(lines[0]), ringing=ringing
         )
 
 
 def _ringing(lines: Array, error: Complex, response: Complex, radius: Array, grid: Array) -> Array:
-    """Return what :attr:`Machine.ringing` is, from the relative error of leaving out each line."""
+    """Return what :attr:`Machine.ringing` is, from relative errors of leaving out each line, in one or several ways."""
     if lines.size < 2:
-        return np.zeros((2, error.shape[0], grid.size))
+        return np.zeros((2, *response.shape[:1], grid.size))
     right = np.clip(np.searchsorted(lines, grid, side="left"), 1, lines.size - 1)
     a, b = lines[right - 1], lines[right]
     peak = np.where((b - a <= _NARROW * a) & (grid >= lines[0]), 0.5 * (b - a) / np.sqrt(a * b) / LEAST_DAMPING, 0.0)
     # A resonance pushes the lines on either side of it in opposite directions, a smooth bend in the same one. A value
     # at a line and that of the spline through the others both have an error.
     size = 0.5 * (np.abs(response[:, right]) + np.abs(response[:, right - 1]))
-    apart = 0.5 * np.abs(error[:, right] - error[:, right - 1]) * size
+    apart = 0.5 * np.min(np.abs(error[..., right] - error[..., right - 1]), axis=0) * size
     noise = np.array([_larger_neighbour(lines, row, grid) for row in radius])
     return peak * np.array([np.maximum(apart - 2.0 * noise, 0.0), noise])
 
 
 def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex, Array, Complex]:
-    """Return grid, response, discs, from the lowest line to the highest, and relative errors of leaving one out."""
+    """Return grid, response, discs, from the lowest line to the highest, and relative errors of leaving one out.
+
+    The errors have the shape (ways, 2, n): of the response as it is, and without the turn of its delay.
+    """
     lines = measured.frequency
     if lines.size < 5:
-        return lines, measured.response, radius, np.zeros_like(measured.response)
+        return lines, measured.response, radius, np.zeros_like(measured.response)[None]
     grid = _grid(lines)
     inverse = 1.0 / measured.response[0]
     ratio = measured.response[1] / measured.response[0]
     relative = radius / np.abs(measured.response)
     values, errors = [], []
-    # A delay turns the response from line to line; what deviates from a smooth plant is sought without that turn.
-    turn = np.exp(-1j * lines * np.median(np.diff(np.unwrap(np.angle(inverse))) / np.diff(lines)))
+    # A delay turns the response from line to line, which no spline follows; a resonance shows either way.
+    slope = np.diff(np.unwrap(np.angle(inverse))) / np.diff(lines)
+    turn = np.exp(-1j * lines * np.median(slope[slope.size // 2 :]))
     apart = []
     for curve, still in ((inverse, inverse * turn), (ratio, ratio)):
         spline, error = _splined(lines, curve, grid)
@@ -179,7 +183,7 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
     noise = np.vstack([_larger_neighbour(lines, row, grid) for row in relative])
     discs = np.abs(response) * (noise + np.where(on_line, 0.0, share))
     response[:, on_line], discs[:, on_line] = measured.response, radius
-    return grid, response, discs, np.vstack([-apart[0], apart[1] - apart[0]])
+    return grid, response, discs, np.array([[-one[0], one[1] - one[0]] for one in (errors, apart)])
 
 
 def _grid(lines: Array) -> Array:
