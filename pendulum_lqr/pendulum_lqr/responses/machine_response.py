@@ -166,15 +166,14 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
     ratio = measured.response[1] / measured.response[0]
     relative = radius / np.abs(measured.response)
     values, errors = [], []
-    # A delay turns the response from line to line, which no spline follows; a resonance shows either way.
-    slope = np.diff(np.unwrap(np.angle(inverse))) / np.diff(lines)
-    turn = np.exp(-1j * lines * np.median(slope[slope.size // 2 :]))
-    apart = []
-    for curve, still in ((inverse, inverse * turn), (ratio, ratio)):
+    for curve in (inverse, ratio):
         spline, error = _splined(lines, curve, grid)
         values.append(spline)
         errors.append(error)
-        apart.append(_splined(lines, still, lines)[1])
+    # A delay turns the response from line to line, which no spline follows; a resonance shows either way.
+    slope = np.diff(np.unwrap(np.angle(inverse))) / np.diff(lines)
+    turn = np.exp(-1j * lines * np.median(slope[slope.size // 2 :]))
+    still = _splined(lines, inverse * turn, lines)[1]
     on_line = np.isin(grid, lines)
     angle = 1.0 / values[0]
     response = np.vstack([angle, values[1] * angle])
@@ -183,7 +182,7 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
     noise = np.vstack([_larger_neighbour(lines, row, grid) for row in relative])
     discs = np.abs(response) * (noise + np.where(on_line, 0.0, share))
     response[:, on_line], discs[:, on_line] = measured.response, radius
-    return grid, response, discs, np.array([[-one[0], one[1] - one[0]] for one in (errors, apart)])
+    return grid, response, discs, np.array([[-one, errors[1] - one] for one in (errors[0], still)])
 
 
 def _grid(lines: Array) -> Array:

@@ -87,7 +87,7 @@ class Comparison:
     @property
     def what_of(self) -> str:
         """Of what runs the intervals are, where runs may differ by more than their seeds, as text; else empty."""
-        if all(is_emulated(pair.hardware) and is_in_lockstep(pair.hardware) for pair in self.tested):
+        if not _may_differ([pair.hardware for pair in self.tested]):
             return ""
         if len(self.tested) == 1:
             return "The intervals are of this run only, with the phase that its loops happened to have. "
@@ -235,10 +235,8 @@ def compare(
     simulations = list(own) or [pair.simulation for pair in tested]
     hardware_runs = [pair.hardware for pair in tested]
     check_clocks(hardware_runs)
-    # Lockstep repeats of an emulator differ by their seeds alone; those of a machine may differ by anything.
-    emulated = all(map(is_emulated, hardware_runs))
-    differ = not (emulated and all(map(is_in_lockstep, hardware_runs)))
-    names = "simulation", "emulated hardware" if emulated else "hardware"
+    differ = _may_differ(hardware_runs)
+    names = "simulation", "emulated hardware" if all(map(is_emulated, hardware_runs)) else "hardware"
     ones, others = ([run.window for run in runs] for runs in (simulations, hardware_runs))
     noises = [_noise(run) for run in simulations], [_noise(run) for run in hardware_runs]
     unpaired = conclude(
@@ -256,6 +254,11 @@ def compare(
         verdict = Verdict(Outcome.UNDECIDED, sentence, unpaired.tests, margins, None)
     thesis = interpolated_difference(simulations[0].window, compared[0].hardware.window)
     return Comparison(compared, simulations, thesis, verdict, unpaired, tested, looks)
+
+
+def _may_differ(hardware_runs: Sequence[RunData]) -> bool:
+    """Return whether runs may differ by more than their seeds, as those of a machine, and those in real time."""
+    return not all(is_emulated(run) and is_in_lockstep(run) for run in hardware_runs)
 
 
 def _noise(run: RunData) -> Disturbance | None:

@@ -95,7 +95,7 @@ class Moments:
         noise: Sums of squares of the noise over the blocks, shape (blocks,).
         known: Whether the disturbance explains the motion; else p is 1.
         short: Correction of the motions for the bias of the window's own mean, from the independent samples that they
-            have; shape (q - p,).
+            have; 1 where the disturbance is known; shape (q - p,).
     """
 
     products: Array
@@ -117,7 +117,11 @@ def moments(clock: SlowClock, motions: Array, disturbance: Disturbance | None, b
     """
     size = len(motions)
     modes, gram, squares = np.empty((size, 0)), np.empty((0, 0)), np.zeros(size)
-    if disturbance is not None:
+    short = np.ones(motions.shape[1])
+    if disturbance is None:
+        sizes = np.array([effective_size(column) for column in motions.T])
+        short = np.sqrt(1.0 / np.maximum(1.0 - 1.0 / np.maximum(sizes, 2.0), 0.5))
+    else:
         squares = disturbance.held_at(clock.even_times) ** 2
         modes, gram = _responses(clock, motions, disturbance)
     columns = np.concatenate((np.ones((size, 1)), modes, motions), axis=1)
@@ -125,14 +129,13 @@ def moments(clock: SlowClock, motions: Array, disturbance: Disturbance | None, b
     parts = [columns[first:last] for first, last in pairwise(edges)]
     whole = np.zeros((1 + len(gram),) * 2)
     whole[1:, 1:] = gram
-    sizes = np.array([effective_size(column) for column in motions.T])
     return Moments(
         np.stack([part.T @ part for part in parts]),
         np.diff(edges).astype(float),
         whole,
         np.array([float(part.sum()) for part in np.split(squares, edges[1:-1])]),
         disturbance is not None,
-        np.sqrt(1.0 / np.maximum(1.0 - 1.0 / np.maximum(sizes, 2.0), 0.5)),
+        short,
     )
 
 

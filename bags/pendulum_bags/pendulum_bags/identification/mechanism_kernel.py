@@ -47,16 +47,6 @@ def lagged(effort: Array, rise: Array, steps: Array, lag: float) -> Array:
     return found
 
 
-def ramp_1(torque: Any, rise: Any, elapsed: float, _constants: Any) -> Any:
-    """Return a rising effort after some time, of one joint, in the place of an actuator's lag."""
-    return (torque[0] + elapsed * rise[0],)
-
-
-def ramp_2(torque: Any, rise: Any, elapsed: float, _constants: Any) -> Any:
-    """Return the same of two joints."""
-    return torque[0] + elapsed * rise[0], torque[1] + elapsed * rise[1]
-
-
 @cache
 def motion_kernel(name: str) -> Any:
     """Return the compiled motion of a mechanism.
@@ -70,9 +60,13 @@ def motion_kernel(name: str) -> Any:
     n, size = len(mechanism.joints), len(mechanism.parameter_names)
     forward = compile_tree(mechanism.forward, inline=True)
     along, put, _ = (compile_tree(function, inline=True) for function in joint_functions(n))
-    ramp = compile_tree({1: ramp_1, 2: ramp_2}[n], inline=True)
     advance = compile_tree(advance_joints, inline=True)
     load, load_p = tuple_loader(n, 1), tuple_loader(size, 1)
+
+    @numba.njit(error_model="numpy", fastmath={"contract"}, forceinline=True)
+    def ramp(torque: Any, rise: Any, elapsed: float, _constants: Any) -> Any:
+        """Return a rising effort after some time, in the place of an actuator's lag."""
+        return along(torque, elapsed, rise)
 
     @numba.njit(error_model="numpy", fastmath={"contract"})
     def run(p: Any, table: Any, push: Any, shift: Any, drive: Any, which: Any, h: Any, states: Any, path: Any) -> None:

@@ -19,10 +19,8 @@ from pendulum_bags.studies.results import run_metrics
 from pendulum_bags.studies.study_file import load_study
 from pendulum_msgs_py.errors import PendulumError
 
-__all__ = ["DEFAULT", "MOST", "contender_specs", "keep_run", "rank_folders", "simulate_contenders"]
+__all__ = ["contender_specs", "keep_run", "place_of", "rank_folders", "simulate_contenders"]
 
-DEFAULT, MOST = 6, 32
-"""Contenders of a ranking, and the most that there are."""
 SEEDS = 3
 """Seeds of the noise under which each runs."""
 _FIRST = ("lqr", "lqi", "pid", "sliding_mode", "lqr_q1_0.01_r1", "lqr_q10000_0.01_r0.1")
@@ -43,13 +41,14 @@ def contender_specs(sim: RunSpec, hw: RunSpec, count: int, seed: int) -> dict[st
         count: Number of contenders, fewer where fewer differ.
         seed: First seed.
     """
-    named = {str(run.labels["controller"]): run.spec for run in load_study("ranking", seeds=[seed]).runs}
+    runs = load_study("ranking", seeds=[seed]).runs
+    named = {str(run.labels["controller"]): run.spec for run in runs if run.spec is not None}
     found: dict[str, list[tuple[RunSpec, RunSpec]]] = {}
     seen: list[Any] = []
     for name in dict.fromkeys((*_FIRST, *named)):
-        spec = named[name]
-        if len(found) == count or spec is None:
+        if len(found) == count:
             break
+        spec = named[name]
         law: dict[str, Any] = {"controller": spec.controller, "controller_parameters": spec.controller_parameters}
         noise: dict[str, Any] = {"disturbance": spec.disturbance, "duration": spec.duration}
         own, theirs = (replace(one, **law, **noise) for one in (sim, hw))
