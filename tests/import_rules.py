@@ -76,24 +76,18 @@ class NoCirclesContract(Contract):
 
 
 class RoomsContract(Contract):
-    """Forbid imports in a circle between what lies side by side in a package or a room: rooms and modules.
-
-    A command line joins what stands beside it with what stands above, and may, unless others than commands import it.
-    """
+    """Forbid cyclic imports between the subpackages and modules of one folder."""
 
     type_name = "rooms"
 
     packages = fields.SetField(subfield=fields.StringField())
-    commands = fields.SetField(subfield=fields.StringField())
 
     def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
         """Look at each folder by itself: what lies in it imports each other one way."""
         ours = {module for package in self.packages for module in {package, *graph.find_descendants(package)}}
-        commands = {module for module in ours if _matches(module, self.commands)}
-        free = {one for one in commands if not graph.find_modules_that_directly_import(one) - commands}
         imports = [
             (importer, imported)
-            for importer in sorted(ours - free)
+            for importer in sorted(ours)
             for imported in sorted(graph.find_modules_directly_imported_by(importer) & ours)
         ]
         folders = sorted(module for module in ours if graph.find_children(module))

@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
-from pendulum_bags.experiments.experiment_cli import main
+from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME
 from pendulum_bags.runs.run_folder import read_stalls
 from pendulum_bags.runs.run_record import run_record

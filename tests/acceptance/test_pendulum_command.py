@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.pendulum_cli import SECTIONS, main
+from pendulum_bags.commands.pendulum_cli import SECTIONS, main
 from pendulum_msgs_py.programs import completion
 from pendulum_msgs_py.programs.executables import tables_of
 from pendulum_testing.fixtures import PROJECT
@@ -47,7 +47,7 @@ def test_help_says_what_each_command_is_for_and_how_to_go_on(capsys: pytest.Capt
 
 def test_help_imports_no_library_and_no_program() -> None:
     code = (
-        "import sys; from pendulum_bags.pendulum_cli import main; assert main(['--help']) == 0; "
+        "import sys; from pendulum_bags.commands.pendulum_cli import main; assert main(['--help']) == 0; "
         "print(*sorted({name.partition('.')[0] for name in sys.modules}), sep='\\n')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PROJECT)

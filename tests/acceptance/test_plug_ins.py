@@ -158,12 +158,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pendulum_bags.analyse.analyse_cli import main as analyse
+from pendulum_bags.commands.analyse_cli import main as analyse
 from pendulum_bags.comparison import compare_folders
 from pendulum_bags.comparison.metrics import Episode, metrics_of
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.identification.identify_cli import main as identify
+from pendulum_bags.commands.identify_cli import main as identify
 from pendulum_bags.identification.kernel import PARAMETER_NAMES, _derivatives_of_terms
 from pendulum_bags.identification.model import from_plant, to_plant
 from pendulum_bags.report import write_report

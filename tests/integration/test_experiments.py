@@ -17,10 +17,10 @@ import numpy as np
 import psutil
 import pytest
 
-from pendulum_bags.course.course_cli import main as course_main
+from pendulum_bags.commands.course_cli import main as course_main
+from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.experiments import lockstep
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
-from pendulum_bags.experiments.experiment_cli import main
 from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, keep_pool
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.joint_run import JointRun, JointSettings

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from pendulum_bags.experiments import move_cli
+from pendulum_bags.commands import move_cli
 from pendulum_testing.processes import ProcessGroup, RunningProgram
 
 PATIENCE = 60.0

@@ -11,9 +11,9 @@ import pytest
 import zstandard
 
 from pendulum_bags.analyse import bag_table
-from pendulum_bags.analyse.analyse_cli import main
 from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
 from pendulum_bags.analyse.questions import timing
+from pendulum_bags.commands.analyse_cli import main
 from pendulum_bags.comparison import compare_runs
 from pendulum_bags.runs.run_data import plant_summary, read_run
 from pendulum_msgs_py.errors import BagError, ParameterError

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pendulum_bags.comparison.compare_cli import main as compare
+from pendulum_bags.commands.compare_cli import main as compare
+from pendulum_bags.commands.report_cli import main as report
 from pendulum_bags.frequency_response.analyse import MACHINE, NUMBERS, analyse_responses
 from pendulum_bags.frequency_response.designs import design_rows, design_text
 from pendulum_bags.report import FIGURES
-from pendulum_bags.report.report_cli import main as report
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import write_layer
 from pendulum_lqr.linear.model import linearise

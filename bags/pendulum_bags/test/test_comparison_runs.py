@@ -12,13 +12,13 @@ import pandas as pd
 import pytest
 from scipy.interpolate import CubicSpline
 
+from pendulum_bags.commands.compare_cli import main
+from pendulum_bags.commands.experiment_cli import _print_summary
+from pendulum_bags.commands.report_cli import main as report_main
 from pendulum_bags.comparison import Outcome, compare_folders, compare_runs, read_run
 from pendulum_bags.comparison.compare import _pool
-from pendulum_bags.comparison.compare_cli import main
-from pendulum_bags.experiments.experiment_cli import _print_summary
 from pendulum_bags.report import FIGURES
 from pendulum_bags.report.data import ReportData
-from pendulum_bags.report.report_cli import main as report_main
 from pendulum_bags.report.tables import make_tables
 from pendulum_bags.runs.run_data import missed_periods, timing_warning
 from pendulum_bags.verdict.same_run import seen_note

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from pendulum_bags.commands.course_cli import main
+from pendulum_bags.commands.excite_cli import main as excite_main
 from pendulum_bags.course import checks, winner
-from pendulum_bags.course.course_cli import main
 from pendulum_bags.course.exercises import answers
 from pendulum_bags.course.tasks import FAULTS, draw_plant, draw_tasks, read_tasks, write_tasks
-from pendulum_bags.experiments.excite_cli import main as excite_main
 from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run, seal_plant

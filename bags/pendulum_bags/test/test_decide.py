@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pendulum_bags.commands.experiment_cli import _summary
 from pendulum_bags.comparison import Margins, Outcome, compare_folders, read_run
 from pendulum_bags.experiments.decide import Budget, decide
-from pendulum_bags.experiments.experiment_cli import _summary
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.repeats import (

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.experiments import experiment_cli
+from pendulum_bags.commands import experiment_cli
 from pendulum_bags.experiments.operator import ask_yes, real_machine
 from pendulum_bags.experiments.run_spec import EMULATOR_LIFETIME, EMULATOR_WATCHDOG
 from pendulum_bags.experiments.settings import RegulationSettings

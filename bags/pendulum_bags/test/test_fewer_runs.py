@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_bags.commands.ranking_cli import main
 from pendulum_bags.ranking.contender import Contender
 from pendulum_bags.ranking.fewer_runs import narrow, narrow_all
-from pendulum_bags.ranking.ranking_cli import main
 from pendulum_msgs_py.errors import DataError
 
 TRIALS = 1500

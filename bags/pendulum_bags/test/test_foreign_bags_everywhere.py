@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pendulum_bags.analyse.analyse_cli import main as analyse_main
+from pendulum_bags.commands.analyse_cli import main as analyse_main
+from pendulum_bags.commands.compare_cli import main as compare_main
+from pendulum_bags.commands.identify_cli import main as identify_main
+from pendulum_bags.commands.replay_cli import main as replay_main
+from pendulum_bags.commands.report_cli import main as report_main
 from pendulum_bags.comparison import compare_runs
-from pendulum_bags.comparison.compare_cli import main as compare_main
-from pendulum_bags.identification.identify_cli import main as identify_main
-from pendulum_bags.replay.replay_cli import main as replay_main
-from pendulum_bags.report.report_cli import main as report_main
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_rosbag.convert.convert_cli import convert_main, cut_main, filter_main, merge_main

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pendulum_bags.commands import experiment_cli
 from pendulum_bags.comparison import Outcome, compare_runs
 from pendulum_bags.comparison.independence import check_pairs
-from pendulum_bags.experiments import experiment_cli
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.repeats import record_repeat, record_simulation, repeat_folder

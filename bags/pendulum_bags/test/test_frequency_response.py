@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_bags.experiments.experiment_cli import main as experiment_main
+from pendulum_bags.commands.experiment_cli import main as experiment_main
+from pendulum_bags.commands.frequency_response_cli import main
 from pendulum_bags.experiments.in_process import simulate_plant
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.frequency_response.analyse import analyse_responses
 from pendulum_bags.frequency_response.compare import compare_responses, continuous
 from pendulum_bags.frequency_response.estimate import estimate
-from pendulum_bags.frequency_response.frequency_response_cli import main
 from pendulum_bags.frequency_response.record import Record, record_of_arrays, record_of_run
 from pendulum_bags.frequency_response.write import write_analysis
 from pendulum_bags.runs.run_data import RunData

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from threadpoolctl import threadpool_limits
 
-from pendulum_bags.identification import identify_cli
+from pendulum_bags.commands import identify_cli
 from pendulum_bags.identification.excitation import Limits, design_excitation
 from pendulum_bags.identification.identify import identify
 from pendulum_bags.identification.options import Geometry, Options, default_window

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pendulum_bags.identification import identify_cli
+from pendulum_bags.commands import identify_cli
 from pendulum_bags.identification.geometry import check_geometry
 from pendulum_bags.identification.identify import identify
 from pendulum_bags.identification.options import Geometry, Options

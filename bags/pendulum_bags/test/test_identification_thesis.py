@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy
 
-from pendulum_bags.identification import identify_cli
+from pendulum_bags.commands import identify_cli
 from pendulum_bags.identification.page import write_thesis_page
 from pendulum_bags.identification.thesis import fit_gravity, fit_inertia_damping, static_holds
 from pendulum_bags.identification.thesis_figures import TrialSet, thesis_figures

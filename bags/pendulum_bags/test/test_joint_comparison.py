@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pendulum_bags.commands.compare_cli import main
+from pendulum_bags.commands.report_cli import main as report_main
 from pendulum_bags.comparison import Outcome, compare_runs
-from pendulum_bags.comparison.compare_cli import main
 from pendulum_bags.comparison.pairs import Pair
 from pendulum_bags.report.joint_page import joint_page
-from pendulum_bags.report.report_cli import main as report_main
 from pendulum_bags.report.write import write_joint_report
 from pendulum_bags.runs.run_data import joints_of, read_run
 from pendulum_bags.runs.run_record import RUN_RECORD

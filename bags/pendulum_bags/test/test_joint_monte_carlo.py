@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_bags.experiments.experiment_cli import main
+from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo, joint_shares
 from pendulum_bags.studies.joint_region import JointRegion
 from pendulum_bags.studies.monte_carlo import MonteCarlo

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_bags.experiments.experiment_cli import main
+from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.studies.chunks import chunk_path, read_columns
 from pendulum_bags.studies.joint_region import JointRegion, JointRegionResult
 from pendulum_bags.studies.start_grid import run_map

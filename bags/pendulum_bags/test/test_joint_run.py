@@ -211,7 +211,7 @@ def test_the_sides_that_fell_are_told_with_their_times(
 def test_an_experiment_for_one_joint_names_what_does_it_for_several(
     command: str, instead: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from pendulum_bags.experiments.experiment_cli import main
+    from pendulum_bags.commands.experiment_cli import main
 
     assert main([command, "--plant", "cart_pole"]) == 2
     said = capsys.readouterr().err
@@ -223,7 +223,7 @@ def test_an_experiment_for_one_joint_names_what_does_it_for_several(
 def test_the_main_experiment_of_a_plant_of_several_joints_is_that_of_joints(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from pendulum_bags.experiments import experiment_cli
+    from pendulum_bags.commands import experiment_cli
 
     asked: list[tuple[tuple[object, ...], dict[str, object]]] = []
     monkeypatch.setattr(experiment_cli, "joints", lambda *args, **options: asked.append((args, options)))
@@ -243,7 +243,7 @@ def test_the_main_experiment_of_a_plant_of_several_joints_is_that_of_joints(
 def test_a_design_is_refused_where_no_frequency_is_measured(
     options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from pendulum_bags.experiments.experiment_cli import main
+    from pendulum_bags.commands.experiment_cli import main
 
     assert main(["joints", "--design", "q=1,1,1,1", "--out", str(tmp_path / "run"), *options]) == 2
     assert "error: --design needs both plants measured" in capsys.readouterr().err
@@ -253,7 +253,7 @@ def test_a_design_is_refused_where_no_frequency_is_measured(
 def test_a_design_that_is_none_is_refused_before_anything_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from pendulum_bags.experiments.experiment_cli import main
+    from pendulum_bags.commands.experiment_cli import main
 
     assert main(["joints", "--plant", "acrobot", "--design", "q=1,1,1", "--out", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
@@ -264,8 +264,8 @@ def test_a_design_that_is_none_is_refused_before_anything_runs(
 def test_a_plant_that_falls_under_the_multisine_alone_has_its_first_layer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from pendulum_bags.comparison import compare_cli
-    from pendulum_bags.experiments.experiment_cli import main
+    from pendulum_bags.commands import compare_cli
+    from pendulum_bags.commands.experiment_cli import main
     from pendulum_bags.frequency_response import joint_experiment
 
     def falls(*_: Any, **__: Any) -> None:
@@ -284,7 +284,7 @@ def test_a_plant_that_falls_under_the_multisine_alone_has_its_first_layer(
 def test_a_run_of_several_joints_that_records_nothing_leaves_no_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from pendulum_bags.experiments.experiment_cli import main
+    from pendulum_bags.commands.experiment_cli import main
 
     def ends(folder: Path, *_: Any, **__: Any) -> None:
         assert (folder / "machine.yaml").is_file()

@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from pendulum_bags.commands.train_cli import main
 from pendulum_bags.learning import evaluation, training
 from pendulum_bags.learning.environment import SwingUp
 from pendulum_bags.learning.evaluation import Trial, run_trial
@@ -18,7 +19,6 @@ from pendulum_bags.learning.network import Adam, Mlp
 from pendulum_bags.learning.pendulum_v1 import PendulumV1
 from pendulum_bags.learning.ppo import Ppo, PpoSettings
 from pendulum_bags.learning.task import SwingUpTask, ranges_of
-from pendulum_bags.learning.train_cli import main
 from pendulum_bags.learning.training import Training, checkpoint_path, train
 from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_msgs_py.contract.angles import wrap

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pendulum_bags.commands.train_cli import main
 from pendulum_bags.learning import training
 from pendulum_bags.learning.body import kicks_of, travel_of, velocity_scales
 from pendulum_bags.learning.environment import SwingUp
 from pendulum_bags.learning.evaluation import Trial, is_up, run_trial, trials_of
 from pendulum_bags.learning.ppo import PpoSettings
 from pendulum_bags.learning.task import SwingUpTask, ranges_of
-from pendulum_bags.learning.train_cli import main
 from pendulum_bags.learning.training import Training, checkpoint_path, train
 from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism

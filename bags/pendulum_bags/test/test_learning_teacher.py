@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pendulum_bags.commands.train_cli import main
 from pendulum_bags.learning import training
 from pendulum_bags.learning.environment import SwingUp
 from pendulum_bags.learning.evaluation import trials_of
@@ -15,7 +16,6 @@ from pendulum_bags.learning.imitation import Imitation
 from pendulum_bags.learning.ppo import PpoSettings
 from pendulum_bags.learning.task import SwingUpTask
 from pendulum_bags.learning.teacher import Teacher
-from pendulum_bags.learning.train_cli import main
 from pendulum_bags.learning.training import Training, checkpoint_path, train
 from pendulum_bags.studies.mechanism_benchmark import benchmark_plant
 from pendulum_bags.studies.mechanism_benchmark_runs import make_stepper, swing_up

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pendulum_bags.experiments.experiment_cli import app
+from pendulum_bags.commands.experiment_cli import app
 from pendulum_bags.studies import mechanism_benchmark_runs as runs
 from pendulum_bags.studies.mechanism_benchmark import (
     PUBLISHED,

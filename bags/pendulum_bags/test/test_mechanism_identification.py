@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from pendulum_bags.identification import identify_cli
+from pendulum_bags.commands import identify_cli, replay_cli
 from pendulum_bags.identification.joint_recordings import FORMAT, JointRecording, read_joints
 from pendulum_bags.identification.mechanism_fit import fit, prepare_windows, scores, window_length
 from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel, tellable
 from pendulum_bags.identification.mechanism_result import identify_mechanism
-from pendulum_bags.replay import replay_cli
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, load_mechanism_file, write_mechanism

@@ -12,10 +12,10 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
+from pendulum_bags.commands.experiment_cli import app as experiment_app
+from pendulum_bags.commands.identify_cli import main
 from pendulum_bags.comparison import compare
-from pendulum_bags.experiments.experiment_cli import app as experiment_app
 from pendulum_bags.identification.identify import identify
-from pendulum_bags.identification.identify_cli import main
 from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.residual_tests import _stretches, _told
 from pendulum_bags.pages.terms import Terms

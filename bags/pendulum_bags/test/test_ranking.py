@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from pendulum_bags.commands.ranking_cli import main
 from pendulum_bags.distributions import Interval
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.ranking.collect import collect_contenders, cost_parts
 from pendulum_bags.ranking.contender import Contender, compared_runs, contenders_of
 from pendulum_bags.ranking.present import same_choice, write_ranking
 from pendulum_bags.ranking.ranking import Ranking, mmrv, rank
-from pendulum_bags.ranking.ranking_cli import main
 from pendulum_bags.verdict import Layer, Mark
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError

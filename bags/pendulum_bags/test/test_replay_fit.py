@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pendulum_bags.identification.identify_cli import main as identify_main
+from pendulum_bags.commands.identify_cli import main as identify_main
+from pendulum_bags.commands.replay_cli import main as replay_main
 from pendulum_bags.replay.input_replay import replay_recording
-from pendulum_bags.replay.replay_cli import main as replay_main
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, write_plant
 from pendulum_testing.synthetic_recordings import multisine, synthetic_recording

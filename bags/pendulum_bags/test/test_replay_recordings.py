@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_bags.identification.identify_cli import main as identify_main
+from pendulum_bags.commands.identify_cli import main as identify_main
+from pendulum_bags.commands.replay_cli import main as replay_main
 from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.replay.controller_replay import replay_controller
 from pendulum_bags.replay.input_replay import replay_input, replay_recording
-from pendulum_bags.replay.replay_cli import main as replay_main
 from pendulum_bags.replay.result import fit_percent
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.contract.cdr import encode_joint_state

@@ -17,6 +17,7 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.serialization import serialize_message
 
+from pendulum_bags.commands.report_cli import main
 from pendulum_bags.comparison import Comparison, compare_folders
 from pendulum_bags.figures import render_files
 from pendulum_bags.figures.figure import ROLES, Figure, Panel, Trace, thinned
@@ -29,7 +30,6 @@ from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.figures import comparison_figures, make_figures
 from pendulum_bags.report.page import page_of
 from pendulum_bags.report.provenance import emulator_table, provenance_table, settings_table
-from pendulum_bags.report.report_cli import main
 from pendulum_bags.report.tables import make_tables
 from pendulum_bags.report.write import title_of
 from pendulum_bags.verdict import Evidence, Layer, LayerResult, Mark, write_layer

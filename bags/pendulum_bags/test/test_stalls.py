@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from pendulum_bags.commands.experiment_cli import _print_summary, _summary
 from pendulum_bags.comparison import compare_folders
-from pendulum_bags.experiments.experiment_cli import _print_summary, _summary
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.experiments.stalls import ATTEMPTS, is_stall, run_undisturbed
 from pendulum_bags.report import write_report

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_bags.experiments.experiment_cli import main
+from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.experiments.in_process import RunArrays, simulate_plant
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.studies.leaderboard import (

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
-from pendulum_bags.experiments.experiment_cli import main
+from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.studies.chunks import chunk_path, cluster_client, read_columns
 from pendulum_bags.studies.monte_carlo import MonteCarlo, sobol
 from pendulum_bags.studies.random_runs import draw_chunk, replay, run_chunk, run_monte_carlo

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LAYOUT", "main"]
 
-LAYOUT = Path(__file__).with_name("foxglove_layout.json")
+LAYOUT = Path(__file__).parents[1] / "live" / "foxglove_layout.json"
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 

@@ -16,10 +16,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
+from pendulum_bags.commands.compare_cli import MarginOption, MarginsFile
+from pendulum_bags.commands.frequency_response_cli import experiment as frequency_response
+from pendulum_bags.commands.joints_cli import joints
+from pendulum_bags.commands.leaderboard_cli import leaderboard
+from pendulum_bags.commands.mechanism_benchmark_cli import benchmark
+from pendulum_bags.commands.monte_carlo_cli import Q, R, monte_carlo
+from pendulum_bags.commands.region_cli import region_of_attraction
+from pendulum_bags.commands.study_cli import add_commands as add_study_commands
+from pendulum_bags.commands.trials_cli import add_commands as add_trial_commands
 from pendulum_bags.experiments.domain import check_domain
 from pendulum_bags.experiments.graph_plant import PREFIX as GRAPH_PREFIX
-from pendulum_bags.experiments.joints_cli import joints
 from pendulum_bags.experiments.new_run import new_run
 from pendulum_bags.experiments.operator import ask_for_running, confirmed
 from pendulum_bags.experiments.plant_options import (
@@ -40,14 +47,7 @@ from pendulum_bags.experiments.settings import (
     NoiseSettings,
     RegulationSettings,
 )
-from pendulum_bags.experiments.trials_cli import add_commands as add_trial_commands
-from pendulum_bags.frequency_response.frequency_response_cli import experiment as frequency_response
 from pendulum_bags.runs.run_folder import versions, write_json
-from pendulum_bags.studies.leaderboard_cli import leaderboard
-from pendulum_bags.studies.mechanism_benchmark_cli import benchmark
-from pendulum_bags.studies.monte_carlo_cli import Q, R, monte_carlo
-from pendulum_bags.studies.region_cli import region_of_attraction
-from pendulum_bags.studies.study_cli import add_commands as add_study_commands
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pendulum_bags.studies.monte_carlo_cli import Device, Plant, Q, R, Scheduler, Uncertain, Workers, options_of_several
+from pendulum_bags.commands.monte_carlo_cli import (
+    Device,
+    Plant,
+    Q,
+    R,
+    Scheduler,
+    Uncertain,
+    Workers,
+    options_of_several,
+)
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counted_progress

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from pendulum_bags.comparison.compare_cli import MarginOption, MarginsFile
+from pendulum_bags.commands.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.experiments.new_run import new_run
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_msgs_py.errors import DataError, FaultError, ParameterError
@@ -99,7 +99,7 @@ def joints(
 
     Example: python -m pendulum_bags experiment joints --plant acrobot --share 0.1
     """
-    from pendulum_bags.comparison.compare_cli import compare
+    from pendulum_bags.commands.compare_cli import compare
     from pendulum_bags.experiments.host_pool import open_pool
     from pendulum_bags.experiments.joint_run import (
         JointSettings,

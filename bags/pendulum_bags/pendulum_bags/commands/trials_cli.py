@@ -92,8 +92,8 @@ def gravity(
 
 
 def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_output: bool, *, yes: bool) -> None:
+    from pendulum_bags.commands import identify_cli
     from pendulum_bags.experiments.trials import run_trials
-    from pendulum_bags.identification import identify_cli
 
     # Checked first: a recording that cannot be evaluated is not worth machine time.
     if importlib.util.find_spec("statsmodels") is None:

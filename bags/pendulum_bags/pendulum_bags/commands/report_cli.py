@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from pendulum_bags.comparison.compare_cli import DesignOption, LayersOption, MachineOption
+from pendulum_bags.commands.compare_cli import DesignOption, LayersOption, MachineOption
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pendulum_bags.identification.identify_cli import Hold
+from pendulum_bags.commands.identify_cli import Hold
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, is_mechanism

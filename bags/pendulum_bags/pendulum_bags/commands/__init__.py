@@ -1,0 +1,1 @@
+"""The command lines: options in, text and files out; nothing imports them."""
