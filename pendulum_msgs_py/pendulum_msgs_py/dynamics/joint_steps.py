@@ -34,6 +34,7 @@ __all__ = [
     "JointTable",
     "advance_joints",
     "joint_functions",
+    "joint_modes",
 ]
 
 JOINT_ROWS = ("coulomb_friction", "static_friction", "stribeck_velocity", "lower_stop", "upper_stop", "time_constant")
@@ -141,7 +142,7 @@ def _step(
     )
 
 
-def _modes(forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any, p: Any, table: Any) -> Any:
+def joint_modes(forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any, p: Any, table: Any) -> Any:
     """Return (direction, held) of each joint: which way friction acts on it, and 1 where it is held at rest."""
     n = len(q)
     direction = along(v, -1.0, v)
@@ -217,7 +218,7 @@ def advance_joints(
     for _ in range(_MAX_EVENTS):
         begin = h - left
         now = along(lag(torque, command, begin, table[LAG]), 1.0, push)
-        direction, held = _modes(forward, along, put, q, v, now, p, table)
+        direction, held = joint_modes(forward, along, put, q, v, now, p, table)
         q_1, v_1 = _step(forward, along, put, lag, q, v, torque, command, push, begin, left, direction, held, p, table)
         for i in range(n):
             if v[i] == 0.0 and direction[i] != 0.0 and v_1[i] * direction[i] < 0.0:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.identification.explained import LARGEST_SHARE
 from pendulum_bags.identification.mechanism_fit import MechanismFit, Windows, fit
 from pendulum_bags.identification.mechanism_model import MechanismModel
 from pendulum_msgs_py.errors import DataError
@@ -37,7 +38,7 @@ def choose(
     Args:
         start: The model to start from.
         data: Windows of the recordings.
-        weights: As for :func:`~pendulum_bags.identification.mechanism_fit.fit`.
+        weights: As :func:`~pendulum_bags.identification.mechanism_fit.first_weights` has them.
         extras: The one candidate of ``EXTRAS`` to fit; None to choose.
 
     Returns:
@@ -53,7 +54,7 @@ def choose(
         free = start.fitted(**wanted)
         if (name != extras if extras else name == ALL_EXTRAS) or free in [b[1].free for b in ([best] if best else [])]:
             continue
-        found = fit(model, data, free, weights, states=states)
+        found = fit(model, data, free, weights, states=states, hopeless=LARGEST_SHARE)
         if extras is not None:
             return found, name, {}
         model, states = (found.model, found.states) if best is None else (model, states)

@@ -53,6 +53,9 @@ _FINE = 0.0005
 MOST = 100
 """Most steps of a search; one that has not ended by then is no result."""
 
+_STUCK, _PROGRESS = 10, 0.99
+"""Steps over which a hopeless search has to take its cost below a share of what it was, or ends."""
+
 _BEFORE = 0.02
 """Longest delay after which an effort from before the recording may still act [s]."""
 
@@ -235,7 +238,7 @@ class MechanismFit:
         blocks: Normal equations by recording, at the minimum.
         errors: Simulated minus measured by recording, positions before velocities, shape (w, l, 2 n), 0 in the padding
             and where no velocity was measured.
-        converged: Whether the search ended before its most steps.
+        converged: Whether the search ended at a minimum, before its most steps.
     """
 
     model: MechanismModel
@@ -296,6 +299,7 @@ def fit(
     states: Sequence[Array] | None = None,
     most: int = MOST,
     tolerance: float = 1e-6,
+    hopeless: float = np.inf,
 ) -> MechanismFit:
     """Minimise the weighted squares of the position errors over free parameters and start states.
 
@@ -307,6 +311,7 @@ def fit(
         states: Start of the start states; by default the windows' first guesses.
         most: Most steps to try.
         tolerance: Relative decrease of the cost below which the fit ends.
+        hopeless: Weighted rms error above which the fit ends as soon as it makes little progress: it is refused anyway.
     """
     index = model.index(free)
     count = len(model.plant.joints)
@@ -326,7 +331,12 @@ def fit(
     normal, errors = _linearise(best, free, data, x, paths, weights)
     if not all(np.isfinite(matrix).all() for matrix in normal[0]):
         raise DataError(_AWAY)
+    beyond, costs = hopeless**2 * sum(_measurements(part, weights) for part in data), [cost]
     for _ in range(most):
+        if cost > beyond and len(costs) > _STUCK and cost > _PROGRESS * costs[-_STUCK - 1]:
+            converged = False
+            break
+        costs.append(cost)
         step = _step(normal, prior, values[index], size, low, damping)
         trial = values.copy()
         trial[index] = np.maximum(values[index] + step[0], low)
@@ -358,8 +368,12 @@ def fit(
         solved = np.linalg.pinv(own, hermitian=True) @ coupling.transpose(0, 2, 1)
         reduced = matrix[:, :k, :k] - coupling @ solved
         along = gradient[:, :k] - np.einsum("wxk,wx->wk", solved, gradient[:, k:])
-        blocks.append(Blocks(reduced, along, int(part.inside.sum()) * int(np.count_nonzero(weights))))
+        blocks.append(Blocks(reduced, along, _measurements(part, weights)))
     return MechanismFit(best, tuple(free), x, cost, blocks, errors, converged)
+
+
+def _measurements(part: Windows, weights: Array) -> int:
+    return int(part.inside.sum()) * int(np.count_nonzero(weights))
 
 
 def _simulate(

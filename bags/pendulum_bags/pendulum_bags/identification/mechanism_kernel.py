@@ -13,18 +13,16 @@ from typing import Any
 import numba
 
 from pendulum_bags.arrays import Array
-from pendulum_msgs_py.dynamics.joint_steps import advance_joints, joint_functions
-from pendulum_msgs_py.loops.trees import compile_tree, tuple_loader
+from pendulum_msgs_py.dynamics.joint_steps import COULOMB, advance_joints, joint_functions, joint_modes
+from pendulum_msgs_py.loops.trees import WITHIN, compile_tree, tuple_loader
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 
 __all__ = ["lagged", "motion_kernel"]
 
 
-AT_REST = 6e-5
-"""Longest step of a joint with dry friction that is slow [s]."""
-SLOW = 0.05
-"""Speed below which it may come to rest within a step [rad/s or m/s]."""
+_BREAKAWAY = 6e-5
+"""Resolution of the instant at which a resting joint breaks away [s]."""
 
 
 @numba.njit(cache=True)
@@ -60,13 +58,26 @@ def motion_kernel(name: str) -> Any:
     n, size = len(mechanism.joints), len(mechanism.parameter_names)
     forward = compile_tree(mechanism.forward, inline=True)
     along, put, _ = (compile_tree(function, inline=True) for function in joint_functions(n))
-    advance = compile_tree(advance_joints, inline=True)
+    advance, modes = compile_tree(advance_joints, inline=True), compile_tree(joint_modes, inline=True)
     load, load_p = tuple_loader(n, 1), tuple_loader(size, 1)
 
     @numba.njit(error_model="numpy", fastmath={"contract"}, forceinline=True)
     def ramp(torque: Any, rise: Any, elapsed: float, _constants: Any) -> Any:
         """Return a rising effort after some time, in the place of an actuator's lag."""
         return along(torque, elapsed, rise)
+
+    @numba.njit(error_model="numpy", fastmath={"contract"}, **WITHIN)
+    def breaks(q: Any, v: Any, effort: Any, p: Any, table: Any) -> bool:
+        """Return whether a joint at rest is not held by its friction."""
+        rest = 0.0
+        for i in range(n):
+            rest += v[i] == 0.0 and table[COULOMB][i] > 0.0
+        if rest > 0.0:
+            _, held = modes(forward, along, put, q, v, effort, p, table)
+            for i in range(n):
+                # What is held without friction is held by an end stop.
+                rest -= held[i] > 0.0 and table[COULOMB][i] > 0.0
+        return rest > 0.0
 
     @numba.njit(error_model="numpy", fastmath={"contract"})
     def run(p: Any, table: Any, push: Any, shift: Any, drive: Any, which: Any, h: Any, states: Any, path: Any) -> None:
@@ -89,15 +100,20 @@ def motion_kernel(name: str) -> Any:
                     if h[w, k] > 0.0:
                         effort = drive[which[c], w, k]
                         rise = load(effort, n)
-                        # A joint at rest breaks away at the start of a step only: such steps are short.
-                        parts = 1
-                        for i in range(n):
-                            if abs(v[i]) < SLOW and table[c, 0, i] > 0.0:
-                                parts = max(parts, math.ceil(h[w, k] / AT_REST - 1e-6))
-                        part = h[w, k] / parts
-                        for j in range(parts):
-                            begun = along(load(effort, 0), j * part, rise)
-                            q, v = advance(forward, along, put, ramp, q, v, begun, rise, pushed, part, own, rows)
+                        # A joint at rest breaks away at the start of a step only. Where one would do so at the end
+                        # of a step, bisection finds when, and a new step starts there.
+                        done, part = 0.0, h[w, k]
+                        while part > 0.0:
+                            begun = along(load(effort, 0), done, rise)
+                            q_1, v_1 = advance(forward, along, put, ramp, q, v, begun, rise, pushed, part, own, rows)
+                            if part > _BREAKAWAY and breaks(
+                                q_1, v_1, along(along(begun, part, rise), 1.0, pushed), own, rows
+                            ):
+                                part *= 0.5
+                            else:
+                                q, v = q_1, v_1
+                                done += part
+                                part = h[w, k] - done
                     for i in range(n):
                         path[c, w, k + 1, i] = q[i] + zero[i]
                         path[c, w, k + 1, n + i] = v[i]

@@ -248,8 +248,9 @@ def identify_mechanism(
     search = _Search(plant, recordings, extras, stride)
     found, chosen, candidates, data, length = search.best(length, fixed=window is not None)
     found, data, pushed = _without_pushes(found, data)
-    # Now that the errors are known, each measurement counts by its own.
-    for _ in range(2 if measured else 1):
+    # Now that the errors are known, each measurement counts by its own; of a fit to be refused none does.
+    weights = error_weights(found, data)
+    for _ in range(0 if _worst(found, data) > LARGEST_SHARE else 2 if measured else 1):
         weights = error_weights(found, data)
         found = fit(found.model, data, found.free, weights, states=found.states)
     found, held = _hold_undetermined(start, found, data, weights)
