@@ -103,8 +103,8 @@ def test_a_moving_reference_is_designed_for_with_the_weights_of_the_chosen_row(c
     ("arguments", "message"),
     [
         (["--preset", "thesys"], "plant is 'thesys'; expected one of the presets"),
-        (["--q", "1"], "--q is '1'; expected two numbers, as 100,0.01"),
-        (["--q", "1,x"], "--q is '1,x'; expected two numbers"),
+        (["--q", "1"], "--q is '1'; expected 2 numbers, for theta, theta_dot, as 100,0.01"),
+        (["--q", "1,x"], "--q is '1,x'; expected 2 numbers"),
         (["--q", "1,-1"], "expected no negative weight"),
         (["--r", "0"], "r is 0.0 1/(N m)^2; expected a finite weight > 0"),
         (["--row", "9"], "--row is 9; expected 1 to 4"),

@@ -165,7 +165,7 @@ def test_a_check_says_right_or_wrong_by_its_exit_code_too(course: Path, capsys: 
     assert main(["check", "gains", "--q", "100,0.01", "--r", "1e6", "--course", str(course)]) == 1
     assert capsys.readouterr().out.startswith("wrong: the time constant of this loop is ")
     assert main(["check", "gains", "--q", "100", "--r", "0.1", "--course", str(course)]) == 2
-    assert "--q is '100'; expected two numbers, as 100,0.01" in capsys.readouterr().err
+    assert "--q is '100'; expected 2 numbers, for theta, theta_dot, as 100,0.01" in capsys.readouterr().err
     assert main(["check", "noise", "2", "--because", "e", "--course", str(course)]) == 2
     assert "cause is 'e'; expected one of a, b, c, d" in capsys.readouterr().err
     assert main(["check", "delay", "0.1", "--course", str(course.parent / "none")]) == 2

@@ -9,6 +9,7 @@ import pendulum_msgs_py.programs.one_thread  # noqa: F401  # before anything tha
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,7 +26,6 @@ from pendulum_lqr.design_command.design_tables import (
     print_worst_cases,
     time_cell,
 )
-from pendulum_lqr.design_command.mechanism_design import design_mechanism
 from pendulum_lqr.design_command.time_figures import time_figures
 from pendulum_lqr.design_command.tracking_table import design_tracking, print_tracking, tracking_document
 from pendulum_lqr.linear.analysis import LoopReport, analyse
@@ -36,8 +36,15 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.determined import require_determined
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, is_mechanism, load_plant
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import (
+    MECHANISM_PRESETS,
+    PRESET_NAMES,
+    PlantParameters,
+    is_mechanism,
+    load_plant,
+)
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import make_console
@@ -114,20 +121,23 @@ def design(
     chosen_plant = str(plant) if plant is not None else preset
     require_determined(chosen_plant)
     if is_mechanism(chosen_plant):
-        if any((figures, machine, theta != UPRIGHT, effort_limit, row, uncertainty, tracking)):
+        if any((figures, machine, theta != UPRIGHT, effort_limit, uncertainty, tracking)):
             raise ParameterError(
-                f"plant {chosen_plant!r} has several joints; expected --q, --r and --json alone: figures, --machine, "
-                "--uncertainty, --tracking, --theta, --effort-limit and --row are for one joint"
+                f"plant {chosen_plant!r} has several joints; expected --q, --r, --row and --json alone: figures, "
+                "--machine, --uncertainty, --tracking, --theta and --effort-limit are for one joint"
             )
-        design_mechanism(load_mechanism(chosen_plant), q, r, as_json=as_json)
+        mechanism = load_mechanism(chosen_plant)
+        own = (mechanism.mechanism.weights,)
+        table = _designed(mechanism, linearise(mechanism), q, r, own, row)
+        if as_json:
+            sys.stdout.write(json_text(table.document()) + "\n")
+        else:
+            table.show(make_console(highlight=False))
         return
     parameters = load_plant(chosen_plant)
     limit = _limit(effort_limit, parameters.effort_limit)
-    model = linearise(parameters, theta)
-    weights = _weights(q, r)
-    gains = [output_lqr(model, diagonal, cost) for diagonal, cost in weights]
-    reports = [analyse(model, None), *(analyse(model, gain.K) for gain in gains)]
-    chosen = _chosen_row(row, len(weights), default=THESIS_CHOICE if not (q or r) else len(weights))
+    table = _designed(parameters, linearise(parameters, theta), q, r, THESIS_WEIGHTS, row)
+    model, gains, weights, chosen = table.model, table.gains, table.weights, table.chosen
     certified = certify_rows(machine, model, gains) if machine is not None else None
     follower = design_tracking(tracking, parameters, weights[chosen - 1], limit) if tracking else None
     in_time = [time_figures(model, gain.K, parameters) for gain in gains]
@@ -138,7 +148,7 @@ def design(
         print(f"asking {len(possible)} plants with {len(gains)} gains ...", file=sys.stderr)
         worst = [worst_case(possible, gain.K, theta, tuple(box.bounds)) for gain in gains]
     if as_json:
-        document = _document(parameters.name, model, weights, reports)
+        document = table.document()
         for line, figure in zip(document["rows"][1:], in_time, strict=True):
             line["time"] = None if figure is None else figure.to_dict()
         if box is not None:
@@ -152,7 +162,7 @@ def design(
         sys.stdout.write(json_text(document) + "\n")
     else:
         console = make_console(highlight=False)
-        _print(console, parameters.name, model, weights, reports, chosen)
+        table.show(console)
         print_time_figures(console, in_time, chosen, limit)
         if box is not None:
             print_worst_cases(console, box, worst, chosen)
@@ -161,7 +171,7 @@ def design(
         if certified is not None:
             print_certificates(console, *certified, chosen)
     if figures is not None:
-        for path in _save(parameters, model, weights, gains, chosen, limit, figures):
+        for path in _save(parameters, table, limit, figures):
             print(path, file=sys.stderr if as_json else sys.stdout)
 
 
@@ -171,146 +181,159 @@ def _limit(given: float, plants_own: float) -> float:
     return given or plants_own
 
 
-def _weights(q: Sequence[str] | None, r: Sequence[float] | None) -> list[tuple[tuple[float, ...], float]]:
-    if not q and not r:
-        return [*THESIS_WEIGHTS]
-    diagonals = [read_diagonal(text) for text in q] if q else sorted({weights for weights, _ in THESIS_WEIGHTS})
-    costs = list(r) if r else [0.1]
-    return [(diagonal, cost) for diagonal in diagonals for cost in costs]
+@dataclass(frozen=True)
+class _Table:
+    """Gains of a plant, one for each pair of weights, and their figures, those without feedback first."""
+
+    plant: AnyPlant
+    model: LinearModel
+    weights: Sequence[tuple[tuple[float, ...], float]]
+    gains: Sequence[Gain]
+    reports: Sequence[LoopReport]
+    chosen: int
+
+    def document(self) -> dict[str, Any]:
+        model, rows = self.model, []
+        for index, report in enumerate(self.reports):
+            row: dict[str, Any] = {"combination": index, "q": None, "r": None, **report.to_dict()}
+            if index:
+                row["q"], row["r"] = list(self.weights[index - 1][0]), self.weights[index - 1][1]
+                row["K"] = self.gains[index - 1].K.tolist()
+            rows.append(row)
+        return {
+            "plant": self.plant.name,
+            "joints": list(self.plant.coordinates.names),
+            "driven": list(self.plant.coordinates.driven_names),
+            "theta": model.theta,
+            "effort": model.effort,
+            "position": list(model.position),
+            "efforts": list(model.efforts),
+            "states": list(model.states),
+            "delay": model.delay,
+            "A": model.A.tolist(),
+            "B": model.B.tolist(),
+            "C": model.C.tolist(),
+            "E": model.E.tolist(),
+            "rows": rows,
+        }
+
+    def show(self, console: Console) -> None:
+        for line in self._plant_lines():
+            console.print(line)
+        left = {"Q", "eigenvalues \\[1/s]", "computed", "K"}
+        headings = ("#", "Q", "r", "eigenvalues \\[1/s]", "computed", "K", "tau \\[s]", "damping")
+        table = RowTable("Eigenvalues and gains", headings, left=left, no_wrap=True)
+        margins_table = RowTable(
+            "Robustness of the loop",
+            ("#", "gain up", "gain down", "phase margin", "delay margin", "modulus", "largest period"),
+        )
+        for index, report in enumerate(self.reports):
+            cells = ["\u2013"] * 3
+            if index:
+                diagonal, cost = self.weights[index - 1]
+                rows = (", ".join(f"{value:.6f}" for value in row) for row in self.gains[index - 1].rows)
+                cells = [", ".join(f"{value:g}" for value in diagonal), f"{cost:g}", "\n".join(rows)]
+            table.add(
+                index,
+                *cells[:2],
+                pole_cell(report.poles),
+                pole_cell(report.poles, 6),
+                cells[2],
+                f"{report.time_constant:.4f}" if report.stable else "unstable",
+                f"{report.damping_ratio:.3f}",
+                chosen=self.chosen,
+            )
+            if index:
+                margins = ["\u2013"] * 5 if report.margins is None else margin_cells(report.margins)
+                period = time_cell(report.largest_period) if report.largest_period else "none"
+                margins_table.add(index, *margins, period, chosen=self.chosen)
+        console.print(table)
+        console.print(margins_table)
+        report = self.reports[self.chosen]
+        K = ", ".join(f"{value:.3f}" for value in report.K)
+        slowest = report.poles[0].real
+        rounded = f"; from the rounded eigenvalue 1/{-slowest:.2f} = {1.0 / round(-slowest, 2):.4f} s"
+        console.print(
+            f"combination {self.chosen}: K = \\[{K}], tau = {report.time_constant:.4f} s{rounded * (slowest < -0.005)}"
+        )
+
+    def _plant_lines(self) -> list[str]:
+        """Return what the design was made for, in sentences."""
+        model, joints = self.model, self.plant.coordinates.joints
+        at = ", ".join(
+            f"{state} = {value:.4f} {joint.unit}"
+            for state, value, joint in zip(model.states, model.position, joints, strict=False)
+        )
+        held = ", ".join(
+            f"{value:.4g} {joints[index].effort_unit}"
+            for index, value in zip(self.plant.coordinates.driven, model.efforts, strict=True)
+        )
+        what = f"states {', '.join(model.states)};"
+        if model.states == ("theta", "theta_dot"):
+            a, b = model.A[1], model.B[1, 0]
+            what = f"A = [[0, 1], [{a[0]:.2f}, {a[1]:.2f}]], B = [0, {b:.2f}],"
+        lines = [f"plant {self.plant.name} at {at}: {what} u* = {held}", *hidden_and_late(model)]
+        if isinstance(self.plant, MechanismParameters) and self.plant.has_dry_friction:
+            lines.append(
+                "dry friction has no derivative at rest and is not in the model: simulate the loop to see its cost"
+            )
+        return lines
 
 
-def read_diagonal(text: str) -> tuple[float, float]:
-    """Return the diagonal of Q that a command line names as ``100,0.01`` [1/rad^2, s^2/rad^2].
+def _designed(
+    plant: AnyPlant,
+    model: LinearModel,
+    q: Sequence[str] | None,
+    r: Sequence[float] | None,
+    own: Sequence[tuple[tuple[float, ...], float]],
+    row: int,
+) -> _Table:
+    """Return the gains of every Q with every R; of the plant's own weights where neither is given."""
+    weights = [*own]
+    if q or r:
+        diagonals = (
+            [read_diagonal(text, model.measured) for text in q] if q else sorted({diagonal for diagonal, _ in own})
+        )
+        weights = [(diagonal, cost) for diagonal in diagonals for cost in r or [own[0][1]]]
+    if not 0 <= row <= len(weights):
+        raise ParameterError(f"--row is {row}; expected 1 to {len(weights)}, or 0 for the default")
+    gains = [output_lqr(model, diagonal, cost) for diagonal, cost in weights]
+    reports = [analyse(model, None), *(analyse(model, gain.K) for gain in gains)]
+    usual = THESIS_CHOICE if weights == [*THESIS_WEIGHTS] and not (q or r) else len(weights)
+    return _Table(plant, model, weights, gains, reports, row or usual)
+
+
+def read_diagonal(text: str, states: Sequence[str] = ("theta", "theta_dot")) -> tuple[float, ...]:
+    """Return the diagonal of Q that a command line names as ``100,0.01``.
+
+    Args:
+        text: The weights.
+        states: What is measured, to each of which a weight belongs.
 
     Raises:
         ParameterError: The text is something else.
     """
     try:
-        q_11, q_22 = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise ParameterError(f"--q is {text!r}; expected two numbers, as 100,0.01") from error
-    return q_11, q_22
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != len(states):
+        raise ParameterError(f"--q is {text!r}; expected {len(states)} numbers, for {', '.join(states)}, as 100,0.01")
+    return values
 
 
-def _chosen_row(row: int, count: int, default: int) -> int:
-    if row < 0 or row > count:
-        raise ParameterError(f"--row is {row}; expected 1 to {count}, or 0 for the default")
-    return row or default
-
-
-def _print(
-    console: Console,
-    name: str,
-    model: LinearModel,
-    weights: Sequence[tuple[tuple[float, ...], float]],
-    reports: Sequence[LoopReport],
-    chosen: int,
-) -> None:
-    for line in _plant_lines(name, model):
-        console.print(line)
-    poles = "eigenvalues \\[1/s]"
-    table = RowTable(
-        "Eigenvalues and gains",
-        ("#", "q11", "q22", "r", poles, "computed", "K", "tau \\[s]", "damping"),
-        left={poles},
-        no_wrap=True,
-    )
-    margins_table = RowTable(
-        "Robustness of the loop",
-        ("#", "gain up", "gain down", "phase margin", "delay margin", "modulus", "largest period"),
-    )
-    for index, report in enumerate(reports):
-        (q11, q22), cost = weights[index - 1] if index else ((math.nan, math.nan), math.nan)
-        cells = [f"{value:g}" if index else "\u2013" for value in (q11, q22, cost)]
-        stable = math.isfinite(report.time_constant) and report.stable
-        table.add(
-            index,
-            *cells,
-            pole_cell(report.poles),
-            pole_cell(report.poles, 6),
-            ", ".join(f"{value:.6f}" for value in report.K) if index else "\u2013",
-            f"{report.time_constant:.4f}" if stable else "unstable",
-            f"{report.damping_ratio:.3f}",
-            chosen=chosen,
-        )
-        margins = report.margins
-        if margins is not None:
-            period = "none" if report.largest_period is None else time_cell(report.largest_period)
-            margins_table.add(index, *margin_cells(margins), period, chosen=chosen)
-    console.print(table)
-    console.print(margins_table)
-    K = ", ".join(f"{value:.3f}" for value in reports[chosen].K)
-    slowest = reports[chosen].poles[0].real
-    tau = reports[chosen].time_constant
-    console.print(
-        f"combination {chosen}: K = \\[{K}], tau = {tau:.4f} s; from the rounded eigenvalue "
-        f"1/{-slowest:.2f} = {1.0 / round(-slowest, 2):.4f} s"
-        if slowest < -0.005
-        else f"combination {chosen}: K = \\[{K}], tau = {tau:.4f} s"
-    )
-
-
-def _plant_lines(name: str, model: LinearModel) -> list[str]:
-    """Return what the design was made for, in sentences."""
-    at = f"plant {name} at theta = {model.theta:.4f} rad"
-    if not model.hidden:
-        lines = [
-            (
-                f"{at}: A = [[0, 1], [{model.A[1, 0]:.2f}, {model.A[1, 1]:.2f}]], B = [0, {model.B[1, 0]:.2f}], "
-                f"u* = {model.effort:.4g} N m"
-            )
-        ]
-    else:
-        lines = [f"{at}: states {', '.join(model.states)}; u* = {model.effort:.4g} N m"]
-    return [*lines, *hidden_and_late(model)]
-
-
-def _document(
-    name: str,
-    model: LinearModel,
-    weights: Sequence[tuple[tuple[float, ...], float]],
-    reports: Sequence[LoopReport],
-) -> dict[str, Any]:
-    rows = []
-    for index, report in enumerate(reports):
-        row: dict[str, Any] = {"combination": index, "q": None, "r": None, **report.to_dict()}
-        if index:
-            row["q"], row["r"] = list(weights[index - 1][0]), weights[index - 1][1]
-        rows.append(row)
-    return {
-        "plant": name,
-        "theta": model.theta,
-        "effort": model.effort,
-        "states": list(model.states),
-        "delay": model.delay,
-        "A": model.A.tolist(),
-        "B": model.B.tolist(),
-        "C": model.C.tolist(),
-        "E": model.E.tolist(),
-        "rows": rows,
-    }
-
-
-def _save(
-    plant: Any,
-    model: LinearModel,
-    weights: Sequence[tuple[tuple[float, ...], float]],
-    gains: Sequence[Gain],
-    chosen: int,
-    effort_limit: float,
-    folder: Path,
-) -> list[Path]:
+def _save(plant: PlantParameters, table: _Table, effort_limit: float, folder: Path) -> list[Path]:
     # Imported late: only --figures needs matplotlib.
     from pendulum_lqr.design_command.figures import design_figures
 
     rows = [
         (f"{index}: Q = ({diagonal[0]:g}, {diagonal[1]:g}), R = {cost:g}", gain)
-        for index, ((diagonal, cost), gain) in enumerate(zip(weights, gains, strict=True), start=1)
+        for index, ((diagonal, cost), gain) in enumerate(zip(table.weights, table.gains, strict=True), start=1)
     ]
     paths = []
     with writing(f"figures in {folder}", ParameterError):
         folder.mkdir(parents=True, exist_ok=True)
-        for name, figure in design_figures(plant, model, rows, chosen - 1, effort_limit).items():
+        for name, figure in design_figures(plant, table.model, rows, table.chosen - 1, effort_limit).items():
             path = folder / f"{name}.png"
             figure.savefig(path)
             paths.append(path)

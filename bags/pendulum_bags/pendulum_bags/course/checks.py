@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -76,7 +77,7 @@ class Judgement:
         return f"{'right' if self.right else 'wrong'}: {self.reason}"
 
 
-def check_gains(tasks: Tasks, q: tuple[float, float], r: float) -> Judgement:
+def check_gains(tasks: Tasks, q: Sequence[float], r: float) -> Judgement:
     """Judge the weights of an LQR on the thesis's plant by the time constant of its loop.
 
     Args:
@@ -234,7 +235,7 @@ def _what_is_missing(since: Any, untold: Any, until: float) -> str:
     return ""
 
 
-def time_constant(q: tuple[float, float], r: float) -> float:
+def time_constant(q: Sequence[float], r: float) -> float:
     """Return the time constant of an LQR's loop around the thesis's plant [s].
 
     Args:
