@@ -14,7 +14,7 @@ import pytest
 from pendulum_bags.commands.compare_cli import main as compare
 from pendulum_bags.commands.report_cli import main as report
 from pendulum_bags.frequency_response.analyse import MACHINE, NUMBERS, analyse_responses
-from pendulum_bags.frequency_response.designs import design_rows, design_text
+from pendulum_bags.frequency_response.designs import design_rows
 from pendulum_bags.report import FIGURES
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.verdict import write_layer
@@ -118,9 +118,10 @@ def test_the_report_draws_the_certified_gains_of_a_measured_machine(
 
 
 @pytest.mark.parametrize("text", [GOOD, BAD, "q=0.5,1e-05 r=2", "lqi", "pid"])
-def test_the_name_of_a_design_says_how_to_ask_for_it_again(machine: Path, text: str) -> None:
+def test_a_stored_design_says_how_to_ask_for_it_again(machine: Path, text: str) -> None:
     (design,) = analyse_responses([read_response(machine)], "thesis", [text]).designs
-    assert design_text(design.name) == text
+    stored = design.to_json()
+    assert (stored["text"] or stored["name"]) == text
 
 
 def policy_file(folder: Path, gains: tuple[float, float], **changes: Any) -> Path:

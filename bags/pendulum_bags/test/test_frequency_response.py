@@ -196,7 +196,7 @@ def test_the_command_reads_bags_of_any_noise(capsys):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("q=100", "expected 'q=100,0.01 r=0.1'|controller is 'q=100'"),
+        ("q=100", "expected 'q=... r=...' or 'k=...' with 2 numbers for q or k, for theta, theta_dot"),
         ("lqx", "controller is 'lqx'; did you mean 'lq"),
     ],
 )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pendulum_bags.experiments.joint_run import JointRun, JointSettings, stand_in_for
-from pendulum_bags.frequency_response.joint_designs import joint_designs
+from pendulum_bags.frequency_response.designs import read_designs
 from pendulum_bags.ranking import joint_choice
 from pendulum_bags.ranking.joint_choice import joint_cost_parts, rank_joints, rankable
 from pendulum_bags.ranking.present import Words, same_choice
@@ -52,7 +52,7 @@ def record(bag: Path, run: JointRun, **_: Any) -> Path:
 
 def designs(*texts: str) -> Any:
     plant = load_mechanism("cart_pole")
-    return joint_designs(texts, plant, linearise(plant))
+    return read_designs(texts, plant, linearise(plant))
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from pendulum_bags.experiments.joint_run import JointSettings, stand_in_for
 from pendulum_bags.frequency_response.analyse import analyse_responses
+from pendulum_bags.frequency_response.designs import certify_designs
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.figures import response_figures
-from pendulum_bags.frequency_response.joint_designs import certify_joint_designs
 from pendulum_bags.frequency_response.joint_experiment import JointMultisine
 from pendulum_bags.frequency_response.record import Record
 from pendulum_bags.verdict import Mark
@@ -271,7 +271,7 @@ def test_a_machine_that_falls_under_the_design_is_not_certified() -> None:
         ("k=1,2,3", "with 4 numbers for q or k"),
         ("q=1,1,1,1 r=1,2", "one for r"),
         ("pid", "expected 'q=... r=...' or 'k=...'"),
-        ("q=1,1,1,e r=1", "are not all numbers"),
+        ("q=1,1,1,e r=1", "with 4 numbers for q or k"),
         ("q=1,1,1,-1 r=1", "weight"),
     ],
 )
@@ -279,14 +279,14 @@ def test_what_is_no_design_of_the_plant_is_refused(design: str, words: str) -> N
     plant, model = load_mechanism("cart_pole"), _model("cart_pole")
     certifier = Certifier(model, Machine.beside(_exact(model, plant, "hw"), model), _scaling(plant, model))
     with pytest.raises(ParameterError, match=words):
-        certify_joint_designs([design], plant, certifier)
+        certify_designs([design], plant, certifier)
 
 
 def test_a_gain_is_certified_as_it_is_written() -> None:
     plant, model = load_mechanism("cart_pole"), _model("cart_pole")
     certifier = Certifier(model, Machine.beside(_exact(model, plant, "hw"), model), _scaling(plant, model))
     K = output_lqr(model, *plant.mechanism.weights).K
-    own, same, wrong = certify_joint_designs(
+    own, same, wrong = certify_designs(
         ["q=10,100,1,1 r=0.1", "k=" + ",".join(map(repr, map(float, K))), "k=0,0,0,0"], plant, certifier
     )
     assert own.certificate == same.certificate

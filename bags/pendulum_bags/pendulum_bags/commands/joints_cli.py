@@ -108,8 +108,7 @@ def joints(
         record_joints,
         stand_in_for,
     )
-    from pendulum_bags.frequency_response.designs import designs_table
-    from pendulum_bags.frequency_response.joint_designs import joint_designs
+    from pendulum_bags.frequency_response.designs import designs_table, read_designs
     from pendulum_bags.frequency_response.joint_experiment import FOLDER, JointMultisine, measure_joints
     from pendulum_bags.ranking.joint_choice import COST, DURATION, rank_joints, rankable
     from pendulum_bags.ranking.joint_choice import FOLDER as RANKING
@@ -133,7 +132,7 @@ def joints(
         )
     on = design_for(simulated)
     # Before anything runs: a slip of the pen should not cost a minute.
-    designs = joint_designs(design or (), on, linearise(on)) if design or rank_seeds else ()
+    designs = read_designs(design or (), on, linearise(on)) if design or rank_seeds else ()
     ranked = rankable(designs) if rank_seeds else ()
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pendulum_bags.frequency_response.compare import compare_responses
-from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, design_text, policies_of
+from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, policies_of
 from pendulum_bags.frequency_response.estimate import estimate
-from pendulum_bags.frequency_response.joint_designs import certify_joint_designs
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, LONGER, same_plant, which_controllers
 from pendulum_bags.frequency_response.record import Record, record_of_joints, record_of_run
 from pendulum_bags.frequency_response.result import Analysis
@@ -27,6 +25,7 @@ from pendulum_lqr.responses.machine_response import Machine
 from pendulum_lqr.responses.measured_response import MeasuredResponse, read_response
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 __all__ = [
@@ -133,9 +132,9 @@ def analyse_responses(
         DataError: A policy file cannot be read.
     """
     by_label = {response.label: response for response in responses}
-    certify: Callable[[Certifier], list[DesignResult]]
+    own: AnyPlant
     if responses[0].joints:
-        mechanism = load_mechanism(plant)
+        own = mechanism = load_mechanism(plant)
         _refuse_other_joints(mechanism, responses[0])
         model, (q, r) = linearise(mechanism), mechanism.mechanism.weights
         joints, effort_unit = mechanism.coordinates.joints, mechanism.coordinates.drive_unit
@@ -143,14 +142,12 @@ def analyse_responses(
         scaling = scaling or JointScaling.of_weights(model.measured, units, q, r, effort_unit)
         machine = Machine.beside(by_label["hw"], model) if "hw" in by_label else None
         longer = longer or f"{LONGER_OF_JOINTS} --plant {plant}"
-        certify = partial(certify_joint_designs, designs, mechanism)
     else:
-        parameters = load_plant(plant)
-        model = linearise(parameters)
+        own = load_plant(plant)
+        model = linearise(own)
         scaling, margin = scaling or DEFAULT_SCALING, GAP_MARGIN if margin is None else margin
         machine = Machine.of(by_label["hw"]) if "hw" in by_label else None
         longer = longer or LONGER
-        certify = partial(certify_designs, designs, parameters, model, recorded=recorded)
     certifier = Certifier(model, machine, scaling) if machine is not None else None
     difference = None
     results: list[DesignResult] = []
@@ -161,7 +158,7 @@ def analyse_responses(
         difference = compare_responses(by_label["sim"], by_label["hw"], model, scaling)
         layers.append(same_plant(by_label["sim"], by_label["hw"], difference, margin, longer=longer))
     if certifier is not None:
-        results = certify(certifier)
+        results = certify_designs(designs, own, certifier, recorded=recorded)
         layers.append(which_controllers(certifier, results, longer=longer))
     case = Case(*(str(by_label[side].facts.get(IDENTITY, "")) if side in by_label else "" for side in ("sim", "hw")))
     layers = [replace(layer, case=case) for layer in layers]
@@ -222,8 +219,6 @@ def _kept(machine: Path) -> _Kept:
     path = (machine if machine.is_dir() else machine.parent) / NUMBERS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return _Kept(
-            [one.get("text") or design_text(one["name"]) for one in content["designs"]], Scaling(**content["scaling"])
-        )
+        return _Kept([one["text"] or one["name"] for one in content["designs"]], Scaling(**content["scaling"]))
     except (OSError, ValueError, KeyError, TypeError):
         return _Kept()

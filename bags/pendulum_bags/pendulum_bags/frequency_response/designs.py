@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pendulum_lqr.design_command.design_cli import THESIS_WEIGHTS
 from pendulum_lqr.linear.design import output_lqr
@@ -17,18 +18,47 @@ from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy
 from pendulum_lqr.responses.certificate import Certificate, Certifier
 from pendulum_lqr.responses.controller_response import controller_response
 from pendulum_msgs_py.errors import ParameterError, PendulumError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.terminal import WholeTable
 
-__all__ = ["DesignResult", "certify_designs", "design_rows", "design_text", "designs_table", "policies_of"]
+__all__ = [
+    "Design",
+    "DesignResult",
+    "certify_designs",
+    "design_rows",
+    "designs_table",
+    "policies_of",
+    "read_designs",
+]
 
-_NUMBER = r"[-+0-9.eE]+"
-_WEIGHTS = re.compile(rf"q=({_NUMBER}),({_NUMBER})(?:[ ;]+r=({_NUMBER}))?")
+_NUMBERS = r"[-+0-9.eE]+(?:,[-+0-9.eE]+)*"
+_WEIGHTS = re.compile(rf"q=({_NUMBERS})(?:[ ;]+r=({_NUMBERS}))?")
+_GAIN = re.compile(rf"k=({_NUMBERS})")
+_OTHER_COSTS = (1.0, 0.1, 10.0, 100.0)
+"""Costs of the effort of the default designs of several joints, in units of that of the plant's own LQR."""
 _LARGER = 10.0
 """A law is linear near upright if it responds to disturbances of this size as to those of size 1 ..."""
 _NOT_LINEAR = 0.1
 """... within this share at each frequency, angle and velocity counted in units of the task."""
-_GAIN = re.compile(rf"k=({_NUMBER}),({_NUMBER})")
+
+
+@dataclass(frozen=True)
+class Design:
+    """A static gain.
+
+    Attributes:
+        name: As in tables.
+        text: As it was given.
+        K: Gain on what is measured, shape (2 k,) for k joints.
+        weights: q and r of an LQR; None for a gain.
+    """
+
+    name: str
+    text: str
+    K: NDArray[np.float64]
+    weights: tuple[tuple[float, ...], float] | None = None
 
 
 @dataclass(frozen=True)
@@ -82,31 +112,87 @@ class DesignResult:
         }
 
 
+def read_designs(texts: Sequence[str], plant: MechanismParameters, model: LinearModel) -> list[Design]:
+    """Return the designs that texts stand for, made on a plant of several joints, one of them driven.
+
+    Args:
+        texts: As of :func:`certify_designs`, LQR and gains alone.
+        plant: The plant.
+        model: Its linear model.
+
+    Raises:
+        ParameterError: A text is no design of this plant.
+    """
+    cost = plant.mechanism.weights[1]
+    return [_static(text, cost, model) for text in _asked(texts, plant)]
+
+
 def certify_designs(
-    texts: Sequence[str], plant: PlantParameters, model: LinearModel, certifier: Certifier, *, recorded: bool = False
+    texts: Sequence[str], plant: AnyPlant, certifier: Certifier, *, recorded: bool = False
 ) -> list[DesignResult]:
     """Return the certificates of designs that were made on a plant.
 
     Args:
-        texts: ``q=100,0.01 r=0.1`` for LQR, ``k=33,0.2`` for a gain, a controller's name or a policy file; none for the
-            four combinations of the thesis.
+        texts: ``q=100,0.01 r=0.1`` for LQR, positions before velocities, ``k=33,0.2`` for a gain; of one joint also a
+            controller's name or a policy file. None for the four combinations of the thesis, or for the own LQR of a
+            plant of several joints and three with another cost of the effort.
         plant: The plant.
-        model: Its linear model.
-        certifier: Of the model and the measured machine.
+        certifier: Of its linear model and the measured machine.
         recorded: Whether they are from an earlier run: a policy file that cannot be read any more is then unknown.
 
     Raises:
         ParameterError: A text is no design, or a policy is not for the plant.
         DataError: A policy file cannot be read.
     """
-    asked = list(texts) or [f"q={q[0]:g},{q[1]:g} r={r:g}" for q, r in THESIS_WEIGHTS]
+    cost = plant.mechanism.weights[1] if isinstance(plant, MechanismParameters) else THESIS_WEIGHTS[0][1]
     found = []
-    for text in map(str.strip, asked):
-        if text.endswith(POLICY_SUFFIX):
+    for text in _asked(texts, plant):
+        if isinstance(plant, MechanismParameters) or text.startswith(("q=", "k=")):
+            one = _static(text, cost, certifier.plant)
+            found.append(DesignResult(one.name, tuple(map(float, one.K)), certifier.gain(one.K), text=text))
+        elif text.endswith(POLICY_SUFFIX):
             found.append(_policy(text, plant, certifier, recorded=recorded))
         else:
-            found.append(_one(text, plant, model, certifier))
+            machine = certifier.machine
+            response, stable = controller_response(text, plant, machine.frequency, machine.period)
+            found.append(DesignResult(text, None, certifier.feedback(response, stable=stable)))
     return found
+
+
+def _asked(texts: Sequence[str], plant: AnyPlant) -> list[str]:
+    usual: Sequence[tuple[tuple[float, ...], float]] = THESIS_WEIGHTS
+    if isinstance(plant, MechanismParameters):
+        q, r = plant.mechanism.weights
+        usual = [(q, r * share) for share in _OTHER_COSTS]
+    written = (f"q={','.join(f'{weight:g}' for weight in q)} r={r:g}" for q, r in usual)
+    return [text.strip() for text in list(texts) or written]
+
+
+def _static(text: str, own_cost: float, model: LinearModel) -> Design:
+    """Return the gain that a text stands for."""
+    size = len(model.measured)
+    if match := _WEIGHTS.fullmatch(text):
+        weights, costs = _numbers(match[1]), _numbers(match[2] or f"{own_cost}")
+        if len(weights) == size and len(costs) == 1:
+            K = np.asarray(output_lqr(model, weights, costs[0]).K, dtype=np.float64)
+            name = f"LQR q=({', '.join(f'{value:g}' for value in weights)}) r={costs[0]:g}"
+            return Design(name, text, K, (tuple(weights), costs[0]))
+    elif match := _GAIN.fullmatch(text):
+        gain = _numbers(match[1])
+        if len(gain) == size:
+            return Design(f"K=({', '.join(f'{value:g}' for value in gain)})", text, np.array(gain))
+    raise ParameterError(
+        f"design is {text!r}; expected 'q=... r=...' or 'k=...' with {size} numbers for q or k, for "
+        f"{', '.join(model.measured)}, and one for r"
+    )
+
+
+def _numbers(text: str) -> list[float]:
+    """Return the numbers that a text lists, none where one of them is no number."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
 
 
 def design_rows(designs: Sequence[DesignResult]) -> list[tuple[str, ...]]:
@@ -144,11 +230,6 @@ def designs_table(designs: Sequence[DesignResult]) -> WholeTable:
     for row in design_rows(designs):
         table.add_row(*row)
     return table
-
-
-def design_text(name: str) -> str:
-    """Return the text that :func:`certify_designs` reads for a design of a name in a table."""
-    return re.sub(r"^K=", "k=", re.sub(r"\(([^()]+), ([^()]+)\)", r"\1,\2", name.removeprefix("LQR ")))
 
 
 def policies_of(record: Mapping[str, Any]) -> list[str]:
@@ -200,25 +281,3 @@ def _policy(path: str, plant: PlantParameters, certifier: Certifier, *, recorded
             f"{100.0 * change:.0f} %"
         )
     return DesignResult(name, None, certifier.feedback(answers[0][0], stable=True), unknown, text)
-
-
-def _one(text: str, plant: PlantParameters, model: LinearModel, certifier: Certifier) -> DesignResult:
-    try:
-        if match := _WEIGHTS.fullmatch(text):
-            q11, q22, r = (float(part) if part else 0.1 for part in match.groups())
-            K = np.asarray(output_lqr(model, (q11, q22), r).K, dtype=np.float64)[:2]
-            name = f"LQR q=({q11:g}, {q22:g}) r={r:g}"
-        elif match := _GAIN.fullmatch(text):
-            K = np.array([float(part) for part in match.groups()])
-            name = f"K=({K[0]:g}, {K[1]:g})"
-        else:
-            machine = certifier.machine
-            response, stable = controller_response(text, plant, machine.frequency, machine.period)
-            return DesignResult(text, None, certifier.feedback(response, stable=stable))
-    except ParameterError:
-        raise
-    except ValueError as error:
-        raise ParameterError(
-            f"design is {text!r}; expected 'q=100,0.01 r=0.1', 'k=33,0.2' or the name of a controller"
-        ) from error
-    return DesignResult(name, (float(K[0]), float(K[1])), certifier.gain(K))

@@ -71,7 +71,7 @@ def measure_joints(
         folder: The run folder; the recordings, numbers, figures and the page go to its ``frequency_response``.
         multisine: What to run.
         machine: Plant file of the surrogate of the machine.
-        designs: As :func:`pendulum_bags.frequency_response.joint_designs.certify_joint_designs` reads them.
+        designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them.
         hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
         on_side: Called with each side's name when it starts.
         on_analysis: Called with the next step's text afterwards.

@@ -13,7 +13,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.joint_run import JointRun, JointSettings, design_file, fall_time
 from pendulum_bags.experiments.lockstep import record_run
-from pendulum_bags.frequency_response.joint_designs import JointDesign
+from pendulum_bags.frequency_response.designs import Design
 from pendulum_bags.ranking.contender import contenders_of
 from pendulum_bags.ranking.ranking import Ranking, rank
 from pendulum_msgs_py.contract.names import EFFORT_COMMAND, JOINT_STATES
@@ -31,7 +31,7 @@ DURATION = 5.0
 _LEAST = 3
 
 
-def rankable(designs: Sequence[JointDesign]) -> Sequence[JointDesign]:
+def rankable(designs: Sequence[Design]) -> Sequence[Design]:
     """Return the designs, if they can be ranked.
 
     Raises:
@@ -81,7 +81,7 @@ def rank_joints(
     folder: Path,
     settings: JointSettings,
     machine: Path,
-    designs: Sequence[JointDesign],
+    designs: Sequence[Design],
     seeds: Sequence[int],
     *,
     hosts: HostPool | None = None,
