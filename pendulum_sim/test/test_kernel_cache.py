@@ -167,6 +167,39 @@ def test_functions_that_differ_in_a_name_or_in_what_they_keep_are_not_the_same()
     assert words(scaled(2.0)) == words(scaled(2.0))
 
 
+def test_a_kernel_is_compiled_again_for_what_it_reaches_and_for_nothing_else(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = {
+        "reach_top": "import reach_middle\ndef law(x):\n    return reach_middle.scaled(x)\n",
+        "reach_middle": "import numba\nfrom reach_numbers import FACTOR\n@numba.njit(forceinline=True)\n"
+        "def scaled(x):\n    return FACTOR * x\n",
+        "reach_numbers": "FACTOR = 2.0\nOTHER = 1.0\n",
+    }
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def made(**changed: str) -> numba.core.dispatcher.Dispatcher:
+        for name, text in (source | changed).items():
+            (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
+            sys.modules.pop(name, None)
+        kernel_cache._source_of.cache_clear()
+        importlib.invalidate_caches()
+        return kernel(importlib.import_module("reach_top").law)
+
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    numbers, middle = source["reach_numbers"], source["reach_middle"]
+    for changed, expected, cached in (
+        ({}, 5.0, False),
+        ({"reach_numbers": numbers.replace("1.0", "7.0")}, 5.0, True),
+        ({"reach_numbers": numbers.replace("2.0", "3.0")}, 7.0, False),
+        ({"reach_middle": middle.replace("* x", "+ x")}, 5.0, False),
+    ):
+        one = made(**changed)
+        assert (one(2.0), taken(one)) == (expected, cached), changed
+    assert (first := made())(2.0) == 5.0
+    assert not taken(first)
+
+
 def test_a_module_of_somebody_else_is_known_by_its_source(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -223,25 +223,6 @@ def test_ctrl_c_behind_the_first_layer_gives_the_answer_so_far(
     assert processes.leftovers() == []
 
 
-def test_a_spent_budget_ends_with_what_was_measured_and_says_what_was_left_out(
-    processes: ProcessGroup, domain_id: int, tmp_path: Path
-) -> None:
-    folder = tmp_path / "run"
-    program = processes.start(
-        "pendulum_bags", "experiment", "thesis", "--out", folder, *FAST, "--budget", "4", alone=True
-    )
-    assert program.wait(300) == 0, program.output
-    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    assert summary["answer"]["layers"][0]["mark"] == "no"
-    assert summary["identified"] is None
-    (note,) = summary["left_out"]
-    assert note.startswith("The budget of 4 s was spent: ")
-    assert note in " ".join(program.output.split())
-    # The next step keeps the options of this run.
-    assert "--ramp-speed 0.8 --duration 1 --budget 16" in program.output
-    assert processes.leftovers() == []
-
-
 def _command_line(process: psutil.Process) -> set[str]:
     """Return the words of a command line, none where the process has just ended."""
     try:

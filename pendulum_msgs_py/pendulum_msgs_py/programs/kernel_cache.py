@@ -1,7 +1,8 @@
 """A cache on disk of what numba compiles, so that a restarted program need not compile for seconds.
 
 Numba's own ``cache=True`` identifies a function by its file alone. Kernels here are made of functions from several
-files, for a method or a mechanism: their key is that choice and all source of the packages that they come from.
+files, for a method or a mechanism: their key is that choice, the modules of all functions that they reach, and the
+values that those functions find in their globals and closures.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import sys
 from collections.abc import Iterable
 from functools import cache, partial
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 from pendulum_msgs_py.whole_file import write_whole
@@ -24,6 +25,9 @@ __all__ = ["KernelStore", "drop_stale_code", "keep_kernel", "name_symbols_apart"
 
 _COUNTED = re.compile(rb"B\dv\d{1,8}B")
 """Part of a symbol that bears a number of numba's own count."""
+_ADDRESS = re.compile(r" at 0x[0-9a-f]+")
+_COMPILERS = ("pendulum_msgs_py.loops.trees", __name__)
+"""Modules that decide how kernels are compiled."""
 
 
 @cache
@@ -43,8 +47,7 @@ def keep_kernel(dispatcher: Any, name: str, *choice: object) -> Any:
     """Return a compiled function that loads its machine code from disk, or stores it there.
 
     Args:
-        dispatcher: What ``numba.njit`` returned. Of the project's functions it may call those of its own package and of
-            ``pendulum_msgs_py``.
+        dispatcher: What ``numba.njit`` returned.
         name: The kernel's name, unique in its package.
         choice: All that the function was made for: functions that it calls, by their code, the rest by ``repr``.
     """
@@ -71,11 +74,9 @@ class KernelStore:
         name_symbols_apart()
         self._folder = Path(self._numba.caching.CompileResultCacheImpl(function).locator.get_cache_path())
         self._name = name
-        made_of = [function, *(each for each in choice if isinstance(each, FunctionType))]
-        packages = sorted({"pendulum_msgs_py", *(each.__module__.partition(".")[0] for each in made_of)})
-        versions = (sys.version, sys.modules["numba"].__version__, sys.modules["llvmlite"].__version__)
-        self._known = (name, packages, tuple(map(_words, choice)), versions)
-        self._source = _digest("".join(map(_source_of, packages)).encode())
+        versions = (sys.version, *(sys.modules[each].__version__ for each in ("numba", "llvmlite", "numpy")))
+        self._known = (name, function.__module__, tuple(map(_words, choice)), versions)
+        self._source = _digest("\n".join(sorted(_made_of((function, *choice)))).encode())
 
     @property
     def cache_path(self) -> str:
@@ -135,18 +136,59 @@ def _digest(content: bytes) -> bytes:
     return hashlib.sha256(content).hexdigest().encode()
 
 
+def _made_of(values: Iterable[Any]) -> set[str]:
+    """Return the source of all modules that functions reach by name, and what else they find there."""
+    found, waiting, seen = set[str](), [*values, *map(sys.modules.get, _COMPILERS)], dict[int, Any]()
+    while waiting:
+        value = waiting.pop()
+        if hasattr(value, "py_func"):
+            found.add(_ADDRESS.sub("", repr(sorted(value.targetoptions.items()))))
+            value = value.py_func
+        if id(value) in seen:
+            continue
+        seen[id(value)] = value
+        if isinstance(value, FunctionType):
+            if _ours(value.__module__):
+                found.add(_source_of(value.__module__))
+                waiting += _reached(value)
+        elif isinstance(value, ModuleType):
+            if _ours(value.__name__):
+                found.add(_source_of(value.__name__))
+        elif isinstance(value, (tuple, list, dict)):
+            waiting += value.values() if isinstance(value, dict) else value
+        else:
+            kind = value if isinstance(value, type) else type(value)
+            if _ours(kind.__module__):
+                found.add(_source_of(kind.__module__))
+            found.add(value.tobytes().hex() if hasattr(value, "tobytes") else _ADDRESS.sub("", repr(value)))
+    return found
+
+
+def _reached(function: FunctionType) -> list[Any]:
+    """Return what the code of a function, and of those inside it, may find by the names in it."""
+    codes, names = [function.__code__], set[str]()
+    for code in codes:
+        names |= set(code.co_names)
+        codes += [each for each in code.co_consts if isinstance(each, CodeType)]
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    values = [*cells, *(function.__globals__[name] for name in names if name in function.__globals__)]
+    for each in values:
+        if isinstance(each, ModuleType) and _ours(each.__name__):
+            inside = [vars(each)[name] for name in names if name in vars(each)]
+            values += [part for part in inside if not any(part is value for value in values)]
+    return [*values, *(function.__defaults__ or ())]
+
+
+def _ours(module: str) -> bool:
+    """Return whether a module's source counts: not that of Python and of what has its version in the key."""
+    return module.partition(".")[0] not in {*sys.stdlib_module_names, "numba", "numpy", "llvmlite"}
+
+
 @cache
-def _source_of(package: str) -> str:
-    """Return what identifies all Python source of a package, or of a single module."""
-    module = sys.modules[package]
-    folders = [Path(each) for each in getattr(module, "__path__", ())]
-    files = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
-    if not folders and (alone := getattr(module, "__file__", None)):
-        files = [Path(alone)]
-    total = hashlib.sha256()
-    for path in files:
-        total.update(f"{path}\n".encode() + path.read_bytes())
-    return total.hexdigest()
+def _source_of(name: str) -> str:
+    """Return what identifies the source of a module."""
+    file = getattr(sys.modules.get(name), "__file__", None)
+    return f"{name} {_digest(Path(file).read_bytes()).decode() if file else ''}"
 
 
 def drop_stale_code(kernel: Any, modules: Iterable[ModuleType]) -> None:
