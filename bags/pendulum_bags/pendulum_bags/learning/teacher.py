@@ -93,7 +93,7 @@ class Teacher:
         return states, np.where(nodes[:, None] > 0, self.efforts[nodes - 1], 0.0)
 
 
-@numba.njit
+@numba.njit(cache=True)
 def _nearest(states: Any, nodes: Any, costs: Any, turns: Any) -> Any:
     """Return the node of least cost for each state, and that cost."""
     count, size = states.shape
