@@ -23,7 +23,6 @@ from pendulum_bags.experiments import lockstep
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, keep_pool
 from pendulum_bags.experiments.in_process import simulate
-from pendulum_bags.experiments.joint_run import JointRun, JointSettings
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
@@ -168,7 +167,7 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
     monkeypatch.setattr(RecorderClient, "received", counted)
     monkeypatch.setattr(lockstep, "time", SimpleNamespace(monotonic=lambda: now))
     # The conductor knows the state of one joint only, and looks away from any.
-    spec = JointRun(JointSettings("cart_pole", duration=20.0), "sim", "cart_pole", "cart_pole")
+    spec = RunSpec(plant="cart_pole", design_plant="cart_pole", duration=20.0)
     with pytest.raises(
         FaultError,
         match=rf"waited {lockstep._PATIENCE:g} s for 10 more states of a run of 20 s of simulated time, in vain",
@@ -234,10 +233,10 @@ def test_several_joints_and_what_stands_in_for_their_machine_end_in_one_answer(
     assert 18.0 < late["estimate"] < 28.0
     designs = [row for row in layers["which_controllers"]["evidence"] if row["quantity"].startswith("margin b")]
     assert len(designs) == 4
-    measured = read_response(out / "frequency_response")
+    measured = read_response(out)
     assert measured.joints == ("cart", "pole")
     assert (measured.facts["blocks"], measured.facts["block_length_s"], measured.frequency[0]) == (3, 1.0, 1.0)
-    assert (out / "frequency_response" / "frequency_response.html").is_file()
+    assert (out / "report.html").is_file()
     machine, plant = load_mechanism(out / "machine.yaml"), load_mechanism("cart_pole")
     assert machine.value("cart.transport_delay") == 0.02
     assert 0.0 < abs(machine.value("cart_mass") / plant.value("cart_mass") - 1.0) <= 0.05

@@ -13,8 +13,8 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from pendulum_bags.commands.compare_cli import main
-from pendulum_bags.commands.experiment_cli import _print_summary
 from pendulum_bags.commands.report_cli import main as report_main
+from pendulum_bags.commands.whole_run import _print_summary
 from pendulum_bags.comparison import Outcome, compare_folders, compare_runs, read_run
 from pendulum_bags.comparison.compare import _pool
 from pendulum_bags.report import FIGURES

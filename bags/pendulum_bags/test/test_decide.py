@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pendulum_bags.commands.experiment_cli import _summary
+from pendulum_bags.commands.whole_run import _summary
 from pendulum_bags.comparison import Margins, Outcome, compare_folders, read_run
-from pendulum_bags.experiments.decide import Budget, decide
+from pendulum_bags.experiments.deadline import BudgetSpentError, Deadline
+from pendulum_bags.experiments.decide import decide
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.repeats import (
@@ -48,7 +49,7 @@ class Recorder:
         self.now = 0.0
         self.recorded: list[int] = []
 
-    def __call__(self, folder: Path, settings: RegulationSettings, number: int, **_: Any) -> None:
+    def __call__(self, folder: Path, settings: Any, number: int, *_: Any) -> None:
         noise = repeat_settings(settings, number).noise
         write_pair(repeat_folder(folder, number), noise.seed, 4.0 * number, **self.changes)
         self.recorded.append(number)
@@ -66,7 +67,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_run_that_decides_is_not_repeated(folder: Path) -> None:
     recorder = Recorder(1.0)
-    found = decide(folder, SETTINGS, Margins.parse(), Budget(60.0, recorder.clock), record=recorder)
+    (found,) = decide(folder, SETTINGS, Margins.parse(), Deadline(60.0, clock=recorder.clock), record=recorder).values()
     assert found.verdict.outcome is Outcome.EQUIVALENT
     assert recorder.recorded == []
     assert read_looks(folder) == 1
@@ -85,7 +86,7 @@ def test_an_undecided_run_is_repeated_with_new_noise_until_it_is_decided_and_rea
 ) -> None:
     recorder = Recorder(1.0)
     margins = near(folder)
-    found = decide(folder, SETTINGS, margins, Budget(1000.0, recorder.clock), record=recorder)
+    (found,) = decide(folder, SETTINGS, margins, Deadline(1000.0, clock=recorder.clock), record=recorder).values()
     assert found.verdict.outcome is not Outcome.UNDECIDED
     assert recorder.recorded == list(range(1, len(found.pairs)))
     assert len(recorder.recorded) >= 1
@@ -97,7 +98,9 @@ def test_an_undecided_run_is_repeated_with_new_noise_until_it_is_decided_and_rea
 
 def test_a_spent_budget_leaves_it_undecided_and_says_what_it_would_take(folder: Path) -> None:
     recorder = Recorder(40.0)
-    found = decide(folder, SETTINGS, near(folder, 0.05), Budget(30.0, recorder.clock), record=recorder)
+    (found,) = decide(
+        folder, SETTINGS, near(folder, 0.05), Deadline(30.0, clock=recorder.clock), record=recorder
+    ).values()
     assert recorder.recorded == [1]
     assert found.verdict.outcome is Outcome.UNDECIDED
     (step,) = same_run_layer(found, more="make experiment").next_steps
@@ -105,14 +108,27 @@ def test_a_spent_budget_leaves_it_undecided_and_says_what_it_would_take(folder: 
     assert "more run" in step
 
 
+def test_a_repeat_that_does_not_end_in_time_is_left_out(folder: Path) -> None:
+    recorder = Recorder(1.0)
+
+    def late(folder: Path, settings: Any, number: int, deadline: Deadline) -> None:
+        recorder.now += 100.0
+        deadline.require()
+
+    (found,) = decide(folder, SETTINGS, near(folder, 0.05), Deadline(60.0, clock=recorder.clock), record=late).values()
+    assert len(found.pairs) == read_looks(folder) == 1
+    with pytest.raises(BudgetSpentError, match="is spent"):
+        Deadline(60.0, 100.0).share(1.0).require(40.0)
+
+
 def test_no_budget_and_a_real_actuator_mean_one_look(folder: Path) -> None:
     recorder = Recorder(1.0)
     margins = near(folder)
-    assert len(decide(folder, SETTINGS, margins, Budget(0.0, recorder.clock), record=recorder).pairs) == 1
+    assert len(decide(folder, SETTINGS, margins, None, record=recorder)[""].pairs) == 1
     hebi = RegulationSettings(noise=NOISE)
     # Behind its check of the lab file, which is not the matter here.
     object.__setattr__(hebi, "hardware", "hebi")
-    assert len(decide(folder, hebi, margins, Budget(60.0, recorder.clock), record=recorder).pairs) == 1
+    assert len(decide(folder, hebi, margins, Deadline(60.0, clock=recorder.clock), record=recorder)[""].pairs) == 1
     assert recorder.recorded == []
 
 
@@ -123,12 +139,16 @@ def test_a_run_that_a_busy_machine_disturbed_is_measured_again_and_left_out(tmp_
     write_pair(folder, 1, 2.0, keep=lost)
     recorder = Recorder(1.0)
     recorder(folder, SETTINGS, 1)
-    found = decide(folder, SETTINGS, Margins.parse(), Budget(60.0, recorder.clock), record=lambda *_, **__: None)
+    (found,) = decide(
+        folder, SETTINGS, Margins.parse(), Deadline(60.0, clock=recorder.clock), record=lambda *_: None
+    ).values()
     assert [pair.hardware.source for pair in found.pairs] == [str(repeat_folder(folder, 1) / "hw")]
     assert "because states are missing (simulation missed 250 states)" in found.left_out[0]
     # The seed that was asked for makes the run again, not that of the repeat.
     answer = answer_of(found)
-    told = _summary(SETTINGS, Findings(Simulated("thesis", SETTINGS, folder, comparison=found)), answer, [answer])
+    told = _summary(
+        "thesis", Findings(Simulated("thesis", SETTINGS, folder, comparisons={"": found})), answer, [answer]
+    )
     assert found.to_json()["seed"] != SETTINGS.noise.seed
     assert told["seed"] == SETTINGS.noise.seed
     assert found.verdict.outcome is Outcome.EQUIVALENT

@@ -22,7 +22,7 @@ from pendulum_bags.report.joint_page import joint_page
 from pendulum_bags.report.write import write_joint_report
 from pendulum_bags.runs.run_data import joints_of, read_run
 from pendulum_bags.runs.run_record import RUN_RECORD
-from pendulum_bags.verdict.answer import answer_of_joints, join_joints
+from pendulum_bags.verdict.answer import answer_of, join_joints
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_msgs_py.contract.cdr import encode_joints
@@ -144,7 +144,7 @@ def test_the_same_plant_twice_is_told_alike_in_every_joint(
     # Noise on the cart moves the pole too: both joints are paired by it.
     assert all("position" in one["paired"] for one in content["joints"].values())
     plants = {layer["sentence"].partition("--plant ")[2].split()[0] for layer in content["answer"]["layers"][1:]}
-    assert plants == {"cart_pole"}
+    assert plants == {"cart_pole."}
 
 
 def test_another_plant_is_told_by_the_joint_that_shows_it(
@@ -272,7 +272,7 @@ def test_a_page_of_several_runs_says_where_it_shows_the_first(bags: dict[str, Pa
     one = {joint: compare_runs(bags["sim"], bags["alike"], joint=joint) for joint in JOINTS}
     three = {joint: replace(found, pairs=[*found.pairs] * 3) for joint, found in one.items()}
     for comparisons, runs, words in ((one, 1, "all samples; "), (three, 3, "all samples of the first of 3 runs; ")):
-        page = joint_page(comparisons, answer_of_joints(comparisons), title="")
+        page = joint_page(comparisons, answer_of(comparisons), title="")
         assert page.runs == runs
         sentence = page.tables[0].sentence
         assert sentence.startswith(f"Spreads are of {words}the tests take both motions at the slower plant's sampling")
@@ -298,7 +298,7 @@ def test_a_report_says_that_an_emulator_stood_in_for_the_machine(
 ) -> None:
     other = write(tmp_path / "hw", recordings["alike"], stand_in="emulated machine")
     found = {joint: compare_runs(bags["sim"], other, joint=joint) for joint in JOINTS}
-    page = write_joint_report(tmp_path, found, folders=[], formats=(), answer=answer_of_joints(found))
+    page = write_joint_report(tmp_path, found, folders=[], formats=(), answer=answer_of(found))
     text = page.read_text(encoding="utf-8")
     assert "no machine was measured: an emulator took the place of the hardware" in text
 

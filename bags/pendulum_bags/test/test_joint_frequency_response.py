@@ -12,11 +12,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pendulum_bags.experiments.joint_run import JointSettings, stand_in_for
+from pendulum_bags.experiments.settings import NoiseSettings
 from pendulum_bags.frequency_response.analyse import analyse_responses
 from pendulum_bags.frequency_response.designs import certify_designs
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.figures import response_figures
-from pendulum_bags.frequency_response.joint_experiment import JointMultisine
+from pendulum_bags.frequency_response.multisine import Multisine
 from pendulum_bags.frequency_response.record import Record
 from pendulum_bags.verdict import Mark
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
@@ -47,15 +48,16 @@ def _model(name: str) -> LinearModel:
 def _record(name: str, *, periods: int = 3, noise: float = 0.0, label: str = "sim") -> Record:
     """Return a plant under its LQR and a multisine, by the plant's own equations."""
     plant = load_mechanism(name)
-    multisine = JointMultisine(JointSettings(name, amplitude=0.02 * plant.effort_limits[0]), periods)
-    parameters = {**multisine.excitation, "amplitude": multisine.run.amplitude, "seed": 3}
-    wave = make_disturbance(validate(DISTURBANCE_SPECS, parameters))
+    run = JointSettings(name, noise=NoiseSettings(3, 0.02 * plant.effort_limits[0])).run("sim")
+    run, _ = Multisine(periods=periods).specs(run, run)
+    parameters = run.disturbance_parameters()
+    wave = make_disturbance(validate(DISTURBANCE_SPECS, {k: v for k, v in parameters.items() if k != "joints"}))
     gain = output_lqr(_model(name), *plant.mechanism.weights).K
     simulated, coordinates = MechanismPlant(plant, PERIOD), plant.coordinates
     state = simulated.reset(coordinates.goal)
     generator = np.random.default_rng(1)
     n = len(coordinates.joints)
-    count = round(multisine.run.duration / PERIOD)
+    count = run.steps
     r, u, y = np.zeros(count), np.zeros(count), np.zeros((2 * n, count))
     for k in range(count):
         x = np.array([*coordinates.deviation(state.position), *state.velocity])

@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import shutil
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from pendulum_bags.experiments import joint_run
 from pendulum_bags.experiments.joint_run import (
-    JointRun,
     JointSettings,
+    default_amplitude,
+    design_file,
     design_for,
     fall_time,
     load_stand_in,
-    record_joints,
+    require_upright,
     stand_in_for,
 )
-from pendulum_bags.frequency_response.joint_experiment import JointMultisine
-from pendulum_bags.runs.run_record import RUN_RECORD
+from pendulum_bags.experiments.repeats import record_simulation
+from pendulum_bags.experiments.settings import NoiseSettings
+from pendulum_bags.frequency_response.multisine import Multisine
+from pendulum_bags.runs.run_record import RUN_RECORD, stands_in
+from pendulum_bags.whole import carry_out
+from pendulum_bags.whole.carry_out import Order
 from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import linearise
-from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
+from pendulum_msgs_py.contract.cdr import encode_joints
+from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.storage import BagWriter
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 GIVEN = ("gravity", "gear_ratio", "elbow.effort_limit", "shoulder.stribeck_velocity")
@@ -53,9 +58,6 @@ def test_a_stand_in_is_off_in_every_value_that_has_to_be_identified_and_in_no_ot
         ({"plant": "acrobot", "joint": "shoulder"}, "joint is 'shoulder'; expected one that is driven: elbow"),
         ({"controller": "mcp"}, r"controller is 'mcp'; expected one of lqr, discrete_lqr, lqi, lqg, mpc"),
         ({"controller": "nmpc"}, "controller is 'nmpc'; expected one of lqr,"),
-        ({"amplitude": 0.0}, "amplitude is 0.0; expected a finite number > 0"),
-        ({"duration": float("nan")}, "duration is nan; expected a finite number > 0"),
-        ({"hold_time": float("inf")}, "hold_time is inf; expected a finite number > 0"),
     ],
 )
 def test_settings_that_cannot_be_run_are_refused_before_anything_starts(values: dict, message: str) -> None:
@@ -63,24 +65,27 @@ def test_settings_that_cannot_be_run_are_refused_before_anything_starts(values: 
         JointSettings(**values)
 
 
-@pytest.mark.parametrize("side", ["sim", "hw"])
-def test_one_controller_is_run_and_told_of_on_both_sides_and_frequencies_are_those_of_an_lqr(side: str) -> None:
+def test_one_controller_holds_both_sides_upright_and_frequencies_are_those_of_an_lqr() -> None:
     settings = JointSettings("cart_pole", controller="mpc")
-    run = JointRun(settings, side, "cart_pole")
-    assert "controller:='mpc'" in run.controller_program().ros_arguments()
-    assert run.metadata()[RUN_RECORD]["controller"]["kind"] == "mpc"
-    multisine = JointRun(JointMultisine(settings).run, side, "cart_pole")
-    assert "controller:='lqr'" in multisine.controller_program().ros_arguments()
+    for side in ("sim", "hw"):
+        run = replace(settings, machine="cart_pole").run(side)
+        assert "controller:='mpc'" in run.controller_program().ros_arguments()
+        record = run.metadata()[RUN_RECORD]
+        assert record["controller"]["kind"] == "mpc"
+        assert stands_in(record) is (side == "hw")
+        started = run.plant_program(4).ros_arguments()
+        assert any(("start:='top'" if side == "sim" else "initial_positions:=[0.0, 3.14159") in one for one in started)
+        measured, _ = Multisine().specs(run, run)
+        assert "controller:='lqr'" in measured.controller_program().ros_arguments()
 
 
 def test_a_multisine_begins_at_the_inverse_of_its_period_and_lasts_for_those_averaged_and_one_more() -> None:
-    settings = JointSettings("cart_pole")
-    for multisine, lowest, duration in (
-        (JointMultisine(settings), 0.25, 36.1),
-        (JointMultisine(settings, 3, 1.0), 1.0, 4.1),
-    ):
-        assert multisine.excitation["frequency"] == 1.0 / multisine.excitation["signal_period"] == lowest
-        assert multisine.run.duration == pytest.approx(duration)
+    run = JointSettings("cart_pole").run("sim")
+    for multisine, lowest, duration in ((Multisine(), 0.25, 36.1), (Multisine(signal_period=1.0, periods=3), 1.0, 4.1)):
+        for measured in multisine.specs(run, replace(run, side="hw")):
+            assert measured.disturbance["frequency"] == lowest
+            assert measured.disturbance["amplitude"] == run.disturbance["amplitude"]
+            assert measured.duration == pytest.approx(duration)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0, float("nan")])
@@ -91,7 +96,7 @@ def test_a_share_that_makes_no_plant_is_refused(share: float) -> None:
 
 def test_the_noise_is_on_the_first_driven_joint_unless_another_is_named() -> None:
     assert JointSettings("double_pendulum").joint == "shoulder"
-    assert JointSettings("double_pendulum", "elbow").joint == "elbow"
+    assert JointSettings("double_pendulum", joint="elbow").joint == "elbow"
 
 
 @pytest.mark.parametrize(
@@ -133,9 +138,9 @@ def _longest_time_upright(plant: MechanismParameters, design: MechanismParameter
 
 @pytest.mark.parametrize("name", ["acrobot", "pendubot"])
 def test_the_design_of_a_run_holds_a_plant_whose_passive_joint_has_dry_friction(name: str) -> None:
-    settings, plant = JointSettings(name), load_mechanism(name)
-    assert settings.amplitude == pytest.approx(0.6)
-    assert _longest_time_upright(plant, design_for(plant), settings.amplitude) == 3.0
+    plant, amplitude = load_mechanism(name), default_amplitude(name)
+    assert amplitude == pytest.approx(0.6)
+    assert _longest_time_upright(plant, design_for(plant), amplitude) == 3.0
 
 
 def test_the_acrobot_falls_under_an_lqr_that_knows_nothing_of_its_dry_friction() -> None:
@@ -158,48 +163,38 @@ def test_a_plant_has_fallen_when_half_of_its_height_is_lost() -> None:
 
 
 @pytest.mark.parametrize(
-    ("failing", "message"),
+    ("side", "stopped", "message"),
     [
         (
-            ("sim", "hw"),
-            (
-                r"both sides failed: the simulation fell after 0.20 s; the stand-in for the machine fell .* s .*"
-                r"fault \(velocity_limit: elbow\), under noise of 0.6 N m at elbow; .* a smaller --amplitude"
-            ),
+            "hw",
+            "went to fault (velocity_limit: elbow)",
+            r"the sides part: the emulated .* fell after \S+ s and went to",
         ),
-        (
-            ("hw",),
-            r"the sides part: the stand-in for the machine fell .* \(velocity_limit: elbow\); the simulation stayed",
-        ),
-        (("sim",), "the sides part: the simulation fell after 0.20 s; the stand-in for the machine stayed upright"),
+        ("sim", "", r"the sides part: the simulation fell after \S+ s; the emulated hardware stayed upright"),
+        ("", "", ""),
     ],
 )
-def test_the_sides_that_fell_are_told_with_their_times(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: tuple[str, ...], message: str
-) -> None:
-    recorded: list[str] = []
-    closed: list[str] = []
-
-    def record(bag: Path, run: Any, **_: Any) -> None:
-        recorded.append(bag.name)
-        assert run.design == str(tmp_path / "design.yaml")
-        # The simulator has no limits and falls without a word; the bridge faults.
-        if run.has_bridge and bag.name in failing:
-            raise PlantStoppedError("/hw", "fault", "velocity_limit: elbow")
-
-    @contextmanager
-    def read(bag: Path) -> Iterator[Any]:
-        goal = np.array(load_mechanism("acrobot").coordinates.goal)
-        low = goal - [3.0, 0.0] if bag.name in failing else goal
-        states = SimpleNamespace(stamp_ns=np.array([0, 200_000_000]), position=np.array([goal, low]))
-        yield SimpleNamespace(joints=lambda topic: states)
-        closed.append(bag.name)
-
-    monkeypatch.setattr(joint_run, "record_run", record)
-    monkeypatch.setattr(joint_run, "read_bag", read)
+def test_sides_that_fell_are_reported_with_their_times(tmp_path: Path, side: str, stopped: str, message: str) -> None:
+    design = design_file(tmp_path, "acrobot")
+    settings = JointSettings("acrobot", design=design, noise=NoiseSettings(amplitude=0.6, duration=0.5))
+    for one in ("sim", "hw"):
+        # An LQR that knows nothing of the dry friction loses it.
+        changes = {"design_plant": "acrobot", "duration": 1.5} if one == side else {}
+        run = replace(settings.run(one), **changes, side="sim")
+        record_simulation(tmp_path / one, run)
+        if one == "hw":
+            bag = read_bag(tmp_path / one)
+            moved = bag.joints("/sim/joint_states")
+            shutil.rmtree(tmp_path / one)
+            with BagWriter(tmp_path / one, metadata={}) as writer:
+                writer.add_topic("/hw/joint_states", "sensor_msgs/msg/JointState")
+                for stamp, position in zip(moved.stamp_ns, moved.position, strict=True):
+                    writer.write("/hw/joint_states", int(stamp), encode_joints(int(stamp), "", moved.names, position))
+    if not message:
+        require_upright(tmp_path, settings)
+        return
     with pytest.raises(FaultError, match=message):
-        record_joints(tmp_path, JointSettings("acrobot"), tmp_path / "machine.yaml")
-    assert recorded == closed == ["sim", "hw"]
+        require_upright(tmp_path, settings, stopped)
 
 
 @pytest.mark.parametrize(
@@ -221,32 +216,34 @@ def test_an_experiment_for_one_joint_names_what_does_it_for_several(
 
 
 def test_the_main_experiment_of_a_plant_of_several_joints_is_that_of_joints(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    from pendulum_bags.commands import experiment_cli
+    from pendulum_bags.commands import experiment_cli, joints_cli
 
-    asked: list[tuple[tuple[object, ...], dict[str, object]]] = []
-    monkeypatch.setattr(experiment_cli, "joints", lambda *args, **options: asked.append((args, options)))
-    assert experiment_cli.main(["thesis", "--plant", "acrobot", "--seed", "4", "--duration", "3", "--out", "x"]) == 0
-    ((args, options),) = asked
-    assert args == (Path("x"), "acrobot")
-    assert (options["seed"], options["duration"]) == (4, 3.0)
+    ordered: list[Order] = []
+    monkeypatch.setattr(joints_cli, "run_whole", lambda out, name, order_in, **_: ordered.append(order_in(out)))
+    words = ["--plant", "acrobot", "--seed", "4", "--duration", "3", "--budget", "5", "--controller", "lqi"]
+    assert experiment_cli.main(["thesis", *words, "--contenders", "4", "--out", str(tmp_path)]) == 0
+    (order,) = ordered
+    settings = order.settings
+    assert isinstance(settings, JointSettings)
     # Its own defaults count where nothing was typed: 2.5 N m would be far too much for an acrobot.
-    assert not {"amplitude", "hold_time"} & set(options)
-    for option, value in (("--controller", "pid"), ("--hardware", "hebi"), ("--budget", "5")):
+    assert settings.noise == NoiseSettings(4, 0.6, 0.01, 3.0)
+    assert (settings.controller, order.budget, order.contenders) == ("lqi", 5.0, 4)
+    assert settings.design == str(tmp_path / "design.yaml")
+    assert load_mechanism(settings.machine).value("elbow.transport_delay") == 0.004
+    for option, value in (("--strategy", "effort_loop"), ("--ramp-speed", "0.3")):
         assert experiment_cli.main(["thesis", "--plant", "acrobot", option, value]) == 2
         assert f"error: {option} is for a plant of one joint, and acrobot has several" in capsys.readouterr().err
-    assert len(asked) == 1
+    assert len(ordered) == 1
 
 
-@pytest.mark.parametrize("options", [["--no-frequencies"], ["--plant", "double_pendulum"]])
-def test_a_design_is_refused_where_no_frequency_is_measured(
-    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_design_is_refused_where_no_frequency_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from pendulum_bags.commands.experiment_cli import main
 
-    assert main(["joints", "--design", "q=1,1,1,1", "--out", str(tmp_path / "run"), *options]) == 2
-    assert "error: --design needs both plants measured" in capsys.readouterr().err
+    words = ["--design", "q=1,1,1,1", "--plant", "double_pendulum", "--out", str(tmp_path / "run")]
+    assert main(["joints", *words]) == 2
+    assert "error: --design is for a plant with one driven joint; double_pendulum has 2" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 
@@ -261,36 +258,16 @@ def test_a_design_that_is_none_is_refused_before_anything_runs(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_plant_that_falls_under_the_multisine_alone_has_its_first_layer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from pendulum_bags.commands import compare_cli
-    from pendulum_bags.commands.experiment_cli import main
-    from pendulum_bags.frequency_response import joint_experiment
-
-    def falls(*_: Any, **__: Any) -> None:
-        raise FaultError("both sides failed: the simulation fell after 3.2 s")
-
-    compared: list[list[Path]] = []
-    monkeypatch.setattr(joint_run, "record_joints", lambda *_, **__: None)
-    monkeypatch.setattr(joint_experiment, "measure_joints", falls)
-    monkeypatch.setattr(compare_cli, "compare", lambda folders, **_: compared.append(folders))
-    assert main(["joints", "--plant", "pendubot", "--out", str(tmp_path / "run")]) == 0
-    assert compared == [[tmp_path / "run"]]
-    said = " ".join(capsys.readouterr().out.split())
-    assert "The frequencies were not measured: both sides failed: the simulation fell after 3.2 s" in said
-
-
 def test_a_run_of_several_joints_that_records_nothing_leaves_no_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from pendulum_bags.commands.experiment_cli import main
 
-    def ends(folder: Path, *_: Any, **__: Any) -> None:
-        assert (folder / "machine.yaml").is_file()
+    def ends(bag: Path, _: object) -> None:
+        assert (bag.parent / "machine.yaml").is_file()
         raise FaultError("sim_plant ended with code 2")
 
-    monkeypatch.setattr(joint_run, "record_joints", ends)
-    assert main(["joints", "--plant", "pendubot", "--out", str(tmp_path / "run")]) == 2
+    monkeypatch.setattr(carry_out, "record_simulation", ends)
+    assert main(["joints", "--plant", "pendubot", "--budget", "0", "--out", str(tmp_path / "run")]) == 2
     assert "error: sim_plant ended with code 2" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -106,6 +106,7 @@ def test_an_experiment_whose_budget_was_spent_is_carried_out_again_with_all_its_
 ) -> None:
     assert with_budget([{}, {"command": command}], 480.0) == f"{THESIS} {options} --budget 480"
     assert with_budget([{"command": "by hand"}], 480.0) == ""
+    assert with_budget([{"command": f"{command} --json"}]) == f"{THESIS} {options}"
 
 
 def test_the_emulated_machine_of_several_joints_is_kept_for_the_next_test(tmp_path: Path) -> None:
@@ -113,11 +114,10 @@ def test_the_emulated_machine_of_several_joints_is_kept_for_the_next_test(tmp_pa
     bag, machine = str(tmp_path / "hw"), tmp_path / "machine.yaml"
     assert next_test_of([{"command": joints}], "my.yaml", [bag]) == f"{joints} --plant my.yaml --seed 2"
     machine.touch()
-    kept = f"{joints} --plant my.yaml --seed 2 --machine {machine}"
+    kept = f"{joints} --plant my.yaml --seed 2 --hardware {machine}"
     assert next_test_of([{"command": joints}], "my.yaml", [bag]) == kept
-    assert next_test_of([{"command": THESIS}], "my.yaml", [bag]) == f"{THESIS} --plant my.yaml --seed 2"
-    given = next_test_of([{"command": f"{joints} --machine other.yaml"}], "my.yaml", [bag])
-    assert given == f"{joints} --machine other.yaml --plant my.yaml --seed 2"
+    given = next_test_of([{"command": f"{joints} --hardware other.yaml"}], "my.yaml", [bag])
+    assert given == f"{joints} --hardware other.yaml --plant my.yaml --seed 2"
 
 
 def test_a_record_without_a_command_tells_no_experiment() -> None:

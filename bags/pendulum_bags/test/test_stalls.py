@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.commands.experiment_cli import _print_summary, _summary
+from pendulum_bags.commands.whole_run import _print_summary, _summary
 from pendulum_bags.comparison import compare_folders
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.experiments.stalls import ATTEMPTS, is_stall, run_undisturbed
@@ -92,8 +92,8 @@ def test_runs_that_broke_off_are_told_by_the_comparison_the_terminal_and_the_rep
     run_undisturbed(run, folder, emulated=True, tell=lambda _: None)
     comparison = compare_folders([folder])
     settings, answer = RegulationSettings(), answer_of(comparison)
-    found = Findings(Simulated("thesis", settings, folder, comparison=comparison))
-    summary = _summary(settings, found, answer, [answer])
+    found = Findings(Simulated("thesis", settings, folder, comparisons={"": comparison}))
+    summary = _summary("thesis", found, answer, [answer])
     assert summary["stalls"] == [{"run": "run", "reason": f"/hw went to fault: {reason}", "logs": ""}]
     _print_summary(make_console(highlight=False), comparison, "emulator")
     page = write_report(folder, summary, comparison=comparison, recordings=[], formats=[]).read_text(encoding="utf-8")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pendulum_bags.comparison import Margins
+from pendulum_bags.experiments.deadline import BudgetSpentError, Deadline
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.machine import Machine, MachineRun
@@ -101,14 +102,14 @@ def test_two_simulations_are_not_repeated_in_advance_since_they_may_be_one(tmp_p
     run.now = "undecided"
     with pytest.raises(DataError):
         run.carry_out(fails)
-    run.compared.set()
+    run.found.given.comparisons = {"": object()}  # type: ignore[dict-item]
     # There is an answer, which must not be lost.
     run.carry_out(fails)
     assert run.found.notes == ["Undecided failed: they hold one and the same recording."]
     assert repeats == [True, False]
     # The identified plant runs as a simulator of ours, under the controller of the given one and under other noise.
     file = write_plant(tmp_path / "plant.yaml", load_plant("thesis").with_values(inertia=0.2))
-    spec, given = (lockstep_spec(one, side="sim") for one in (run.tested_with(file), settings))
+    spec, given = (lockstep_spec(one, side="sim") for one in (carry_out._with_plant(run.tested, file), settings))
     assert (spec.plant, spec.simulation) == (str(file), "")
     assert spec.design_plant == given.design_plant == "thesis"
     assert spec.seed != given.seed
@@ -127,34 +128,32 @@ def test_an_identified_plant_runs_under_the_controller_of_the_given_one(tmp_path
     assert not np.allclose(run.window.effort, simulate(own).command[:-1], atol=1e-3)
 
 
-def test_a_budget_interrupts_when_the_first_layer_is_there_and_not_before() -> None:
-    compared, spent = threading.Event(), threading.Event()
-
-    def held() -> None:
-        with carry_out._ends_with_budget(0.05, compared, spent):
-            assert not spent.wait(0.3)
-            compared.set()
-            # It comes as Ctrl-C does.
-            threading.Event().wait(20.0)
-
-    with pytest.raises(KeyboardInterrupt):
-        held()
-    assert spent.is_set()
+def test_waiting_for_a_recording_ends_with_the_budget(tmp_path: Path) -> None:
+    runs = [MachineRun(tmp_path / "a", RunSpec(disturbance=NOISE, duration=600.0))]
+    with Machine(tmp_path, runs) as machine:
+        machine.start()
+        with pytest.raises(BudgetSpentError, match=r"budget of 0.1 s is spent"):
+            machine.wait(tmp_path / "a", Deadline(0.1))
 
 
-def test_what_ends_before_its_budget_is_not_interrupted() -> None:
-    compared, spent = threading.Event(), threading.Event()
-    compared.set()
-    with carry_out._ends_with_budget(60.0, compared, spent):
-        pass
-    assert not spent.is_set()
+def test_recordings_pause_between_two_runs(tmp_path: Path) -> None:
+    runs = [MachineRun(tmp_path / name, RunSpec(disturbance=NOISE, duration=0.2)) for name in "ab"]
+    with Machine(tmp_path, runs) as machine:
+        assert machine.rests()
+        machine.start()
+        while not machine.rests():
+            threading.Event().wait(0.02)
+        assert not (tmp_path / "b").exists()
+        machine.resume()
+        machine.wait(tmp_path / "b", Deadline(60.0))
 
 
 def _answer(mark: Mark, choice: Mark) -> Answer:
     layers = [LayerResult(layer, mark, "A sentence.", reason="a reason") for layer in list(Layer)[:3]]
-    missing = " Not measured: “same choice”." if (mark, choice) == (Mark.YES, Mark.NOT_MEASURED) else ""
-    text = f"{mark.value.capitalize()}: a reason.{missing}"
-    return Answer(mark, text, [*layers, LayerResult(Layer.SAME_CHOICE, choice, "Another.")], ("the next step",))
+    missing = ("same choice",) if (mark, choice) == (Mark.YES, Mark.NOT_MEASURED) else ()
+    last = LayerResult(Layer.SAME_CHOICE, choice, "Another.")
+    holds = "" if mark is Mark.YES else "it stands"
+    return Answer(mark, "a reason", [*layers, last], ("the next step",), "Test 3 decides.", holds, missing)
 
 
 @pytest.mark.parametrize(
@@ -164,25 +163,26 @@ def _answer(mark: Mark, choice: Mark) -> Answer:
             (Mark.NO, Mark.YES),
             (Mark.YES, Mark.YES),
             (
-                "No with thesis, the plant that you had: a reason. Yes with plant.yaml, which this run found. "
-                "Of these 6 controllers the simulation picks the right one with both."
+                "No with thesis, the plant that you had; yes with plant.yaml, which this run found. Of these 6 "
+                "controllers the simulation picks the right one with both. With thesis: a reason. Test 3 decides."
             ),
         ),
         (
             (Mark.NO, Mark.UNDECIDED),
             (Mark.NO, Mark.YES),
             (
-                "No with thesis, the plant that you had: a reason. Undecided with plant.yaml, which this run found: "
-                "a reason. Of these 6 controllers the simulation picks a wrong one with thesis and picks the right one "
-                "with plant.yaml."
+                "No with thesis, the plant that you had; undecided with plant.yaml, which this run found. Of these 6 "
+                "controllers the simulation picks a wrong one with thesis and picks the right one with plant.yaml. "
+                "With thesis: a reason. With plant.yaml: a reason. Test 3 decides. What holds with plant.yaml: it "
+                "stands."
             ),
         ),
         (
             (Mark.NO, Mark.YES),
             (Mark.NOT_MEASURED, Mark.NOT_MEASURED),
             (
-                "No with thesis, the plant that you had: a reason. Yes with plant.yaml, which this run found. "
-                "Not measured: “same choice”."
+                "No with thesis, the plant that you had; yes with plant.yaml, which this run found. With thesis: a "
+                "reason. Test 3 decides. Not measured: “same choice”."
             ),
         ),
     ],
@@ -201,7 +201,7 @@ def test_one_sentence_names_both_plants_and_the_choice(
     monkeypatch.setattr(Simulated, "answer", lambda _: next(answers))
     settings = RegulationSettings()
     given, identified = (
-        Simulated(name, settings, tmp_path, comparison=object(), ranking=Ranked())  # type: ignore[arg-type]
+        Simulated(name, settings, tmp_path, comparisons={"": object()}, ranking=Ranked())  # type: ignore[dict-item,arg-type]
         for name in ("thesis", "plant.yaml")
     )
     answer, own = words.whole_answer(Findings(given, identified))

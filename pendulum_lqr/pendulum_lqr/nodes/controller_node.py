@@ -36,14 +36,11 @@ from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import JointSample, Vector
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_differences import load_any_plant
 from pendulum_msgs_py.plants.plant_parameters import (
     MECHANISM_PRESETS,
     PRESET_NAMES,
     PlantParameters,
-    is_mechanism,
-    load_plant,
 )
 from pendulum_msgs_py.programs.realtime import as_ordinary
 from pendulum_msgs_py.ros import qos
@@ -118,7 +115,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._loop: ControlLoop | None = None
         kind, plant = self._choose("controller"), self._choose("plant")
         self._own = {spec.name for spec in NODE_SPECS}
-        self._plant: AnyPlant = load_mechanism(plant) if is_mechanism(plant) else load_plant(plant)
+        self._plant = load_any_plant(plant)
         self._coordinates = self._plant.coordinates
         self._kind = controller_class(kind, self._plant)
         own = controller_parameters(kind, self._plant)

@@ -11,12 +11,14 @@ from typing import Any
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.plants.joint_parameters import Actuator, JointParameters
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import (
     DRIVETRAIN_SPECS,
     PLANT_SPECS,
     PlantParameters,
     SeriesElasticParameters,
+    is_mechanism,
+    load_plant,
 )
 
 __all__ = [
@@ -24,6 +26,7 @@ __all__ = [
     "AnyPlant",
     "PlantDifference",
     "describe_plants",
+    "load_any_plant",
     "plant_differences",
     "plant_mismatch",
     "read_plants",
@@ -61,6 +64,15 @@ class PlantDifference:
 
 
 AnyPlant = PlantParameters | MechanismParameters
+
+
+def load_any_plant(preset_or_path: str) -> AnyPlant:
+    """Return the plant of a preset or a file, of one joint or several.
+
+    Raises:
+        ParameterError: It cannot be read.
+    """
+    return load_mechanism(preset_or_path) if is_mechanism(preset_or_path) else load_plant(preset_or_path)
 
 
 def plant_differences(designed: AnyPlant, running: AnyPlant) -> tuple[PlantDifference, ...]:

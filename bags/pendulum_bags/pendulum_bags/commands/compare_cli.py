@@ -156,10 +156,10 @@ def _judge(
 ) -> tuple[Answer, dict[str, Any], Sequence[DesignResult]]:
     """Return the answer, its JSON, and the designs with a known certificate."""
     from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
-    from pendulum_bags.verdict.answer import answer_of, answer_of_joints
+    from pendulum_bags.verdict.answer import answer_of
 
     if "" not in results:
-        answer = answer_of_joints(results, kept)
+        answer = answer_of(results, kept)
         joints = {joint: result.to_json() for joint, result in results.items()}
         return answer, {"joints": joints, "answer": answer.to_json()}, ()
     certified = carry_over(results[""], kept, machine, designs)

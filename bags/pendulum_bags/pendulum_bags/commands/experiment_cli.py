@@ -6,15 +6,12 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from pendulum_bags.commands.compare_cli import MarginOption, MarginsFile
 from pendulum_bags.commands.frequency_response_cli import experiment as frequency_response
@@ -25,9 +22,19 @@ from pendulum_bags.commands.monte_carlo_cli import Q, R, monte_carlo
 from pendulum_bags.commands.region_cli import region_of_attraction
 from pendulum_bags.commands.study_cli import add_commands as add_study_commands
 from pendulum_bags.commands.trials_cli import add_commands as add_trial_commands
+from pendulum_bags.commands.whole_run import (
+    Budget,
+    Contenders,
+    Design,
+    Only,
+    Periods,
+    Seeds,
+    SignalPeriod,
+    run_whole,
+    steps_of,
+)
 from pendulum_bags.experiments.domain import check_domain
 from pendulum_bags.experiments.graph_plant import PREFIX as GRAPH_PREFIX
-from pendulum_bags.experiments.new_run import new_run
 from pendulum_bags.experiments.operator import ask_for_running, confirmed
 from pendulum_bags.experiments.plant_options import (
     AcceptDifferences,
@@ -37,28 +44,21 @@ from pendulum_bags.experiments.plant_options import (
     Strategy,
     equation_file,
 )
-from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.experiments.session import refuse_existing
 from pendulum_bags.experiments.settings import (
-    HARDWARE,
     RAMP_SPEED,
     SETTLE_TIME,
     NoiseSettings,
     RegulationSettings,
 )
-from pendulum_bags.runs.run_folder import versions, write_json
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Domain, Json, Lab, Storage, Yes, out_option
-from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
-    from pendulum_bags.comparison import Comparison
-    from pendulum_bags.verdict import Answer
-    from pendulum_bags.whole.carry_out import Findings, Simulated
+    from pendulum_bags.whole.carry_out import Order
 
 __all__ = ["app", "main"]
 
@@ -82,21 +82,14 @@ Seed = Annotated[int, typer.Option(help="Seed of the noise; one seed is one sign
 Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m].")]
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
 Duration = Annotated[float, typer.Option(help="Length of the noise [s].")]
-Only = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Measure this alone: same_run, identified, same_plant, which_controllers or same_choice; may be given "
-        "again. The layer same_run comes first in any case."
-    ),
-]
 Controller = Annotated[str, typer.Option(help="Kind of controller, or a policy file (.npz).")]
 
 
-_OF_SEVERAL_JOINTS = {"duration", "amplitude", "hold_time"}
+_OF_SEVERAL_JOINTS = {"duration", "amplitude", "hold_time", "controller", "hardware"}
 """Options of ``thesis`` whose defaults are others for several joints."""
 _OF_ONE_JOINT = {
-    *("simulation", "mapping", "accept_differences", "hardware", "hardware_mapping", "lab", "yes", "domain"),
-    *("strategy", "controller", "q", "r", "ramp_speed", "budget", "only", "contenders"),
+    *("simulation", "mapping", "accept_differences", "hardware_mapping", "lab", "yes", "domain"),
+    *("strategy", "q", "r", "ramp_speed"),
 }
 """Options of ``thesis`` that plants of several joints do not have."""
 
@@ -146,18 +139,13 @@ def thesis(
     domain: Domain = None,
     margin: MarginOption = None,
     margins_file: MarginsFile = None,
-    budget: Annotated[
-        float,
-        typer.Option(
-            help="Longest wall time of what follows the run in real time, where hardware is emulated: repeats, "
-            "identification, further layers; 0 for that run alone [s].",
-            min=0.0,
-        ),
-    ] = 120.0,
+    budget: Budget = 120.0,
     only: Only = None,
-    contenders: Annotated[
-        int, typer.Option(help="Controllers of the layer same_choice; each differs from all others.", min=3, max=32)
-    ] = 6,
+    contenders: Contenders = 6,
+    seeds: Seeds = 3,
+    periods: Periods = 8,
+    signal_period: SignalPeriod = 4.0,
+    design: Design = None,
     json_output: Json = False,
 ) -> None:
     """Regulate the upright pendulum under noise on simulator and hardware: is the simulation good enough?
@@ -169,9 +157,8 @@ def thesis(
     Example: python -m pendulum_bags experiment thesis --out /tmp/my_run --seed 7 --margin delay=8ms
     """
     from pendulum_bags.comparison import Margins
-    from pendulum_bags.whole.carry_out import STEPS, Order, carry_out
-    from pendulum_bags.whole.page import write_whole_report
-    from pendulum_bags.whole.words import whole_answer
+    from pendulum_bags.frequency_response.multisine import Multisine
+    from pendulum_bags.whole.carry_out import Order
 
     if plant is not None and is_mechanism(plant):
         if typed := typed_options(context, _OF_ONE_JOINT):
@@ -187,6 +174,13 @@ def thesis(
             storage=storage,
             margin=margin,
             margins_file=margins_file,
+            budget=budget,
+            only=only,
+            contenders=contenders,
+            seeds=seeds,
+            periods=periods,
+            signal_period=signal_period,
+            design=design,
             json_output=json_output,
             **chosen,
         )
@@ -207,46 +201,23 @@ def thesis(
         ramp_speed=ramp_speed,
     )
     margins = Margins.of(margins_file, margin)
-    steps = only or STEPS
-    if unknown := set(steps) - set(STEPS):
-        raise ParameterError(f"--only is {min(unknown)}; expected one of {', '.join(STEPS)}")
-    if budget <= 0.0 and (further := set(only or ()) - set(STEPS[:1])):
-        raise ParameterError(f"--only {min(further)} needs time after the run; expected --budget above 0 s")
+    steps = steps_of(only, budget)
     domain = check_domain(domain)
     if (foreign := settings.foreign) is not None and plant is None and not accept_differences:
         foreign.require_equation()
-    console = make_console(stderr=json_output, highlight=False)
+    multisine = Multisine(signal_period=signal_period, periods=periods, lowest=1.0 / signal_period)
     running = _running(settings, domain, plant)
     ask_for_running(running, domain or 0, _plan(settings), yes=yes)
-    with (
-        confirmed(settings.machine, settings.bridge_program(), _plan(settings), yes=yes),
-        new_run(out, "thesis", console) as folder,
-        ExitStack() as leaving,
-    ):
+
+    def order_in(folder: Path) -> Order:
+        of = settings
         if foreign is not None:
             equation = foreign.write_equation(folder)
-            settings = settings if plant else replace(settings, plant=str(equation))
-        started = time.monotonic()
-        order = Order(settings, margins, budget, steps, contenders, domain)
-        with PhaseProgress(order.expected_wall_time, console) as progress:
-            found = carry_out(folder, order, progress, leaving, partial(_print_first, console, json_output=json_output))
-            answer, answers = whole_answer(found)
-            summary = _summary(settings, found, answer, answers)
-            write_json(folder / "summary.json", summary)
-            # Before the page, which takes seconds: Ctrl-C then loses no answer.
-            if json_output:
-                print(json_text(summary), flush=True)
-            else:
-                _print_whole(console, found, answer, answers)
-            progress.phase("writing the report", 6.0)
-            write_whole_report(folder, summary, found, answer, answers)
-        elapsed = time.monotonic() - started
-        console.print(
-            f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}\n({elapsed:.0f} s)",
-            soft_wrap=True,
-        )
-        if found.interrupted:
-            raise KeyboardInterrupt
+            of = settings if plant else replace(settings, plant=str(equation))
+        return Order(of, margins, budget, steps, contenders, seeds, domain, multisine, design or ())
+
+    with confirmed(settings.machine, settings.bridge_program(), _plan(settings), yes=yes):
+        run_whole(out, "thesis", order_in, json_output=json_output)
 
 
 @app.command()
@@ -357,81 +328,6 @@ def _plan(settings: RegulationSettings) -> str:
         f"{SETTLE_TIME + noise.duration:g} s under noise of up to {noise.amplitude:g} N m, turns it down again in "
         f"about {settings.ramp_time:.0f} s, and disarms."
     )
-
-
-def _summary(
-    settings: RegulationSettings, found: Findings, answer: Answer, answers: Sequence[Answer]
-) -> dict[str, Any]:
-    from pendulum_bags.whole.carry_out import IDENTIFIED
-
-    given, *others = found.plants
-    assert given.comparison is not None
-    return {
-        **given.comparison.to_json(),
-        # The requested seed: where the first run is excluded, the comparison has that of a repeat.
-        "experiment": "thesis",
-        "hardware": settings.hardware,
-        "seed": settings.noise.seed,
-        "strategy": settings.strategy,
-        "versions": versions(),
-        "answer": answer.to_json(),
-        IDENTIFIED: {"plant": others[0].settings.plant, "answer": answers[1].to_json()} if others else None,
-        "left_out": found.notes,
-    }
-
-
-def _print_first(console: Console, plant: Simulated, *, json_output: bool) -> None:
-    """Print the first layer of the given plant, while the others are measured."""
-    from pendulum_bags.verdict.terminal import print_tests
-
-    assert plant.comparison is not None
-    if not json_output:
-        _print_summary(console, plant.comparison, plant.settings.hardware)
-        print_tests(console, plant.comparison)
-    console.print(plant.answer().sentence, style="bold", highlight=False, markup=False)
-
-
-def _print_whole(console: Console, found: Findings, answer: Answer, answers: Sequence[Answer]) -> None:
-    from pendulum_bags.verdict.terminal import layers_table, print_sentence, print_tests
-
-    for plant, own in zip(found.plants, answers, strict=True):
-        if plant is found.identified and plant.comparison is not None:
-            console.print(
-                f"\n{plant.name}, identified from these recordings, under noise of another seed", style="bold"
-            )
-            print_tests(console, plant.comparison)
-        console.print(layers_table(own, f"The layers of the answer, {plant.name}"))
-    for note in found.notes:
-        console.print(note, style="yellow", highlight=False, markup=False)
-    print_sentence(console, answer)
-
-
-def _print_summary(console: Console, comparison: Comparison, hardware: str) -> None:
-    from pendulum_bags.figures.terminal_table import plants_table
-    from pendulum_bags.runs.run_data import timing_warning
-
-    emulated, summary = comparison.is_emulated, comparison.to_json()
-    title = f"Simulation and {'emulated hardware' if emulated else 'hardware'} under the same noise"
-    if summary["runs"] > 1:
-        title += f", all samples of {summary['runs']} runs"
-    plants = summary["plants"]
-    stands_in = "emulator" if hardware in HARDWARE else "a simulation"
-    headings = [f"hw ({stands_in})" if name == "hw" and emulated else name for name in plants]
-    rows = (
-        (r"noise recorded \[s]", "duration_s", ".1f"),
-        (r"rate \[Hz]", "rate_hz", ".1f"),
-        ("missed deadlines", "missed_deadlines", ".0f"),
-        (r"std of theta \[rad]", "std_theta", ".5f"),
-        (r"std of theta' \[rad/s]", "std_theta_dot", ".5f"),
-        (r"max |u| \[N m]", "max_abs_u", ".3f"),
-    )
-    console.print(plants_table(title, headings, list(plants.values()), rows))
-    if "sim_500hz" in plants:
-        console.print("(sim_500hz: simulation by the thesis's own protocol, with new noise every 2 ms)")
-    if warning := timing_warning(plants):
-        console.print(warning, style="bold red")
-    for note in summary["notes"]:
-        console.print(note, style="yellow", markup=False)
 
 
 main = partial(cli_main, app, name="python -m pendulum_bags experiment")

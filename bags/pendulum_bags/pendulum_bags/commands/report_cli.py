@@ -55,7 +55,7 @@ def report(
     from pendulum_bags.report.write import margin_of, write_joint_report
     from pendulum_bags.runs.kept_bags import KeptBags
     from pendulum_bags.runs.run_data import joints_of
-    from pendulum_bags.verdict.answer import answer_of, answer_of_joints
+    from pendulum_bags.verdict.answer import answer_of
 
     started = time.monotonic()
     trials = [folder for folder in folders if (folder / "trial_1").exists()]
@@ -95,7 +95,7 @@ def report(
             if alone and not margins.stated:
                 margins = Margins.parse(margin_of(_of_joint(alone, joints[0])))
             comparisons = {joint: run(margin=margins, joint=joint, open_bag=bags) for joint in joints}
-            answer = answer_of_joints(comparisons, kept)
+            answer = answer_of(comparisons, kept)
             page = write_joint_report(target, comparisons, folders=folders, formats=formats, answer=answer)
         else:
             summary = _summary(alone) if alone and not margins.stated else None
@@ -125,7 +125,7 @@ def report(
 def _of_joint(folder: Path, joint: str) -> dict[str, object] | None:
     """Return the run's own comparison of a joint; empty if damaged or missing."""
     try:
-        content = json.loads((folder / "comparison.json").read_text(encoding="utf-8"))
+        content = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         found = content["joints"][joint]
     except (OSError, ValueError, TypeError, KeyError):
         return None

@@ -1,6 +1,6 @@
 """Comparison of simulation and hardware: the thesis's analysis, the paired one, statistics, spectra, metrics."""
 
-from pendulum_bags.comparison.compare import Comparison, compare, compare_folders, compare_runs
+from pendulum_bags.comparison.compare import Comparison, compare, compare_folders, compare_joints, compare_runs
 from pendulum_bags.comparison.equivalence import EquivalenceTest, Outcome, Verdict
 from pendulum_bags.comparison.margins import Margins
 from pendulum_bags.comparison.same_run import Looks
@@ -19,6 +19,7 @@ __all__ = [
     "Verdict",
     "compare",
     "compare_folders",
+    "compare_joints",
     "compare_runs",
     "read_run",
 ]

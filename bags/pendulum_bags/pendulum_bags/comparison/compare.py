@@ -18,6 +18,7 @@ from pendulum_bags.comparison.margins import MarginArgument, Margins
 from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
 from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
+from pendulum_bags.runs.kept_bags import KeptBags
 from pendulum_bags.runs.run_data import (
     OpenBag,
     RunData,
@@ -298,6 +299,26 @@ def compare_runs(
     hardware = read_run(hw_bag, prefix=hw_prefix, label="hardware", joint=joint, or_all=True, open_bag=open_bag)
     own = [] if own_protocol is None else [_read_own(own_protocol, joint, open_bag)]
     return compare([(simulation, hardware)], own=own, margin=margins)
+
+
+def compare_joints(
+    folders: Sequence[PathArgument],
+    joints: Sequence[str],
+    *,
+    margin: MarginArgument = None,
+    looks: Looks | None = None,
+) -> dict[str, Comparison]:
+    """Compare run folders, joint by joint, as :func:`compare_folders` does.
+
+    Args:
+        folders: Run folders.
+        joints: Joints of plants of several; one empty name for plants of one.
+        margin: What difference does not matter.
+        looks: Number of interim analyses.
+    """
+    with KeptBags() as bags:
+        more: dict[str, Any] = {"margin": margin, "looks": looks, **({"open_bag": bags} if any(joints) else {})}
+        return {joint: compare_folders(folders, joint=joint or None, **more) for joint in joints}
 
 
 def compare_folders(

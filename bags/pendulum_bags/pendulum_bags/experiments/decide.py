@@ -1,43 +1,34 @@
-"""Analyse the recordings, and record more, until they decide or the budget is spent."""
+"""Analyse the recordings, and record more, until they decide or no time is left."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from pendulum_bags.comparison import Comparison, Looks, Margins, Outcome, compare_folders
+from pendulum_bags.comparison import Comparison, Looks, Margins, Outcome, compare_joints
+from pendulum_bags.experiments.deadline import NEVER, BudgetSpentError, Deadline
+from pendulum_bags.experiments.joint_run import JointSettings
 from pendulum_bags.experiments.repeats import record_repeat, repeat_folder, repeat_settings
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.runs.run_folder import write_looks
 
-__all__ = ["Budget", "decide"]
+__all__ = ["decide"]
 
-
-@dataclass(frozen=True)
-class Budget:
-    """How long an experiment may last.
-
-    Args:
-        seconds: Wall time for repeats beyond the first analysis; 0 for one analysis of one run [s].
-        clock: Monotonic clock [s].
-    """
-
-    seconds: float = 60.0
-    clock: Callable[[], float] = time.monotonic
+_COMPARING = 1.0
+"""Processor time to compare the recordings of one joint [s]."""
 
 
 def decide(
     folder: Path,
-    settings: RegulationSettings,
+    settings: RegulationSettings | JointSettings,
     margins: Margins,
-    budget: Budget,
+    deadline: Deadline | None,
     *,
+    joints: Sequence[str] = ("",),
     on_look: Callable[[int, float], None] = lambda number, duration: None,
-    on_comparison: Callable[[Comparison], None] = lambda found: None,
-    record: Callable[[Path, RegulationSettings, int], None] = record_repeat,
-) -> Comparison:
+    on_comparison: Callable[[Mapping[str, Comparison]], None] = lambda found: None,
+    record: Callable[[Path, RegulationSettings | JointSettings, int, Deadline], None] = record_repeat,
+) -> Mapping[str, Comparison]:
     """Compare a run folder, and record repeats into it until the comparison is decided.
 
     Only an emulator or a simulation is repeated: a machine moves when its operator wants it to. Each interim analysis
@@ -47,34 +38,43 @@ def decide(
         folder: Folder of the run, recorded; a repeat whose hardware recording exists already is used at once.
         settings: Settings of the run.
         margins: What difference does not matter.
-        budget: Limit of the repeats.
+        deadline: Of the repeats; None for one analysis of what is there.
+        joints: Joints of plants of several; else one without a name.
         on_look: Called with the number of a repeat and its duration of noise [s] before it is recorded.
-        on_comparison: Called with the comparison after each analysis.
-        record: Records what a repeat lacks.
+        on_comparison: Called with the comparison of each joint after each analysis.
+        record: Records what a repeat lacks, or raises BudgetSpentError.
     """
-    if not settings.can_repeat or budget.seconds <= 0.0:
-        comparison = compare_folders([folder], margin=margins)
-        on_comparison(comparison)
-        return comparison
-    started = budget.clock()
+    if not settings.can_repeat or deadline is None:
+        compared = compare_joints([folder], joints, margin=margins)
+        on_comparison(compared)
+        return compared
     number = 0
     while repeat_folder(folder, number + 1).is_dir():
         number += 1
-        record(folder, settings, number)
+        record(folder, settings, number, NEVER)
     look = 1
     slowest = 0.0
     while True:
         write_looks(folder, look)
-        comparison = compare_folders([folder], margin=margins, looks=Looks(look))
-        on_comparison(comparison)
-        spent = budget.clock() - started
+        compared = compare_joints([folder], joints, margin=margins, looks=Looks(look))
+        on_comparison(compared)
+        left = deadline.left
         # The next repeat has at most twice the noise of the last one.
-        decided = comparison.verdict.outcome is not Outcome.UNDECIDED or comparison.unlike_references
-        if decided or spent + 1.5 * slowest > budget.seconds:
-            return comparison
+        if _is_decided(compared) or 1.5 * slowest > left:
+            return compared
         number += 1
-        look += 1
-        before = budget.clock()
         on_look(number, repeat_settings(settings, number).noise.duration)
-        record(folder, settings, number)
-        slowest = budget.clock() - before
+        try:
+            record(folder, settings, number, deadline)
+            deadline.require(_COMPARING * len(joints))
+        except BudgetSpentError:
+            return compared
+        look += 1
+        slowest = left - deadline.left
+
+
+def _is_decided(compared: Mapping[str, Comparison]) -> bool:
+    """Return whether more repeats would change nothing: one joint decides a no, and all of them a yes."""
+    outcomes = [one.verdict.outcome for one in compared.values()]
+    decided = Outcome.DIFFERENT in outcomes or Outcome.UNDECIDED not in outcomes
+    return decided or any(one.unlike_references for one in compared.values())

@@ -19,8 +19,10 @@ from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
+from pendulum_msgs_py.plants.plant_differences import load_any_plant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.stepping.plant import Plant
+from pendulum_sim.stepping.joint_plant import JointPlant, OneJoint
+from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_sim.stepping.plants import make_plant
 from pendulum_sim.stepping.sensors import Sensors
 
@@ -29,16 +31,19 @@ __all__ = ["RunArrays", "simulate", "simulate_plant"]
 
 @dataclass(frozen=True)
 class RunArrays:
-    """What a bag of the run would hold; every array has shape (n + 1,) for n steps, but ``applied``: (n,).
+    """What a bag of the run would hold, n + 1 rows for n steps, but n of ``applied``.
+
+    A row is a number for a plant of one joint; of several it has the joints, in ``command`` and ``applied`` the driven
+    ones.
 
     Attributes:
         stamp_ns: Of the states [ns].
-        position: [rad].
-        velocity: [rad/s].
-        effort: Measured torque [N m].
-        command: The controller's commands; NaN where it gave none [N m].
-        disturbance: [N m].
-        applied: Torque that acted from each state on [N m].
+        position: [rad or m].
+        velocity: [rad/s or m/s].
+        effort: Measured efforts [N m or N].
+        command: The controller's commands; NaN where it gave none [N m or N].
+        disturbance: On the joint that has it [N m or N].
+        applied: Efforts that acted from each state on [N m or N].
     """
 
     stamp_ns: NDArray[np.int64]
@@ -59,7 +64,9 @@ def simulate(spec: RunSpec) -> RunArrays:
     if spec.has_bridge or spec.plant_parameters:
         raise ParameterError("a run in one process is of the plain simulator; others run as nodes")
     if (foreign := spec.foreign) is not None:
-        return _simulate(spec, foreign.open(), Sensors())
+        return _simulate(spec, OneJoint(foreign.open()), Sensors())
+    if (mechanism := spec.mechanism) is not None:
+        return _simulate(spec, MechanismPlant(mechanism, _whole(spec.period)), Sensors())
     return simulate_plant(spec, load_plant(spec.plant))
 
 
@@ -71,21 +78,29 @@ def simulate_plant(spec: RunSpec, parameters: PlantParameters, sensors: Sensors 
         parameters: The plant.
         sensors: What the controller sees; None for the truth. They must not drop samples.
     """
-    dt = round(NANOSECONDS * spec.period) / NANOSECONDS
-    return _simulate(spec, make_plant(parameters, dt, method=spec.method), sensors or Sensors())
+    plant = make_plant(parameters, _whole(spec.period), method=spec.method)
+    return _simulate(spec, OneJoint(plant), sensors or Sensors())
 
 
-def _simulate(spec: RunSpec, plant: Plant, sensors: Sensors) -> RunArrays:
+def _whole(period: float) -> float:
+    """Return a period of whole nanoseconds [s]."""
+    return round(NANOSECONDS * period) / NANOSECONDS
+
+
+def _simulate(spec: RunSpec, plant: JointPlant, sensors: Sensors) -> RunArrays:
     period_ns = round(NANOSECONDS * spec.period)
-    parameters = plant.parameters
-    limits: dict[str, Any] = validate(LIMIT_SPECS, BEGINS_ANYWHERE)
-    supervisor = PlantSupervisor(limits_from_parameters(limits, (parameters.effort_limit,), lockstep=True))
-    values = {**spec.controller_parameters, "set_point": spec.set_point}
-    design = load_plant(spec.design_plant)
+    coordinates, is_one = plant.coordinates, isinstance(plant, OneJoint)
+    limits: dict[str, Any] = validate(LIMIT_SPECS, BEGINS_ANYWHERE if is_one else {})
+    supervisor = PlantSupervisor(
+        limits_from_parameters(limits, plant.effort_limits, coordinates=coordinates, lockstep=True),
+        coordinates=coordinates,
+    )
+    design = load_any_plant(spec.design_plant)
     controller = ControlLoop(
-        make_controller(spec.controller, design, spec.period, values), float("inf"), simulated_time=True
+        make_controller(spec.controller, design, spec.period, spec.law(design)), float("inf"), simulated_time=True
     )
     chosen = spec.disturbance_parameters()
+    disturbed = tuple(chosen.pop("joints", coordinates.driven_names[:1]))
     length = chosen.pop("duration", 0.0)
     signal = make_disturbance(validate(DISTURBANCE_SPECS, chosen))
     disturbance = DisturbanceLoop(signal, length, simulated_time=True)
@@ -93,9 +108,12 @@ def _simulate(spec: RunSpec, plant: Plant, sensors: Sensors) -> RunArrays:
 
     count = spec.steps
     stamps = LOCKSTEP_EPOCH_NS + period_ns * np.arange(count + 1, dtype=np.int64)
-    rows = np.full((count + 1, 6), np.nan)
-    state = plant.reset(spec.theta, 0.0)
-    sample = sensors.measure(LOCKSTEP_EPOCH_NS, (state.theta,), (state.theta_dot,), (state.effort,))
+    joints, driven = len(coordinates.joints), len(coordinates.driven)
+    states, commands = np.full((count + 1, 3, joints), np.nan), np.full((count + 1, 2, driven), np.nan)
+    pushes = np.zeros(count + 1)
+    start = (spec.theta,) if is_one else coordinates.goal
+    _, *state = plant.reset(start, (0.0,) * joints)
+    sample = sensors.measure(LOCKSTEP_EPOCH_NS, *state)
     if sample is None:
         raise ParameterError("sensors drop samples; expected a drop_rate of 0 in a run in one process")
     supervisor.arm(LOCKSTEP_EPOCH_NS, sample)
@@ -105,19 +123,23 @@ def _simulate(spec: RunSpec, plant: Plant, sensors: Sensors) -> RunArrays:
         push = disturbance.answer(now_ns)
         torque = push.torque if push is not None else 0.0
         if answer is not None:
-            supervisor.offer(Input.EFFORT_COMMAND, JointCommand(now_ns, answer, "controller"), now_ns)
-        supervisor.offer(Input.DISTURBANCE, JointCommand.of_one(now_ns, torque, "disturbance"), now_ns)
-        row = rows[index]
-        row[:3] = sample.position[0], sample.velocity[0], sample.effort[0]
-        row[3:5] = np.nan if answer is None else answer[0], torque
+            command = JointCommand(now_ns, answer, "controller", coordinates.driven_names)
+            supervisor.offer(Input.EFFORT_COMMAND, command, now_ns)
+        supervisor.offer(Input.DISTURBANCE, JointCommand(now_ns, (torque,), "disturbance", disturbed), now_ns)
+        states[index] = sample.position, sample.velocity, sample.effort
+        pushes[index] = torque
+        if answer is not None:
+            commands[index, 0] = answer
         if index == count:
             break
         drive = supervisor.decide(now_ns, sample)
-        state = plant.step(drive.effort[0], drive.push[0])
+        _, *state = plant.step(drive.effort, drive.push)
         supervisor.report_applied(drive.effort)
-        row[5] = drive.effort[0]
-        measured = sensors.measure(int(stamps[index + 1]), (state.theta,), (state.theta_dot,), (state.effort,))
+        commands[index, 1] = drive.effort
+        measured = sensors.measure(int(stamps[index + 1]), *state)
         if measured is None:
             raise ParameterError("sensors drop samples; expected a drop_rate of 0 in a run in one process")
         sample = measured
-    return RunArrays(stamps, rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4], rows[:-1, 5])
+    columns = [states[:, 0], states[:, 1], states[:, 2], commands[:, 0], commands[:-1, 1]]
+    position, velocity, effort, command_rows, applied = (one[:, 0] for one in columns) if is_one else columns
+    return RunArrays(stamps, position, velocity, effort, command_rows, pushes, applied)

@@ -2,41 +2,34 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_bags.experiments.host_pool import HostPool
-from pendulum_bags.experiments.lockstep import record_run
-from pendulum_bags.experiments.run_spec import lockstep_parameters
-from pendulum_bags.runs.case import IDENTITY, plant_identity
-from pendulum_bags.runs.run_folder import provenance
-from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.experiments.settings import NoiseSettings
 from pendulum_msgs_py.contract.names import JOINT_STATES
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from pendulum_msgs_py.errors import FaultError, ParameterError, PlantStoppedError
+from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism, write_mechanism
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism
-from pendulum_msgs_py.programs import graph
-from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_rosbag.reader.bag import read_bag
 
 __all__ = [
     "HOLDING",
     "LIMIT_PER_NOISE",
-    "JointRun",
     "JointSettings",
+    "default_amplitude",
     "design_file",
     "design_for",
+    "driven_joint",
     "fall_time",
     "identified_names",
     "load_stand_in",
-    "record_joints",
+    "require_upright",
     "stand_in_for",
 ]
 
@@ -47,6 +40,8 @@ _UNCHANGED = frozenset(
 )
 """Values of a plant file that are not identified: constants, limits, and what belongs to a model of friction."""
 _DELAY = "transport_delay"
+DURATION = 20.0
+"""Length of the noise by default [s]."""
 HOLDING = ("lqr", "discrete_lqr", "lqi", "lqg", "mpc")
 """Controllers that hold a plant upright; ``tvlqr`` and ``ilqr`` begin at hanging, and ``nmpc`` is an LQR there."""
 LIMIT_PER_NOISE = 10.0
@@ -59,29 +54,30 @@ noise. At 1 the pendubot falls; at 0.25 both plants stay, nearer to the end of w
 
 @dataclass(frozen=True)
 class JointSettings:
-    """Noise on one joint of a plant that a controller holds upright.
+    """Noise on one joint of a plant that a controller holds upright, in simulation and on an emulated machine.
 
     Attributes:
-        plant: Preset or file of the simulated plant; the controller is designed on it on both sides.
+        plant: Preset or file of the simulated plant.
+        machine: Plant file of the emulated machine.
+        design: Preset or file that the controller is designed on; empty for the simulated plant.
         joint: Driven joint that has the noise; empty for the first.
-        amplitude: Largest effort of the noise [N m or N]; None for a tenth of the joint's effort limit.
-        hold_time: Time for which a sample is held [s].
-        duration: Length [s].
-        seed: Seed of the noise.
-        period: Time between two states [s].
+        noise: The disturbance, such as one of :func:`default_amplitude`.
         storage: Storage of the bags.
         controller: What holds it, one of ``HOLDING``.
     """
 
     plant: str = "cart_pole"
+    machine: str = ""
+    design: str = ""
     joint: str = ""
-    amplitude: float | None = None
-    hold_time: float = 0.01
-    duration: float = 20.0
-    seed: int = 1
-    period: float = 0.002
+    noise: NoiseSettings = field(default_factory=lambda: NoiseSettings(duration=DURATION))
     storage: str = "mcap"
     controller: str = "lqr"
+    can_repeat: ClassVar[bool] = True
+    is_emulated: ClassVar[bool] = True
+    hardware: ClassVar[str] = "emulator"
+    strategy: ClassVar[str] = ""
+    foreign: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run before anything starts; the joint defaults to the first driven one."""
@@ -90,140 +86,69 @@ class JointSettings:
                 f"plant is {self.plant!r}, which has one joint; expected one of several, such as cart_pole "
                 "(experiment thesis is for one joint)"
             )
-        plant = load_mechanism(self.plant)
-        driven = plant.coordinates.driven_names
-        if not driven:
-            raise ParameterError(f"plant {plant.name!r} has no driven joint; expected an actuator at one of its joints")
-        if self.joint and self.joint not in driven:
-            raise ParameterError(f"joint is {self.joint!r}; expected one that is driven: {', '.join(driven)}")
-        object.__setattr__(self, "joint", self.joint or driven[0])
-        if self.amplitude is None:
-            limit = plant.effort_limits[driven.index(self.joint)]
-            object.__setattr__(self, "amplitude", limit / LIMIT_PER_NOISE)
+        object.__setattr__(self, "joint", driven_joint(self.plant, self.joint))
         if self.controller not in HOLDING:
             raise ParameterError(f"controller is {self.controller!r}; expected one of {', '.join(HOLDING)}")
-        for name in ("amplitude", "hold_time", "duration", "period"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ParameterError(f"{name} is {value}; expected a finite number > 0")
+
+    @property
+    def design_plant(self) -> str:
+        """Preset or file that the controller is designed on."""
+        return self.design or self.plant
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the plant's joints."""
+        return load_mechanism(self.plant).coordinates.names
+
+    @property
+    def expected_wall_time(self) -> float:
+        """Wall time of the first recordings, measured on two cores [s]."""
+        return 6.0 + 0.25 * self.noise.duration
+
+    def running(self, side: str) -> None:
+        """Return the namespace of a plant that runs already; there is none."""
+
+    def run(self, side: str) -> RunSpec:
+        """Return one side as a run in lockstep, for as long as the noise lasts."""
+        noise = self.noise
+        return RunSpec(
+            side=side,
+            plant=self.plant if side == "sim" else self.machine or self.plant,
+            design_plant=self.design_plant,
+            controller=self.controller,
+            disturbance={
+                "kind": "uniform",
+                "joints": [self.joint],
+                "amplitude": noise.amplitude,
+                "hold_time": noise.hold_time,
+                "duration": noise.duration,
+            },
+            duration=noise.duration,
+            seed=noise.seed,
+            storage=self.storage,
+        )
 
 
-@dataclass(frozen=True)
-class JointRun:
-    """One side of it, as :func:`pendulum_bags.experiments.lockstep.record_run` carries it out.
+def driven_joint(plant: str, joint: str = "") -> str:
+    """Return the joint that has the noise: the one that is named, or the first that is driven.
 
-    Attributes:
-        settings: The settings.
-        side: ``sim``, or ``hw`` for the surrogate of the machine.
-        plant: Preset or file of what runs on this side.
-        design: Preset or file on which the controller is designed; empty for the simulated plant.
-        excitation: Parameters of the disturbance that differ from those of the noise.
-        tuning: Parameters of the controller that differ from those of the plant, ``q`` and ``r``.
+    Raises:
+        ParameterError: It is not driven, or none is.
     """
+    loaded = load_mechanism(plant)
+    driven = loaded.coordinates.driven_names
+    if not driven:
+        raise ParameterError(f"plant {loaded.name!r} has no driven joint; expected an actuator at one of its joints")
+    if joint and joint not in driven:
+        raise ParameterError(f"joint is {joint!r}; expected one that is driven: {', '.join(driven)}")
+    return joint or driven[0]
 
-    settings: JointSettings
-    side: str
-    plant: str
-    design: str = ""
-    simulated_time: bool = True
-    excitation: Mapping[str, Any] = field(default_factory=dict)
-    tuning: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def has_bridge(self) -> bool:
-        """Whether the plant is the bridge, on an emulated machine."""
-        return self.side == "hw"
-
-    @property
-    def namespace(self) -> str:
-        """Namespace of the plant."""
-        return f"/{self.side}"
-
-    @property
-    def duration(self) -> float:
-        """Length [s]."""
-        return self.settings.duration
-
-    @property
-    def steps(self) -> int:
-        """Number of steps of the plant."""
-        return round(self.duration / self.settings.period)
-
-    @property
-    def storage(self) -> str:
-        """Storage of the bag."""
-        return self.settings.storage
-
-    def plant_program(self, listeners: int) -> NodeProgram:
-        """Return the simulator, paused, or the bridge; either waits for a number of subscriptions to its states."""
-        rate = 1.0 / self.settings.period
-        lockstep: dict[str, Any] = lockstep_parameters(listeners, self.duration)
-        if self.has_bridge:
-            goal = list(load_mechanism(self.plant).coordinates.goal)
-            return graph.bridge(
-                self.namespace,
-                plant=self.plant,
-                backend="emulator",
-                initial_positions=goal,
-                feedback_rate=rate,
-                seed=self.settings.seed,
-                **lockstep,
-            )
-        return graph.simulator(
-            self.namespace, plant=self.plant, start="top", rate_hz=rate, armed_at_start=True, paused=True, **lockstep
-        )
-
-    def controller_program(self) -> NodeProgram:
-        """Return the controller, designed on one plant on both sides."""
-        return graph.controller(
-            self.namespace,
-            controller=self.settings.controller,
-            plant=self.design or self.settings.plant,
-            period=self.settings.period,
-            use_sim_time=True,
-            **self.tuning,
-        )
-
-    def disturbance_program(self) -> NodeProgram:
-        """Return the disturbance."""
-        return graph.disturbance(self.namespace, **self._noise(), autostart=True, use_sim_time=True)
-
-    def metadata(self) -> dict[str, Any]:
-        """Return the bag's metadata of its run."""
-        return {
-            RUN_RECORD: {
-                "experiment": "joints",
-                "clock": "lockstep",
-                "namespace": self.namespace,
-                "side": self.side,
-                "plant": self.plant if self.side == "sim" else "another plant file",
-                "design_plant": self.settings.plant,
-                IDENTITY: plant_identity(load_mechanism(self.plant)),
-                "seed": self.settings.seed,
-                "disturbance": self._noise(),
-                "controller": {
-                    "kind": self.settings.controller,
-                    **self.tuning,
-                    **({"linearised": Path(self.design).name} if self.design else {}),
-                },
-                **({STAND_IN: "emulated machine"} if self.side == "hw" else {}),
-                "duration": self.duration,
-                "period": self.settings.period,
-                **provenance(),
-            }
-        }
-
-    def _noise(self) -> dict[str, Any]:
-        own = self.settings
-        return {
-            "kind": "uniform",
-            "joints": [own.joint],
-            "amplitude": own.amplitude,
-            "hold_time": own.hold_time,
-            "duration": own.duration,
-            "seed": own.seed,
-            **self.excitation,
-        }
+def default_amplitude(plant: str, joint: str = "") -> float:
+    """Return the largest effort of the noise, as a share of the effort limit of its joint [N m or N]."""
+    loaded = load_mechanism(plant)
+    index = loaded.coordinates.driven_names.index(driven_joint(plant, joint))
+    return loaded.effort_limits[index] / LIMIT_PER_NOISE
 
 
 def identified_names(plant: MechanismParameters) -> list[str]:
@@ -268,12 +193,13 @@ def design_for(plant: MechanismParameters) -> MechanismParameters:
     return replace(plant.with_values(changes), name=f"{plant.name}_design") if changes else plant
 
 
-def design_file(folder: Path, plant: MechanismParameters) -> str:
-    """Return the file of the plant on which the LQR is designed, stored in a folder; empty where that is the plant."""
-    designed = design_for(plant)
-    if designed is plant:
-        return ""
-    meaning = f"{plant.name}, dry friction of its passive joints as viscous friction at {_SLIDING:g} rad/s or m/s"
+def design_file(folder: Path, plant: str) -> str:
+    """Return the plant on which the controller is designed: the preset or file itself, or one stored in a folder."""
+    loaded = load_mechanism(plant)
+    designed = design_for(loaded)
+    if designed is loaded:
+        return plant
+    meaning = f"{loaded.name}, dry friction of its passive joints as viscous friction at {_SLIDING:g} rad/s or m/s"
     return str(write_mechanism(folder / "design.yaml", designed, provenance={"design_of": meaning}))
 
 
@@ -300,50 +226,6 @@ def load_stand_in(path: str | Path, plant: MechanismParameters) -> MechanismPara
     return found
 
 
-def record_joints(
-    folder: Path,
-    settings: JointSettings,
-    machine: Path,
-    *,
-    excitation: Mapping[str, Any] | None = None,
-    hosts: HostPool | None = None,
-    on_side: Callable[[str], None] = lambda side: None,
-) -> None:
-    """Record both sides over DDS, in lockstep, as the bags ``sim`` and ``hw`` of a run folder.
-
-    Where the plant of the design is another than the simulated one, it is stored there as ``design.yaml``.
-
-    Args:
-        folder: The run folder.
-        settings: What to run.
-        machine: Plant file of the surrogate of the machine.
-        excitation: Parameters of the disturbance that differ from those of the noise.
-        hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
-        on_side: Called with each side's name when it starts.
-
-    Raises:
-        BagError: A bag exists, or cannot be written.
-        FaultError: A program ended or did not respond, or a plant fell or faulted; it reports both sides.
-    """
-    plant = load_mechanism(settings.plant)
-    design = design_file(folder, plant)
-    ends: dict[str, str] = {}
-    for side, runs, words in (
-        ("sim", settings.plant, "simulation"),
-        ("hw", str(machine), "stand-in for the machine"),
-    ):
-        on_side(words)
-        stopped = ""
-        try:
-            run = JointRun(settings, side, runs, design, excitation=excitation or {})
-            record_run(folder / side, run, hosts=hosts)
-        except PlantStoppedError as error:
-            stopped = f"went to {error.mode} ({error.reason})"
-        ends[words] = _end_of(folder / side, f"/{side}", plant, stopped)
-    if any(ends.values()):
-        raise FaultError(_told(ends, settings))
-
-
 def fall_time(plant: MechanismParameters, stamps_ns: Array, position: Array) -> float | None:
     """Return when a plant fell, from the first state on [s], or None: half of its height of potential energy is lost.
 
@@ -360,21 +242,32 @@ def fall_time(plant: MechanismParameters, stamps_ns: Array, position: Array) -> 
     return None
 
 
-def _end_of(bag: Path, namespace: str, plant: MechanismParameters, stopped: str) -> str:
-    """Return how a side failed, as text, or an empty string."""
-    with read_bag(bag) as opened:
-        states = opened.joints(f"{namespace}/{JOINT_STATES}")
-    fell = fall_time(plant, states.stamp_ns, states.position) if len(states.stamp_ns) else None
-    said = [] if fell is None else [f"fell after {fell:.2f} s"]
-    return " and ".join([*said, stopped] if stopped else said)
+def require_upright(folder: Path, settings: JointSettings, stopped: str = "") -> None:
+    """Refuse the recordings ``sim`` and ``hw`` of a folder where a plant fell.
 
+    Args:
+        folder: Where they are; a side without states has not fallen.
+        settings: What ran.
+        stopped: Why the machine stopped; empty where it did not.
 
-def _told(ends: Mapping[str, str], settings: JointSettings) -> str:
+    Raises:
+        FaultError: One fell or stopped; it reports both sides.
+    """
+    plant = load_mechanism(settings.plant)
+    ends: dict[str, str] = {}
+    for side, words in (("sim", "simulation"), ("hw", "emulated hardware")):
+        with read_bag(folder / side) as opened:
+            states = opened.joints(f"/{side}/{JOINT_STATES}")
+        fell = fall_time(plant, states.stamp_ns, states.position) if len(states.stamp_ns) else None
+        found = [] if fell is None else [f"fell after {fell:.2f} s"]
+        ends[words] = " and ".join([*found, *([stopped] if stopped and side == "hw" else [])])
+    if not any(ends.values()):
+        return
     failed = [f"the {words} {end}" for words, end in ends.items() if end]
     held = [f"the {words} stayed upright" for words, end in ends.items() if not end]
-    joint = next(joint for joint in load_mechanism(settings.plant).mechanism.joints if joint.name == settings.joint)
-    return (
+    joint = next(joint for joint in plant.mechanism.joints if joint.name == settings.joint)
+    raise FaultError(
         f"{'both sides failed' if not held else 'the sides part'}: {'; '.join(failed + held)}, under noise of "
-        f"{settings.amplitude:g} {joint.effort_unit} at {settings.joint}; expected both to stay upright: compare with "
-        "a smaller --amplitude"
+        f"{settings.noise.amplitude:g} {joint.effort_unit} at {settings.joint}; expected both to stay upright: compare "
+        "with a smaller --amplitude"
     )

@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
 
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.host_pool import HostPool
+from pendulum_bags.experiments.joint_run import JointSettings
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.session import (
     ANSWER_PRIORITY,
@@ -26,9 +26,8 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import FaultError
-from pendulum_msgs_py.programs.graph import NodeProgram
 
-__all__ = ["GraphRun", "lockstep_spec", "longest_run", "record_run", "run_lockstep"]
+__all__ = ["lockstep_spec", "longest_run", "record_run", "run_lockstep"]
 
 _LAST_WORDS = 0.2
 """Time for the recorder to receive the end of a run in real time [s]."""
@@ -78,8 +77,10 @@ def run_lockstep(
     return record_run(bag, lockstep_spec(settings, side=side), domain=domain, on_wait=on_wait, hosts=hosts)
 
 
-def lockstep_spec(settings: RegulationSettings, *, side: str) -> RunSpec:
-    """Return one side of the thesis's experiment as a run in lockstep, for as long as the noise lasts."""
+def lockstep_spec(settings: RegulationSettings | JointSettings, *, side: str) -> RunSpec:
+    """Return one side of an experiment as a run in lockstep, for as long as the noise lasts."""
+    if isinstance(settings, JointSettings):
+        return settings.run(side)
     noise, foreign = settings.noise, settings.foreign_of(side)
     return RunSpec(
         side=side,
@@ -108,49 +109,9 @@ def longest_run(duration: float) -> float:
     return 4.0 * START_TIMEOUT + _SLOWEST * duration
 
 
-class GraphRun(Protocol):
-    """What a run over DDS has to provide; a :class:`RunSpec` does."""
-
-    @property
-    def namespace(self) -> str:
-        """Namespace of the plant."""
-
-    @property
-    def storage(self) -> str:
-        """Storage of the bag."""
-
-    @property
-    def duration(self) -> float:
-        """Length [s]."""
-
-    @property
-    def steps(self) -> int:
-        """Number of steps of the plant."""
-
-    @property
-    def simulated_time(self) -> bool:
-        """Whether time is that of the plant and not that of the wall."""
-
-    @property
-    def has_bridge(self) -> bool:
-        """Whether the plant is the bridge, which no parameter arms."""
-
-    def metadata(self) -> dict[str, Any]:
-        """Return the bag's metadata of its run."""
-
-    def plant_program(self, listeners: int) -> NodeProgram:
-        """Return the plant, which waits for a number of subscriptions to its states."""
-
-    def controller_program(self) -> NodeProgram:
-        """Return the controller."""
-
-    def disturbance_program(self) -> NodeProgram:
-        """Return the disturbance."""
-
-
 def record_run(
     bag: Path,
-    spec: GraphRun,
+    spec: RunSpec,
     *,
     domain: int | None = None,
     on_wait: Callable[[], None] = lambda: None,
@@ -197,7 +158,7 @@ def record_run(
     return bag
 
 
-def _keep_time(session: Session, plant: PlantClient, spec: GraphRun) -> None:
+def _keep_time(session: Session, plant: PlantClient, spec: RunSpec) -> None:
     """Let a run in real time go, wait for its length by the plant's clock, and put the plant to rest."""
     conductor = session.conductor
     plant.watch()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
+from pendulum_bags.experiments.deadline import NEVER, Deadline
 from pendulum_bags.experiments.host_pool import open_pool
 from pendulum_bags.experiments.lockstep import longest_run
 from pendulum_bags.experiments.processes import Child, ProcessSet
@@ -25,6 +27,8 @@ __all__ = ["Machine", "MachineRun", "record_listed"]
 
 _ENDED = "ended: "
 """Begins the line that the program prints when a run has ended: its bag, and why it failed, as JSON."""
+_HOLD, _REST = "hold", "rest"
+"""Files that ask the program not to begin a run, and that tell that it waits."""
 _POLL = 0.05
 _ENDING = 25.0
 """Time that the program has to end its own, in two waves [s]."""
@@ -50,6 +54,8 @@ class Machine:
         self._processes = ProcessSet(folder / "logs" / "machine", {})
         self._child: Child | None = None
         self._interrupted = False
+        self._hold, self._rest = (folder / "logs" / "machine" / name for name in (_HOLD, _REST))
+        self._read, self._ends = 0, dict[str, tuple[bool, str]]()
 
     def __enter__(self) -> Machine:
         return self
@@ -58,6 +64,10 @@ class Machine:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.interrupt()
+        if kind is KeyboardInterrupt and self._child is not None:
+            # Nothing real moves, and whoever interrupts twice wants no more waiting: its own end with it.
+            with suppress(ProcessLookupError):
+                os.killpg(self._child.process.pid, signal.SIGKILL)
         if self._child is not None:
             # It ends programs of its own, which a kill would leave behind.
             with suppress(FaultError):
@@ -77,6 +87,7 @@ class Machine:
             return
         self._processes.__enter__()
         listed = self._processes.log_folder / "runs.json"
+        self._rest.unlink(missing_ok=True)
         write_json(listed, [{"bag": str(run.bag.resolve()), "spec": run.spec.to_json()} for run in self.runs])
         command = [sys.executable, "-m", "pendulum_bags", "experiment", "run", str(listed)]
         # In a domain of its own, whichever the experiment has.
@@ -87,25 +98,46 @@ class Machine:
     def discard(self) -> None:
         """End the program, and remove what it has recorded."""
         self._processes.stop()
+        self._child, self._read = None, 0
+        self._ends.clear()
         for run in self.runs:
             shutil.rmtree(run.bag, ignore_errors=True)
 
-    def wait(self, bag: Path) -> None:
+    def rests(self) -> bool:
+        """Let no run begin before :meth:`resume`; return whether the one that is being recorded has ended."""
+        if self._child is None or self._child.process.poll() is not None:
+            return True
+        self._hold.touch()
+        return self._rest.exists()
+
+    def resume(self) -> None:
+        """Record the runs that are left, or begin where nothing was started."""
+        if self._child is None:
+            self.start()
+        self._hold.unlink(missing_ok=True)
+
+    def wait(self, bag: Path, deadline: Deadline = NEVER) -> None:
         """Wait until a bag is recorded.
 
+        Args:
+            bag: One of the runs'.
+            deadline: When to stop waiting.
+
         Raises:
+            BudgetSpentError: It is not recorded by then.
             PlantStoppedError: The plant stopped, because its controller lost it.
             FaultError: It could not be recorded, or not in time.
         """
         (run,) = (run for run in self.runs if run.bag == bag)
-        deadline = time.monotonic() + longest_run(sum(one.spec.duration for one in self.runs))
+        latest = time.monotonic() + longest_run(sum(one.spec.duration for one in self.runs))
         while (ended := self._ended(run.bag)) is None:
-            if self._child is None or time.monotonic() > deadline:
+            if self._child is None or time.monotonic() > latest:
                 raise FaultError(f"bag {bag} was not recorded in time")
             if (code := self._child.process.poll()) is not None and self._ended(run.bag) is None:
                 words = self._child.last_words(1)
                 output = "" if words.startswith(_ENDED) or not words else f"; its last output: {words}"
                 raise FaultError(f"bag {bag} was not recorded: its program ended with code {code}{output}")
+            deadline.require()
             time.sleep(_POLL)
         stopped, reason = ended
         if stopped:
@@ -115,14 +147,17 @@ class Machine:
 
     def _ended(self, bag: Path) -> tuple[bool, str] | None:
         """Return whether the plant stopped and why, with no reason for a bag that is whole; None for none yet."""
-        if self._child is None:
-            return None
-        for line in self._child.log.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
-            if line.startswith(_ENDED) and line.endswith("\n"):
-                name, stopped, reason = json.loads(line.removeprefix(_ENDED))
-                if name == str(bag.resolve()):
-                    return bool(stopped), str(reason)
-        return None
+        if self._child is not None:
+            with self._child.log.open("rb") as log:
+                log.seek(self._read)
+                # A line that is being written is read when it is whole.
+                *lines, rest = log.read().split(b"\n")
+                self._read = log.tell() - len(rest)
+            for line in (one.decode(errors="replace") for one in lines):
+                if line.startswith(_ENDED):
+                    name, stopped, reason = json.loads(line.removeprefix(_ENDED))
+                    self._ends[name] = bool(stopped), str(reason)
+        return self._ends.get(str(bag.resolve()))
 
 
 def record_listed(listed: Path) -> None:
@@ -131,8 +166,14 @@ def record_listed(listed: Path) -> None:
     Args:
         listed: JSON file with the bag and the run of each.
     """
+    hold, rest = (listed.with_name(name) for name in (_HOLD, _REST))
     with open_pool() as hosts:
         for entry in json.loads(listed.read_text(encoding="utf-8")):
+            if hold.exists():
+                rest.touch()
+                while hold.exists():
+                    time.sleep(_POLL)
+                rest.unlink(missing_ok=True)
             stopped, reason = False, ""
             try:
                 record_spec(Path(entry["bag"]), RunSpec.from_json(entry["spec"]), hosts=hosts)

@@ -7,13 +7,16 @@ its nodes to the last bit in a tenth of the time; both are stored as bags.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
-import numpy as np
-
+from pendulum_bags.arrays import Array
+from pendulum_bags.experiments.deadline import NEVER, Deadline
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.in_process import RunArrays, simulate
+from pendulum_bags.experiments.joint_run import JointSettings
 from pendulum_bags.experiments.lockstep import lockstep_spec, record_run
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
@@ -21,7 +24,8 @@ from pendulum_bags.runs.run_data import END_EVENT, START_EVENT
 from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joints
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Vector
 from pendulum_rosbag.storage import BagWriter
 
 __all__ = ["SHORTEST", "record_repeat", "record_simulation", "record_spec", "repeat_folder", "repeat_settings"]
@@ -32,6 +36,9 @@ SHORTEST = 20.0
 """Length of the first repeat, four times the thesis's run: starting the nodes takes longer than the noise [s]."""
 LONGEST = 60.0
 """Length that no repeat exceeds, so that a run ends soon after its budget [s]."""
+_SIMULATING = 0.1
+"""Processor time to simulate a second of noise and write it, on a side [s]."""
+_Settings = TypeVar("_Settings", bound=RegulationSettings | JointSettings)
 _STATE = "sensor_msgs/msg/JointState"
 _TEXT = "std_msgs/msg/String"
 
@@ -41,29 +48,34 @@ def repeat_folder(folder: Path, number: int) -> Path:
     return folder / REPEATS / str(number)
 
 
-def repeat_settings(settings: RegulationSettings, number: int) -> RegulationSettings:
+def repeat_settings(settings: _Settings, number: int) -> _Settings:
     """Return the settings of a repeat: new noise, and twice as much of it each time."""
     noise = settings.noise
     duration = min(LONGEST, max(SHORTEST, noise.duration) * 2.0 ** (number - 1))
     return replace(settings, noise=replace(noise, seed=noise.seed + SEED_STEP * number, duration=duration))
 
 
-def record_repeat(folder: Path, settings: RegulationSettings, number: int) -> None:
+def record_repeat(
+    folder: Path, settings: RegulationSettings | JointSettings, number: int, deadline: Deadline = NEVER
+) -> None:
     """Record what a repeat lacks of its two bags.
 
     Args:
         folder: Folder of the run.
         settings: Settings of the run.
         number: Of the repeat, from 1.
+        deadline: When to be ready; a recording that began ends.
 
     Raises:
         BagError: A bag cannot be written.
+        BudgetSpentError: No time is left for one of them.
         FaultError: A program ended or did not respond.
     """
     chosen = repeat_settings(settings, number)
     place = repeat_folder(folder, number)
     for side in ("hw", "sim"):
         if not (place / side).exists():
+            deadline.require(_SIMULATING * chosen.noise.duration)
             record_spec(place / side, lockstep_spec(chosen, side=side))
 
 
@@ -105,17 +117,27 @@ def _write(bag: Path, spec: RunSpec, run: RunArrays) -> None:
             writer.write(events, stamp, b"\0\1\0\0" + len(text).to_bytes(4, "little") + text)
 
         stamps = [int(stamp) for stamp in run.stamp_ns]
+        coordinates = ONE_JOINT if (mechanism := spec.mechanism) is None else mechanism.coordinates
+        driven = coordinates.driven_names
+        disturbed = tuple(spec.disturbance_parameters().get("joints", driven))
+        states = zip(*map(_rows, (run.position, run.velocity, run.effort)), strict=True)
+        efforts = [
+            (topics[name], source, joints, _rows(values))
+            for name, source, joints, values in (
+                (names.EFFORT_COMMAND, "controller", driven, run.command),
+                (names.DISTURBANCE, "disturbance", disturbed, run.disturbance),
+                (names.APPLIED_EFFORT, "", driven, run.applied),
+            )
+        ]
         event(stamps[0], START_EVENT)
-        for i, stamp in enumerate(stamps):
-            position, velocity, effort = (float(one[i]) for one in (run.position, run.velocity, run.effort))
-            state = encode_joint_state(stamp, position=position, velocity=velocity, effort=effort)
-            writer.write(topics[names.JOINT_STATES], stamp, state)
-            for name, values, source in (
-                (names.EFFORT_COMMAND, run.command, "controller"),
-                (names.DISTURBANCE, run.disturbance, "disturbance"),
-                (names.APPLIED_EFFORT, run.applied, ""),
-            ):
-                if i < values.size and np.isfinite(values[i]):
-                    data = encode_joint_state(stamp, frame_id=source, effort=float(values[i]))
-                    writer.write(topics[name], stamp, data)
+        for i, (stamp, state) in enumerate(zip(stamps, states, strict=True)):
+            writer.write(topics[names.JOINT_STATES], stamp, encode_joints(stamp, "", coordinates.names, *state))
+            for topic, source, joints, rows in efforts:
+                if i < len(rows) and not math.isnan(rows[i][0]):
+                    writer.write(topic, stamp, encode_joints(stamp, source, joints, effort=rows[i]))
         event(stamps[-1], END_EVENT)
+
+
+def _rows(values: Array) -> list[Vector]:
+    """Return numbers, or rows of numbers, as tuples."""
+    return [tuple(row) for row in values.reshape(len(values), -1).tolist()]

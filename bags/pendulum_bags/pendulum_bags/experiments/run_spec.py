@@ -19,7 +19,9 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import reject_unknown, validate
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_differences import AnyPlant, load_any_plant
+from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
@@ -57,14 +59,14 @@ BEGINS_ANYWHERE = {"start_effort_limit": 0.0}
 THESIS_METHOD = "euler"
 """Integrator of the thesis's simulation, for rigid plants."""
 PERIODS = {"sim": 0.002, "hw": 0.01}
-"""Period of the states of each plant, as in the thesis [s]."""
-_OF_THE_NODE = {"duration", "file"}
+"""Period of the states of each plant, as in the thesis; of several joints, both have that of the simulator [s]."""
+_OF_THE_NODE = {"duration", "file", "joints"}
 """Parameters of the disturbance that are the node's, not the signal's."""
 
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One run of one plant under one controller and one disturbance.
+    """One run of one plant, of one joint or several, under one controller and one disturbance.
 
     Attributes:
         side: ``sim`` for the simulator, ``hw`` for the emulated hardware.
@@ -74,7 +76,7 @@ class RunSpec:
         controller: Kind of controller.
         controller_parameters: Its parameters.
         disturbance: Parameters of the disturbance; no parameters for none.
-        theta: Initial angle [rad].
+        theta: Initial angle; plants of several joints begin upright [rad].
         set_point: Angle to hold, from upright [rad].
         duration: Length [s].
         seed: Seed of the disturbance, and of the sensors of the emulated hardware.
@@ -130,9 +132,9 @@ class RunSpec:
                 # The node judges what it has, but what a run is made of is written down before it starts.
                 if isinstance(value, float) and not math.isfinite(value):
                     raise ParameterError(f"parameter {name} of the plant is {value}; expected a finite number")
-        load_plant(self.design_plant)
-        law = {**self.controller_parameters, "set_point": self.set_point}
-        validate(controller_parameters(self.controller), law, where=f"controller {self.controller}")
+        design = load_any_plant(self.design_plant)
+        known = controller_parameters(self.controller, design)
+        validate(known, self.law(design), where=f"controller {self.controller}")
         own = {spec.name for spec in DISTURBANCE_SPECS} | _OF_THE_NODE
         reject_unknown(self.disturbance, own, where="disturbance")
         signal = {k: v for k, v in self.disturbance.items() if k not in _OF_THE_NODE}
@@ -144,10 +146,21 @@ class RunSpec:
         return f"/{self.side}"
 
     @property
+    def mechanism(self) -> MechanismParameters | None:
+        """The plant that runs, where it has several joints; else None."""
+        return load_mechanism(self.plant) if is_mechanism(self.plant) else None
+
+    def law(self, design: AnyPlant) -> dict[str, Any]:
+        """Return the parameters of the controller, with the set-point that those of one joint have."""
+        own = {} if isinstance(design, MechanismParameters) else {"set_point": float(self.set_point)}
+        return {**self.controller_parameters, **own}
+
+    @property
     def period(self) -> float:
         """Time between two states [s]."""
-        foreign = self.foreign
-        return PERIODS[self.side] if foreign is None else foreign.period
+        if (foreign := self.foreign) is not None:
+            return foreign.period
+        return PERIODS["sim" if is_mechanism(self.plant) else self.side]
 
     @property
     def foreign(self) -> ForeignSimulation | None:
@@ -177,8 +190,10 @@ class RunSpec:
         return round(self.duration / self.period)
 
     def disturbance_parameters(self) -> dict[str, Any]:
-        """Return the parameters of the disturbance, the seed of the run among them."""
+        """Return the parameters of the disturbance, the seed of the run among them, and of several joints which."""
         values: dict[str, Any] = {"kind": "uniform", "amplitude": 0.0, "hold_time": 0.01}
+        if (mechanism := self.mechanism) is not None:
+            values["joints"] = list(mechanism.coordinates.driven_names[:1])
         values.update(self.disturbance)
         return {**values, "seed": self.seed}
 
@@ -196,10 +211,19 @@ class RunSpec:
         foreign = self.foreign
         if foreign is None:
             loop.setdefault("plant", absolute_plant(self.plant))
+        mechanism = self.mechanism
         if self.has_bridge:
             # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
-            loop.update(initial_position=float(self.theta), seed=self.seed)
+            loop["seed"] = self.seed
+            if mechanism is not None:
+                goal = list(mechanism.coordinates.goal)
+                rate = 1.0 / self.period
+                return graph.bridge("/hw", backend="emulator", initial_positions=goal, feedback_rate=rate, **loop)
+            loop["initial_position"] = float(self.theta)
             return graph.bridge("/hw", backend="emulator", effort_strategy=self.strategy, **loop)
+        if mechanism is not None:
+            loop.update(start="top", rate_hz=1.0 / self.period, armed_at_start=True, paused=True)
+            return graph.simulator("/sim", **loop)
         loop = {**BEGINS_ANYWHERE, **loop, "initial_theta": float(self.theta), "armed_at_start": True, "paused": True}
         if foreign is not None:
             return foreign.program(self.namespace, **loop)
@@ -212,12 +236,11 @@ class RunSpec:
             **{
                 **{
                     name: str(Path(value).resolve()) if name == "policy" and value else value
-                    for name, value in self.controller_parameters.items()
+                    for name, value in self.law(load_any_plant(self.design_plant)).items()
                 },
                 "controller": self.controller,
                 "plant": absolute_plant(self.design_plant),
                 "period": self.period,
-                "set_point": float(self.set_point),
                 "use_sim_time": self.simulated_time,
             },
         )
@@ -284,6 +307,8 @@ def run_identity(plant: str, strategy: str = "") -> str:
     Raises:
         ParameterError: The plant is unknown.
     """
+    if is_mechanism(plant):
+        return plant_identity(load_mechanism(plant))
     found = plant_identity(load_plant_to_run(plant)[0])
     return f"emulator of {found}, {strategy}" if strategy else found
 
@@ -294,6 +319,8 @@ def integrator_of(plant: str, method: str) -> str:
     Raises:
         ParameterError: The plant is unknown.
     """
+    if is_mechanism(plant):
+        return "auto"
     elastic = load_plant_to_run(plant)[0].drivetrain is not None
     return "auto" if elastic and method == THESIS_METHOD else method
 

@@ -32,6 +32,8 @@ from pendulum_msgs_py.errors import FaultError
 
 __all__ = ["run_thesis"]
 
+_PAUSING = 4.0
+"""Time before the end of the ramp up from which on nothing is begun beside it [s]."""
 OWN_PROTOCOL_SEED_STEP = 1_000_000
 """Added to the seed for the unpaired simulation, whose noise must not be that of the hardware."""
 
@@ -44,6 +46,7 @@ def run_thesis(
     leaving: ExitStack,
     *,
     on_idle: Callable[[], None] = lambda: None,
+    rests: Callable[[], bool] = lambda: True,
 ) -> None:
     """Run the experiment and leave the bags ``sim``, ``hw`` and ``sim_500hz`` in the folder.
 
@@ -54,7 +57,8 @@ def run_thesis(
         progress: Shows where it is.
         leaving: Leaves the graph of a run that succeeded, in which the middleware can hang for good: close it when
             everything is written.
-        on_idle: Called when the ramp down begins, which leaves the computer idle.
+        on_idle: Called when a ramp begins, which leaves the computer idle.
+        rests: Called until it returns that what was begun then has paused, before the noise.
 
     Raises:
         FaultError: A program ended, a plant refused or faulted; everything is at rest again when this is raised.
@@ -65,7 +69,7 @@ def run_thesis(
         _refuse_occupied_domain(session.conductor, settings)
         plants, recorders = _start(session, folder, settings)
         session.drives(*plants)
-        _regulate(session, plants, settings, progress, on_idle)
+        _regulate(session, plants, settings, progress, on_idle, rests)
         progress.phase("closing the bags", 2.0)
         # Before any wait: messages from here on are no part of the experiment.
         for recorder in recorders:
@@ -118,6 +122,7 @@ def _regulate(
     settings: RegulationSettings,
     progress: PhaseProgress,
     on_idle: Callable[[], None],
+    rests: Callable[[], bool],
 ) -> None:
     """Carry out the phases, ramp to ramp."""
     conductor, noise = session.conductor, settings.noise
@@ -130,7 +135,13 @@ def _regulate(
         plant.configure_controller()
         plant.arm()
 
-    _wait_for_goal(conductor, plants, _start_move(conductor, plants, settings, UPRIGHT, "ramp_up", progress))
+    durations = _start_move(conductor, plants, settings, UPRIGHT, "ramp_up", progress)
+    on_idle()
+    conductor.spin(max(0.0, max(durations) - _PAUSING))
+    rests()
+    _wait_for_goal(conductor, plants, durations)
+    # Upright, the plants hold their positions meanwhile.
+    conductor.wait_for("other recordings to pause", rests, START_TIMEOUT)
 
     progress.phase("regulation", SETTLE_TIME)
     for plant in plants:

@@ -29,7 +29,6 @@ from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
 __all__ = [
-    "LONGER_OF_JOINTS",
     "analyse_machine",
     "analyse_responses",
     "find_machine",
@@ -39,8 +38,6 @@ __all__ = [
 
 MACHINE = "hw_response.json"
 """File of a run folder with the measured response of its hardware."""
-LONGER_OF_JOINTS = "python -m pendulum_bags experiment joints --periods 40"
-"""Measures plants of several joints longer than by default."""
 NUMBERS = "frequency_response.json"
 """File of it with the results."""
 
@@ -141,7 +138,7 @@ def analyse_responses(
         units = [joint.unit for joint in joints] + [joint.velocity_unit for joint in joints]
         scaling = scaling or JointScaling.of_weights(model.measured, units, q, r, effort_unit)
         machine = Machine.beside(by_label["hw"], model) if "hw" in by_label else None
-        longer = longer or f"{LONGER_OF_JOINTS} --plant {plant}"
+        longer = longer or f"python -m pendulum_bags experiment joints --plant {plant} --periods 40"
     else:
         own = load_plant(plant)
         model = linearise(own)

@@ -29,6 +29,7 @@ __all__ = [
     "certify_designs",
     "design_rows",
     "designs_table",
+    "lqr_name",
     "policies_of",
     "read_designs",
 ]
@@ -52,13 +53,11 @@ class Design:
         name: As in tables.
         text: As it was given.
         K: Gain on what is measured, shape (2 k,) for k joints.
-        weights: q and r of an LQR; None for a gain.
     """
 
     name: str
     text: str
     K: NDArray[np.float64]
-    weights: tuple[tuple[float, ...], float] | None = None
 
 
 @dataclass(frozen=True)
@@ -168,6 +167,11 @@ def _asked(texts: Sequence[str], plant: AnyPlant) -> list[str]:
     return [text.strip() for text in list(texts) or written]
 
 
+def lqr_name(weights: Sequence[float], cost: float) -> str:
+    """Return how tables name an LQR."""
+    return f"LQR q=({', '.join(f'{value:g}' for value in weights)}) r={cost:g}"
+
+
 def _static(text: str, own_cost: float, model: LinearModel) -> Design:
     """Return the gain that a text stands for."""
     size = len(model.measured)
@@ -175,8 +179,7 @@ def _static(text: str, own_cost: float, model: LinearModel) -> Design:
         weights, costs = _numbers(match[1]), _numbers(match[2] or f"{own_cost}")
         if len(weights) == size and len(costs) == 1:
             K = np.asarray(output_lqr(model, weights, costs[0]).K, dtype=np.float64)
-            name = f"LQR q=({', '.join(f'{value:g}' for value in weights)}) r={costs[0]:g}"
-            return Design(name, text, K, (tuple(weights), costs[0]))
+            return Design(lqr_name(weights, costs[0]), text, K)
     elif match := _GAIN.fullmatch(text):
         gain = _numbers(match[1])
         if len(gain) == size:

@@ -1,4 +1,4 @@
-"""The multisine that measures both plants of one joint, as a run of each side."""
+"""The multisine that measures both plants, as a run of each side."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ FOLDER = "frequency_response"
 """Folder within a run folder that holds the recordings under the multisine."""
 _HOLD_TIME = 0.01
 """Both plants hold each sample for the slower one's period: the same torque as a function of time [s]."""
+
+_HIGHEST_OF_JOINTS = 100.0
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,8 @@ class Multisine:
         """
         if (foreign := sim.foreign) is not None:
             foreign.check(_HOLD_TIME)
+        if sim.mechanism is not None:
+            return self._of_joints(sim), self._of_joints(hw)
         disturbance = {
             "kind": "multisine",
             "amplitude": self.amplitude,
@@ -58,3 +62,22 @@ class Multisine:
         duration = self.signal_period * (self.periods + 1) + 0.1
         ours, theirs = (replace(spec, disturbance=disturbance, duration=duration) for spec in (sim, hw))
         return ours, theirs
+
+    def _of_joints(self, spec: RunSpec) -> RunSpec:
+        """Return a run of several joints, with the amplitude of its noise: a tenth of what its motor gives.
+
+        It is under an LQR, since a response is that of a linear loop, and ends at 100 Hz, where the loops of all
+        presets are small.
+        """
+        disturbance = {
+            "kind": "multisine",
+            "joints": spec.disturbance["joints"],
+            "amplitude": spec.disturbance["amplitude"],
+            "signal_period": self.signal_period,
+            "frequency": 1.0 / self.signal_period,
+            "frequency_end": _HIGHEST_OF_JOINTS,
+            "lines": self.lines,
+            "hold_time": spec.period,
+        }
+        duration = self.signal_period * (self.periods + 1) + 0.1
+        return replace(spec, disturbance=disturbance, duration=duration, controller="lqr", controller_parameters={})

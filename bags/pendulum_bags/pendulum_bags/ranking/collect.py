@@ -14,6 +14,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.metrics import episode_of, metrics_of
 from pendulum_bags.experiments.run_spec import SIDES, RunSpec
 from pendulum_bags.ranking.contender import Contender, contenders_of
+from pendulum_bags.ranking.joint_choice import joint_cost_parts
 from pendulum_bags.runs.case import IDENTITY, Case
 from pendulum_bags.runs.find_bags import bags_below
 from pendulum_bags.runs.run_data import is_emulated, read_run
@@ -128,11 +129,13 @@ def _why(error: Exception) -> str:
 
 def _studied_run(record: Path, weights: Sequence[float]) -> _Run:
     result, spec = (json.loads(path.read_text(encoding="utf-8")) for path in (record, record.with_name("spec.json")))
-    name, side, seed = str(result["labels"]["controller"]), str(spec["side"]), int(spec["seed"])
+    name, run = str(result["labels"]["controller"]), RunSpec.from_json(spec)
     parts = None
-    if result.get("status") == "done" and result.get("metrics", {}).get("success"):
-        parts = _parts(result["metrics"], float(spec["duration"]), weights, f"{name} on {side} under seed {seed}")
-    return _Run(name, side, seed, parts, True, RunSpec.from_json(spec).identity)
+    if result.get("status") == "done" and run.mechanism is not None:
+        parts = joint_cost_parts(record.parent, run)
+    elif result.get("status") == "done" and result.get("metrics", {}).get("success"):
+        parts = _parts(result["metrics"], run.duration, weights, f"{name} on {run.side} under seed {run.seed}")
+    return _Run(name, run.side, run.seed, parts, True, run.identity)
 
 
 def _parts(metrics: Mapping[str, float | None], duration: float, weights: Sequence[float], who: str) -> Array:

@@ -40,7 +40,7 @@ class Words:
 
     Attributes:
         more: Options that record more.
-        in_frequency: The experiment that compares the plants in frequency.
+        in_frequency: The experiment that compares the plants in frequency; empty where that was done.
         cost: What the cost is, as a sentence.
     """
 
@@ -102,7 +102,8 @@ def same_choice(ranking: Ranking, words: Words = Words(), case: Case = UNKNOWN) 
     )
     steps = (f"record more seeds: {words.more}",) if mark is Mark.UNDECIDED else ()
     if mark is Mark.NO:
-        steps = (f"compare the plants in frequency, where {ranking.pick} works: {words.in_frequency}",)
+        where = f"compare the plants in frequency, where {ranking.pick} works"
+        steps = (f"{where}: {words.in_frequency}",) if words.in_frequency else ()
     percent = [100.0 * value for value in share]
     dearer = f"{percent[0]:.0f} % dearer than {ranking.best}"
     if np.isinf(share[0]):

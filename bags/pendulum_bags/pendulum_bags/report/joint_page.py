@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,7 +22,9 @@ from pendulum_bags.report.tables import tests_table
 from pendulum_bags.runs.run_data import stand_in_of, timing_warning
 from pendulum_bags.verdict import Answer
 
-__all__ = ["joint_page"]
+__all__ = ["joint_page", "of_joint"]
+
+_Shown = TypeVar("_Shown", Figure, Table)
 
 
 def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: str) -> Page:
@@ -37,13 +40,12 @@ def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: 
     data = ReportData(first, {"seed": seed_of(first.pairs[0].simulation)}, answer=answer)
     differences = joint_differences(comparisons)
     figures = [
-        *(_of_joint(joint, equivalence(comparison.verdict)) for joint, comparison in comparisons.items()),
+        *(of_joint(joint, equivalence(comparison.verdict)) for joint, comparison in comparisons.items()),
         joints_together(comparisons),
         *([] if isinstance(differences, str) else [differences]),
         joint_spectra(comparisons),
         timing(data),
     ]
-    tests = [tests_table(comparison) for comparison in comparisons.values()]
     warning = timing_warning(first.plants)
     return Page(
         title=title,
@@ -55,7 +57,7 @@ def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: 
         figures=figures,
         tables=[
             _motions(comparisons),
-            *(replace(one, title=f"{one.title}: {joint}") for joint, one in zip(comparisons, tests, strict=True)),
+            *(of_joint(joint, tests_table(one)) for joint, one in comparisons.items()),
         ],
         provenance=[table for table in (provenance_table(data), settings_table(data)) if table is not None],
         animation=joint_animation(comparisons, str(data.run.get("design_plant", ""))),
@@ -66,8 +68,14 @@ def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: 
     )
 
 
-def _of_joint(joint: str, figure: Figure) -> Figure:
-    return replace(figure, name=f"{figure.name}_{joint}", title=f"{figure.title}: {joint}")
+def of_joint(joint: str, shown: _Shown) -> _Shown:
+    """Return a figure or a table with the name of its joint; as it is where that has none."""
+    if not joint:
+        return shown
+    title = f"{shown.title}: {joint}"
+    if isinstance(shown, Table):
+        return replace(shown, title=title)
+    return replace(shown, title=title, name=f"{shown.name}_{joint}")
 
 
 def _facts(comparisons: Mapping[str, Comparison]) -> list[tuple[str, str]]:

@@ -106,6 +106,7 @@ def write_joint_report(
     folders: Sequence[Path],
     formats: Sequence[str] = ("png", "pdf"),
     answer: Answer,
+    extend: Callable[[Page], Page] = lambda page: page,
 ) -> Path:
     """Write ``report.html`` and ``figures/`` of plants of several joints into a folder.
 
@@ -115,6 +116,7 @@ def write_joint_report(
         folders: Run folders, or the two bags.
         formats: Formats of the figures.
         answer: The answer for all joints.
+        extend: Returns the page with what else was measured.
 
     Returns:
         Path of the page.
@@ -123,7 +125,7 @@ def write_joint_report(
         BagError: The folder cannot be written.
     """
     pairs = len(next(iter(comparisons.values())).pairs)
-    return _save(out, joint_page(comparisons, answer, title=title_of(folders, pairs)), formats)
+    return _save(out, extend(joint_page(comparisons, answer, title=title_of(folders, pairs))), formats)
 
 
 def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:

@@ -13,14 +13,14 @@ __all__ = ["MACHINE_FILE", "measurement_of", "next_test_of", "plant_file_of", "q
 _EXPERIMENTS = ("thesis", "joints")
 MACHINE_FILE = "machine.yaml"
 """Plant file of the emulated machine of several joints, within its run folder."""
-_REPLACED = ("--plant", "--seed", "--out", "-o", "--simulation", "--mapping")
+_REPLACED = ("--plant", "--seed", "--out", "-o", "--simulation", "--mapping", "--only")
 """Options, each with a value, that the test has of its own: noise that a fit has seen is no test of it, and somebody
 else's simulation would stand where the plant is to."""
 _OF_THE_CASE = ("--plant", "--simulation", "--mapping", "--strategy")
 """Options that say which plants an experiment is of; those that measure other layers take them too."""
 _PLANT_FILES = (".yaml", ".yml")
-_LEFT_OUT = ("--yes",)
-"""Nobody is to be spared the question whether a machine may move."""
+_LEFT_OUT = ("--yes", "--json")
+"""The question whether a machine may move is asked again, and the answer is for a reader."""
 
 
 def next_test_of(records: Sequence[Mapping[str, Any]], plant: str, bags: Sequence[str] = ()) -> str:
@@ -37,8 +37,9 @@ def next_test_of(records: Sequence[Mapping[str, Any]], plant: str, bags: Sequenc
     seen = {str(record.get("seed", "")) for record in records}
     command = next(filter(None, (_again(record, plant, seen) for record in records)), "")
     machines = (path for bag in bags if (path := Path(bag).parent / MACHINE_FILE).is_file())
-    if command.split()[4:5] == ["joints"] and not _values_of("--machine", shlex.split(command)):
-        command += "".join(f" --machine {shlex.quote(str(path))}" for path in [*machines][:1])
+    words = shlex.split(command)
+    if command and set(_values_of("--hardware", words)) <= {"emulator"}:
+        command += "".join(f" --hardware {shlex.quote(str(path))}" for path in [*machines][:1])
     return command
 
 
@@ -61,20 +62,21 @@ def measurement_of(records: Sequence[Mapping[str, Any]], experiment: str) -> str
     return ""
 
 
-def with_budget(records: Sequence[Mapping[str, Any]], seconds: float) -> str:
-    """Return the command that carries out a recorded experiment again, all of it, with another budget.
+def with_budget(records: Sequence[Mapping[str, Any]], seconds: float = 0.0) -> str:
+    """Return the command that carries out a recorded experiment again, all of it.
 
     Args:
-        records: What bags say of their runs; the first that was an experiment on plants of one joint counts.
-        seconds: The budget [s].
+        records: What bags say of their runs; the first that was an experiment counts.
+        seconds: Another budget; 0 for the default [s].
 
     Returns:
-        The command; empty where no record tells of such an experiment.
+        The command; empty where no record tells of an experiment that compares two plants.
     """
     for words in map(_words, records):
-        if words[:5] == ["python", "-m", "pendulum_bags", "experiment", "thesis"]:
+        if _is_experiment(words):
             kept, _ = _without(words[5:], ("--budget", "--only", "--out", "-o"))
-            return shlex.join([*words[:5], *kept, "--budget", f"{seconds:.0f}"])
+            kept = [word for word in kept if word not in _LEFT_OUT]
+            return shlex.join([*words[:5], *kept, *(["--budget", f"{seconds:.0f}"] if seconds else [])])
     return ""
 
 
@@ -92,7 +94,7 @@ def question_of(command: str) -> str:
 
 def _again(record: Mapping[str, Any], plant: str, seen: Set[str]) -> str:
     words = _words(record)
-    if words[:4] != ["python", "-m", "pendulum_bags", "experiment"] or " ".join(words[4:5]) not in _EXPERIMENTS:
+    if not _is_experiment(words):
         return ""
     kept, left = _without(words[5:], _REPLACED)
     seed = left.get("--seed", "1")
@@ -100,6 +102,11 @@ def _again(record: Mapping[str, Any], plant: str, seen: Set[str]) -> str:
     first = int(seed) + 1 if seed.isdecimal() else 2
     unseen = next(number for number in count(first) if str(number) not in seen)
     return shlex.join([*words[:5], *kept, "--plant", plant, "--seed", str(unseen)])
+
+
+def _is_experiment(words: Sequence[str]) -> bool:
+    """Return whether a command compares two plants."""
+    return words[:4] == ["python", "-m", "pendulum_bags", "experiment"] and " ".join(words[4:5]) in _EXPERIMENTS
 
 
 def _without(words: Sequence[str], names: Collection[str]) -> tuple[list[str], dict[str, str]]:

@@ -16,10 +16,11 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.metrics import METRICS, Episode, metrics_of
 from pendulum_bags.distributions import mean_interval, share_interval
 from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.study_file import AXES, Study, StudyRun
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.errors import DataError, PendulumError
 from pendulum_rosbag.reader import read_bag
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "groups_to_json",
     "read_record",
     "run_metrics",
+    "write_outcome",
     "write_table",
 ]
 
@@ -108,6 +110,27 @@ def episode_of_run(place: Path, spec: RunSpec) -> Episode:
     error -= 2.0 * np.pi * np.round(error[-1] / (2.0 * np.pi))
     step = float(error[0]) if abs(error[0]) > _LEAST_STEP and _is_step(spec) else 0.0
     return Episode((stamps - stamps[0]) / NANOSECONDS, error, velocity, np.nan_to_num(command), step)
+
+
+def write_outcome(place: Path, spec: RunSpec | None, labels: Mapping[str, Any], failure: str = "", **more: Any) -> str:
+    """Store how a run went as ``run.json`` in its folder; return why it failed, what cannot be read included.
+
+    Args:
+        place: Folder of the run, with ``bag`` or ``run.npz``.
+        spec: The run, of which metrics are stored where it has one joint; None for none.
+        labels: Its place in the study, such as its controller.
+        failure: Why it failed; empty where it did not.
+        **more: What else is stored.
+    """
+    record: dict[str, Any] = {**more, "labels": dict(labels)}
+    if not failure and spec is not None and spec.mechanism is None:
+        try:
+            record["metrics"] = run_metrics(place, spec)
+        except PendulumError as error:
+            failure = f"recorded, but cannot be read: {error}"
+    record.update(status="failed" if failure else "done", reason=failure)
+    write_json(place / "run.json", record)
+    return failure
 
 
 def run_metrics(place: Path, spec: RunSpec) -> dict[str, float | None]:

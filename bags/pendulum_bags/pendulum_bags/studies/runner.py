@@ -12,14 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.runs.run_folder import write_json
-from pendulum_bags.studies.results import read_record, run_metrics
+from pendulum_bags.studies.results import read_record, write_outcome
 from pendulum_bags.studies.study_file import Study, StudyRun
-from pendulum_msgs_py.errors import BagError, PendulumError
+from pendulum_msgs_py.errors import BagError
 
 __all__ = ["StudyProgress", "default_workers", "open_study_folder", "run_study"]
 
@@ -249,23 +248,18 @@ def _simulate(run: StudyRun, place: Path) -> None:
 def _record(item: _Running, failure: str) -> str:
     """Keep how a run went; return why it failed, what cannot be read included, or an empty string."""
     run = item.run
-    record: dict[str, Any] = {
-        "number": run.number,
-        "labels": dict(run.labels),
-        "fingerprint": run.fingerprint(),
-        "engine": run.engine,
-        "attempts": item.attempts,
-        "wall_s": round(time.monotonic() - item.started, 3),
-        "simulated_s": run.spec.duration if run.spec else None,
-    }
-    if not failure and run.spec is not None:
-        try:
-            record["metrics"] = run_metrics(item.folder, run.spec)
-        except PendulumError as error:
-            failure = f"recorded, but cannot be read: {error}"
-    record.update(status="failed" if failure else "done", reason=failure)
-    write_json(item.folder / "run.json", record)
-    return failure
+    return write_outcome(
+        item.folder,
+        run.spec,
+        run.labels,
+        failure,
+        number=run.number,
+        fingerprint=run.fingerprint(),
+        engine=run.engine,
+        attempts=item.attempts,
+        wall_s=round(time.monotonic() - item.started, 3),
+        simulated_s=run.spec.duration if run.spec else None,
+    )
 
 
 class _Pace:

@@ -22,8 +22,6 @@ from pendulum_msgs_py.json_values import without_nan
 
 __all__ = [
     "HOW",
-    "NOT_MEASURED",
-    "WHAT_HOLDS",
     "Answer",
     "Evidence",
     "Layer",
@@ -34,10 +32,6 @@ __all__ = [
     "write_layer",
 ]
 
-WHAT_HOLDS = " What holds: "
-"""Begins the part of the answer's text that stays true where it is not yes."""
-NOT_MEASURED = " Not measured: "
-"""Begins the part of a yes that names the layers without a result."""
 FOLDER = "layers"
 """Folder within a run folder in which layers are stored, each in a file ``<key>.json``."""
 
@@ -192,15 +186,38 @@ class Answer:
 
     Args:
         mark: Yes, no or undecided.
-        sentence: The answer as text.
+        reasons: Why, half a sentence.
         layers: One result for each layer, in order.
         next_steps: What to do next.
+        decides: Which test decides about what, where two contradict each other; a sentence, empty where none do.
+        holds: What stays true although the answer is not yes, half a sentence; empty for nothing.
+        missing: Titles of layers that a yes lacks.
+        text: The answer as text where it is more than the sum of these.
     """
 
     mark: Mark
-    sentence: str
+    reasons: str
     layers: Sequence[LayerResult]
     next_steps: Sequence[str]
+    decides: str = ""
+    holds: str = ""
+    missing: Sequence[str] = ()
+    text: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """The answer as text."""
+        return self.text or f"{self.mark.value.capitalize()}: {self.reasons}.{self.remarks()}"
+
+    def remarks(self, of: str = "") -> str:
+        """Return the sentences that follow the reasons, each behind a space.
+
+        Args:
+            of: The simulated plant, where there are several.
+        """
+        holds = f"What holds{f' with {of}' if of else ''}: {self.holds}." if self.holds else ""
+        missing = f"Not measured: {_listed([f'“{title}”' for title in self.missing])}." if self.missing else ""
+        return "".join(f" {one}" for one in (self.decides, holds, missing) if one)
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON values."""
@@ -246,35 +263,31 @@ def sum_up(
     layers = tuple(given.get(layer) or _not_measured(layer, how.get(layer, HOW[layer])) for layer in Layer)
     by_mark = {mark: [result for result in layers if result.mark is mark] for mark in Mark}
     measured = [result for result in layers if result.mark is not Mark.NOT_MEASURED]
-    if by_mark[Mark.NO]:
-        mark = Mark.NO
-        text = f"No: {_reasons(by_mark[mark])}."
-    elif by_mark[Mark.UNDECIDED] or not measured:
-        mark = Mark.UNDECIDED
-        text = f"Undecided: {_reasons(by_mark[mark]) or 'nothing was measured'}."
-    else:
-        mark = Mark.YES
-        text = f"Yes: {_reasons(by_mark[mark])}."
+    mark = Mark.NO if by_mark[Mark.NO] else Mark.UNDECIDED if by_mark[Mark.UNDECIDED] or not measured else Mark.YES
+    decides = ""
     holds = [result.holds for result in layers if result.holds]
     certified = given[Layer.WHICH_CONTROLLERS].mark if Layer.WHICH_CONTROLLERS in given else Mark.NOT_MEASURED
     others = {given[layer].mark for layer in (Layer.SAME_RUN, Layer.SAME_PLANT) if layer in given}
     if (certified is Mark.YES and Mark.NO in others) or (certified is Mark.NO and Mark.YES in others):
-        text += (
-            f" For the stability of a design, test 3 ({Layer.WHICH_CONTROLLERS.title}) decides; for how closely the "
+        decides = (
+            f"For the stability of a design, test 3 ({Layer.WHICH_CONTROLLERS.title}) decides; for how closely the "
             f"motion matches, test 1 ({Layer.SAME_RUN.title})."
         )
-    if holds and mark is not Mark.YES:
-        text += f"{WHAT_HOLDS}{'; '.join(holds)}."
-    if mark is Mark.YES and by_mark[Mark.NOT_MEASURED]:
-        missing = _listed([f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED]])
-        text += f"{NOT_MEASURED}{missing}."
     # Steps that mend a no come first, then those that decide, then those for missing layers.
     order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES])
     steps = dict.fromkeys(step for result in order for step in result.next_steps)
     for command in dict.fromkeys(result.reason for result in by_mark[Mark.NOT_MEASURED] if result.reason):
         titles = [f"“{result.layer.title}”" for result in by_mark[Mark.NOT_MEASURED] if result.reason == command]
         steps[f"Measure {_listed(titles)}: {command}"] = None
-    return Answer(mark, text, layers, tuple(steps))
+    return Answer(
+        mark,
+        _reasons(by_mark[mark]) or "nothing was measured",
+        layers,
+        tuple(steps),
+        decides,
+        "; ".join(holds) if mark is not Mark.YES else "",
+        tuple(result.layer.title for result in by_mark[Mark.NOT_MEASURED]) if mark is Mark.YES else (),
+    )
 
 
 def _not_measured(layer: Layer, how: str) -> LayerResult:

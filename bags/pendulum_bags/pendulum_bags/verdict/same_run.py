@@ -10,12 +10,12 @@ from typing import Any
 
 from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
 from pendulum_bags.runs.case import Case
-from pendulum_bags.runs.next_test import measurement_of, next_test_of, plant_file_of, question_of
+from pendulum_bags.runs.next_test import measurement_of, next_test_of, plant_file_of, question_of, with_budget
 from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 
-__all__ = ["case_of", "design_plant", "how_to_measure", "in_words", "recordings_of", "same_run_layer", "seen_note"]
+__all__ = ["case_of", "how_to_measure", "in_words", "recordings_of", "same_run_layer", "seen_note", "simulated_plant"]
 
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
@@ -77,6 +77,11 @@ def how_to_measure(comparison: Comparison) -> dict[Layer, str]:
     first = comparison.pairs[0]
     bags = [one.source or name for one, name in ((first.simulation, "SIM"), (first.hardware, "HW"))]
     records = _records(comparison)
+    if first.hardware.joint:
+        plant = shlex.quote(simulated_plant(comparison))
+        return dict.fromkeys(
+            Layer, with_budget(records) or f"python -m pendulum_bags experiment joints --plant {plant}"
+        )
     in_frequency = measurement_of(records, "frequency_response") or (
         f"python -m pendulum_bags frequency_response {' '.join(map(shlex.quote, bags))} --out FOLDER"
         if not (first.simulation.is_whole or first.hardware.is_whole)
@@ -160,9 +165,9 @@ def _beyond(test: EquivalenceTest) -> float:
     return abs(value) / test.high
 
 
-def design_plant(comparison: Comparison) -> str:
-    """Return the plant that the controller of a run was designed for, as commands name it; MECHANISM if unknown."""
-    return str(run_record(comparison.pairs[0].simulation.metadata).get("design_plant", "MECHANISM"))
+def simulated_plant(comparison: Comparison) -> str:
+    """Return the plant that a run simulated, as commands name it; MECHANISM if unknown."""
+    return str(run_record(comparison.pairs[0].simulation.metadata).get("plant", "MECHANISM"))
 
 
 def _each_once(failed: Sequence[EquivalenceTest]) -> list[EquivalenceTest]:
@@ -183,7 +188,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tupl
         out = _next_file(fitted)
         identify = f"python -m pendulum_bags identify {source} --out {shlex.quote(out)}"
         if comparison.pairs[0].hardware.joint:
-            identify = f"{identify} --plant {shlex.quote(design_plant(comparison))}"
+            identify = f"{identify} --plant {shlex.quote(simulated_plant(comparison))}"
         begin = "Identify the plant from what the hardware did"
         if fitted:
             begin = (

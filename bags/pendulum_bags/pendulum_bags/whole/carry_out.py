@@ -1,25 +1,31 @@
 """Carry out the whole answer: what the machine does is recorded once, while this process simulates and analyses.
 
-The machine's recordings begin while the ramp down of the run in real time leaves the computer idle. Every simulated
-plant is compared with the same recordings, under the controllers that were designed on the given plant.
+Plants of one joint are compared in real time first, from ramp to ramp; their machine's other recordings are made while
+the ramps leave the computer idle, and go on behind the analysis. Plants of several joints, which no ramp lifts, begin
+upright in lockstep. Every simulated plant is compared with the same recordings, under the controllers that were
+designed on the given plant.
 """
 
 from __future__ import annotations
 
-import os
-import signal
-import threading
+import json
+import math
+import sys
 import time
-from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from pendulum_bags.comparison import Comparison, Margins
-from pendulum_bags.experiments.decide import Budget, decide
+from pendulum_bags.experiments.deadline import BudgetSpentError, Deadline
+from pendulum_bags.experiments.decide import decide
+from pendulum_bags.experiments.joint_run import JointSettings, design_file, require_upright
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.machine import Machine, MachineRun
+from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.repeats import SHORTEST, record_repeat, record_simulation, repeat_folder, repeat_settings
 from pendulum_bags.experiments.run_spec import RunSpec
@@ -32,17 +38,18 @@ from pendulum_bags.frequency_response.multisine import FOLDER as MULTISINE
 from pendulum_bags.frequency_response.multisine import Multisine
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.frequency_response.write import write_numbers
-from pendulum_bags.identification.identify import identify
-from pendulum_bags.ranking.present import same_choice
+from pendulum_bags.ranking.joint_choice import COST
+from pendulum_bags.ranking.present import Words, same_choice
 from pendulum_bags.ranking.ranking import Ranking
 from pendulum_bags.runs.next_test import with_budget
-from pendulum_bags.runs.read_recording import read_recording
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict import Answer, Layer, LayerResult, Mark, write_layer
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_bags.verdict.same_run import case_of, recordings_of
 from pendulum_bags.whole.contenders import (
+    CONTENDERS,
+    SEEDS,
     contender_specs,
     keep_run,
     place_of,
@@ -50,10 +57,13 @@ from pendulum_bags.whole.contenders import (
     simulate_contenders,
 )
 from pendulum_msgs_py.errors import DataError, FaultError, PendulumError, PlantStoppedError
+from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 
-__all__ = ["IDENTIFIED", "STEPS", "Findings", "Order", "Simulated", "carry_out"]
+__all__ = ["IDENTIFIED", "STEPS", "Findings", "Order", "Settings", "Simulated", "carry_out"]
 
+Settings = RegulationSettings | JointSettings
+_Settings = TypeVar("_Settings", bound=RegulationSettings | JointSettings)
 IDENTIFIED = "identified"
 """Step that identifies a plant, folder of its recordings within the run folder, and its entry in ``summary.json``."""
 STEPS = (Layer.SAME_RUN.key, IDENTIFIED, *(layer.key for layer in Layer if layer is not Layer.SAME_RUN))
@@ -63,14 +73,12 @@ RANKING = "ranking"
 _TEST_SEED_STEP = 2_000_000
 """Added to the seed for the noise under which an identified plant is tested: a fit has seen the other."""
 _SHARE = 0.4
-"""Share of the budget for repeats of one plant, so that the other layers have time, too."""
-_WRITING = 5.0
+"""Share of the time for repeats of one plant, so that the other layers have time, too."""
+_WRITING = 6.0
 """Processor time to end all programs and write the page without files of its figures [s]."""
-_OWN_LOAD = 2.0
-"""Programs of this run that want to run at once: this one, and of the machine's one at a time."""
-_POLL = 0.2
-_MOST_WRITING = 0.5
-"""Largest share of the budget that is left for it, where this computer is busy."""
+_POLL = 0.05
+_ANALYSING, _SIMULATING = 3.0, 0.4
+"""Processor time of an analysis of frequencies, and of a contender's run, which nothing ends before [s]."""
 
 
 @dataclass(frozen=True)
@@ -80,35 +88,53 @@ class Order:
     Attributes:
         settings: The given plant, the machine, controller and noise.
         margins: What difference does not matter.
-        budget: Longest wall time of what follows the run in real time; 0 for one analysis of that run alone [s].
+        budget: Longest wall time of what follows the first recordings; 0 for one analysis of these alone [s].
         steps: Of :data:`STEPS`.
         contenders: Controllers of the ranking.
+        seeds: Seeds of the noise under which each of them runs.
         domain: ROS domain of the run in real time; None for any free one.
+        multisine: What measures frequencies.
+        designs: Designs to certify, as text; none for the default ones.
     """
 
-    settings: RegulationSettings
+    settings: Settings
     margins: Margins
     budget: float
     steps: Collection[str]
-    contenders: int
+    contenders: int = CONTENDERS
+    seeds: int = SEEDS
     domain: int | None = None
+    multisine: Multisine = field(default_factory=Multisine)
+    designs: Collection[str] = ()
 
     @property
     def alone(self) -> bool:
-        """Whether the run in real time is all: a machine moves when its operator wants it to."""
+        """Whether the first recordings are all: a machine moves when its operator wants it to."""
         return not self.settings.can_repeat or self.budget <= 0.0
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints of plants of several; one empty name for plants of one."""
+        return self.settings.joints if isinstance(self.settings, JointSettings) else ("",)
 
     @property
     def expected_wall_time(self) -> float:
         """Wall time of all steps, measured on two cores [s]."""
         further = 0.0 if self.alone else 4.0 + 18.0 * (IDENTIFIED in self.steps)
-        further += 6.0 * self.wants(Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS)
-        further += (5.0 + 3.6 * self.contenders) * self.wants(Layer.SAME_CHOICE)
+        further += 6.0 * self.in_frequency
+        further += (5.0 + 1.2 * self.seeds * self.contenders) * self.wants(Layer.SAME_CHOICE)
         return self.settings.expected_wall_time + further
 
     def wants(self, *layers: Layer) -> bool:
         """Return whether one of some layers is asked for."""
         return not self.alone and bool({layer.key for layer in layers} & set(self.steps))
+
+    @property
+    def in_frequency(self) -> bool:
+        """Whether both plants are measured in frequency, which is defined where one joint is driven."""
+        settings = self.settings
+        one = not isinstance(settings, JointSettings) or len(load_mechanism(settings.plant).effort_limits) == 1
+        return one and self.wants(Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS)
 
 
 @dataclass
@@ -120,24 +146,33 @@ class Simulated:
         settings: What ran.
         folder: Of its recordings.
         budget: That of the next run where this one's did not suffice; 0 where more of it measures nothing [s].
+        comparisons: Of each joint; empty before the first analysis.
     """
 
     name: str
-    settings: RegulationSettings
+    settings: Settings
     folder: Path
     budget: float = 0.0
-    comparison: Comparison | None = None
+    comparisons: Mapping[str, Comparison] = field(default_factory=dict)
     analysis: Analysis | None = None
     ranking: Ranking | None = None
     layers: list[LayerResult] = field(default_factory=list)
 
+    @property
+    def comparison(self) -> Comparison:
+        """That of the only joint, or of the first; there is one."""
+        return next(iter(self.comparisons.values()))
+
+    def more(self, options: str = "") -> str:
+        """Return the command that carries out this run again, all of it, with further options; empty for none."""
+        command = with_budget([run_record(self.comparison.pairs[0].simulation.metadata)], self.budget)
+        return f"{command} {options}".rstrip() if command else ""
+
     def answer(self) -> Answer:
         """Return the sum of what was measured; there is a comparison."""
-        assert self.comparison is not None
-        more = (
-            with_budget([run_record(self.comparison.pairs[0].simulation.metadata)], self.budget) if self.budget else ""
-        )
-        return answer_of(self.comparison, anew=self.layers, more=more, how=dict.fromkeys(Layer, more) if more else {})
+        more = self.more() if self.budget else ""
+        how = dict.fromkeys(Layer, more) if more else {}
+        return answer_of(self.comparisons, anew=self.layers, more=more, how=how)
 
     def add(self, *layers: LayerResult) -> None:
         """Add layers of this plant and store them.
@@ -145,7 +180,6 @@ class Simulated:
         Raises:
             DataError: They are of another plant or machine.
         """
-        assert self.comparison is not None
         for layer in layers:
             case_of(self.comparison).require_same(layer.case, f"“{layer.layer.title}”")
             write_layer(self.folder, layer)
@@ -159,6 +193,7 @@ class Findings:
     Attributes:
         given: The plant that was given.
         identified: The one that was identified; None for none.
+        deadline: When the run, its page included, has to be over.
         notes: What could not be done, a sentence each.
         interrupted: Whether the user ended it early.
         spent: Whether the budget did.
@@ -166,6 +201,7 @@ class Findings:
 
     given: Simulated
     identified: Simulated | None = None
+    deadline: Deadline = field(default_factory=Deadline)
     notes: list[str] = field(default_factory=list)
     interrupted: bool = False
     spent: bool = False
@@ -173,7 +209,7 @@ class Findings:
     @property
     def plants(self) -> list[Simulated]:
         """Every plant that was compared."""
-        return [one for one in (self.given, self.identified) if one is not None and one.comparison is not None]
+        return [one for one in (self.given, self.identified) if one is not None and one.comparisons]
 
 
 def carry_out(
@@ -185,30 +221,33 @@ def carry_out(
         folder: The run's folder.
         order: What is wanted.
         progress: Shows where it is.
-        leaving: Ends the machine's program and leaves the graph; close it when everything is written.
+        leaving: Ends the programs and leaves the graph; close it when everything is written.
         on_first: Called with the given plant when its first layer is there.
 
     Raises:
-        FaultError: The run in real time failed.
+        FaultError: The first recordings failed.
         KeyboardInterrupt: The user interrupted it before the first layer.
     """
     run = _Run(folder, order, progress, on_first)
     leaving.enter_context(run.machine)
-    spent = threading.Event()
+    leaving.enter_context(run.programs)
+    found = run.found
     try:
         run.measure(leaving)
-        with _ends_with_budget(order.budget, run.compared, spent):
-            run.carry_out(run.compare_given)
-            for step in run.steps():
-                run.carry_out(step)
+        found.deadline = Deadline(order.budget or math.inf, _WRITING)
+        run.carry_out(run.compare_given)
+        for step in run.steps():
+            run.carry_out(step)
     except KeyboardInterrupt:
-        if not run.compared.is_set():
+        if not found.given.comparisons:
             raise
-        run.machine.interrupt()
-        run.found.spent, run.found.interrupted = spent.is_set(), not spent.is_set()
-        why = f"The budget of {order.budget:g} s was spent" if run.found.spent else "The run was interrupted"
-        run.found.notes.append(f"{why}: “{run.now}” and what follows it was left out.")
-    return run.found
+        found.interrupted = True
+        found.notes.append(f"The run was interrupted: “{run.now}” and what follows it was left out.")
+    except BudgetSpentError:
+        found.spent = True
+        found.notes.append(f"The budget of {order.budget:g} s was spent: “{run.now}” and what follows it was left out.")
+    run.stop()
+    return found
 
 
 class _Run:
@@ -221,30 +260,27 @@ class _Run:
         self.folder, self.order, self.progress, self.on_first = folder, order, progress, on_first
         self.found = Findings(Simulated(settings.plant, settings, folder, 0.0 if order.alone else 4.0 * order.budget))
         self.now = ""
-        self.compared = threading.Event()
-        self.tested = replace(
-            settings,
-            noise=replace(
-                settings.noise,
-                seed=settings.noise.seed + _TEST_SEED_STEP,
-                duration=max(SHORTEST, settings.noise.duration),
-            ),
-        )
+        self.programs = ProcessSet(folder / "logs" / "identify", {})
+        self.identification: Child | None = None
+        self.tested = _under_other_noise(settings)
         self.contenders: dict[str, list[tuple[RunSpec, RunSpec]]] = {}
         runs: list[MachineRun] = []
+        if isinstance(settings, JointSettings):
+            runs.append(MachineRun(folder / "hw", lockstep_spec(settings, side="hw")))
         if not order.alone:
             sim, hw = (lockstep_spec(settings, side=side) for side in ("sim", "hw"))
             # Two simulations without noise of their own may be one: in lockstep their recordings would be one, too.
-            if hw.has_bridge:
-                runs.append(self._recorded(repeat_folder(folder, 1) / "hw", repeat_settings(settings, 1)))
+            if hw.has_bridge and not isinstance(settings, JointSettings):
+                first = lockstep_spec(repeat_settings(settings, 1), side="hw")
+                runs.append(MachineRun(repeat_folder(folder, 1) / "hw", first))
             if IDENTIFIED in order.steps:
-                runs.append(self._recorded(folder / IDENTIFIED / "hw", self.tested))
-            if order.wants(Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS):
-                self.multisine, machine = Multisine().specs(sim, hw)
+                runs.append(MachineRun(folder / IDENTIFIED / "hw", lockstep_spec(self.tested, side="hw")))
+            if order.in_frequency:
+                self.multisine, machine = order.multisine.specs(sim, hw)
                 runs.append(MachineRun(folder / MULTISINE / "hw", machine))
             if order.wants(Layer.SAME_CHOICE):
                 self._phase("choosing controllers", 0.1 * order.contenders)
-                self.contenders = contender_specs(sim, hw, order.contenders, settings.noise.seed)
+                self.contenders = contender_specs(sim, hw, order.contenders, settings.noise.seed, order.seeds)
                 runs += [
                     MachineRun(place_of(folder / RANKING, name, machine) / "bag", machine)
                     for name, specs in self.contenders.items()
@@ -252,17 +288,33 @@ class _Run:
                 ]
         self.machine = Machine(folder, runs)
 
-    @staticmethod
-    def _recorded(bag: Path, settings: RegulationSettings) -> MachineRun:
-        return MachineRun(bag, lockstep_spec(settings, side="hw"))
-
     def measure(self, leaving: ExitStack) -> None:
-        """Carry out the run in real time, from ramp to ramp."""
+        """Make the first recordings."""
         settings = self.order.settings
+        if isinstance(settings, JointSettings):
+            self._phase("noise on the simulation", 0.1 * settings.noise.duration)
+            self.machine.start()
+            record_simulation(self.folder / "sim", lockstep_spec(settings, side="sim"))
+            self._phase("noise on the hardware", 4.0 + 0.15 * settings.noise.duration)
+            stopped = ""
+            try:
+                self.machine.wait(self.folder / "hw")
+            except PlantStoppedError as error:
+                stopped = f"went to {error.mode} ({error.reason})"
+            require_upright(self.folder, settings, stopped)
+            return
 
         def run() -> None:
             try:
-                run_thesis(self.folder, settings, self.order.domain, self.progress, leaving, on_idle=self.machine.start)
+                run_thesis(
+                    self.folder,
+                    settings,
+                    self.order.domain,
+                    self.progress,
+                    leaving,
+                    on_idle=self.machine.resume,
+                    rests=self.machine.rests,
+                )
             except FaultError:
                 self.machine.discard()
                 raise
@@ -276,47 +328,49 @@ class _Run:
             self._phase("repeat on the hardware", 2.0)
             self.machine.wait(repeat)
         self._phase("comparing", 2.0)
-        share = 1.0 if set(self.order.steps) == {Layer.SAME_RUN.key} else _SHARE
-        self._compare(self.found.given, 0.0 if self.order.alone else share * self.order.budget)
+        alone = set(self.order.steps) == {Layer.SAME_RUN.key}
+        deadline = self.found.deadline if alone else self.found.deadline.share(_SHARE)
+        self._compare(self.found.given, None if self.order.alone else deadline)
 
-    def _compare(self, plant: Simulated, seconds: float) -> None:
-        def take(comparison: Comparison) -> None:
-            first = plant.comparison is None
-            settings = plant.settings
+    def _compare(self, plant: Simulated, deadline: Deadline | None) -> None:
+        def take(compared: Mapping[str, Comparison]) -> None:
+            first, settings = not plant.comparisons, plant.settings
             if (space := settings.running("sim")) is not None:
                 unproved = recorded_difference(plant.folder / "sim", space, settings.plant)
-                comparison = replace(comparison, unproved=[unproved])
-            plant.comparison = comparison
+                compared = {joint: replace(one, unproved=[unproved]) for joint, one in compared.items()}
+            plant.comparisons = compared
             if first and plant is self.found.given:
                 self.on_first(plant)
-                self.compared.set()
 
         decide(
             plant.folder,
             plant.settings,
             self.order.margins,
-            Budget(seconds),
+            deadline,
+            joints=self.order.joints,
             on_look=lambda number, duration: self._phase(f"undecided: {duration:.0f} s more", 4.0 + 0.25 * duration),
             on_comparison=take,
             record=self._repeat,
         )
 
-    def _repeat(self, folder: Path, settings: RegulationSettings, number: int) -> None:
+    def _repeat(self, folder: Path, settings: Settings, number: int, deadline: Deadline) -> None:
         """Record a repeat; the hardware's in a program of its own, so that this one has a graph once only."""
         bag = repeat_folder(folder, number) / "hw"
-        run = self._recorded(bag, repeat_settings(settings, number))
+        run = MachineRun(bag, lockstep_spec(repeat_settings(settings, number), side="hw"))
         if run.spec.has_bridge and not bag.exists():
             with Machine(bag.parent, [run]) as machine:
                 machine.start()
-                machine.wait(bag)
-        record_repeat(folder, settings, number)
+                machine.wait(bag, deadline)
+        record_repeat(folder, settings, number, deadline)
 
     def carry_out(self, step: Callable[[], None]) -> None:
         """Carry out a step; one that fails once there is an answer leaves a note, and the others go on."""
         try:
             step()
+        except BudgetSpentError:
+            raise
         except PendulumError as error:
-            if not self.compared.is_set():
+            if not self.found.given.comparisons:
                 raise
             self.found.notes.append(f"{self.now[0].upper()}{self.now[1:]} failed: {error}".rstrip(".") + ".")
 
@@ -324,61 +378,93 @@ class _Run:
         """Yield what follows the first layer of the given plant, each step when the one before is done."""
         if self.order.alone:
             return
-        found, wants = self.found, self.order.wants
+        found = self.found
         if IDENTIFIED in self.order.steps and found.given.answer().mark is not Mark.YES:
-            yield self._identify
-        if wants(Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS):
-            for plant in found.plants:
-                yield partial(self._frequencies, plant)
+            # It runs in a program of its own, which can be ended at any time, beside what this one computes.
+            yield self._begin_identification
+        yield from self._simulate(found.given)
+        if self.identification is not None:
+            yield self._end_identification
+        if found.identified is not None:
+            yield from self._simulate(found.identified)
         if self.contenders:
-            for plant in found.plants:
-                yield partial(self._simulate_contenders, plant)
             yield self._machine_contenders
             for plant in found.plants:
                 yield partial(self._rank, plant)
+
+    def _simulate(self, plant: Simulated) -> Iterator[Callable[[], None]]:
+        if plant.comparisons and self.order.in_frequency:
+            yield partial(self._frequencies, plant)
+        if plant.comparisons and self.contenders:
+            yield partial(self._simulate_contenders, plant)
 
     def _phase(self, name: str, seconds: float) -> None:
         self.now = name
         self.progress.phase(name, seconds)
 
-    def _identify(self) -> None:
-        """Identify a plant from what the given one was compared with, and compare it under noise of another seed."""
-        given = self.found.given
-        assert given.comparison is not None
-        self._phase("identifying the plant", 14.0)
-        result = identify([read_recording(path) for path in recordings_of(given.comparison)])
-        if result.refused:
-            raise DataError(f"no plant was identified: {result.verdict}")
-        limit = load_plant(given.settings.design_plant).effort_limit
-        file = result.write(self.folder / PLANT_FILE, effort_limit=limit)
-        self._phase(f"comparing {PLANT_FILE}", 4.0)
-        place = self.folder / IDENTIFIED
-        self.machine.wait(place / "hw")
-        settings = self.tested_with(file)
-        record_simulation(place / "sim", lockstep_spec(settings, side="sim"))
-        self.found.identified = Simulated(PLANT_FILE, settings, place, given.budget)
-        self._compare(self.found.identified, _SHARE * self.order.budget)
+    def stop(self) -> None:
+        """End what still runs; leaving its context waits for that."""
+        self.machine.interrupt()
+        self.programs.stop()
 
-    def tested_with(self, file: Path) -> RegulationSettings:
-        """Return the settings that test a plant file under the controller that was designed on the given plant."""
-        design = self.order.settings.design_plant
-        return replace(self.tested, plant=str(file), design=design, simulation="", mapping="")
+    def _begin_identification(self) -> None:
+        """Identify a plant from what the given one was compared with."""
+        given = self.found.given
+        self._phase("identifying the plant", 0.5)
+        words = ["identify", *recordings_of(given.comparison), "--out", str(self.folder / PLANT_FILE), "--json"]
+        if isinstance(given.settings, JointSettings):
+            words += ["--plant", given.settings.plant]
+        else:
+            limit = load_plant(given.settings.design_plant).effort_limit
+            words += ["--no-page", "--effort-limit", str(limit)]
+        self.programs.__enter__()
+        self.identification = self.programs.start(
+            "identify", [sys.executable, "-m", "pendulum_bags", *words], ends_by_itself=True
+        )
+
+    def _end_identification(self) -> None:
+        """Compare the identified plant under noise of another seed."""
+        assert self.identification is not None
+        deadline, file, place = self.found.deadline, self.folder / PLANT_FILE, self.folder / IDENTIFIED
+        self._phase("identifying the plant", 12.0)
+        while (code := self.identification.process.poll()) is None:
+            deadline.require()
+            time.sleep(_POLL)
+        self.programs.children.clear()
+        if code != 0:
+            raise DataError(f"no plant was identified: {_refusal(self.identification)}")
+        self._phase(f"comparing {PLANT_FILE}", 4.0)
+        self.machine.wait(place / "hw", deadline)
+        deadline.require(_ANALYSING)
+        settings = _with_plant(self.tested, file)
+        record_simulation(place / "sim", lockstep_spec(settings, side="sim"))
+        if isinstance(settings, JointSettings):
+            require_upright(place, settings)
+        self.found.identified = Simulated(PLANT_FILE, settings, place, self.found.given.budget)
+        self._compare(self.found.identified, deadline.share(_SHARE))
 
     def _frequencies(self, plant: Simulated) -> None:
         """Compare a plant with the machine in frequency, and certify designs on it."""
         self._phase(f"frequencies of {plant.name}", 3.0)
         own, machine = plant.folder / MULTISINE / "sim", self.folder / MULTISINE / "hw"
+        self.found.deadline.require(_ANALYSING)
         record_simulation(own, _of(plant, self.multisine))
-        self.machine.wait(machine)
+        self.machine.wait(machine, self.found.deadline)
+        self.found.deadline.require(_ANALYSING)
         responses, _, ran = read_responses([own, machine])
-        plant.analysis = analyse_responses(responses, plant.settings.plant, ran)
+        settings = plant.settings
+        design = settings.plant
+        if isinstance(settings, JointSettings):
+            design = design_file(plant.folder, settings.plant)
+        longer = plant.more(f"--periods {5 * self.order.multisine.periods}")
+        plant.analysis = analyse_responses(responses, design, [*self.order.designs, *ran], longer=longer)
         write_numbers(plant.folder, plant.analysis)
         plant.add(*(one for one in plant.analysis.layers if self.order.wants(one.layer)))
 
     def _simulate_contenders(self, plant: Simulated) -> None:
         self._phase(f"{len(self.contenders)} controllers on {plant.name}", 0.6 * len(self.contenders))
         specs = {name: [_of(plant, sim) for sim, _ in both] for name, both in self.contenders.items()}
-        simulate_contenders(plant.folder / RANKING, specs)
+        simulate_contenders(plant.folder / RANKING, specs, partial(self.found.deadline.require, _SIMULATING))
 
     def _machine_contenders(self) -> None:
         self._phase(f"{len(self.contenders)} controllers on the hardware", 3.0 * len(self.contenders))
@@ -386,57 +472,50 @@ class _Run:
             for _, spec in both:
                 place, failure = place_of(self.folder / RANKING, name, spec), ""
                 try:
-                    self.machine.wait(place / "bag")
+                    self.machine.wait(place / "bag", self.found.deadline)
                 except PlantStoppedError as error:
                     failure = str(error)
                 keep_run(place, name, spec, failure)
 
     def _rank(self, plant: Simulated) -> None:
         self._phase(f"ranking on {plant.name}", 1.0)
+        self.found.deadline.require(_SIMULATING)
         plant.ranking, case = rank_folders(plant.folder / RANKING, self.folder / RANKING)
         write_json(plant.folder / "ranking.json", plant.ranking.to_json())
-        plant.add(same_choice(plant.ranking, case=case))
+        words = Words(plant.more(f"--seeds {4 * self.order.seeds}"), "")
+        if isinstance(plant.settings, JointSettings):
+            words = replace(words, cost=COST)
+        plant.add(same_choice(plant.ranking, words, case=case))
+
+
+def _under_other_noise(settings: _Settings) -> _Settings:
+    """Return the settings of the test of an identified plant, whose fit has seen the noise of the given ones."""
+    noise = settings.noise
+    other = replace(noise, seed=noise.seed + _TEST_SEED_STEP, duration=max(SHORTEST, noise.duration))
+    return replace(settings, noise=other)
+
+
+def _with_plant(settings: Settings, file: Path) -> Settings:
+    """Return the settings that simulate a plant file under the controller that was designed on the given plant."""
+    if isinstance(settings, JointSettings):
+        return replace(settings, plant=str(file), design=settings.design_plant)
+    return replace(settings, plant=str(file), design=settings.design_plant, simulation="", mapping="")
 
 
 def _of(plant: Simulated, spec: RunSpec) -> RunSpec:
     """Return a run of the given plant's simulation as one of another plant; the controller stays."""
     settings = plant.settings
+    if isinstance(settings, JointSettings):
+        return replace(spec, plant=settings.plant)
     return replace(
         spec, plant=settings.plant, method=settings.method, simulation=settings.simulation, mapping=settings.mapping
     )
 
 
-def _slowness() -> float:
-    """Return how many times longer than alone a computation takes, by the programs that others want to run."""
-    return max(1.0, (os.getloadavg()[0] - _OWN_LOAD) / (os.cpu_count() or 1))
-
-
-@contextmanager
-def _ends_with_budget(budget: float, compared: threading.Event, spent: threading.Event) -> Iterator[None]:
-    """Interrupt the main thread when the budget less the time to write the page is spent, as Ctrl-C would.
-
-    Args:
-        budget: Wall time from now on; 0 for no end [s].
-        compared: Set when the first layer is there, for which there is always time.
-        spent: Set before the interruption.
-    """
-    ends, done = time.monotonic() + budget, threading.Event()
-
-    def end() -> None:
-        compared.wait()
-        while time.monotonic() < ends - min(_WRITING * _slowness(), _MOST_WRITING * budget):
-            if done.wait(_POLL):
-                return
-        spent.set()
-        os.kill(os.getpid(), signal.SIGINT)
-
-    watch = threading.Thread(target=end, daemon=True)
-    if budget > 0.0:
-        watch.start()
+def _refusal(identification: Child) -> str:
+    """Return why an identification refused its recordings, or its last output."""
     try:
-        yield
-    finally:
-        done.set()
-        if budget > 0.0 and compared.is_set():
-            # One that has just ended interrupts here, and not what comes next.
-            watch.join()
+        result = json.loads(identification.log.read_text(encoding="utf-8"))
+        return str(result.get("refused") or result["verdict"])
+    except (ValueError, KeyError, AttributeError):
+        return identification.last_words(1).removeprefix("error: ")

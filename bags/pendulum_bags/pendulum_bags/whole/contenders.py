@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +12,58 @@ import numpy as np
 
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.frequency_response.designs import lqr_name
 from pendulum_bags.ranking.collect import collect_contenders
 from pendulum_bags.ranking.ranking import Ranking, rank
 from pendulum_bags.runs.case import Case
 from pendulum_bags.runs.run_folder import write_json
-from pendulum_bags.studies.results import run_metrics
+from pendulum_bags.studies.results import write_outcome
 from pendulum_bags.studies.study_file import load_study
 from pendulum_msgs_py.errors import PendulumError
 
-__all__ = ["contender_specs", "keep_run", "place_of", "rank_folders", "simulate_contenders"]
+__all__ = ["CONTENDERS", "MOST", "contender_specs", "keep_run", "place_of", "rank_folders", "simulate_contenders"]
 
+CONTENDERS, MOST = 6, 32
+"""Controllers that a ranking compares by default, and at most."""
 SEEDS = 3
 """Seeds of the noise under which each runs."""
 _FIRST = ("lqr", "lqi", "pid", "sliding_mode", "lqr_q1_0.01_r1", "lqr_q10000_0.01_r0.1")
 """The thesis's LQR, laws of other kinds, and an LQR much softer and one much stiffer."""
+_COSTS, _VELOCITIES, _POSITIONS = (1.0, 100.0, 10.0, 0.1, 1e3, 0.01), (1.0, 30.0), (1.0, 10.0, 0.1)
+"""By what the weights of several joints' own LQR are multiplied: those of efforts, velocities and positions."""
+_LENGTH = 5.0
+"""Longest noise under which controllers of several joints run [s]."""
 _PROBE = 1.0
 """Length of the run that shows whether two controllers differ [s]."""
 
 
-def contender_specs(sim: RunSpec, hw: RunSpec, count: int, seed: int) -> dict[str, list[tuple[RunSpec, RunSpec]]]:
+def _laws(spec: RunSpec) -> dict[str, dict[str, Any]]:
+    """Return what contends: for each name, what changes of a run."""
+    if (mechanism := spec.mechanism) is None:
+        runs = load_study("ranking", seeds=[spec.seed]).runs
+        fields = ("controller", "controller_parameters", "disturbance", "duration")
+        named = {
+            str(run.labels["controller"]): {field: getattr(run.spec, field) for field in fields}
+            for run in runs
+            if run.spec is not None
+        }
+        return {name: named[name] for name in dict.fromkeys((*_FIRST, *named))}
+    weights, cost = mechanism.mechanism.weights
+    half = len(weights) // 2
+    noise = {"duration": min(spec.duration, _LENGTH)}
+    laws: dict[str, dict[str, Any]] = {}
+    for stiff, quick, dear in product(_POSITIONS, _VELOCITIES, _COSTS):
+        q = [*(stiff * one for one in weights[:half]), *(quick * one for one in weights[half:])]
+        name = lqr_name(q, dear * cost)
+        laws[name] = {"controller": "lqr", "controller_parameters": {"q": q, "r": dear * cost}, **noise}
+        if len(laws) == 1:
+            laws |= {kind: {"controller": kind, "controller_parameters": {}, **noise} for kind in ("lqi", "lqg")}
+    return laws
+
+
+def contender_specs(
+    sim: RunSpec, hw: RunSpec, count: int, seed: int, seeds: int = SEEDS
+) -> dict[str, list[tuple[RunSpec, RunSpec]]]:
     """Return the runs of each contender on both sides, under each seed of the noise.
 
     Of controllers that command the same, the first alone contends: it would count twice in a correlation. One that
@@ -40,27 +74,23 @@ def contender_specs(sim: RunSpec, hw: RunSpec, count: int, seed: int) -> dict[st
         hw: The hardware likewise.
         count: Number of contenders, fewer where fewer differ.
         seed: First seed.
+        seeds: Number of seeds.
     """
-    runs = load_study("ranking", seeds=[seed]).runs
-    named = {str(run.labels["controller"]): run.spec for run in runs if run.spec is not None}
     found: dict[str, list[tuple[RunSpec, RunSpec]]] = {}
     seen: list[Any] = []
-    for name in dict.fromkeys((*_FIRST, *named)):
+    for name, law in _laws(replace(sim, seed=seed)).items():
         if len(found) == count:
             break
-        spec = named[name]
-        law: dict[str, Any] = {"controller": spec.controller, "controller_parameters": spec.controller_parameters}
-        noise: dict[str, Any] = {"disturbance": spec.disturbance, "duration": spec.duration}
-        own, theirs = (replace(one, **law, **noise) for one in (sim, hw))
         try:
+            own, theirs = (replace(one, **law) for one in (sim, hw))
             commands = simulate(replace(own, duration=_PROBE, seed=seed)).command
         except PendulumError:  # a law that the plant is none for, such as one for rigid plants alone
             continue
         if any(np.allclose(commands, others, rtol=1e-6, atol=1e-9, equal_nan=True) for others in seen):
             continue
         seen.append(commands)
-        seeds = range(seed, seed + SEEDS)
-        found[name] = [(replace(own, seed=number), replace(theirs, seed=number)) for number in seeds]
+        numbers = range(seed, seed + seeds)
+        found[name] = [(replace(own, seed=number), replace(theirs, seed=number)) for number in numbers]
     return found
 
 
@@ -79,15 +109,22 @@ def keep_run(place: Path, name: str, spec: RunSpec, failure: str = "") -> None:
         failure: Why the plant stopped; empty where it did not.
     """
     write_json(place / "spec.json", spec.to_json())
-    record: dict[str, Any] = {"labels": {"controller": name}, "status": "failed" if failure else "done"}
-    record |= {"reason": failure} if failure else {"metrics": run_metrics(place, spec)}
-    write_json(place / "run.json", record)
+    write_outcome(place, spec, {"controller": name}, failure)
 
 
-def simulate_contenders(folder: Path, specs: Mapping[str, Sequence[RunSpec]]) -> None:
-    """Simulate every run in this process, and store it."""
+def simulate_contenders(
+    folder: Path, specs: Mapping[str, Sequence[RunSpec]], before: Callable[[], None] = lambda: None
+) -> None:
+    """Simulate every run in this process, and store it.
+
+    Args:
+        folder: Where to.
+        specs: Runs of each contender.
+        before: Called before each run.
+    """
     for name, runs in specs.items():
         for spec in runs:
+            before()
             place = place_of(folder, name, spec)
             place.mkdir(parents=True)
             np.savez(place / "run.npz", **vars(simulate(spec)))

@@ -9,20 +9,26 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
+from pendulum_bags.experiments.deadline import slowness
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.table import Table
 from pendulum_bags.frequency_response.figures import bode
 from pendulum_bags.frequency_response.write import designs_tables
 from pendulum_bags.pages.layer_page import evidence_table
-from pendulum_bags.ranking.present import ranking_figure, ranking_tables
+from pendulum_bags.ranking.joint_choice import COST
+from pendulum_bags.ranking.present import Words, ranking_figure, ranking_tables
 from pendulum_bags.report.analysis_figures import equivalence
+from pendulum_bags.report.joint_page import of_joint
 from pendulum_bags.report.page import Page
 from pendulum_bags.report.tables import tests_table
-from pendulum_bags.report.write import write_report
+from pendulum_bags.report.write import write_joint_report, write_report
 from pendulum_bags.verdict import Answer, Layer, Mark
 from pendulum_bags.whole.carry_out import Findings, Simulated
 
 __all__ = ["write_whole_report"]
+
+_FILES = 20.0
+"""Processor time to write the page and the files of its figures [s]."""
 
 
 def write_whole_report(
@@ -46,6 +52,13 @@ def write_whole_report(
         others = [(plant.name, own) for plant, own in zip(found.plants[1:], answers[1:], strict=True)]
         return replace(page, figures=figures, tables=tables, others=others, notes=[*page.notes, *found.notes])
 
+    # Files for paper take three times as long as the page: what ends early has its plots alone.
+    ends_early = found.interrupted or found.spent or found.deadline.total_left < _FILES * slowness()
+    formats = () if ends_early else ("png", "pdf")
+    if "" not in given.comparisons:
+        return write_joint_report(
+            folder, given.comparisons, folders=[folder], formats=formats, answer=answer, extend=extend
+        )
     return write_report(
         folder,
         summary,
@@ -54,20 +67,19 @@ def write_whole_report(
         answer=answer,
         certified=given.analysis,
         extend=extend,
-        # Files for paper take three times as long as the page: what ends early has its plots alone.
-        formats=() if found.interrupted or found.spent else ("png", "pdf"),
+        formats=formats,
     )
 
 
 def _add(figures: list[Figure], tables: list[Table], plant: Simulated, answer: Answer, *, given: bool) -> None:
     """Add what was found of a plant; of the given one, the page has tests and evidence already."""
-    assert plant.comparison is not None
     section = "" if given else f"With {plant.name}"
     mine: list[Figure] = []
     listed: list[Table] = []
     if not given:
-        mine.append(equivalence(plant.comparison.verdict))
-        listed.append(tests_table(plant.comparison))
+        for joint, one in plant.comparisons.items():
+            mine.append(of_joint(joint, equivalence(one.verdict)))
+            listed.append(of_joint(joint, tests_table(one)))
         listed += [
             evidence_table(one)
             for one in answer.layers
@@ -79,7 +91,8 @@ def _add(figures: list[Figure], tables: list[Table], plant: Simulated, answer: A
         listed += designs_tables(plant.analysis)
     if plant.ranking is not None:
         mine.append(replace(ranking_figure(plant.ranking), section="Same choice"))
-        listed += [replace(one, section="Same choice") for one in ranking_tables(plant.ranking)]
+        words = Words() if "" in plant.comparisons else Words(cost=COST)
+        listed += [replace(one, section="Same choice") for one in ranking_tables(plant.ranking, words)]
     for figure in mine:
         named = (
             figure

@@ -7,36 +7,38 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pendulum_bags.verdict import Answer, Layer, Mark
-from pendulum_bags.verdict.layers import NOT_MEASURED, WHAT_HOLDS
 from pendulum_bags.whole.carry_out import Findings, Simulated
 
 __all__ = ["whole_answer"]
 
 
 def whole_answer(found: Findings) -> tuple[Answer, list[Answer]]:
-    """Return the answer for the given plant, with a sentence and next steps that take all in, and that of each plant.
+    """Return the answer for the given plant, with a text and next steps that take all in, and that of each plant.
 
     Args:
         found: What the run found.
     """
-    answers = [plant.answer() for plant in found.plants]
-    given = answers[0]
+    plants = found.plants
+    answers = [plant.answer() for plant in plants]
+    given, choice = answers[0], _choice(plants, answers)
     if len(answers) == 1:
-        return given, answers
-    identified, name, file = answers[1], found.plants[1].name, shlex.quote(found.plants[1].settings.plant)
-    head, holds, rest = given.sentence.partition(WHAT_HOLDS)
-    sentence = head.replace(": ", f" with {found.given.name}, the plant that you had: ", 1)
-    sentence += f" {identified.mark.value.capitalize()} with {name}, which this run found"
+        return replace(given, text=f"{given.sentence}{choice}"), answers
+    identified, (first, name) = answers[1], (plant.name for plant in plants)
+    text = (
+        f"{given.mark.value.capitalize()} with {first}, the plant that you had; {identified.mark.value} with {name}, "
+        f"which this run found.{choice} With {first}: {given.reasons}."
+    )
     if identified.mark is Mark.YES:
-        sentence += f".{''.join(identified.sentence.partition(NOT_MEASURED)[1:])}"
+        # What held of the given plant is no longer needed; which test decides is.
+        text += replace(given, holds="", missing=identified.missing).remarks()
     else:
-        sentence += f":{identified.sentence.partition(':')[2]}"
-    sentence += _choice(found.plants, answers) + ("" if identified.mark is Mark.YES else holds + rest)
+        text += f" With {name}: {identified.reasons}."
+        text += replace(identified, decides=identified.decides or given.decides).remarks(name)
     steps: Sequence[str] = identified.next_steps
     if identified.mark is Mark.YES:
-        design = f"python -m pendulum_lqr design --plant {file}"
+        design = f"python -m pendulum_lqr design --plant {shlex.quote(plants[1].settings.plant)}"
         steps = (f"Simulate with that plant from now on, and design on it ({design}).", *steps)
-    return replace(given, sentence=sentence, next_steps=tuple(steps)), answers
+    return replace(given, text=text, next_steps=tuple(steps)), answers
 
 
 def _choice(plants: Sequence[Simulated], answers: Sequence[Answer]) -> str:
@@ -46,8 +48,8 @@ def _choice(plants: Sequence[Simulated], answers: Sequence[Answer]) -> str:
     if ranking is None or Mark.NOT_MEASURED in marks:
         return ""
     of = f" Of these {len(ranking.names)} controllers"
-    if marks == [Mark.YES, Mark.YES]:
-        return f"{of} the simulation picks the right one with both."
+    if set(marks) == {Mark.YES}:
+        return f"{of} the simulation picks the right one{' with both' if len(marks) > 1 else ''}."
     picks = {
         Mark.YES: "picks the right one",
         Mark.NO: "picks a wrong one",
