@@ -7,15 +7,14 @@ told.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,7 +23,6 @@ import pytest
 
 from pendulum_bags.experiments.session import NO_REALTIME
 from pendulum_testing.fixtures import PROJECT
-from tests.suite_events import PIPE
 
 __all__ = ["Part", "exit_code", "main", "rooms", "run_parts"]
 
@@ -91,7 +89,9 @@ _LOOK_EVERY = 0.2
 """Time between two looks at the parts [s]."""
 _YOUNG = 5.0
 """Age up to which a process that was started in a session of its own may not have begun it, on a busy machine [s]."""
-_GRAVITY = ("", "passed", "skipped", "failed")
+_ENDED = re.compile(r"\[gw\d+\] \[ *(\d+)%\] ([A-Z]+) (.*\S)")
+"""What xdist prints of each test: how far it is [%], the outcome, the name."""
+_BAD = ("FAILED", "ERROR")
 _PATIENCE = 20.0
 """Time to end after Ctrl-C [s]; then a part is killed."""
 
@@ -149,44 +149,40 @@ class Part:
     ) -> None:
         self._realtime = realtime
         self.name = name
-        self.collected = 0
-        self.outcomes: dict[str, str] = {}
-        self.durations: defaultdict[str, float] = defaultdict(float)
+        self.share = "0"
+        self.outcomes = Counter[str]()
         self._arguments = arguments
         self._workers = min(workers, os.cpu_count() or 1)
         self._nice = nice
         self._looked_at: set[int] = set()
         self._begun: dict[int, float] = {}
         self._popen: subprocess.Popen[bytes] | None = None
-        self._output = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the part)
+        self._output = tempfile.NamedTemporaryFile()  # noqa: SIM115  (lives as long as the part)
+        self._reader = Path(self._output.name).open(errors="replace", encoding="utf-8")  # noqa: SIM115
+        self._rest = ""
 
     def start(self) -> None:
         """Start pytest, once, in a session of its own: Linux shares the cores among sessions first."""
         if self._popen is not None:
             return
-        reader, writer = os.pipe()
         # Within a worker's test this is no worker.
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
         if not self._realtime:
             environment[NO_REALTIME] = "1"
         # One worker too has a process that waits for it, and tells if it crashes.
-        command = [sys.executable, "-m", "pytest", "-p", "tests.suite_events", "-n", str(self._workers)]
+        command = [sys.executable, "-m", "pytest", "-v", "--color=no", "--durations=10", "-n", str(self._workers)]
         self._popen = subprocess.Popen(
             [*command, "--dist", "loadfile", "--no-loadscope-reorder", *self._arguments],
             cwd=PROJECT,
-            env={**environment, PIPE: str(writer)},
+            env=environment,
             stdin=subprocess.DEVNULL,
             stdout=self._output,
             stderr=subprocess.STDOUT,
-            pass_fds=[writer],
             start_new_session=True,
         )
-        os.close(writer)
         if self._nice:
             os.setpriority(os.PRIO_PGRP, self._popen.pid, self._nice)
             self.hold_back()
-        self._listener = threading.Thread(target=self._listen, args=(reader,), daemon=True)
-        self._listener.start()
 
     @property
     def code(self) -> int | None:
@@ -238,25 +234,18 @@ class Part:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._popen.wait(timeout)
 
-    def output(self) -> str:
-        """Return what pytest has printed, once it has ended."""
-        self._listener.join(_PATIENCE)
-        self._output.seek(0)
-        return self._output.read().decode(errors="replace")
+    def follow(self) -> None:
+        """Count what has ended, and name what has failed."""
+        *lines, self._rest = (self._rest + self._reader.read()).split("\n")
+        for self.share, outcome, test in (found.groups() for found in map(_ENDED.match, lines) if found):
+            self.outcomes[outcome] += 1
+            if outcome in _BAD:
+                print(f"{outcome} {test} ({self.name}; why stands below at the end)", flush=True)
 
-    def _listen(self, reader: int) -> None:
-        with os.fdopen(reader, encoding="utf-8") as events:
-            for line in events:
-                event = json.loads(line)
-                if "collected" in event:
-                    self.collected = event["collected"]
-                    continue
-                test, outcome = event["test"], event["outcome"]
-                self.durations[test] += event["duration"]
-                if outcome == "failed" and self.outcomes.get(test) != "failed":
-                    print(f"FAILED {test} ({self.name}; why stands below at the end)", flush=True)
-                if outcome != "passed" or event["when"] == "call":
-                    self.outcomes[test] = max(self.outcomes.get(test, ""), outcome, key=_GRAVITY.index)
+    def output(self) -> str:
+        """Return what pytest has printed behind the last test."""
+        text = Path(self._output.name).read_text(encoding="utf-8", errors="replace")
+        return text[max((found.end() for found in _ENDED.finditer(text)), default=0) :].strip()
 
 
 def run_parts(*lanes: Sequence[Part]) -> int:
@@ -276,6 +265,7 @@ def run_parts(*lanes: Sequence[Part]) -> int:
                     unfinished[0].start()
             for part in parts:
                 part.hold_back()
+                part.follow()
             time.sleep(_LOOK_EVERY)
             if time.monotonic() - told >= _TELLS_EVERY:
                 told += _TELLS_EVERY
@@ -284,15 +274,12 @@ def run_parts(*lanes: Sequence[Part]) -> int:
         print("interrupted: ending what runs", flush=True)
         _end(parts)
         for part in parts:
-            if "failed" in part.outcomes.values():
+            if part.outcomes.keys() & set(_BAD):
                 print(part.output())
         return int(pytest.ExitCode.INTERRUPTED)
     for part in parts:
+        part.follow()
         print(f"\n{f' {part.name} ':=^100}\n{part.output()}")
-    durations = Counter({test: time for part in parts for test, time in part.durations.items()})
-    print("ten slowest:")
-    for test, duration in durations.most_common(10):
-        print(f"{duration:7.1f} s  {test}")
     print(f"{'; '.join(map(_progress, parts))}; took {_clock(time.monotonic() - begin)} min")
     return exit_code([part.code or 0 for part in parts])
 
@@ -314,10 +301,8 @@ def exit_code(codes: Sequence[int]) -> int:
 
 
 def _progress(part: Part) -> str:
-    outcomes = Counter(part.outcomes.values())
-    failed = f", {outcomes['failed']} FAILED" if outcomes["failed"] else ""
-    skipped = f", {outcomes['skipped']} skipped" if outcomes["skipped"] else ""
-    return f"{part.name} {len(part.outcomes)} of {part.collected or '?'}{skipped}{failed}"
+    told = [f"{part.outcomes[outcome]} {outcome}" for outcome in ("SKIPPED", *_BAD) if part.outcomes[outcome]]
+    return ", ".join((f"{part.name} {part.share} %", *told))
 
 
 def _clock(seconds: float) -> str:
