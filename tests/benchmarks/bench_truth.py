@@ -16,8 +16,8 @@ from pendulum_bags.comparison import Looks, Margins, Outcome
 from pendulum_bags.comparison.equivalence import EquivalenceTest, conclude
 from pendulum_bags.comparison.long_run import Disturbance
 from pendulum_bags.comparison.same_run import paired_tests, unpaired_tests
+from pendulum_bags.identification.identify_mechanism import identify_mechanism
 from pendulum_bags.identification.joint_recordings import JointRecording
-from pendulum_bags.identification.mechanism_result import identify_mechanism
 from pendulum_bags.runs.series import Series, Signal
 from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_testing.balanced_machine import PRESETS, run_balanced

@@ -8,8 +8,8 @@ from functools import cache
 
 import numpy as np
 
+from pendulum_bags.identification.identify_mechanism import identify_mechanism
 from pendulum_bags.identification.joint_recordings import JointRecording
-from pendulum_bags.identification.mechanism_result import identify_mechanism
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
 

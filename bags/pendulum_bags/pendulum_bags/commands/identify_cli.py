@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import DataError
@@ -20,7 +21,6 @@ from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.typed_commands import as_typed
 
 if TYPE_CHECKING:
-    from pendulum_bags.identification.mechanism_result import MechanismResult
     from pendulum_bags.identification.result import IdentificationResult
     from pendulum_bags.identification.thesis import ThesisResult
     from pendulum_bags.runs.datasets import Recording
@@ -31,7 +31,7 @@ Hold = Annotated[
     str | None,
     typer.Option(help="Input of a CSV between its samples: zero (a held command) or linear (measured)."),
 ]
-_FOR_SEVERAL_JOINTS = frozenset({"plant", "mapping", "window", "held_out", "out", "name", "as_json"})
+_FOR_SEVERAL_JOINTS = frozenset({"plant", "mapping", "window", "held_out", "out", "name", "page", "as_json"})
 _FOR_REGRESSION = frozenset({"method", "mapping", "hold", "experiment", "skew", "out", "page", "as_json", "verbose"})
 _FOR_REGRESSION_ALONE = frozenset({"experiment", "skew", "verbose"})
 
@@ -104,12 +104,20 @@ def identify(
     """
     from pendulum_bags.runs.read_recording import read_recording
 
+    paths = [*data, *(held_out or [])]
     if plant is not None:
-        # There is no page with --plant.
-        _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS | (set() if page else {"page"}))
-        others = held_out or []
-        rules_of = _mappings(mapping, len(data), len(data) + len(others))
-        _several_joints(plant, data, rules_of, others, window, out, name, as_json)
+        _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS)
+        from pendulum_bags.identification.identify_mechanism import identify_mechanism
+        from pendulum_bags.identification.joint_recordings import read_joints
+        from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+
+        start = load_mechanism(plant)
+        if len(start.joints) == 1:
+            raise DataError(f"plant {start.name!r} has one joint; expected a mechanism, or no --plant for one joint")
+        rules_of = _mappings(mapping, len(data), len(paths))
+        logs = [read_joints(path, start.coordinates, rules) for path, rules in zip(paths, rules_of, strict=True)]
+        joints = identify_mechanism(start, logs[: len(data)], held_out=logs[len(data) :], window=window)
+        _finish(joints, joints.write(out, name=name) if out and not joints.refused else None, page, as_json)
         return
     if method not in {"output_error", "thesis"}:
         raise DataError(f"method is {method!r}; expected output_error or thesis")
@@ -135,25 +143,28 @@ def identify(
     from pendulum_bags.identification.options import Geometry, Options
 
     options = Options(window=window, friction=friction, geometry=Geometry(mass, length, inertia), fix_scale=fix_scale)
-    paths = [*data, *(held_out or [])]
     everything = [
         read_recording(path, rules, effort=effort, hold=hold)
         for path, rules in zip(paths, _mappings(mapping, len(data), len(paths)), strict=True)
     ]
-    result = run(everything[: len(data)], options, held_out=everything[len(data) :])
-    if result.refused:
-        out = None
-    if out is not None:
-        result.write(out, name=name, effort_limit=effort_limit)
-        if page:
-            from pendulum_bags.identification.page import write_page
+    found = run(everything[: len(data)], options, held_out=everything[len(data) :])
+    written = found.write(out, name=name, effort_limit=effort_limit) if out and not found.refused else None
+    _finish(found, written, page, as_json, contradicts=found.geometry is not None and found.geometry.contradicts)
 
-            write_page(result, out.with_suffix(""))
+
+def _finish(
+    result: IdentificationResult, written: Path | None, page: bool, as_json: bool, *, contradicts: bool = False
+) -> None:
+    """Write the page, print the result; exit with 3 where it is not to be believed."""
+    if written is not None and page:
+        from pendulum_bags.identification.page import write_page
+
+        write_page(result, written.with_suffix(""))
     if as_json:
         typer.echo(json_text(result.to_dict()))
     else:
-        _print_result(result, out)
-    if result.refused or (result.geometry is not None and result.geometry.contradicts):
+        _print_result(result, written)
+    if result.refused or contradicts:
         raise typer.Exit(3)
 
 
@@ -248,109 +259,28 @@ def _narrow(summary: str, width: int = 78) -> str:
 
 
 def _print_result(result: IdentificationResult, out: Path | None) -> None:
-    from pendulum_bags.identification.selection import CHOICE
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
     console = make_console()
-    _print_verdict(console, result.verdict)
+    style = "bold red" if result.refused else "bold"
+    console.print(result.verdict, style=style, markup=False, highlight=False)
     if result.refused:
         _print_sentences(console, result.sentences()[1:])
         return
-    predicted = result.predicted
-    headings = ("parameter", "value", "95 % interval", *(["predicted"] if predicted else []), "unit")
-    table = WholeTable(*headings, title=f"Identified by output error, friction {result.fit.chosen.friction}")
-    for key in (*result.fit.chosen.free, "natural_frequency"):
-        unit = result.model.units.get(key, "rad/s")
-        interval = result.uncertainty.intervals.get(key)
-        value = result.model[key] if key in result.model.units else result.model.natural_frequency
-        cells = [key, f"{value:.5g}", interval.text if interval else "at the edge of its domain"]
-        if predicted:
-            cells.append(f"+-{predicted[key]:.2g}" if key in predicted else "-")
-        table.add_row(*cells, unit)
-    console.print(table)
-    models = WholeTable("model", "held-out rms \\[mrad]", "training rms \\[mrad]", "", title="Friction models")
-    for candidate in result.fit.candidates:
-        held = "-" if candidate.validation is None else f"{1e3 * candidate.validation.rms:.3f}"
-        mark = "chosen" if candidate is result.fit.chosen else ""
-        models.add_row(candidate.friction, held, f"{1e3 * candidate.training_rms:.3f}", mark)
-    console.print(models)
-    if len(result.fit.candidates) > 1:
-        console.print(CHOICE, highlight=False)
-    for label, score in result.held_out.items():
-        console.print(
-            f"held out {label}: rms {1e3 * score.rms:.3f} mrad, mean absolute {1e3 * score.mean_absolute:.3f} mrad"
-        )
+    for one in result.tables():
+        if one.rows:
+            table = WholeTable(*map(escape, one.head), title=one.title)
+            for row in one.rows:
+                table.add_row(*row)
+            console.print(table)
+            if one.sentence:
+                console.print(one.sentence, highlight=False)
     _print_sentences(console, result.sentences())
     if out is not None:
         console.print(f"wrote {out}", highlight=False)
         told, command = result.next_step(str(out))
         # The command is on a line of its own, to be copied.
         console.print(f"{told}\n  {as_typed(command)}", markup=False, highlight=False, soft_wrap=True)
-
-
-def _several_joints(
-    plant: str,
-    data: Sequence[Path],
-    mappings: Sequence[str | None],
-    held_out: Sequence[Path],
-    window: float | None,
-    out: Path | None,
-    name: str,
-    as_json: bool,
-) -> None:
-    """Identify a plant of several joints, print, write; exit with 3 where the fit is refused."""
-    from pendulum_bags.identification.joint_recordings import read_joints
-    from pendulum_bags.identification.mechanism_result import identify_mechanism
-    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-
-    start = load_mechanism(plant)
-    if len(start.joints) == 1:
-        raise DataError(f"plant {start.name!r} has one joint; expected a mechanism, or no --plant for one joint")
-    paths = [*data, *held_out]
-    everything = [read_joints(path, start.coordinates, rules) for path, rules in zip(paths, mappings, strict=True)]
-    result = identify_mechanism(start, everything[: len(data)], held_out=everything[len(data) :], window=window)
-    if out is not None and not result.refused:
-        result.write(out, name=name)
-    if as_json:
-        typer.echo(json_text(result.to_dict()))
-    else:
-        _print_mechanism(result, out)
-    if result.refused:
-        raise typer.Exit(3)
-
-
-def _print_mechanism(result: MechanismResult, out: Path | None) -> None:
-    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
-
-    console = make_console()
-    model = result.model
-    _print_verdict(console, result.verdict)
-    if result.refused:
-        _print_sentences(console, result.notes)
-        return
-    title = f"{model.plant.mechanism.name}, identified by output error: {result.extras}"
-    table = WholeTable("parameter", "value", "95 % interval", "unit", title=title)
-    for key in result.fit.free:
-        interval = result.intervals[key]
-        table.add_row(key, f"{model[key]:.5g}", interval.text, model.unit(key))
-    console.print(table)
-    joints = (f"{joint.name} \\[m{joint.unit}]" for joint in model.plant.coordinates.joints)
-    title = f"Free run over windows of {result.window:g} s, the start of each fitted: rms"
-    errors = WholeTable("recording", *joints, "of straight lines", title=title)
-    for label, found in (("", result.training), ("held out ", result.held_out)):
-        for recording, score in found.items():
-            cells = [f"{1e3 * value:.2f}" for value in score.rms]
-            errors.add_row(f"{label}{recording}", *cells, f"{100.0 * score.share:.1f} %")
-    console.print(errors)
-    _print_sentences(console, result.sentences())
-    if out is not None and not result.refused:
-        console.print(f"wrote {out}", highlight=False)
-
-
-def _print_verdict(console: Console, verdict: str) -> None:
-    from pendulum_bags.identification.explained import REFUSED
-
-    console.print(verdict, style="bold red" if verdict.startswith(REFUSED) else "bold", markup=False, highlight=False)
 
 
 def _print_sentences(console: Console, sentences: Sequence[str]) -> None:

@@ -20,6 +20,7 @@ from pendulum_bags.identification.residual_tests import INCOMPLETE
 from pendulum_bags.identification.selection import at_bounds
 from pendulum_bags.identification.solver import residuals
 from pendulum_bags.identification.uncertainty import Uncertainty
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.plants.determined import SPAN, undetermined
 
 __all__ = ["REFUSED", "Explained", "explained", "undetermined_fit"]
@@ -36,18 +37,35 @@ class Explained:
     """How much of the motion a fit explains.
 
     Args:
-        rms: Error of the model over the windows without outliers [rad].
-        lines: Error of the best straight line through each of those windows [rad].
-        share: Their ratio: 0 explains everything, 1 as much as no model at all.
+        rms: Error of the model over the windows without outliers, of each joint [rad or m].
+        lines: Error of the best straight line through each of those windows.
+        share: Their ratio, of the joint where it is worst: 0 explains everything, 1 as much as no model at all.
         refusal: Sentence that the fit is no model of this motion; None where it is one.
         doubt: Sentence that a part of the motion is not explained; None where it is, or where noise hides it.
+        joints: Of the plant.
     """
 
-    rms: float
-    lines: float
+    rms: tuple[float, ...]
+    lines: tuple[float, ...]
     share: float
     refusal: str | None
     doubt: str | None = None
+    joints: tuple[Joint, ...] = ONE_JOINT.joints
+
+    @property
+    def sentence(self) -> str:
+        """How much it explains, in words, without the full stop."""
+        several = len(self.joints) > 1
+        missed, straight = (
+            ", ".join(
+                f"{joint.name + ' ' if several else ''}{1e3 * value:.3g} m{joint.unit}"
+                for joint, value in zip(self.joints, values, strict=True)
+            )
+            for values in (self.rms, self.lines)
+        )
+        least = " or more, joint by joint" if several else ""
+        fits = f"Fits {100.0 * (1.0 - self.share):.3g} % of the motion{least}"
+        return f"{fits}: it misses {missed} rms where straight lines miss {straight}"
 
 
 def explained(fit: OutputErrorFit, outliers: Sequence[tuple[str, float, float, float]] = ()) -> Explained:
@@ -89,7 +107,7 @@ def explained(fit: OutputErrorFit, outliers: Sequence[tuple[str, float, float, f
             f"straight lines miss {straight:.3g} rad, and the sensor's noise is {noise:.2g} rad). Something moves the "
             "pendulum that is not in the model or not in the recording; no interval covers it."
         )
-    return Explained(rms, straight, share, refusal, doubt)
+    return Explained((rms,), (straight,), share, refusal, doubt)
 
 
 def undetermined_fit(fit: OutputErrorFit, uncertainty: Uncertainty) -> str | None:

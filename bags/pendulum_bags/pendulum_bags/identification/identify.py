@@ -17,7 +17,7 @@ from pendulum_bags.identification.output_error import OutputErrorFit, fit_output
 from pendulum_bags.identification.problem import prepare
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_bags.identification.residual_tests import residual_tests
-from pendulum_bags.identification.result import IdentificationResult, fingerprint
+from pendulum_bags.identification.result import PendulumResult, check_distinct, data_sentences, fingerprint
 from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.uncertainty import assess
 from pendulum_bags.identification.window_score import free_run, window_score
@@ -42,7 +42,7 @@ def identify(
     *,
     held_out: Sequence[Recording] = (),
     profiles: int = 2,
-) -> IdentificationResult:
+) -> PendulumResult:
     """Identify a pendulum by output error and judge the result.
 
     Args:
@@ -51,7 +51,7 @@ def identify(
         held_out: Recordings to score only.
         profiles: For how many weak parameters to compute profile intervals.
     """
-    _check_distinct(recordings, held_out)
+    check_distinct(recordings, held_out)
     if recordings and all(r.input_kind == "effort" and not np.any(r.input) for r in recordings):
         # A column of zeros is no drive: a gain or a delay of it could be anything.
         recordings = [replace(r, input_kind="none", meta={**r.meta, "no_torque": True}) for r in recordings]
@@ -86,7 +86,24 @@ def identify(
         for name, recording in zip(scores, held_out, strict=True)
         if (found := _moved_zero(fit, recording, scores[name].rms)) is not None
     }
-    return IdentificationResult(fit, uncertainty, tests, geometry, scores, created, account, moved, excluding)
+    delay = uncertainty.intervals.get("transport_delay")
+    return PendulumResult(
+        fit,
+        fit.chosen.friction,
+        {c.friction: (c.validation.rms if c.validation else None, c.training_rms) for c in fit.candidates},
+        uncertainty,
+        account,
+        {},
+        scores,
+        fit.window,
+        created,
+        tuple(map(fingerprint, fit.recordings)),
+        tuple(data_sentences(fit, delay, refused=account.refusal is not None)),
+        tests,
+        geometry,
+        moved,
+        excluding,
+    )
 
 
 def _excluding(fit: OutputErrorFit) -> str | None:
@@ -126,16 +143,3 @@ def _moved_zero(fit: OutputErrorFit, recording: Recording, rms: float) -> tuple[
     found = solve(fit.model, [piece], ("angle_offset",), scale=fit.scale, tolerance=1e-5, max_iterations=20)
     own = window_score(found.model, recording, fit.window).rms
     return (found.model["angle_offset"] - fit.model["angle_offset"], own) if own < 0.8 * rms else None
-
-
-def _check_distinct(recordings: Sequence[Recording], held_out: Sequence[Recording]) -> None:
-    """Refuse data that count twice: intervals would be too narrow, a held-out score too good."""
-    prints = [fingerprint(recording)["sha256"] for recording in (*recordings, *held_out)]
-    names = distinct_names([*recordings, *held_out])
-    for i, own in enumerate(prints):
-        j = prints.index(own)
-        if j == i or j >= len(recordings):
-            continue
-        if i < len(recordings):
-            raise DataError(f"{names[i]} has the same samples as {names[j]}; expected each recording once")
-        raise DataError(f"{names[i]} took part in the fit as {names[j]}; expected another recording to hold out")

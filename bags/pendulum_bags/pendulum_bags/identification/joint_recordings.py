@@ -84,6 +84,21 @@ class JointRecording:
         if size < 10 or not np.isfinite(values).all() or np.any(np.diff(self.time) <= 0.0):
             raise DataError(f"{self.name}: expected at least 10 samples, finite numbers and increasing stamps")
 
+    @property
+    def input(self) -> Array:
+        """The effort."""
+        return self.effort
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def period(self) -> float:
+        """Median sampling period [s]."""
+        return float(np.median(np.diff(self.time)))
+
     def check(self, coordinates: Coordinates) -> None:
         """Refuse a recording that cannot be of this mechanism.
 

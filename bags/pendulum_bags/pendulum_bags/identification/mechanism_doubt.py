@@ -10,21 +10,13 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED
-from pendulum_bags.identification.mechanism_fit import (
-    MechanismFit,
-    Windows,
-    first_weights,
-    fit,
-    line_errors,
-    rms_by_joint,
-)
+from pendulum_bags.identification.mechanism_fit import MechanismFit, Score, Windows, first_weights, fit, noise_of
 from pendulum_bags.identification.mechanism_model import MechanismModel, tellable
-from pendulum_bags.identification.problem import sensor_noise
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 
-__all__ = ["Score", "better_reading", "noise_of", "refusal"]
+__all__ = ["better_reading", "refusal"]
 
 _BETTER = 0.5
 """Another reading of the recording explains better where it misses less than this share of what the fit misses."""
@@ -37,53 +29,6 @@ _NUMBERS_OF_DEGREES = 4.0
 
 _QUICK = 6
 """Windows of each recording that another reading is fitted to."""
-
-
-@dataclass(frozen=True)
-class Score:
-    """How well a recording is predicted, the start of each window fitted.
-
-    Attributes:
-        rms: Of each joint, shape (n,) [rad or m].
-        lines: What straight lines through the windows would leave, shape (n,).
-        noise: Of the sensors, which no model explains, shape (n,).
-    """
-
-    rms: Array
-    lines: Array
-    noise: Array | float = 0.0
-
-    @classmethod
-    def of(cls, errors: Array, data: Windows) -> Score:
-        """Return the score of position errors, shape (w, l, n)."""
-        return cls(rms_by_joint(errors, data), line_errors(data), noise_of(data.recording.position))
-
-    @property
-    def total(self) -> float:
-        """Rms over all joints [rad or m]."""
-        return float(np.sqrt(np.mean(self.rms**2)))
-
-    @property
-    def share(self) -> float:
-        """Error over that of straight lines, of the joint where it is worst."""
-        return float(np.max(self.shares()))
-
-    def shares(self, least: Array | float = 1e-12) -> Array:
-        """Return the error beyond the sensors' noise over that of straight lines, by joint, shape (n,).
-
-        Args:
-            least: Below which straight lines count as missing nothing, by joint: a joint that hardly moves shows
-                its noise alone [rad or m].
-        """
-        left = np.sqrt(np.maximum(self.rms**2 - np.square(self.noise), 0.0))
-        return np.asarray(left / np.maximum(self.lines, least))
-
-
-def noise_of(position: Array) -> Array:
-    """Return the noise of positions, or of rounding to their encoders' steps where that is more, shape (n,)."""
-    apart = np.abs(np.diff(position, axis=0))
-    step = np.min(np.where(apart > 1e-9, apart, np.inf), axis=0)
-    return np.maximum(sensor_noise(position), np.where(np.isfinite(step), step, 0.0) / math.sqrt(12.0))
 
 
 @dataclass(frozen=True)
@@ -153,23 +98,16 @@ def _readings(plant: MechanismParameters, data: Sequence[Windows]) -> Iterator[_
         yield _Reading(words, advice, unit, unit, math.pi * unit[i])
 
 
-def refusal(
-    plant: MechanismParameters,
-    found: MechanismFit,
-    data: Sequence[Windows],
-    training: Mapping[str, Score],
-    held_out: Mapping[str, Score],
-) -> str | None:
+def refusal(found: MechanismFit, training: Mapping[str, Score], held_out: Mapping[str, Score]) -> str | None:
     """Return why a fit is no model of the machine, in a sentence; None where it may be one.
 
     Args:
-        plant: The start.
         found: The fit.
-        data: Its windows.
         training: Scores of the recordings of the fit, by name.
         held_out: Scores of recordings that took no part, by name.
     """
-    far = _far_off(plant, found)
+    plant, data = found.model.plant, found.data
+    far = _far_off(found)
     if far is not None or max(score.share for score in training.values()) > DOUBTFUL_SHARE:
         better = better_reading(plant, data, found)
         if better is not None:
@@ -194,7 +132,8 @@ def refusal(
     return far
 
 
-def _far_off(plant: MechanismParameters, found: MechanismFit) -> str | None:
+def _far_off(found: MechanismFit) -> str | None:
+    plant = found.model.plant
     for name in tellable(plant):
         start, value = plant.value(name), found.model[name]
         if name in found.free and start > 0.0 and not start / _FAR < value < start * _FAR:
@@ -222,9 +161,7 @@ def better_reading(
     """
     own = math.inf
     if found is not None:
-        own = float(np.mean([_share(e, p) for e, p in zip(found.residuals, data, strict=True)]))
-        if _far_off(plant, found) is not None:
-            own = math.inf
+        own = _share(found)
     few = [part.subset(range(0, len(part.time), max(1, len(part.time) // _QUICK))) for part in data]
     unit = np.eye(len(plant.joints))
     given = _Reading("", "", unit, unit, np.zeros(len(unit)))
@@ -251,13 +188,11 @@ def _fits(plant: MechanismParameters, reading: _Reading, data: Sequence[Windows]
     others = [reading.of(part) for part in data]
     model = MechanismModel.of(plant)
     try:
-        quick = fit(model, others, model.fitted(), first_weights(others), most=15, tolerance=1e-3)
+        return _share(fit(model, others, model.fitted(), first_weights(others), most=15, tolerance=1e-3))
     except (DataError, np.linalg.LinAlgError):
         return math.inf
-    if _far_off(plant, quick) is not None:
-        return math.inf
-    return float(np.mean([_share(e, p) for e, p in zip(quick.residuals, others, strict=True)]))
 
 
-def _share(errors: Array, data: Windows) -> float:
-    return Score.of(errors, data).share
+def _share(found: MechanismFit) -> float:
+    """Return the mean share that a fit misses, inf where it ended far from the start."""
+    return math.inf if _far_off(found) is not None else float(np.mean([score.share for score in found.scores]))

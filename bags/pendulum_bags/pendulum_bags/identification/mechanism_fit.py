@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.joint_recordings import JointRecording
+from pendulum_bags.identification.kernel import cumulative_input
 from pendulum_bags.identification.mechanism_kernel import lagged, motion_kernel
 from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel
-from pendulum_bags.identification.problem import cut_windows, off_line
+from pendulum_bags.identification.problem import cut_windows, first_state, off_line, sensor_noise
+from pendulum_bags.runs.datasets import longest_step
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [
@@ -28,11 +30,13 @@ __all__ = [
     "Blocks",
     "MechanismFit",
     "Prior",
+    "Score",
     "Windows",
     "error_weights",
     "first_weights",
     "fit",
     "line_errors",
+    "noise_of",
     "prepare_windows",
     "rms_by_joint",
     "scores",
@@ -55,6 +59,9 @@ MOST = 100
 
 _STUCK, _PROGRESS = 10, 0.99
 """Steps over which a hopeless search has to take its cost below a share of what it was, or ends."""
+
+_NEAR = 5
+"""Samples to each side from which the state at the start of a window is guessed."""
 
 _BEFORE = 0.02
 """Longest delay after which an effort from before the recording may still act [s]."""
@@ -137,8 +144,7 @@ def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1
     cuts = begin + cut_windows(recording.time[begin:], window)
     parts = [np.arange(first, stop, stride) for first, stop in cuts]
     # No window reaches across a gap.
-    period = float(np.median(np.diff(recording.time)))
-    longest = max(10.0 * period, 0.1)
+    period, longest = recording.period, longest_step(recording.time)
     steps = np.diff(recording.time)
     parts = [p for p in parts if p.size >= 8 and steps[p[0] : p[-1]].max() <= longest]
     if not parts:
@@ -165,22 +171,16 @@ def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1
 
 def _area(recording: JointRecording) -> Array:
     """Return the integral of the effort up to each sample, shape (s, n)."""
-    mean = np.where(
-        [hold == "linear" for hold in recording.hold],
-        0.5 * (recording.effort[1:] + recording.effort[:-1]),
-        recording.effort[:-1],
-    )
-    rise = np.cumsum(mean * np.diff(recording.time)[:, None], axis=0)
-    return np.concatenate((np.zeros((1, mean.shape[1])), rise))
+    columns = zip(recording.effort.T, recording.hold, strict=True)
+    time = recording.time
+    return np.stack([cumulative_input(time, np.array(u), hold == "linear") for u, hold in columns], axis=1)
 
 
 def _first_state(recording: JointRecording, first: int) -> Array:
-    low, high = max(first - 5, 0), min(first + 6, recording.time.size)
-    t = recording.time[low:high] - recording.time[first]
-    scale = float(np.max(np.abs(t)))
-    found = np.polynomial.polynomial.polyfit(t / scale, recording.position[low:high], 2)
-    rate = found[1] / scale if recording.velocity is None else recording.velocity[low:high].mean(axis=0)
-    return np.concatenate((found[0], rate))
+    position, rate = first_state(recording.time, recording.position, first, _NEAR)
+    if recording.velocity is not None:
+        rate = recording.velocity[max(first - _NEAR, 0) : first + _NEAR + 1].mean(axis=0)
+    return np.concatenate((position, rate))
 
 
 @dataclass(frozen=True)
@@ -212,6 +212,53 @@ class Prior:
 
 
 @dataclass(frozen=True)
+class Score:
+    """How well a recording is predicted, the start of each window fitted.
+
+    Attributes:
+        rms: Of each joint, shape (n,) [rad or m].
+        lines: What straight lines through the windows would leave, shape (n,).
+        noise: Of the sensors, which no model explains, shape (n,).
+    """
+
+    rms: Array
+    lines: Array
+    noise: Array | float = 0.0
+
+    @classmethod
+    def of(cls, rms: Array, data: Windows) -> Score:
+        """Return the score of errors of each joint, shape (n,)."""
+        return cls(rms, line_errors(data), noise_of(data.recording.position))
+
+    @property
+    def total(self) -> float:
+        """Rms over all joints [rad or m]."""
+        return float(np.sqrt(np.mean(self.rms**2)))
+
+    @property
+    def share(self) -> float:
+        """Error over that of straight lines, of the joint where it is worst."""
+        return float(np.max(self.shares()))
+
+    def shares(self, least: Array | float = 1e-12) -> Array:
+        """Return the error beyond the sensors' noise over that of straight lines, by joint, shape (n,).
+
+        Args:
+            least: Below which straight lines count as missing nothing, by joint: a joint that hardly moves shows
+                its noise alone [rad or m].
+        """
+        left = np.sqrt(np.maximum(self.rms**2 - np.square(self.noise), 0.0))
+        return np.asarray(left / np.maximum(self.lines, least))
+
+
+def noise_of(position: Array) -> Array:
+    """Return the noise of positions, or of rounding to their encoders' steps where that is more, shape (n,)."""
+    apart = np.abs(np.diff(position, axis=0))
+    step = np.min(np.where(apart > 1e-9, apart, np.inf), axis=0)
+    return np.maximum(sensor_noise(position), np.where(np.isfinite(step), step, 0.0) / math.sqrt(12.0))
+
+
+@dataclass(frozen=True)
 class Blocks:
     """Normal equations of one recording with the start states eliminated.
 
@@ -239,6 +286,7 @@ class MechanismFit:
         errors: Simulated minus measured by recording, positions before velocities, shape (w, l, 2 n), 0 in the padding
             and where no velocity was measured.
         converged: Whether the search ended at a minimum, before its most steps.
+        data: The windows of each recording.
     """
 
     model: MechanismModel
@@ -248,11 +296,23 @@ class MechanismFit:
     blocks: list[Blocks]
     errors: list[Array]
     converged: bool
+    data: Sequence[Windows]
 
     @property
     def residuals(self) -> list[Array]:
         """Errors of the positions by recording, shape (w, l, n)."""
         return [each[..., : each.shape[-1] // 2] for each in self.errors]
+
+    @property
+    def scores(self) -> list[Score]:
+        """How well each recording is explained."""
+        pairs = zip(self.residuals, self.data, strict=True)
+        return [Score.of(rms_by_joint(errors, part), part) for errors, part in pairs]
+
+    @property
+    def worst(self) -> float:
+        """What it misses over what straight lines miss, of the joint and recording where it is worst."""
+        return max(score.share for score in self.scores)
 
 
 def _motions(model: MechanismModel, values: Array, data: Windows, states: Array) -> Array:
@@ -369,7 +429,7 @@ def fit(
         reduced = matrix[:, :k, :k] - coupling @ solved
         along = gradient[:, :k] - np.einsum("wxk,wx->wk", solved, gradient[:, k:])
         blocks.append(Blocks(reduced, along, _measurements(part, weights)))
-    return MechanismFit(best, tuple(free), x, cost, blocks, errors, converged)
+    return MechanismFit(best, tuple(free), x, cost, blocks, errors, converged, data)
 
 
 def _measurements(part: Windows, weights: Array) -> int:
@@ -456,8 +516,8 @@ def _step(
     return step, [-(found[:, :, k] + found[:, :, :k] @ step) for found in solved]
 
 
-def scores(model: MechanismModel, data: Sequence[Windows], weights: Array | None = None) -> list[Array]:
-    """Return the rms errors of each joint of each recording with the start of each window fitted, shape (n,).
+def scores(model: MechanismModel, data: Sequence[Windows], weights: Array | None = None) -> list[Score]:
+    """Return how well a model explains each recording with the start of each window fitted.
 
     Args:
         model: The model.
@@ -465,10 +525,10 @@ def scores(model: MechanismModel, data: Sequence[Windows], weights: Array | None
         weights: Of each joint's error, shape (n,); by default one over what straight lines miss: metres and radians
             have no common scale.
     """
-    found = []
+    found: list[Score] = []
     for part in data:
         own = 1.0 / np.maximum(line_errors(part), 1e-9) if weights is None else weights
-        found.append(rms_by_joint(fit(model, [part], (), own, most=12, tolerance=1e-6).residuals[0], part))
+        found += fit(model, [part], (), own, most=12, tolerance=1e-6).scores
     return found
 
 
@@ -489,7 +549,7 @@ def window_length(model: MechanismModel, recordings: Sequence[JointRecording], l
     smooth = model.values.copy()
     smooth[model.index([f"{joint}.coulomb_friction" for joint in model.plant.coordinates.names])] = 0.0
     for recording in recordings:
-        stride = max(1, round(_LONGEST / float(np.median(np.diff(recording.time)))))
+        stride = max(1, round(_LONGEST / recording.period))
         time, q = recording.time[::stride], recording.position[::stride]
         if time.size < 4:
             continue
@@ -532,8 +592,9 @@ def first_weights(data: Sequence[Windows]) -> Array:
     return 1.0 / np.maximum(size, 1e-9)
 
 
-def error_weights(found: MechanismFit, data: Sequence[Windows]) -> Array:
+def error_weights(found: MechanismFit) -> Array:
     """Return weights of positions and velocities by the errors of a fit, 0 for what was not measured."""
+    data = found.data
     squares = np.mean([rms_by_joint(e, part) ** 2 for e, part in zip(found.errors, data, strict=True)], axis=0)
     measured = np.repeat([True, all(part.velocity is not None for part in data)], squares.size // 2)
     return np.asarray(np.where(measured, 1.0 / np.maximum(np.sqrt(squares), 1e-9), 0.0))

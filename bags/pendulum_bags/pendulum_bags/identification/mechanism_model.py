@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import cmath
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -120,6 +120,22 @@ class MechanismModel:
         if joints.driven:
             names += [name for name, wanted in ((DELAY, delay), (LAG, lag)) if wanted]
         return tuple(names)
+
+    def identified(self, free: Sequence[str], name: str) -> MechanismParameters:
+        """Return the plant that has the values of what was fitted; a delay below 0 and offsets are left out.
+
+        Raises:
+            ParameterError: No body has these masses and inertias.
+        """
+        joints = tuple(replace(joint, static_friction=None) for joint in self.plant.joints)
+        plant = replace(self.plant, joints=joints, name=name)
+        changes = {each: self[each] for each in free if each in plant.specs}
+        for joint in plant.coordinates.driven_names:
+            if DELAY in free:
+                changes[f"{joint}.transport_delay"] = max(self[DELAY], 0.0)
+            if LAG in free:
+                changes[f"{joint}.{LAG}"] = self[LAG]
+        return plant.with_values(changes)
 
     def tables(self, values: Array) -> tuple[Array, Array, Array, Array]:
         """Return what :func:`~pendulum_bags.identification.mechanism_kernel.motion_kernel` takes of c sets of values.

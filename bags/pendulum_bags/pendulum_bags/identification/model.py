@@ -152,6 +152,15 @@ class FitModel:
         return float(np.sqrt(max(self["gravity"], 0.0) / self["inertia"]))
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters."""
+        return tuple(UNITS)
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a parameter, or of the natural frequency."""
+        return self.units.get(name, "rad/s")
+
+    @property
     def units(self) -> Mapping[str, str]:
         """Unit of each parameter; without a torque to compare with all are per unit of inertia."""
         if self.input_kind not in {"none", "voltage"} or self["inertia"] != 1.0:

@@ -71,6 +71,11 @@ class OutputErrorFit:
     recordings: tuple[Recording, ...] = ()
 
     @property
+    def free(self) -> tuple[str, ...]:
+        """Names of what was fitted."""
+        return self.chosen.free
+
+    @property
     def model(self) -> FitModel:
         """The fitted model."""
         return self.chosen.solution.model

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure as Canvas
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.figures.table import Table
+from pendulum_bags.identification.mechanism_fit import MechanismFit
 from pendulum_bags.identification.model import UNITS
 from pendulum_bags.identification.problem import simulate
-from pendulum_bags.identification.selection import CHOICE
+from pendulum_bags.identification.result import ALARMS, IdentificationResult, PendulumResult
 from pendulum_bags.identification.thesis import ThesisResult, trial_part
 from pendulum_bags.identification.thesis_figures import TrialSet, thesis_figures
 from pendulum_bags.pages.sheet import Sentence, write_sheet
 from pendulum_bags.runs.datasets import Recording, distinct_names
-
-if TYPE_CHECKING:
-    from pendulum_bags.identification.result import IdentificationResult
 
 __all__ = ["write_page", "write_thesis_page"]
 
@@ -32,38 +31,16 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
     """Write figures and ``index.html`` of an output-error fit into a folder and return the page's path."""
     target = Path(folder)
     figures = _save(_fit_figures(result), target / "figures")
-    chosen = result.fit.chosen
-    parameters = []
-    for name in (*chosen.free, "natural_frequency"):
-        value = result.model[name] if name in UNITS else result.model.natural_frequency
-        interval = result.uncertainty.intervals.get(name)
-        ends = interval.text if interval else "at the edge of its domain"
-        parameters.append((name, f"{value:.5g}", ends, result.model.units.get(name, "rad/s")))
-    models = []
-    for one in result.fit.candidates:
-        held_out = "-" if one.validation is None else f"{1e3 * one.validation.rms:.3f}"
-        mark = " (chosen)" if one is chosen else ""
-        models.append((f"{one.friction}{mark}", held_out, f"{1e3 * one.training_rms:.3f}"))
-    held = [(n, f"{1e3 * s.rms:.3f}", f"{1e3 * s.mean_absolute:.3f}") for n, s in result.held_out.items()]
     names = result.uncertainty.names
-    correlation = [
-        (name, *(f"{value:+.2f}" for value in row))
-        for name, row in zip(names, result.uncertainty.correlation, strict=True)
-    ]
-    tables = [
-        Table("Parameters", "", ("parameter", "value", "95 % interval", "unit"), parameters),
-        Table("Friction models", CHOICE, ("model", "held-out rms [mrad]", "training rms [mrad]"), models),
-        Table("Other recordings", "", ("recording", "rms [mrad]", "mean absolute [mrad]"), held),
-        Table("Correlation", "", ("", *names), correlation),
-    ]
-    kicker = f"Friction model {chosen.friction}, {result.created}"
+    rows = zip(names, result.uncertainty.correlation, strict=True)
+    correlation = [(name, *(f"{value:+.2f}" for value in row)) for name, row in rows]
     return write_sheet(
         target / "index.html",
         "Identification",
         _told([result.verdict, *result.sentences()]),
-        tables,
+        [*result.tables(), Table("Correlation", "", ("", *names), correlation)],
         figures,
-        kicker=kicker,
+        kicker=f"{result.choice}, {result.created}",
     )
 
 
@@ -89,42 +66,72 @@ def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], fol
 
 
 def _told(sentences: Sequence[str]) -> list[Sentence]:
-    from pendulum_bags.identification.result import ALARMS
-
     return [Sentence(sentence, alarming=sentence.startswith(ALARMS)) for sentence in sentences]
 
 
-def _fit_figures(result: IdentificationResult) -> dict[str, Canvas]:
-    """Return the figures of an output-error fit: by recording, residual tests, friction models."""
-    figures: dict[str, Canvas] = {}
-    names = distinct_names([piece.recording for piece in result.fit.pieces])
-    states = result.fit.chosen.solution.states
-    for i, (name, piece, state) in enumerate(zip(names, result.fit.pieces, states, strict=True)):
+@dataclass(frozen=True)
+class _Motion:
+    """One recording of n joints, its simulation NaN at the start of each window, and what drives it."""
+
+    name: str
+    time: Array
+    measured: Array
+    simulated: Array
+    input_time: Array
+    input: Array
+    input_label: str
+
+
+def _motions(result: IdentificationResult) -> Iterator[_Motion]:
+    fit = result.fit
+    if isinstance(fit, MechanismFit):
+        unit = fit.model.plant.coordinates.drive_unit
+        for name, part, errors in zip(result.training, fit.data, fit.residuals, strict=True):
+            simulated, log = part.position + errors, part.recording
+            simulated[:, 0] = np.nan
+            motion = part.time[part.inside], part.position[part.inside], simulated[part.inside]
+            yield _Motion(name, *motion, log.time, log.effort, f"effort [{unit}]")
+        return
+    names = distinct_names([piece.recording for piece in fit.pieces])
+    for name, piece, state in zip(names, fit.pieces, fit.chosen.solution.states, strict=True):
         recording = piece.recording
-        simulated = simulate(result.model, piece, state)
-        figure = Canvas(figsize=(9.0, 5.2), layout="constrained")
-        top, middle, low = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1.5))
-        top.plot(recording.time, recording.position, color=_MEASURED, linewidth=1.0, label="measured")
-        # NaN before each window breaks the line where the simulation starts anew.
-        theta = simulated.theta.copy()
+        theta = simulate(fit.model, piece, state).theta
+        # NaN before each window breaks the line where the simulation starts again.
         theta[piece.windows[1:, 0]] = np.nan
-        top.plot(recording.time, theta, color=_SIMULATED, linewidth=0.9, label="simulated")
-        top.set_ylabel("angle [rad]")
-        top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
-        top.set_title(name)
-        middle.plot(recording.time, 1e3 * (simulated.theta - recording.position), color=_SIMULATED, linewidth=0.7)
-        middle.axhline(0.0, color="black", linewidth=0.5)
-        middle.set_ylabel("residual [mrad]")
-        low.plot(recording.input_stamps, recording.input, color=_MEASURED, linewidth=0.7)
-        low.set_ylabel({"effort": "effort [N m]", "voltage": "input [V]"}.get(recording.input_kind, "input"))
-        low.set_xlabel("time [s]")
+        motion = recording.time, recording.position[:, None], theta[:, None]
+        label = {"effort": "effort [N m]", "voltage": "input [V]"}.get(recording.input_kind, "input")
+        yield _Motion(name, *motion, recording.input_stamps, recording.input, label)
+
+
+def _fit_figures(result: IdentificationResult) -> dict[str, Canvas]:
+    """Return the figures of an output-error fit: by recording, and of one joint residual tests and friction models."""
+    figures: dict[str, Canvas] = {}
+    joints = result.explained.joints
+    for i, motion in enumerate(_motions(result)):
+        figure = Canvas(figsize=(9.0, 1.7 + 3.5 * len(joints)), layout="constrained")
+        axes = figure.subplots(2 * len(joints) + 1, 1, sharex=True, height_ratios=[*(3, 2) * len(joints), 1.5])
+        for k, joint in enumerate(joints):
+            top, middle = axes[2 * k : 2 * k + 2]
+            measured, simulated = motion.measured[:, k], motion.simulated[:, k]
+            top.plot(motion.time, measured, color=_MEASURED, linewidth=1.0, label="measured")
+            top.plot(motion.time, simulated, color=_SIMULATED, linewidth=0.9, label="simulated")
+            top.set_ylabel(f"{joint.name if len(joints) > 1 else 'angle'} [{joint.unit}]")
+            middle.plot(motion.time, 1e3 * (simulated - measured), color=_SIMULATED, linewidth=0.7)
+            middle.axhline(0.0, color="black", linewidth=0.5)
+            middle.set_ylabel(f"residual [m{joint.unit}]")
+        axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
+        axes[0].set_title(motion.name)
+        axes[-1].plot(motion.input_time, motion.input, color=_MEASURED, linewidth=0.7)
+        axes[-1].set_ylabel(motion.input_label)
+        axes[-1].set_xlabel("time [s]")
         figures[f"fit_{i + 1}"] = figure
-    figures["residuals"] = _residual_figure(result)
-    figures["friction_models"] = _candidate_figure(result)
+    if isinstance(result, PendulumResult):
+        figures["residuals"] = _residual_figure(result)
+        figures["friction_models"] = _candidate_figure(result)
     return figures
 
 
-def _residual_figure(result: IdentificationResult) -> Canvas:
+def _residual_figure(result: PendulumResult) -> Canvas:
     tests = result.tests
     figure = Canvas(figsize=(9.0, 3.0), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -140,7 +147,7 @@ def _residual_figure(result: IdentificationResult) -> Canvas:
     return figure
 
 
-def _candidate_figure(result: IdentificationResult) -> Canvas:
+def _candidate_figure(result: PendulumResult) -> Canvas:
     figure = Canvas(figsize=(9.0, 2.6), layout="constrained")
     axes = figure.subplots()
     names = [c.friction for c in result.fit.candidates]

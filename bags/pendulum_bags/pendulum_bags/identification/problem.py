@@ -19,6 +19,7 @@ __all__ = [
     "Piece",
     "Simulation",
     "cut_windows",
+    "first_state",
     "longest_step",
     "off_line",
     "prepare",
@@ -140,20 +141,26 @@ def prepare(recording: Recording, window: float | None, *, across_gaps: bool = F
     stamps = recording.input_stamps
     integral = kernel.cumulative_input(stamps, recording.input, recording.hold == "linear")
     enabled = np.ones(stamps.size) if recording.enabled is None else recording.enabled
-    states = np.array([_first_state(recording, first) for first, _ in windows])
+    reach = max(4, round(0.02 / recording.period))
+    states = np.array([first_state(recording.time, recording.position, first, reach) for first, _ in windows])
     return Piece(recording, windows, states, integral, enabled)
 
 
-def _first_state(recording: Recording, first: int) -> tuple[float, float]:
-    """Return angle and velocity at a sample from a parabola through its neighbours on both sides."""
-    reach = max(4, round(0.02 / recording.period))
-    low, high = max(first - reach, 0), min(first + reach + 1, recording.time.size)
-    t = recording.time[low:high] - recording.time[first]
-    degree = min(2, t.size - 1)
+def first_state(time: Array, position: Array, first: int, reach: int) -> tuple[Array, Array]:
+    """Return position and velocity at a sample from a parabola through its neighbours on both sides.
+
+    Args:
+        time: shape (n,) [s].
+        position: shape (n,) or (n, joints) [rad or m].
+        first: The sample.
+        reach: Neighbours to each side.
+    """
+    near = slice(max(first - reach, 0), first + reach + 1)
+    t = time[near] - time[first]
     # polyfit conditions badly on short times in seconds: scale to about 1.
     scale = max(float(np.max(np.abs(t))), 1e-9)
-    fit = np.polynomial.polynomial.polyfit(t / scale, recording.position[low:high], degree)
-    return float(fit[0]), float(fit[1] / scale)
+    fit = np.polynomial.polynomial.polyfit(t / scale, position[near], min(2, t.size - 1))
+    return fit[0], fit[1] / scale
 
 
 def off_line(time: Array, values: Array) -> Array:

@@ -6,15 +6,21 @@ import hashlib
 import json
 import platform
 import shlex
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
+from pendulum_bags.figures.table import Table
+from pendulum_bags.identification.covariance import FREQUENCY
 from pendulum_bags.identification.explained import REFUSED, Explained
 from pendulum_bags.identification.geometry import CONTRADICTION, GeometryCheck
+from pendulum_bags.identification.joint_recordings import JointRecording
+from pendulum_bags.identification.mechanism_fit import MechanismFit, Score
+from pendulum_bags.identification.mechanism_model import MechanismModel
 from pendulum_bags.identification.model import (
     FRICTION_MODELS,
     PLANT_FRICTION_MODELS,
@@ -22,21 +28,30 @@ from pendulum_bags.identification.model import (
     FitModel,
     to_plant,
 )
+from pendulum_bags.identification.notes import Interval
 from pendulum_bags.identification.output_error import OutputErrorFit
-from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.residual_tests import INCOMPLETE, ResidualTests
-from pendulum_bags.identification.selection import Candidate
+from pendulum_bags.identification.selection import CHOICE, Candidate
 from pendulum_bags.identification.uncertainty import Uncertainty
 from pendulum_bags.identification.window_score import WindowScore
-from pendulum_bags.identification.wording import Interval
 from pendulum_bags.runs.datasets import INPUT_KINDS, Recording, data_notes, distinct_names
 from pendulum_bags.runs.next_test import next_test_of, question_of
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, write_mechanism
+from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
 
-__all__ = ["ALARMS", "IdentificationResult", "fingerprint", "load_fit_model"]
+__all__ = [
+    "ALARMS",
+    "IdentificationResult",
+    "PendulumResult",
+    "check_distinct",
+    "data_sentences",
+    "fingerprint",
+    "load_fit_model",
+]
 
 FORMAT = "pendulum_identification/1"
 
@@ -46,29 +61,264 @@ ALARMS = (CONTRADICTION, REFUSED, INCOMPLETE)
 
 @dataclass(frozen=True)
 class IdentificationResult:
-    """Fit, intervals, tests and scores of one identification.
+    """Values, intervals, scores and verdict of one identification, of one joint or several.
 
     Args:
-        fit: Chosen and rejected candidates.
+        fit: The chosen fit.
+        choice: Which candidate it is.
+        candidates: Held-out error of each candidate and its error in training, by name; None where there is none.
         uncertainty: Intervals and what cannot be determined.
+        explained: How much of the motion the fit explains.
+        training: Scores of the recordings of the fit, by name; of one joint ``explained`` has their error.
+        held_out: Scores on recordings that took no part in the fit, by name.
+        window: Length of the windows [s]; None for whole recordings.
+        created: Date, ISO 8601.
+        data: What the recordings are known by, as of :func:`fingerprint`.
+        notes: What is to be known of the recordings and of how they were fitted, in sentences.
+    """
+
+    fit: OutputErrorFit | MechanismFit
+    choice: str
+    candidates: Mapping[str, tuple[float | None, float | None]]
+    uncertainty: Uncertainty
+    explained: Explained
+    training: Mapping[str, Score]
+    held_out: Mapping[str, Score | WindowScore]
+    window: float | None
+    created: str
+    data: tuple[dict[str, Any], ...]
+    notes: tuple[str, ...]
+
+    @property
+    def model(self) -> FitModel | MechanismModel:
+        """The fitted model."""
+        return self.fit.model
+
+    @property
+    def intervals(self) -> Mapping[str, Interval]:
+        """95 % intervals by name."""
+        return self.uncertainty.intervals
+
+    @property
+    def fitted(self) -> tuple[str, ...]:
+        """Names of what was fitted."""
+        return self.fit.free
+
+    @property
+    def refusal(self) -> str | None:
+        """Sentence that the fit is no model of the recorded motion; None where it is one."""
+        return self.explained.refusal
+
+    @property
+    def refused(self) -> bool:
+        """Whether the fit is no model of the recorded motion: it is written to no plant file."""
+        return self.explained.refusal is not None
+
+    @property
+    def incomplete(self) -> bool:
+        """Whether the machine does something that no candidate model has, or that the fit does not explain."""
+        return self.explained.doubt is not None
+
+    @property
+    def verdict(self) -> str:
+        """Whether the fit is a model of the motion, in one sentence."""
+        lacks = "; the model is incomplete, see below" if self.incomplete else ""
+        return self.explained.refusal or f"{self.explained.sentence}{self._apart}{lacks}."
+
+    @property
+    def _apart(self) -> str:
+        return ""
+
+    def sentences(self) -> list[str]:
+        """Return what there is to say about the fit, most important first."""
+        if self.explained.refusal is not None:
+            return [self.explained.refusal, *self.notes]
+        return [*self._warnings(), *self.notes, *self._remarks(), *self.uncertainty.sentences]
+
+    def _warnings(self) -> list[str]:
+        return [] if self.explained.doubt is None else [self.explained.doubt]
+
+    def _remarks(self) -> list[str]:
+        return []
+
+    def plant(self, name: str = "identified") -> AnyPlant:
+        """Return the plant that simulator, bridge and controller load.
+
+        Raises:
+            ParameterError: No body has the masses and inertias that were found.
+        """
+        assert isinstance(self.fit, MechanismFit)
+        return self.fit.model.identified(self.fit.free, name)
+
+    def next_step(self, plant: str) -> tuple[str, str]:
+        """Return what a plant file is to be tested by, in words and as a command: a fit does not tell what it is for.
+
+        Args:
+            plant: The file, written.
+        """
+        command = next_test_of(self._records(), plant)
+        unseen = "under noise" if command else "on a recording"
+        command = command or f"python -m pendulum_bags replay RECORDING --params {shlex.quote(plant)}"
+        incomplete = "The model is incomplete. " if self.incomplete else ""
+        apart = "Apart from the windows named above, it" if self._apart else "It"
+        told = (
+            f"{incomplete}{apart} misses {100.0 * self.explained.share:.2g} % of what straight lines through the "
+            "windows miss; whether that is good enough to design a controller on, no fit can say. Test it "
+            f"{unseen} that it was not fitted to.{question_of(command)}"
+        )
+        return f"{told.removesuffix('.')}:", command
+
+    def _records(self) -> list[Mapping[str, Any]]:
+        """Return what the bags of the fit say of their runs."""
+        return []
+
+    def tables(self) -> list[Table]:
+        """Return parameters, candidates and recordings, for terminal and page."""
+        predicted = self._predicted()
+        head = ("parameter", "value", "95 % interval", *(["predicted"] if predicted else []), "unit")
+        rows = []
+        for name in dict.fromkeys((*self.fitted, *(n for n in self.intervals if n == FREQUENCY))):
+            interval = self.intervals.get(name)
+            value = interval.value if interval else self.model[name]
+            cells = [name, f"{value:.5g}", interval.text if interval else "at the edge of its domain"]
+            if predicted:
+                cells.append(f"+-{predicted[name]:.2g}" if name in predicted else "-")
+            rows.append((*cells, self.model.unit(name)))
+        one = len(self.explained.joints) == 1
+        unit, scale = ("mrad", 1e3) if one else ("share of the motion", 1.0)
+        errors = [
+            (name, *("-" if each is None else f"{scale * each:.3f}" for each in pair), "chosen" * (name == self.choice))
+            for name, pair in self.candidates.items()
+        ]
+        joints = [f"{'rms' if one else joint.name} [m{joint.unit}]" for joint in self.explained.joints]
+        scores = [
+            (f"{label}{name}", *(f"{1e3 * each:.3f}" for each in np.ravel(score.rms)), f"{100.0 * score.share:.1f} %")
+            for label, found in (("", self.training), ("held out ", self.held_out))
+            for name, score in found.items()
+        ]
+        window = "the whole recording" if self.window is None else f"windows of {self.window:g} s"
+        rule = CHOICE if one and len(errors) > 1 else ""
+        return [
+            Table(f"Identified by output error: {self.choice}", "", head, rows),
+            Table("Candidates", rule, ("model", f"held-out rms [{unit}]", f"training rms [{unit}]", ""), errors),
+            Table(f"Free run over {window}", "", ("recording", *joints, "of straight lines"), scores),
+        ]
+
+    def _predicted(self) -> dict[str, float]:
+        return {}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain JSON values."""
+        found, names = self.uncertainty, [joint.name for joint in self.explained.joints]
+
+        def by_joint(values: Sequence[float] | Array) -> Any:
+            return float(values[0]) if len(names) == 1 else dict(zip(names, map(float, values), strict=True))
+
+        def table(scores: Mapping[str, Score | WindowScore]) -> dict[str, Any]:
+            return {
+                name: {
+                    "window_rms": by_joint(np.ravel(one.rms)),
+                    "straight_lines": by_joint(np.ravel(one.lines)),
+                    **({"mean_absolute": one.mean_absolute} if isinstance(one, WindowScore) else {}),
+                }
+                for name, one in scores.items()
+            }
+
+        return {
+            "format": FORMAT,
+            "created": self.created,
+            "method": "output_error",
+            "choice": self.choice,
+            "window": self.window,
+            "parameters": {name: self.model[name] for name in self.model.names},
+            "units": {name: self.model.unit(name) for name in self.model.names},
+            "fitted": list(self.fitted),
+            "intervals": {name: one.to_json() for name, one in found.intervals.items()},
+            "covariance": {"names": list(found.names), "matrix": found.covariance.tolist()},
+            "correlation": found.correlation.tolist(),
+            "condition_number": found.condition_number,
+            "interval_basis": found.basis,
+            "candidates": [
+                {"name": name, "held_out_rms": held, "training_rms": own}
+                for name, (held, own) in self.candidates.items()
+            ],
+            "training": table(self.training),
+            "held_out": table(self.held_out),
+            "explained": {
+                "rms": by_joint(self.explained.rms),
+                "straight_lines_rms": by_joint(self.explained.lines),
+                "share": self.explained.share,
+                "refused": self.refused,
+            },
+            "incomplete": self.incomplete,
+            "sentences": self.sentences(),
+            "data": list(self.data),
+            **self._own_values(),
+        }
+
+    def _own_values(self) -> dict[str, Any]:
+        assert isinstance(self.fit, MechanismFit)
+        return {"mechanism": self.fit.model.plant.mechanism.name}
+
+    def write(self, path: str | Path, *, name: str = "identified") -> Path:
+        """Write the plant file with intervals and provenance, and everything else as JSON beside it.
+
+        Args:
+            path: Plant file to write, ``*.yaml``; the JSON gets the same name.
+            name: Name of the plant.
+
+        Raises:
+            DataError: The fit is refused, or the name has another suffix.
+            ParameterError: No body has the masses and inertias that were found.
+        """
+        return self._write(path, self.plant(name) if not self.refused else None)
+
+    def _write(self, path: str | Path, plant: AnyPlant | None) -> Path:
+        if plant is None:
+            raise DataError(f"{self.refusal} No plant file is written.")
+        target = Path(path)
+        if target.suffix not in {".yaml", ".yml"}:
+            raise DataError(f"plant file is {target.name!r}; expected a name that ends in .yaml")
+        intervals, facts, remarks = self._of_the_file(plant)
+        provenance = {
+            "method": "output error, multiple shooting",
+            "date": self.created,
+            "data": list(self.data),
+            "python": platform.python_version(),
+            **facts,
+            "remarks": [*remarks, *self.sentences()],
+        }
+        if isinstance(plant, MechanismParameters):
+            write_mechanism(target, plant, provenance=provenance, intervals=intervals)
+        else:
+            write_plant(target, plant, provenance=provenance, intervals=intervals)
+        write_json(target.with_suffix(".json"), self.to_dict())
+        return target
+
+    def _of_the_file(self, plant: AnyPlant) -> tuple[dict[str, tuple[float, float]], dict[str, Any], list[str]]:
+        """Return the intervals of what the plant file holds, facts on the fit, and remarks on what is left out."""
+        model, known = self.model, plant.specs if isinstance(plant, MechanismParameters) else {}
+        intervals = {n: (one.low, one.high) for n, one in self.intervals.items() if n in known and one.low < one.high}
+        left_out = {f"{n} [{model.unit(n)}]": model[n] for n in self.fitted if n not in known}
+        return intervals, {"not_in_the_plant": left_out}, []
+
+
+@dataclass(frozen=True)
+class PendulumResult(IdentificationResult):
+    """The result of one joint, which is judged by its residuals, by rulers and scales, and recording by recording too.
+
+    Args:
         tests: Of the residuals.
         geometry: Comparison with mass and length, None where they are unknown.
-        held_out: Scores on recordings that took no part in the fit, by name.
-        created: Date, ISO 8601.
-        explained: How much of the motion the fit explains.
         moved_zeros: Held-out recordings whose zero lies elsewhere: by how much [rad], and their rms with it [rad].
         excluding: That the recordings are of two machines, in a sentence; None where they may be of one.
     """
 
     fit: OutputErrorFit
-    uncertainty: Uncertainty
     tests: ResidualTests
     geometry: GeometryCheck | None
-    held_out: Mapping[str, WindowScore]
-    created: str
-    explained: Explained
-    moved_zeros: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    excluding: str | None = None
+    moved_zeros: Mapping[str, tuple[float, float]]
+    excluding: str | None
 
     @property
     def model(self) -> FitModel:
@@ -94,96 +344,28 @@ class IdentificationResult:
         return to_plant(self.plant_candidate.solution.model, name=name, effort_limit=effort_limit)
 
     @property
-    def refused(self) -> bool:
-        """Whether the fit is no model of the recorded motion: it is written to no plant file."""
-        return self.explained.refusal is not None
-
-    @property
     def incomplete(self) -> bool:
         """Whether the pendulum does something that no candidate model has, or that the fit does not explain."""
-        return self.tests.incomplete or self.explained.doubt is not None
+        return self.tests.incomplete or super().incomplete
 
     @property
-    def verdict(self) -> str:
-        """Whether the fit is a model of the motion, in one sentence."""
-        if self.explained.refusal is not None:
-            return self.explained.refusal
-        found = self.explained
-        apart = ", apart from the windows named below" if self.tests.outliers else ""
-        lacks = "; the model is incomplete, see below" if self.incomplete else ""
-        return (
-            f"Fits {100.0 * (1.0 - found.share):.3g} % of the motion: it misses {1e3 * found.rms:.3g} mrad rms where "
-            f"straight lines miss {1e3 * found.lines:.3g} mrad{apart}{lacks}."
-        )
+    def _apart(self) -> str:
+        return ", apart from the windows named below" if self.tests.outliers else ""
 
-    def sentences(self) -> list[str]:
-        """Return what there is to say about the fit, most important first."""
-        if self.explained.refusal is not None:
-            return [self.explained.refusal, *self._of_the_data()]
+    def _warnings(self) -> list[str]:
         said = [self.excluding] if self.excluding is not None else []
         said += self.geometry.sentences if self.geometry is not None else []
-        tests = list(self.tests.sentences)
-        if self.explained.doubt is not None:
-            said.append(self.explained.doubt)
-        if self.tests.incomplete:
-            said.append(tests.pop(0))
-        said.extend(self._of_the_data())
-        said.extend(
+        return [*said, *super()._warnings(), *self.tests.sentences[: self.tests.incomplete]]
+
+    def _remarks(self) -> list[str]:
+        said = [
             f"Held out, {name}: its zero lies {offset:+.4f} rad from that of the fit (homing?); with a zero of its "
             f"own the parameters miss it by {1e3 * own:.3g} mrad."
             for name, (offset, own) in self.moved_zeros.items()
-        )
+        ]
         if self.score is None:
             said.append("There is one window only: no held-out score; give a longer recording or a shorter --window.")
-        return [*said, *self._calibration(), *tests, *self.uncertainty.sentences]
-
-    def next_step(self, plant: str) -> tuple[str, str]:
-        """Return what a plant file is to be tested by, in words and as a command: a fit does not tell what it is for.
-
-        Args:
-            plant: The file, written.
-        """
-        records = [run_record(piece.recording.meta) for piece in self.fit.pieces]
-        if any(record.get("plant") == "emulator" for record in records):
-            records.append({"command": "python -m pendulum_bags experiment thesis"})
-        command = next_test_of(records, plant)
-        unseen = "under noise" if command else "on a recording"
-        command = command or f"python -m pendulum_bags replay RECORDING --params {shlex.quote(plant)}"
-        incomplete = "The model is incomplete. " if self.incomplete else ""
-        apart = "Apart from the windows named above, it" if self.tests.outliers else "It"
-        told = (
-            f"{incomplete}{apart} misses {100.0 * self.explained.share:.2g} % of what straight lines through the "
-            "windows miss; whether that is good enough to design a controller on, no fit can say. Test it "
-            f"{unseen} that it was not fitted to.{question_of(command)}"
-        )
-        return f"{told.removesuffix('.')}:", command
-
-    def _of_the_data(self) -> list[str]:
-        said = [f"{name}: {note}" for name, piece in self._named() for note in data_notes(piece.recording)]
-        said.extend(
-            _held(name, self.uncertainty.intervals["transport_delay"], piece.recording)
-            for name, piece in self._named()
-            if _looks_held(piece.recording, self.uncertainty.intervals.get("transport_delay"))
-        )
-        zeros = self.fit.zeros
-        if zeros is not None:
-            listing = ", ".join(
-                f"{name} {value:+.4f}" for (name, _), value in zip(self._named(), zeros.values, strict=True)
-            )
-            said.append(
-                f"Each recording has a zero of its own (homing, or the tare of the torque): {zeros.name} is {listing} "
-                f"{self.model.units[zeros.name]} beside the common one, which is their mean."
-            )
-        if self.fit.sign_flipped and not self.refused:
-            said.append(
-                "The recorded effort has the opposite sign of the motion that it causes: the fit counts it with sign "
-                "-1; `sign: -1` of `input` in a mapping file says so."
-            )
-        return said
-
-    def _named(self) -> list[tuple[str, Piece]]:
-        pieces = self.fit.pieces
-        return list(zip(distinct_names([p.recording for p in pieces]), pieces, strict=True))
+        return [*said, *self._calibration(), *self.tests.sentences[self.tests.incomplete :]]
 
     @property
     def predicted(self) -> dict[str, float]:
@@ -211,46 +393,29 @@ class IdentificationResult:
         text = f"Half widths obtained over those that the design of the excitation predicted: {listing}; they are 1 "
         return [text + "where the prior plant and the sensor noise were true and the model misses nothing."]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain JSON values."""
-        chosen = self.fit.chosen
+    def _predicted(self) -> dict[str, float]:
+        return self.predicted
+
+    def _records(self) -> list[Mapping[str, Any]]:
+        records = [run_record(piece.recording.meta) for piece in self.fit.pieces]
+        if any(record.get("plant") == "emulator" for record in records):
+            records.append({"command": "python -m pendulum_bags experiment thesis"})
+        return records
+
+    def _own_values(self) -> dict[str, Any]:
+        chosen, zeros = self.fit.chosen, self.fit.zeros
         return {
-            "format": FORMAT,
-            "created": self.created,
-            "method": "output_error",
             "input_kind": self.model.input_kind,
             "duty_gain": self.model.duty_gain,
             "friction": chosen.friction,
-            "window": self.fit.window,
             "held_out_rms": self.score,
             "training_rms": chosen.training_rms,
             "natural_frequency": self.model.natural_frequency,
             "sign_flipped": self.fit.sign_flipped,
-            "own_zeros": None
-            if self.fit.zeros is None
-            else {"name": self.fit.zeros.name, "values": self.fit.zeros.values.tolist()},
-            "parameters": {n: self.model[n] for n in UNITS},
-            "units": dict(self.model.units),
-            "fitted": list(chosen.free),
-            "intervals": {name: found.to_json() for name, found in self.uncertainty.intervals.items()},
+            "own_zeros": None if zeros is None else {"name": zeros.name, "values": zeros.values.tolist()},
             "profiles": {n: list(p) for n, p in self.uncertainty.profiles.items()},
-            "covariance": {
-                "names": list(self.uncertainty.names),
-                "matrix": self.uncertainty.covariance.tolist(),
-            },
-            "correlation": self.uncertainty.correlation.tolist(),
-            "condition_number": self.uncertainty.condition_number,
-            "interval_basis": self.uncertainty.basis,
             "predicted_half_widths": self.predicted,
-            "candidates": [
-                {
-                    "friction": c.friction,
-                    "held_out_rms": None if c.validation is None else c.validation.rms,
-                    "training_rms": c.training_rms,
-                    "parameters": {n: c.solution.model[n] for n in c.free},
-                }
-                for c in self.fit.candidates
-            ],
+            "candidate_parameters": {c.friction: {n: c.solution.model[n] for n in c.free} for c in self.fit.candidates},
             "residuals": {
                 "white": self.tests.white,
                 "white_p": self.tests.white_p,
@@ -260,68 +425,35 @@ class IdentificationResult:
             "geometry": None
             if self.geometry is None
             else {"contradicts": self.geometry.contradicts, "rows": [list(r) for r in self.geometry.rows]},
-            "held_out": {
-                name: {"window_rms": score.rms, "mean_absolute": score.mean_absolute}
-                for name, score in self.held_out.items()
-            },
-            "explained": {
-                "rms": self.explained.rms,
-                "straight_lines_rms": self.explained.lines,
-                "share": self.explained.share,
-                "refused": self.refused,
-            },
-            "incomplete": self.incomplete,
-            "sentences": self.sentences(),
-            "data": [fingerprint(recording) for recording in self.fit.recordings],
         }
 
     def write(self, path: str | Path, *, name: str = "identified", effort_limit: float = 13.0) -> Path:
-        """Write the plant file with intervals and provenance, and everything else as JSON beside it.
+        """Write the plant file and JSON as :meth:`IdentificationResult.write` does.
 
         Args:
-            path: Plant file to write, ``*.yaml``; the JSON gets the same name.
+            path: Plant file to write.
             name: Name of the plant.
             effort_limit: Of the actuator [N m]; a recording does not tell.
-
-        Raises:
-            DataError: for a fit that is refused, or another suffix.
         """
-        if self.explained.refusal is not None:
-            raise DataError(f"{self.explained.refusal} No plant file is written.")
-        target = Path(path)
-        if target.suffix not in {".yaml", ".yml"}:
-            raise DataError(f"plant file is {target.name!r}; expected a name that ends in .yaml")
+        return self._write(path, None if self.refused else self.plant(name, effort_limit))
+
+    def _of_the_file(self, plant: AnyPlant) -> tuple[dict[str, tuple[float, float]], dict[str, Any], list[str]]:
         candidate = self.plant_candidate
-        same = candidate is self.fit.chosen
-        plant = self.plant(name, effort_limit)
-        intervals, remarks = self._file_intervals(plant) if same else ({}, [])
-        torque = self.model.input_kind in {"effort", "position_goal"}
-        remark = "torques are per unit of inertia: the recording does not fix their scale"
-        provenance: dict[str, Any] = {
-            "method": "output error, multiple shooting",
-            "date": self.created,
-            "data": [fingerprint(recording) for recording in self.fit.recordings],
+        facts = {
             "friction": candidate.friction,
             "held_out_rms_rad": candidate.score,
             "training_rms_rad": candidate.training_rms,
             "input_gain": candidate.solution.model["input_gain"],
-            "python": platform.python_version(),
-            "remarks": [
-                *([] if torque or self.fit.options.fix_scale else [remark]),
-                *remarks,
-                *self.sentences(),
-            ],
         }
-        if not same:
-            provenance["remarks"].insert(
-                0,
-                f"the best fit has friction {self.fit.chosen.friction}, which a plant file cannot hold; see the JSON",
-            )
-        write_plant(target, plant, provenance=provenance, intervals=intervals)
-        write_json(target.with_suffix(".json"), self.to_dict())
-        return target
+        intervals, remarks = self._file_intervals(plant)
+        if candidate is not self.fit.chosen:
+            best = f"the best fit has friction {self.fit.chosen.friction}, which a plant file cannot hold; see the JSON"
+            intervals, remarks = {}, [best]
+        if self.model.input_kind not in {"effort", "position_goal"} and not self.fit.options.fix_scale:
+            remarks.insert(0, "torques are per unit of inertia: the recording does not fix their scale")
+        return intervals, facts, remarks
 
-    def _file_intervals(self, plant: PlantParameters) -> tuple[dict[str, tuple[float, float]], list[str]]:
+    def _file_intervals(self, plant: AnyPlant) -> tuple[dict[str, tuple[float, float]], list[str]]:
         """Return the intervals of what the plant file holds, and remarks on those that are of something else."""
         intervals: dict[str, tuple[float, float]] = {}
         remarks = []
@@ -342,9 +474,9 @@ class IdentificationResult:
         return intervals, remarks
 
 
-def _looks_held(recording: Recording, delay: Interval | None) -> bool:
+def _looks_held(recording: Recording, delay: Interval) -> bool:
     """Return whether an input read as straight lines is late by half a sample, as one that is held would be."""
-    if delay is None or recording.hold != "linear" or not recording.meta.get("hold_assumed"):
+    if recording.hold != "linear" or not recording.meta.get("hold_assumed"):
         return False
     half = 0.5 * recording.period
     return abs(delay.value - half) < 0.2 * half and delay.low > 0.25 * half and delay.high < 1.75 * half
@@ -357,6 +489,32 @@ def _held(name: str, delay: Interval, recording: Recording) -> str:
         "it is a command that is held until the next one, this delay is none: say `--hold zero`, or `hold: zero` in a "
         "mapping file."
     )
+
+
+def data_sentences(fit: OutputErrorFit, delay: Interval | None, *, refused: bool) -> list[str]:
+    """Return what was done to the recordings of a fit, and what they seem to be, in words.
+
+    Args:
+        fit: The fit.
+        delay: Interval of the delay.
+        refused: Whether the fit is refused.
+    """
+    named = list(zip(distinct_names([p.recording for p in fit.pieces]), fit.pieces, strict=True))
+    said = [f"{name}: {note}" for name, piece in named for note in data_notes(piece.recording)]
+    if delay is not None:
+        said += [_held(name, delay, p.recording) for name, p in named if _looks_held(p.recording, delay)]
+    if fit.zeros is not None:
+        listing = ", ".join(f"{name} {value:+.4f}" for (name, _), value in zip(named, fit.zeros.values, strict=True))
+        said.append(
+            f"Each recording has a zero of its own (homing, or the tare of the torque): {fit.zeros.name} is {listing} "
+            f"{fit.model.units[fit.zeros.name]} beside the common one, which is their mean."
+        )
+    if fit.sign_flipped and not refused:
+        said.append(
+            "The recorded effort has the opposite sign of the motion that it causes: the fit counts it with sign "
+            "-1; `sign: -1` of `input` in a mapping file says so."
+        )
+    return said
 
 
 _DIFFERENCES = {
@@ -392,14 +550,29 @@ def load_fit_model(path: str | Path) -> FitModel:
     return FitModel(content["parameters"], content["input_kind"], content["friction"], content["duty_gain"])
 
 
-def fingerprint(recording: Recording) -> dict[str, Any]:
+def fingerprint(recording: Recording | JointRecording) -> dict[str, Any]:
     """Return what a recording is known by: source, samples, duration [s] and a hash of its samples."""
     digest = hashlib.sha256()
     for values in (recording.time, recording.position, recording.input):
         digest.update(np.ascontiguousarray(values).tobytes())
     return {
-        "source": str(recording.meta.get("source", "")),
+        "source": recording.source,
         "samples": int(recording.time.size),
         "duration_s": round(recording.duration, 6),
         "sha256": digest.hexdigest()[:16],
     }
+
+
+def check_distinct(
+    recordings: Sequence[Recording | JointRecording], held_out: Sequence[Recording | JointRecording]
+) -> None:
+    """Refuse data that count twice: intervals would be too narrow, a held-out score too good."""
+    prints = [fingerprint(recording)["sha256"] for recording in (*recordings, *held_out)]
+    names = distinct_names([*recordings, *held_out])
+    for i, own in enumerate(prints):
+        j = prints.index(own)
+        if j == i or j >= len(recordings):
+            continue
+        if i < len(recordings):
+            raise DataError(f"{names[i]} has the same samples as {names[j]}; expected each recording once")
+        raise DataError(f"{names[i]} took part in the fit as {names[j]}; expected another recording to hold out")

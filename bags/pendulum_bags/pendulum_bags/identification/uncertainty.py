@@ -11,11 +11,11 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.covariance import FREQUENCY, Errors, candidate_errors, least_scale
 from pendulum_bags.identification.model import BOUNDS, INDEX, UNITS, FitModel
+from pendulum_bags.identification.notes import Interval, edge_sentences, open_sentences, scale_sentences
 from pendulum_bags.identification.output_error import OFFSETS, OutputErrorFit
 from pendulum_bags.identification.residual_tests import ResidualTests
 from pendulum_bags.identification.selection import Candidate, akaike_weights, at_bounds
 from pendulum_bags.identification.solver import solve
-from pendulum_bags.identification.wording import Interval, plain_sentences
 
 __all__ = ["Uncertainty", "assess", "profile_interval", "unresolved_offset"]
 
@@ -116,9 +116,11 @@ def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2, expl
         if model[name] <= 0.0 == BOUNDS[name][0]:
             high = profile_interval(fit, name, inflation=inflation)[1]
             intervals[name] = Interval(0.0, 0.0, high, 0.5 * high, 0.0)
-    sentences = plain_sentences(
-        intervals, names, correlation, own.condition, own.singular, fit, unresolved=unresolved_offset(fit)
-    )
+    sentences = [
+        *scale_sentences(intervals, names, fit),
+        *open_sentences(intervals, names, correlation, own.condition, own.singular, "transport_delay"),
+        *edge_sentences(intervals, fit, unresolved_offset(fit)),
+    ]
     return Uncertainty(
         intervals, names, covariance, correlation, own.condition, inflation, basis, found, tuple(sentences)
     )

@@ -44,6 +44,11 @@ class WindowScore:
     states: Array
 
     @property
+    def share(self) -> float:
+        """Error over that of straight lines."""
+        return self.rms / max(self.lines, 1e-300)
+
+    @property
     def lines(self) -> float:
         """Root mean square error of the best straight line through each window [rad]."""
         left = np.concatenate([off_line(self.time[a:b], self.measured[a:b]) for a, b in self.windows])

@@ -13,8 +13,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.identification.explained import LARGEST_SHARE
 from pendulum_bags.identification.joint_recordings import read_joints
-from pendulum_bags.identification.mechanism_doubt import Score
-from pendulum_bags.identification.mechanism_fit import fit, line_errors, prepare_windows
+from pendulum_bags.identification.mechanism_fit import Score, fit, line_errors, prepare_windows
 from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel
 from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.errors import DataError
@@ -131,7 +130,7 @@ def replay_joints(
         own.name,
         own.coordinates.joints,
         window,
-        Score.of(found.residuals[0], data),
+        found.scores[0],
         data.time[inside] - recording.time[0],
         measured,
         measured + found.residuals[0][inside],

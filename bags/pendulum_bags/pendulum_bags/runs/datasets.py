@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ __all__ = [
     "first_of_each_stamp",
     "gap_length",
     "gaps",
+    "longest_step",
     "unwrap",
 ]
 
@@ -128,10 +129,15 @@ class Recording:
             )
 
     @property
+    def source(self) -> str:
+        """File that it was read from; empty for none."""
+        return str(self.meta.get("source", ""))
+
+    @property
     def name(self) -> str:
         """Short name for messages and figures: that of the source file."""
         # (a bag given as `.` has a name, too)
-        return Path(str(self.meta.get("source", "recording"))).resolve().name
+        return Path(self.source or "recording").resolve().name
 
     @property
     def input_stamps(self) -> Array:
@@ -201,21 +207,21 @@ def gaps(recording: Recording) -> list[tuple[float, float]]:
     """
     found = []
     for stamps in {id(s): s for s in (recording.time, recording.input_stamps)}.values():
-        for i in np.flatnonzero(np.diff(stamps) > _longest_step(stamps)):
+        for i in np.flatnonzero(np.diff(stamps) > longest_step(stamps)):
             start, stop = float(stamps[i]), float(stamps[i + 1])
             if stop > recording.time[0] and start < recording.time[-1]:
                 found.append((start - float(recording.time[0]), stop - float(recording.time[0])))
     return sorted(found)
 
 
-def _longest_step(stamps: Array) -> float:
+def longest_step(stamps: Array) -> float:
     """Return the longest time between two stamps that is no gap [s]."""
     return max(10.0 * float(np.median(np.diff(stamps))), 0.1) if stamps.size > 1 else 0.1
 
 
 def gap_length(stamps: Array) -> float:
     """Return a time that counts as a gap between some stamps [s]."""
-    return 1.2 * _longest_step(stamps)
+    return 1.2 * longest_step(stamps)
 
 
 def continued(time: Array) -> tuple[Array, list[str]]:
@@ -247,7 +253,7 @@ def _joints(time: Array, position: Array) -> NDArray[np.int64]:
     """
     step, intervals = np.diff(position), np.diff(time)
     ordinary = 20.0 * float(np.quantile(np.abs(step), 0.99))
-    rows = np.flatnonzero((intervals <= _longest_step(time)) & (np.abs(step) > max(_LEAST_JUMP, ordinary)))
+    rows = np.flatnonzero((intervals <= longest_step(time)) & (np.abs(step) > max(_LEAST_JUMP, ordinary)))
     rows = rows[(rows > 0) & (rows < step.size - 1)]
     speed = step / intervals
     usual = float(np.quantile(np.abs(np.diff(speed)), 0.95))
@@ -291,9 +297,19 @@ def unwrap(recording: Recording) -> Recording:
     return result
 
 
-def distinct_names(recordings: Sequence[Recording]) -> list[str]:
+class _Named(Protocol):
+    """A recording, of one joint or several."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def source(self) -> str: ...
+
+
+def distinct_names(recordings: Sequence[_Named]) -> list[str]:
     """Return a name for each recording: that of its file, with as many of its folders as tell it from the others."""
-    parts = [Path(str(r.meta.get("source", r.name))).parts or (r.name,) for r in recordings]
+    parts = [Path(r.source or r.name).parts or (r.name,) for r in recordings]
     names = []
     for i, own in enumerate(parts):
         others = parts[:i] + parts[i + 1 :]
@@ -367,7 +383,7 @@ def _slope(recording: Recording, position: Array, velocity: Array) -> tuple[floa
     integrated = np.concatenate(([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * step)))
     # Over stretches of about 0.1 s the quantisation of the angle and the noise of the velocity average out.
     taken = slice(None, None, max(1, round(0.1 / recording.period)))
-    passed = np.concatenate(([0], np.cumsum(step > _longest_step(recording.time))))
+    passed = np.concatenate(([0], np.cumsum(step > longest_step(recording.time))))
     whole = np.diff(passed[taken]) == 0
     moved, expected = np.diff(position[taken])[whole], np.diff(integrated[taken])[whole]
     power = float(moved @ moved)
