@@ -16,8 +16,7 @@ delay: exact for both holds, and differentiable in a fractional delay.
 
 Source: leapfrog with an exponential damping factor as in Hairer, Lubich, Wanner, "Geometric Numerical
 Integration", ch. I.1 and XIII; saltation at the reversal as in Leine and Nijmeijer, "Dynamics and Bifurcations
-of Non-Smooth Mechanical Systems", ch. 7. The equation is `pendulum_msgs_py.dynamics.rigid`, its friction the
-one there; tests hold both together.
+of Non-Smooth Mechanical Systems", ch. 7. The equation and its friction are those of `pendulum_msgs_py.dynamics.rigid`.
 """
 
 from __future__ import annotations
@@ -30,36 +29,34 @@ import numpy as np
 from numba import njit
 
 from pendulum_bags.arrays import Array
+from pendulum_msgs_py.dynamics import rigid
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
+from pendulum_msgs_py.dynamics.rigid import friction_magnitude, rigid_acceleration
 from pendulum_msgs_py.plants import friction_terms
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_friction
 from pendulum_msgs_py.programs.kernel_cache import drop_stale_code
+from pendulum_sim.stepping.dry_friction import LAG, PACKED
 
 __all__ = ["PARAMETER_NAMES", "cumulative_input", "normal_blocks", "simulate_windows"]
 
 PARAMETER_NAMES = (
-    "inertia",
-    "damping",
-    "gravity",
-    "coulomb_friction",
-    "stribeck_excess",
-    "stribeck_velocity",
-    "load_friction",
-    "torque_offset",
-    "angle_offset",
+    # Those of a plant but its lag, which a fit counts as delay; of static friction what exceeds the sliding one.
+    *(name.replace("static_friction", "stribeck_excess") for name in PACKED[:LAG]),
     "input_gain",
     "transport_delay",
     "drive_damping",
     "drive_load_friction",
     "load_stribeck",
+    "load_friction",
     *(name for name in TERM_PARAMETERS if name != "load_friction"),
 )
-"""Order of the parameter vector; the constants below are its indices, those of further friction terms follow."""
-J, B, G, C, S, VS, LG, T0, TH0, K, D, KB, LM, LS = range(14)
+"""Order of the parameter vector, that of ``PACKED``; the constants below are its indices, further terms follow."""
+J, B, G, C, S, VS, T0, TH0, K, D, KB, LM, LS, LG = range(14)
 _OWN = 14
 _FURTHER = len(PARAMETER_NAMES) - _OWN
 # The load's term stands below, where it also knows the load of the drive.
 _OF_TERMS = ("", *PARAMETER_NAMES[1:LG], "", *PARAMETER_NAMES[LG + 1 :])
+_acceleration, _friction_magnitude = njit(rigid_acceleration), njit(friction_magnitude)
 _added_friction = njit(added_friction(_OF_TERMS, njit))
 _added_friction_complex = njit(added_friction(_OF_TERMS, lambda magnitude: njit(in_arithmetic(magnitude, cmath))))
 _STEP = 2.0**-64
@@ -209,13 +206,14 @@ def simulate_windows(
                         drive_th = -drive_u
                 drive = p[K] * on * level
                 rate = (p[B] + on * p[KB]) * inv
-                smooth = drive + p[T0] - gravity * sine
+                # The torque behind a velocity that does not decay: what the damping takes is exact below.
+                smooth = _acceleration(middle - p[TH0], 0.0, drive + p[T0], 1.0, 0.0, gravity)
                 speed = abs(w)
                 bump = math.exp(-((speed / p[VS]) ** 2)) if slows else 0.0
                 # What the gears carry: drive and gravity press the teeth together when they oppose each other.
                 carried = p[LG] * gravity * sine + p[LM] * drive
                 raise_load = 1.0 + p[LS] * bump
-                friction = p[C] + p[S] * bump + raise_load * abs(carried)
+                friction = _friction_magnitude(speed, p[C], p[C] + p[S], p[VS]) + raise_load * abs(carried)
                 if _FURTHER > 0:
                     friction += _added_friction(speed, abs(gravity * sine), p)
                 x = rate * h
@@ -358,4 +356,4 @@ def normal_blocks(
 
 
 for _kernel in (cumulative_input, simulate_windows, normal_blocks):
-    drop_stale_code(_kernel, friction_terms.modules())
+    drop_stale_code(_kernel, [*friction_terms.modules(), rigid])

@@ -185,7 +185,7 @@ class IdentificationResult:
                 cells.append(f"+-{predicted[name]:.2g}" if name in predicted else "-")
             rows.append((*cells, self.model.unit(name)))
         one = len(self.explained.joints) == 1
-        unit, scale = ("mrad", 1e3) if one else ("share of the motion", 1.0)
+        unit, scale = ("mrad", 1e3) if one else ("% of the motion", 100.0)
         errors = [
             (name, *("-" if each is None else f"{scale * each:.3f}" for each in pair), "chosen" * (name == self.choice))
             for name, pair in self.candidates.items()
@@ -196,7 +196,7 @@ class IdentificationResult:
             for label, found in (("", self.training), ("held out ", self.held_out))
             for name, score in found.items()
         ]
-        window = "the whole recording" if self.window is None else f"windows of {self.window:g} s"
+        window = "the whole recording" if self.window is None else f"windows of {self.window:.3g} s"
         rule = CHOICE if one and len(errors) > 1 else ""
         return [
             Table(f"Identified by output error: {self.choice}", "", head, rows),
