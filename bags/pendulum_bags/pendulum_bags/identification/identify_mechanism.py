@@ -183,10 +183,6 @@ class _Attempt:
     candidates: dict[str, float]
     length: float
 
-    @property
-    def worst(self) -> float:
-        return self.fit.worst
-
 
 @dataclass(frozen=True)
 class _Search:
@@ -213,18 +209,18 @@ class _Search:
         tried = [first] if isinstance(first, _Attempt) else []
         shortest = None
         for shorter in (length / 3.0, length / 9.0):
-            if (tried and min(one.worst for one in tried) <= _POOR) or shorter < _SHORTEST:
+            if (tried and min(one.fit.worst for one in tried) <= _POOR) or shorter < _SHORTEST:
                 break
             # Short windows have fewer minima: what they find is another start.
             near = self._attempt(start, self._windows(shorter), shorter)
-            if not isinstance(near, _Attempt) or near.worst > DOUBTFUL_SHARE:
+            if not isinstance(near, _Attempt) or near.fit.worst > DOUBTFUL_SHARE:
                 continue
             again = self._attempt(near.fit.model, data, length)
             tried += [again] if isinstance(again, _Attempt) else []
             shortest = None if fixed else near
-        best = min(tried, key=lambda one: one.worst) if tried else None
+        best = min(tried, key=lambda one: one.fit.worst) if tried else None
         # What long windows show, if poorly, predicts better than what short ones do.
-        if shortest is not None and (best is None or best.worst > LARGEST_SHARE):
+        if shortest is not None and (best is None or best.fit.worst > LARGEST_SHARE):
             best = shortest
         if best is None:
             raise DataError(better_reading(self.plant, data) or str(first))

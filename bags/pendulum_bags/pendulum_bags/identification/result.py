@@ -100,11 +100,6 @@ class IdentificationResult:
         return self.uncertainty.intervals
 
     @property
-    def fitted(self) -> tuple[str, ...]:
-        """Names of what was fitted."""
-        return self.fit.free
-
-    @property
     def refusal(self) -> str | None:
         """Sentence that the fit is no model of the recorded motion; None where it is one."""
         return self.explained.refusal
@@ -177,7 +172,7 @@ class IdentificationResult:
         predicted = self._predicted()
         head = ("parameter", "value", "95 % interval", *(["predicted"] if predicted else []), "unit")
         rows = []
-        for name in dict.fromkeys((*self.fitted, *(n for n in self.intervals if n == FREQUENCY))):
+        for name in dict.fromkeys((*self.fit.free, *(n for n in self.intervals if n == FREQUENCY))):
             interval = self.intervals.get(name)
             value = interval.value if interval else self.model[name]
             cells = [name, f"{value:.5g}", interval.text if interval else "at the edge of its domain"]
@@ -232,7 +227,7 @@ class IdentificationResult:
             "window": self.window,
             "parameters": {name: self.model[name] for name in self.model.names},
             "units": {name: self.model.unit(name) for name in self.model.names},
-            "fitted": list(self.fitted),
+            "fitted": list(self.fit.free),
             "intervals": {name: one.to_json() for name, one in found.intervals.items()},
             "covariance": {"names": list(found.names), "matrix": found.covariance.tolist()},
             "correlation": found.correlation.tolist(),
@@ -299,7 +294,7 @@ class IdentificationResult:
         """Return the intervals of what the plant file holds, facts on the fit, and remarks on what is left out."""
         model, known = self.model, plant.specs if isinstance(plant, MechanismParameters) else {}
         intervals = {n: (one.low, one.high) for n, one in self.intervals.items() if n in known and one.low < one.high}
-        left_out = {f"{n} [{model.unit(n)}]": model[n] for n in self.fitted if n not in known}
+        left_out = {f"{n} [{model.unit(n)}]": model[n] for n in self.fit.free if n not in known}
         return intervals, {"not_in_the_plant": left_out}, []
 
 
