@@ -40,7 +40,7 @@ from pathlib import Path
 from pendulum_bags.console.jobs import Jobs
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.processes import ProcessSet, start_recorder
-from pendulum_bags.runs.bridge_programs import run_bridge_program
+from pendulum_bags.recordings.bridge_programs import run_bridge_program
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.executables import run_program
 from pendulum_msgs_py.programs.starter import bound_environment

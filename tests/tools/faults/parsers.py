@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from pendulum_bags.identification.result import load_fit_model
-from pendulum_bags.runs.csv_mapping import read_csv
-from pendulum_bags.runs.read_recording import read_servo_log
+from pendulum_bags.recordings.reading import Reading
+from pendulum_bags.runs.read_recording import read_recording
 from pendulum_bags.studies.study_file import load_study
 from pendulum_hw_bridge.backends.replay import load_feedback
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, load_gains, write_gains
@@ -205,6 +205,11 @@ def _feedback_npz(folder: Path) -> Path:
     return path
 
 
+def read_motion(path: Path) -> object:
+    """Read a recording by the guess of its columns."""
+    return Reading(path).motion
+
+
 def _feedback_csv(folder: Path) -> Path:
     path = folder / "feedback.csv"
     rows = "".join(f"{0.01 * i:.2f},{0.1 * i:.2f},10.0,0.5\n" for i in range(20))
@@ -282,7 +287,7 @@ def _read_csv_by(mapping: Path) -> object:
     data = mapping.with_name("data.csv")
     if not data.exists():
         data.write_text(_CSV, encoding="utf-8")
-    return read_csv(data, mapping)
+    return read_recording(data, mapping)
 
 
 def _study_runs(path: Path) -> object:
@@ -298,8 +303,9 @@ PARSERS: Sequence[Parser] = (
     Parser("plant YAML", _plant, load_plant, text=True),
     Parser("study YAML", _study, _study_runs, text=True),
     Parser("CSV mapping", _text_file("mapping.yaml", _MAPPING), _read_csv_by, text=True),
-    Parser("CSV", _text_file("data.csv", _CSV), read_csv, text=True),
-    Parser("JSON log", _servo_log, read_servo_log, text=True),
+    Parser("CSV", _text_file("data.csv", _CSV), read_recording, text=True),
+    Parser("JSON log", _servo_log, read_recording, text=True),
+    Parser("NPZ", _feedback_npz, read_motion),
     Parser("identification JSON", _fit_model, load_fit_model, text=True),
     Parser("run metadata JSON", _text_file("run.json", '{"pendulum.run": {"seed": 1}}'), read_metadata, text=True),
     Parser("HEBI gains XML", _gains, load_gains, text=True),

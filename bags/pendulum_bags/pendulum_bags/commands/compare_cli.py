@@ -4,12 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pendulum_bags.commands.recording_options import (
+    Dt,
+    Mappings,
+    Start,
+    Stop,
+    Topics,
+    WriteMapping,
+    readings_of,
+    show_guesses,
+)
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import cli_main
@@ -20,13 +31,20 @@ if TYPE_CHECKING:
 
     from pendulum_bags.comparison import Comparison
     from pendulum_bags.frequency_response.designs import DesignResult
+    from pendulum_bags.recordings.reading import Reading
     from pendulum_bags.verdict import Answer
 
 __all__ = ["main"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-Paths = Annotated[list[Path], typer.Argument(help="Simulation and hardware bag, or run folders with sim and hw.")]
+Paths = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Recording of the simulation and of the hardware (bag, .mat, .csv, .npz, .parquet, ...; several of a run "
+        "that was repeated), or run folders with sim and hw."
+    ),
+]
 MarginOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -83,9 +101,18 @@ def compare(
     joint: Annotated[
         str | None, typer.Option(help="One joint of plants of several; by default all, and one answer.")
     ] = None,
+    mapping: Mappings = None,
+    write_mapping: WriteMapping = None,
+    topic: Topics = None,
+    dt: Dt = None,
+    start: Start = None,
+    stop: Stop = None,
     json_output: Json = False,
 ) -> None:
-    """Compare simulation and hardware under noise: statistics of the difference, equivalence tests, a verdict.
+    """Compare simulation and hardware: statistics of the difference, equivalence tests, a verdict.
+
+    Of recordings that say nothing of an experiment, what both recorded (a disturbance, a reference, an input) decides
+    which tests there are.
 
     Where the hardware's frequency response was measured, it also lists which designs carry over. Plants of several
     joints are compared joint by joint.
@@ -95,29 +122,33 @@ def compare(
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
     from pendulum_bags.frequency_response.designs import designs_table
     from pendulum_bags.runs.kept_bags import KeptBags
-    from pendulum_bags.runs.run_data import joints_of
+    from pendulum_bags.runs.run_data import joints_of, shared_joints
     from pendulum_bags.verdict.terminal import print_answer
     from pendulum_msgs_py.programs.terminal import make_console
 
     margins = Margins.of(margins_file, margin)
-    with KeptBags() as bags:
+    readings: Sequence[Reading] = ()
+    # What was guessed is shown where it ends in an error, too.
+    with ExitStack() as guesses, KeptBags() as bags:
         if all((path / "sim").is_dir() and (path / "hw").is_dir() for path in paths):
             run = partial(compare_folders, paths, margin=margins)
-            joints = joints_of(paths[0] / "sim", open_bag=bags)
-        elif len(paths) == 2:
+            joints = dict.fromkeys(joints_of(paths[0] / "sim", open_bag=bags))
+        elif len(paths) > 1:
+            readings = readings_of(paths, mapping, topic, dt, start, stop)
+            guesses.callback(show_guesses, make_console(stderr=json_output), readings, write_mapping)
             run = partial(
                 compare_runs,
-                *paths,
+                *readings,
                 sim_prefix=sim_prefix,
                 hw_prefix=hw_prefix,
                 own_protocol=own_protocol,
                 margin=margins,
             )
-            joints = joints_of(paths[0], sim_prefix, open_bag=bags)
+            joints = shared_joints(readings, (sim_prefix, hw_prefix), open_bag=bags)
         else:
             raise DataError(
                 f"got {len(paths)} paths ({', '.join(map(str, paths))}); "
-                "expected a simulation and a hardware bag, or run folders that hold sim and hw"
+                "expected recordings of a simulation and of hardware, or run folders that hold sim and hw"
             )
         kept = [*(paths if len(paths) == 1 else ()), *(layers or ())]
         if joints or joint:
@@ -125,6 +156,7 @@ def compare(
                 raise DataError("--machine and --design are of plants of one joint; expected neither for several")
             # Bags of one joint are closed one by one: of a hundred runs not all need be open.
             run = partial(run, open_bag=bags)
+            run = partial(run, joints=joints) if readings else run
             results = {name: run(joint=name) for name in ([joint] if joint else joints)}
         else:
             results = {"": run()}
@@ -190,20 +222,23 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
     unit, what = motion.unit, "x" if motion.slides else "theta"
     plants = content["plants"]
     pooled = f", all samples of {len(result.pairs)} runs" if len(result.pairs) > 1 else ""
+    noise = [] if result.of_files else [("noise held for \\[s]", "noise_hold_time", ".4f")]
     rows = [
-        ("noise recorded \\[s]", "duration_s", ".1f"),
+        ("recorded \\[s]" if result.of_files else "noise recorded \\[s]", "duration_s", ".1f"),
         ("rate \\[Hz]", "rate_hz", ".1f"),
         ("missed deadlines", "missed_deadlines", ".0f"),
-        ("noise held for \\[s]", "noise_hold_time", ".4f"),
+        *noise,
         (f"std of {what} \\[{unit}]", "std_theta", ".5f"),
         (f"std of {what}' \\[{unit}/s]", "std_theta_dot", ".5f"),
         (f"max |u| \\[{motion.effort_unit}]", "max_abs_u", ".4f"),
     ]
     if any("rms_tracking_error" in plant for plant in plants.values()):
         rows.append(("rms of tracking error \\[rad]", "rms_tracking_error", ".5f"))
-    console.print(plants_table(f"Plants during the noise{pooled}", list(plants), list(plants.values()), rows))
+    when = "in the part that both have" if result.of_files else "during the noise"
+    console.print(plants_table(f"Plants {when}{pooled}", list(plants), list(plants.values()), rows))
     blocks = [("paired", content["paired"])] if "position" in content["paired"] else []
-    blocks.append(("unpaired", content["unpaired"]))
+    if not (blocks and result.of_files):
+        blocks.append(("unpaired", content["unpaired"]))
     headings = (f"{title} \\[{of}]" for title, _ in blocks for of in (unit, f"{unit}/s"))
     statistics = number_table("Hardware minus simulation", "", *headings)
     for name in content["unpaired"]["position"]:
@@ -215,7 +250,9 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
             console.print(f"{name}: {sentence}", style="bold red", highlight=False, markup=False)
     if warning := timing_warning(plants):
         console.print(warning, style="bold red", highlight=False)
-    if result.is_paired:
+    if result.of_files:
+        pass  # the notes say what both share
+    elif result.is_paired:
         pair = result.pairs[0]
         delay = result.delay * 1e3
         answers = f"answers {abs(delay):.2f} ms {'later' if delay >= 0 else 'earlier'} than the simulation"
@@ -228,7 +265,10 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
         console.print(f"Not paired: {content['paired']['reason']}.")
     for note in result.notes:
         console.print(note, style="yellow", highlight=False, markup=False)
-    print_tests(console, result)
+    if result.operating is not None:
+        console.print(result.operating.sentence, highlight=False)
+    if result.verdict.tests:
+        print_tests(console, result)
 
 
 main = partial(cli_main, app, name="python -m pendulum_bags compare")

@@ -16,6 +16,7 @@ from pendulum_bags.comparison.independence import check_clocks, check_pairs
 from pendulum_bags.comparison.long_run import Disturbance
 from pendulum_bags.comparison.margins import MarginArgument, Margins
 from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
+from pendulum_bags.comparison.operating_band import Band
 from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
 from pendulum_bags.runs.kept_bags import KeptBags
@@ -34,7 +35,7 @@ from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_msgs_py.json_values import without_nan
 from pendulum_rosbag.reader import read_bag
 
-__all__ = ["Comparison", "compare", "compare_folders", "compare_runs"]
+__all__ = ["Comparison", "PathArgument", "compare", "compare_folders", "compare_joints", "read_own"]
 
 PathArgument: TypeAlias = "str | os.PathLike[str]"
 
@@ -54,6 +55,9 @@ class Comparison:
         left_out: What was recorded and is excluded, and why, as text.
         unproved: What could be checked of a plant only in part, as text.
         stalls: Run folder, reason and logs of each run that a stalled machine aborted before the one that counts.
+        shared: What brought both to one clock: ``disturbance``, or of files ``reference``, ``input`` or ``motion``.
+        advice: What to do next where files do not allow a verdict; empty for what the tests say.
+        operating: Operating band of repeated runs of a machine.
     """
 
     pairs: Sequence[Pair]
@@ -66,6 +70,9 @@ class Comparison:
     left_out: Sequence[str] = ()
     unproved: Sequence[str] = ()
     stalls: Sequence[Mapping[str, str]] = ()
+    shared: str = "disturbance"
+    advice: str = ""
+    operating: Band | None = None
 
     @property
     def notes(self) -> list[str]:
@@ -76,9 +83,14 @@ class Comparison:
             simulation = record.get("simulation") if run.label == "simulation" or STAND_IN in record else None
             if isinstance(simulation, Mapping) and (difference := simulation.get(DIFFERENCE)):
                 notes.append(f"The {run.label}, {simulation.get('name')}, {difference}.")
-            if run.is_whole:
+            if run.is_whole and not self.left_out:
                 notes.append(f"The {run.label} has neither a disturbance nor events: all of its recording is compared.")
         return [*dict.fromkeys(notes), *self.unproved, *self.left_out]
+
+    @property
+    def of_files(self) -> bool:
+        """Whether a side is a recording that says nothing of an experiment."""
+        return any(run.of_file or run.is_whole for pair in self.pairs for run in (pair.simulation, pair.hardware))
 
     @property
     def is_emulated(self) -> bool:
@@ -204,6 +216,8 @@ class Comparison:
             "metrics": self.metrics,
             "verdict": self.verdict.as_dict(),
         }
+        if self.operating is not None:
+            content["operating_band"] = {"coverage": self.operating.coverage, "own_coverage": self.operating.own}
         return without_nan(content)
 
 
@@ -214,6 +228,7 @@ def compare(
     margin: MarginArgument = None,
     looks: Looks = Looks(),  # noqa: B008 - frozen
     shown: Sequence[int] = (),
+    on_one_clock: bool = False,
 ) -> Comparison:
     """Compare runs that are in memory.
 
@@ -223,6 +238,7 @@ def compare(
         margin: What difference does not matter; see :meth:`Margins.parse`.
         looks: Number of interim analyses, where data are added until they decide.
         shown: Runs, by their place among the pairs, that are shown and not tested; some other run is tested.
+        on_one_clock: As :meth:`Pair.of` takes it.
 
     Raises:
         DataError: There is nothing to compare, or runs are given that must not be pooled.
@@ -231,7 +247,7 @@ def compare(
         raise DataError("nothing to compare: 0 runs; expected at least 1 run with simulation and hardware")
     check_pairs(pairs)
     margins = Margins.parse(margin)
-    compared = [Pair.of(simulation, hardware) for simulation, hardware in pairs]
+    compared = [Pair.of(*pair, on_one_clock=on_one_clock) for pair in pairs]
     tested = [pair for index, pair in enumerate(compared) if index not in shown]
     simulations = list(own) or [pair.simulation for pair in tested]
     hardware_runs = [pair.hardware for pair in tested]
@@ -264,41 +280,6 @@ def _may_differ(hardware_runs: Sequence[RunData]) -> bool:
 
 def _noise(run: RunData) -> Disturbance | None:
     return Disturbance.of(run.disturbance, noise_hold_time(run))
-
-
-def compare_runs(
-    sim_bag: PathArgument,
-    hw_bag: PathArgument,
-    *,
-    sim_prefix: str | None = None,
-    hw_prefix: str | None = None,
-    own_protocol: PathArgument | None = None,
-    margin: MarginArgument = None,
-    joint: str | None = None,
-    open_bag: OpenBag = read_bag,
-) -> Comparison:
-    """Compare the bag of a simulation with that of hardware, during the noise.
-
-    Args:
-        sim_bag: Bag of the simulation.
-        hw_bag: Bag of the hardware.
-        sim_prefix: Namespace of the simulation's topics; None for that of the bag's only plant.
-        hw_prefix: Namespace of the hardware's topics.
-        own_protocol: Bag of a simulation with noise of its own, for the thesis's analysis.
-        margin: What difference does not matter; see :meth:`Margins.parse`.
-        joint: Joint of plants of several.
-        open_bag: How bags are opened.
-
-    Raises:
-        BagError: A bag cannot be read.
-        DataError: A bag lacks states or noise.
-        ParameterError: A margin is out of domain.
-    """
-    margins = Margins.parse(margin)
-    simulation = read_run(sim_bag, prefix=sim_prefix, label="simulation", joint=joint, or_all=True, open_bag=open_bag)
-    hardware = read_run(hw_bag, prefix=hw_prefix, label="hardware", joint=joint, or_all=True, open_bag=open_bag)
-    own = [] if own_protocol is None else [_read_own(own_protocol, joint, open_bag)]
-    return compare([(simulation, hardware)], own=own, margin=margins)
 
 
 def compare_joints(
@@ -374,7 +355,7 @@ def compare_folders(
                     left_out.append(_PHASE)
                 pairs.append(pair)
         if (folder / "sim_500hz").is_dir():
-            own.append(_read_own(folder / "sim_500hz", joint, open_bag))
+            own.append(read_own(folder / "sim_500hz", joint, open_bag))
     looked = looks or Looks(max(read_looks(Path(folder)) for folder in folders) if folders else 0)
     return replace(
         compare(pairs, own=own, margin=margins, looks=looked, shown=shown), left_out=tuple(left_out), stalls=stalls
@@ -397,7 +378,8 @@ def _in_words(stalls: Sequence[Mapping[str, str]]) -> str:
     )
 
 
-def _read_own(bag: PathArgument, joint: str | None, open_bag: OpenBag) -> RunData:
+def read_own(bag: PathArgument, joint: str | None, open_bag: OpenBag) -> RunData:
+    """Return a simulation with noise of its own."""
     return read_run(bag, label="simulation, own noise", joint=joint, open_bag=open_bag)
 
 

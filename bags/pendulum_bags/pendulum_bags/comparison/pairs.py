@@ -76,6 +76,7 @@ class Pair:
         difference: As recorded.
         aligned: After the response delay has been taken out of the hardware.
         spectra: Spectra and coherence of the velocities.
+        on_one_clock: Whether another signal than a disturbance was found to be one and brought both to one clock.
     """
 
     simulation: RunData
@@ -85,10 +86,16 @@ class Pair:
     difference: Difference
     aligned: Difference
     spectra: Spectra
+    on_one_clock: bool = False
 
     @classmethod
-    def of(cls, simulation: RunData, hardware: RunData) -> Pair:
+    def of(cls, simulation: RunData, hardware: RunData, *, on_one_clock: bool = False) -> Pair:
         """Compare two runs.
+
+        Args:
+            simulation: The simulation.
+            hardware: The hardware.
+            on_one_clock: Whether a signal that both have brought them to one clock already.
 
         Raises:
             DataError: A plant did not move, one of several joints fell, or the runs have too little in common.
@@ -96,12 +103,13 @@ class Pair:
         for run in (simulation, hardware):
             if not np.ptp(run.window.position):
                 where = f" in {run.joint}" if run.joint else ""
+                while_noisy = "" if run.is_whole or run.of_file else " under the noise"
                 raise DataError(
                     f"the {run.label} of {run.source} stood still{where} at {run.window.position[0]:.4g} "
-                    f"{run.window.unit}{' under the noise' * (not run.is_whole)}; expected a plant that moves: was it "
+                    f"{run.window.unit}{while_noisy}; expected a plant that moves: was it "
                     "armed, and free?"
                 )
-            held = run.joint and not run.window.slides and not run.is_whole
+            held = run.joint and not run.window.slides and not run.is_whole and not run.of_file
             if held and np.ptp(run.window.position) > np.pi:
                 raise DataError(
                     f"the {run.label} of {run.source} fell: {run.joint} turned by "
@@ -114,7 +122,9 @@ class Pair:
         return cls(
             simulation,
             hardware,
-            compare_signals(
+            None
+            if on_one_clock
+            else compare_signals(
                 simulation.disturbance,
                 hardware.disturbance,
                 min(simulation.window.period, hardware.window.period),
@@ -123,17 +133,18 @@ class Pair:
             interpolated_difference(simulation.window, hardware.window, at="slower"),
             interpolated_difference(simulation.window, shifted, at="slower"),
             spectra_of(simulation.window, hardware.window),
+            on_one_clock,
         )
 
     @property
     def clock(self) -> Alignment | None:
         """Alignment of the disturbances; None where they were not recorded."""
-        return None if self.signal is None else self.signal.alignment
+        return None if self.signal is None or self.on_one_clock else self.signal.alignment
 
     @property
     def is_paired(self) -> bool:
         """Whether both had one disturbance, but for samples that a late loop skipped or repeated."""
-        return self.signal is not None and self.signal.is_one
+        return self.on_one_clock or (self.signal is not None and self.signal.is_one)
 
     @property
     def why_not_paired(self) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 from rich.console import Console
 
 from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE
-from pendulum_bags.runs.bridge_programs import last_words, run_bridge_program
+from pendulum_bags.recordings.bridge_programs import last_words, run_bridge_program
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS, LabFile, load_lab
 from pendulum_msgs_py.programs import graph

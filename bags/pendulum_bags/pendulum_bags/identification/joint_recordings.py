@@ -1,43 +1,25 @@
-"""Recordings of all joints of a mechanism, from bags, or from CSV files of any columns by a mapping file.
-
-Example of a mapping file::
-
-    format: pendulum_joint_columns/1
-    time: {column: time, unit: s}
-    joints:
-      shoulder:
-        position: {column: pos_meas1, unit: rad}
-        velocity: {column: vel_meas1, unit: rad/s}        # optional: checks the unit of the position
-        effort: {column: tau_meas1, unit: N m, hold: linear}
-      elbow:
-        position: {column: pos_meas2, unit: rad}          # no effort: nothing drives this joint
-
-Each joint is read as one pendulum is (:mod:`~pendulum_bags.runs.csv_mapping`): units, signs, offsets, unwrapping, the
-check of the velocity against the position. Rows with a NaN are left out and counted.
-"""
+"""Recordings of all joints of a mechanism, of any format."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.runs.csv_mapping import read_csv
-from pendulum_bags.runs.datasets import Recording, check_consistency, unwrap
+from pendulum_bags.recordings.mapping import JointMotion
+from pendulum_bags.recordings.reading import Reading
+from pendulum_bags.runs.datasets import Recording, check_consistency, recording_of, unwrap
 from pendulum_bags.runs.run_data import find_prefix
 from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.contract.names import APPLIED_EFFORT, JOINT_STATES, PUSH
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping
 from pendulum_rosbag.reader import read_bag
 
-__all__ = ["FORMAT", "JointRecording", "read_joints"]
-
-FORMAT = "pendulum_joint_columns/1"
+__all__ = ["JointRecording", "read_joints"]
 
 _FOLLOWED = 0.1
 """Time over which a velocity has to lead to the position [s]."""
@@ -119,72 +101,80 @@ class JointRecording:
                 )
 
 
-def read_joints(path: str | Path, coordinates: Coordinates, mapping: str | Path | None = None) -> JointRecording:
-    """Read a bag, or a CSV file with the columns of every joint.
+def read_joints(
+    path: str | os.PathLike[str], coordinates: Coordinates, mapping: str | Path | None = None
+) -> JointRecording:
+    """Read a recording of every joint.
 
     Of a bag, velocities are read too, unless they contradict the positions. The input is what the plant says it applied
     (topic ``applied_effort``, held until the next state), or else the effort measured with the states.
 
     Args:
-        path: The bag or file.
+        path: File or folder, or a :class:`~pendulum_bags.recordings.reading.Reading`.
         coordinates: Joints of the plant, and which are driven.
-        mapping: Mapping file, for CSV files; by default the columns are ``time`` and, for each joint,
-            ``JOINT.position`` and, where it is driven, ``JOINT.effort`` in SI units (``JOINT.velocity`` is used where
-            it is there).
+        mapping: Mapping file; by default the columns are guessed, ``JOINT.position`` and ``JOINT.effort`` surely.
 
     Raises:
         BagError: The bag cannot be read.
         DataError: A column, a unit or a joint is not as the mapping says, joints are missing or foreign, or the
             input is not an effort.
     """
-    source = Path(path)
-    if not source.exists():
-        raise DataError(f"{source} does not exist; expected a bag or a CSV file")
-    if source.is_dir() or source.suffix.lower() in {".mcap", ".db3"}:
-        if mapping is not None:
-            raise DataError(f"{source} is a bag, whose joints have names; expected no mapping file for it")
-        return _read_bag(source, coordinates)
-    if source.suffix.lower() not in {".csv", ".txt"}:
-        raise DataError(f"{source} is neither a bag nor a CSV file; expected a recording of all joints")
-    rules, origin = _rules(coordinates, mapping, source)
-    common = {key: value for key, value in rules.items() if key not in {"format", "joints"}}
+    reading = Reading.of(path)
+    if mapping is not None:
+        reading = replace(reading, mapping=mapping, _cache={})
+    if reading.has_states:
+        return _read_bag(reading.path, coordinates)
+    motion = reading.motion
     parts: list[Recording] = []
-    # A row with a hole in one joint's column is left out for all joints: their rows must stay those of one moment.
-    others = [
-        {**section, "input": section.get("effort")}
-        for section in rules["joints"].values()
-        if isinstance(section, Mapping)
-    ]
-    for index, joint in enumerate(coordinates.joints):
-        section = require_mapping(rules["joints"][joint.name], f"{origin}: joints.{joint.name}")
-        reject_unknown(section, ("position", "velocity", "effort"), where=f"{origin}: joints.{joint.name}")
-        own = {key: value for key, value in section.items() if key != "effort"}
-        if "effort" in section:
-            own["input"] = section["effort"]
-        elif index in coordinates.driven:
+    for index, (joint, moved) in enumerate(zip(coordinates.joints, _ordered(reading, coordinates), strict=True)):
+        drive = moved.drive
+        if drive is None and index in coordinates.driven:
             raise DataError(
-                f"{origin}: joints.{joint.name} has no effort, but the plant has an actuator there; expected the "
-                "column of its torque or force"
+                f"{motion.meta['mapping']}: joints.{joint.name} has no effort, but the plant has an actuator there; "
+                "expected the column of its torque or force"
             )
-        if joint.effort_unit == "N":
-            own = _as_turning(own)
-        part = read_csv(source, {**common, "drop_nan": True, **own}, also=others)
-        if part.input_kind not in {"effort", "none"}:
+        if moved.slides != (joint.unit == "m"):
             raise DataError(
-                f"{origin}: the input of {joint.name} is a {part.input_kind}; expected an effort in {joint.effort_unit}"
+                f"{reading.path}: {moved.name} is in {'m' if moved.slides else 'rad'}; expected {joint.unit} for "
+                f"{joint.name}: correct its unit in a mapping file"
             )
-        part = check_consistency(unwrap(part)) if joint.turns else check_consistency(part)
-        parts.append(part)
+        if drive is not None and drive.quantity != ("effort" if joint.unit == "rad" else "force"):
+            raise DataError(
+                f"{motion.meta['mapping']}: the input of {joint.name} is a {drive.quantity}; expected an effort in "
+                f"{joint.effort_unit}"
+            )
+        part = recording_of(motion, moved)
+        parts.append(check_consistency(unwrap(part)) if joint.turns else check_consistency(part))
     return JointRecording(
-        source.resolve().name,
+        reading.name,
         parts[0].time,
         np.stack([part.position for part in parts], axis=1),
-        np.stack([part.input for part in parts], axis=1),
+        np.stack([_at(part, parts[0].time) for part in parts], axis=1),
         tuple(part.hold for part in parts),
-        str(source),
-        sum(int(parts[0].meta.get(key, 0)) for key in ("repeated_stamps", "nan_rows")),
+        str(reading.path),
+        sum(int(motion.meta.get(key, 0)) for key in ("repeated_stamps", "nan_rows")),
         _passive(coordinates, [bool(np.any(part.input)) for part in parts]),
     )
+
+
+def _ordered(reading: Reading, coordinates: Coordinates) -> list[JointMotion]:
+    """Return the joints of a recording in the order of the plant's: by their names, guessed ones as they stand."""
+    found = {joint.name: joint for joint in reading.motion.joints}
+    names = coordinates.names
+    if sorted(found) == sorted(names):
+        return [found[name] for name in names]
+    if len(found) != len(names) or not reading.rules.guessed:
+        known = ", ".join(name or "one without a name" for name in found)
+        raise DataError(f"{reading.rules.origin} of {reading.name}: joints are {known}; expected {', '.join(names)}")
+    return list(found.values())
+
+
+def _at(part: Recording, time: Array) -> Array:
+    """Return the input at the stamps of the states."""
+    if part.input_time is None:
+        return part.input
+    newest = np.searchsorted(part.input_time, time, side="right") - 1
+    return np.where(newest >= 0, part.input[np.maximum(newest, 0)], 0.0)
 
 
 def _passive(coordinates: Coordinates, driven: Sequence[bool]) -> tuple[str, ...]:
@@ -246,56 +236,3 @@ def _tracks_position(time: Array, position: Array, velocity: Array) -> Array | N
     moved = np.diff(position[::stride], axis=0)
     left = np.sum((np.diff(way[::stride], axis=0) - moved) ** 2, axis=0)
     return velocity if np.all(left < 0.25 * np.sum(moved**2, axis=0)) else None
-
-
-_SLIDING = {"m": "rad", "m/s": "rad/s", "N": "N m"}
-"""Units of a joint that slides, and what the reader of one hinge calls them."""
-
-
-def _as_turning(own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the sections of a joint that slides with those units that the reader knows."""
-    found = {}
-    for key, section in own.items():
-        if not isinstance(section, Mapping) or section.get("unit") not in _SLIDING:
-            raise DataError(f"unit of {key} is {section!r}; expected m, m/s or N: this joint slides")
-        found[key] = {**section, "unit": _SLIDING[section["unit"]]}
-    return found
-
-
-def _rules(coordinates: Coordinates, mapping: str | Path | None, source: Path) -> tuple[dict[str, Any], str]:
-    names = coordinates.names
-    if mapping is None:
-        joints: dict[str, Any] = {}
-        with source.open(encoding="utf-8", errors="replace") as file:
-            head = {cell.strip().casefold() for cell in file.readline().lstrip("# ").split(",")}
-        for index, joint in enumerate(coordinates.joints):
-            joints[joint.name] = {
-                "position": {"column": [f"{joint.name}.position", f"{joint.name}_position"], "unit": joint.unit},
-                "velocity": {
-                    "column": [f"{joint.name}.velocity", f"{joint.name}_velocity"],
-                    "unit": joint.velocity_unit,
-                    "optional": True,
-                },
-            }
-            columns = [f"{joint.name}.effort", f"{joint.name}_effort"]
-            if index in coordinates.driven or head & set(columns):
-                joints[joint.name]["effort"] = {"column": columns, "unit": joint.effort_unit, "hold": "linear"}
-        return {"time": {"column": "time", "unit": "s"}, "joints": joints}, "names of the joints"
-    rules = load_yaml(Path(mapping), "mapping file")
-    origin = str(mapping)
-    if rules.get("format") != FORMAT:
-        raise DataError(f"{origin}: format is {rules.get('format')!r}; expected {FORMAT!r}")
-    joints = dict(require_mapping(rules.get("joints"), f"{origin}: joints"))
-    if list(joints) != list(names):
-        raise DataError(f"{origin}: joints are {', '.join(joints)}; expected {', '.join(names)}, in this order")
-    _check_distinct_columns(joints, origin)
-    return {**rules, "joints": joints}, origin
-
-
-def _check_distinct_columns(joints: Mapping[str, Any], origin: str) -> None:
-    seen: dict[str, str] = {}
-    for joint, section in joints.items():
-        column = (section or {}).get("position", {}).get("column")
-        if isinstance(column, str) and column in seen:
-            raise DataError(f"{origin}: {seen[column]} and {joint} have the same column {column!r}; expected two")
-        seen[str(column)] = joint

@@ -22,7 +22,7 @@ from pendulum_bags.identification.kernel import cumulative_input
 from pendulum_bags.identification.mechanism_kernel import lagged, motion_kernel
 from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel
 from pendulum_bags.identification.problem import cut_windows, first_state, off_line, sensor_noise
-from pendulum_bags.runs.datasets import longest_step
+from pendulum_bags.recordings.clock import longest_step
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [

@@ -1,1 +1,1 @@
-"""A recording as arrays: bags, CSV and JSON logs, and the folder of a run."""
+"""A recording as arrays of one plant, and the folder of a run."""

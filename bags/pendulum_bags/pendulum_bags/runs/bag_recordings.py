@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_bags.runs.datasets import Recording, gap_length
+from pendulum_bags.recordings.clock import gap_length
+from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.run_data import find_prefix
 from pendulum_msgs_py.contract.names import APPLIED_EFFORT, JOINT_STATES
 from pendulum_msgs_py.errors import DataError

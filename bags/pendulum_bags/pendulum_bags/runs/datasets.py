@@ -1,12 +1,7 @@
-"""One way to read measurements of a pendulum: CSV with a mapping file, friction-study JSON logs, rosbag2 bags.
-
-Whatever the source, the result is one :class:`Recording` in SI units with its time stamps as they were
-recorded: irregular sampling is kept, nothing is resampled.
-"""
+"""Measurements of one pendulum in SI units, with the stamps that were recorded: nothing is resampled."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,28 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.recordings.clock import gap_length, longest_step
+from pendulum_bags.recordings.mapping import JointMotion, Motion
+from pendulum_bags.recordings.physics import ALIKE, FASTEST, derivative
 from pendulum_msgs_py.errors import DataError
-from pendulum_rosbag.reader.clock import steps_back
 
 __all__ = [
     "INPUT_KINDS",
     "Recording",
     "check_consistency",
-    "continued",
     "data_notes",
     "distinct_names",
-    "first_of_each_stamp",
-    "gap_length",
     "gaps",
-    "longest_step",
+    "recording_of",
     "unwrap",
 ]
 
 INPUT_KINDS: Mapping[str, str] = {"effort": "N m", "voltage": "V", "position_goal": "rad", "none": "-"}
 """What drives the pendulum, and its unit. ``position_goal`` is the set point of a servo's own position loop."""
-
-FASTEST = 300.0
-"""Speed that no pendulum on a drive reaches [rad/s]: a faster change of the angle is a jump of the recording."""
 
 _MOST_JOINTS, _LEAST_PIECE, _LEAST_JUMP = 5, 50, 0.3
 """Jumps of the angle that join recordings: how many at most, samples between two of them, and size [rad] at least."""
@@ -51,6 +42,10 @@ _CONSISTENCY_FACTORS = (
     ("rev/s instead of rad/s", 0.5 / np.pi),
     ("a reversed sign", -1.0),
 )
+
+
+_KINDS = {"effort": "effort", "force": "effort", "voltage": "voltage", "command": "voltage", "angle": "position_goal"}
+"""Quantity of an input -> what drives the pendulum; a number without a unit has a gain of its own, as a voltage has."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +169,33 @@ class Recording:
         return self.rows(int(first), int(last))
 
 
+def recording_of(motion: Motion, joint: JointMotion, hold: str | None = None) -> Recording:
+    """Return one joint of a recording.
+
+    Args:
+        motion: The recording.
+        joint: The joint.
+        hold: Of its input, in place of the mapping's.
+    """
+    drive, meta = joint.drive, dict(motion.meta)
+    if drive is None:
+        return Recording(motion.time, joint.position, joint.velocity, np.zeros_like(motion.time), "none", meta=meta)
+    if hold is None and drive.hold_assumed:
+        meta["hold_assumed"] = True
+    if drive.quantity == "command":
+        meta["input_unit"] = "-"
+    return Recording(
+        motion.time,
+        joint.position,
+        joint.velocity,
+        drive.values,
+        input_kind=_KINDS[drive.quantity],
+        hold=hold or drive.hold,
+        input_time=drive.time if drive.own_clock else None,
+        meta=meta,
+    )
+
+
 def data_notes(recording: Recording) -> list[str]:
     """Return what was done to a recording while it was read, in words."""
     notes = [f"{sentence}." for sentence in recording.meta.get("clock_notes", ())]
@@ -182,6 +204,10 @@ def data_notes(recording: Recording) -> list[str]:
     if recording.meta.get("rows_by_topic"):
         between = ", the velocity by interpolation" * ("velocity" in recording.meta["rows_by_topic"])
         notes.append(f"no row holds all quantities: each is taken from its own rows{between}.")
+    if recording.meta.get("nan_rows"):
+        notes.append(f"{recording.meta['nan_rows']} rows without a number are left out.")
+    if recording.meta.get("input_unit") == "-":
+        notes.append("the input has no unit: its gain is per unit of the recorded number.")
     if recording.meta.get("repeated_stamps"):
         notes.append(f"{recording.meta['repeated_stamps']} samples repeat the stamp before them and are left out.")
     if recording.meta.get("unwrapped"):
@@ -212,27 +238,6 @@ def gaps(recording: Recording) -> list[tuple[float, float]]:
             if stop > recording.time[0] and start < recording.time[-1]:
                 found.append((start - float(recording.time[0]), stop - float(recording.time[0])))
     return sorted(found)
-
-
-def longest_step(stamps: Array) -> float:
-    """Return the longest time between two stamps that is no gap [s]."""
-    return max(10.0 * float(np.median(np.diff(stamps))), 0.1) if stamps.size > 1 else 0.1
-
-
-def gap_length(stamps: Array) -> float:
-    """Return a time that counts as a gap between some stamps [s]."""
-    return 1.2 * longest_step(stamps)
-
-
-def continued(time: Array) -> tuple[Array, list[str]]:
-    """Return stamps [s] that go on, behind a gap, where a clock stepped back, and a note on each step."""
-    notes = []
-    gap = gap_length(np.sort(time))
-    for row in steps_back(np.round(time * 1e9).astype(np.int64)):
-        size = float(time[row - 1] - time[row])
-        notes.append(f"the time steps back by {size:.3f} s in sample {row}: the recording is cut there")
-        time = np.concatenate([time[:row], time[row:] + size + gap])
-    return time, notes
 
 
 def _cut_at(recording: Recording, rows: NDArray[np.int64]) -> Recording:
@@ -321,11 +326,6 @@ def distinct_names(recordings: Sequence[_Named]) -> list[str]:
     return names
 
 
-def first_of_each_stamp(time: Array) -> NDArray[np.bool_]:
-    """Return which samples to keep where a logger wrote some stamps more than once: the first of each, shape (n,)."""
-    return np.append(True, np.diff(time) != 0.0) if time.size else np.zeros(0, dtype=bool)
-
-
 def check_consistency(recording: Recording) -> Recording:
     """Return the recording if its velocity is the derivative of its position, else name the likely unit.
 
@@ -346,14 +346,14 @@ def check_consistency(recording: Recording) -> Recording:
     if np.ptp(recording.position) < 0.2:
         return recording
     position, velocity = recording.position, recording.velocity
-    slope, alike = _slope(recording, position, velocity)
+    slope, alike = derivative(recording.time, position, velocity)
     if 0.5 <= slope <= 2.0:
         return recording
     drive = np.interp(recording.time, recording.input_stamps, recording.input)
     orders = (("position and velocity", velocity, position), ("position and input", drive, velocity))
     for words, angle, rate in (*orders, ("velocity and input", position, drive)):
-        other, fits = _slope(recording, angle, rate)
-        if 0.5 <= other <= 2.0 and fits > _ALIKE > abs(alike):
+        other, fits = derivative(recording.time, angle, rate)
+        if 0.5 <= other <= 2.0 and fits > ALIKE > abs(alike):
             raise DataError(
                 f"{recording.name}: the columns of {words} seem to be exchanged: so read, the velocity is {other:.2g} "
                 f"times the derivative of the position, and as given {slope:.3g} times; correct them in a mapping file"
@@ -365,29 +365,9 @@ def check_consistency(recording: Recording) -> Recording:
         elif factor > 0.0 and abs(slope * factor - 1.0) < 0.3:
             likely = f"; this looks like {text.split('/s')[0]} instead of rad in the position"
     mend = "correct `unit` or `sign` in the mapping file"
-    if abs(alike) < _ALIKE:
+    if abs(alike) < ALIKE:
         likely, mend = "", "name another column in a mapping file, or none: no unit or sign makes it the derivative"
     raise DataError(
         f"{recording.name}: the velocity is {slope:.3g} times the derivative of the position; "
         f"expected 0.5 to 2{likely}: {mend}"
     )
-
-
-_ALIKE = 0.9
-"""Correlation from which on one column is the derivative of another, whatever its unit."""
-
-
-def _slope(recording: Recording, position: Array, velocity: Array) -> tuple[float, float]:
-    """Return the slope of integrated velocity against travelled angle, and their correlation."""
-    step = np.diff(recording.time)
-    integrated = np.concatenate(([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * step)))
-    # Over stretches of about 0.1 s the quantisation of the angle and the noise of the velocity average out.
-    taken = slice(None, None, max(1, round(0.1 / recording.period)))
-    passed = np.concatenate(([0], np.cumsum(step > longest_step(recording.time))))
-    whole = np.diff(passed[taken]) == 0
-    moved, expected = np.diff(position[taken])[whole], np.diff(integrated[taken])[whole]
-    power = float(moved @ moved)
-    if not power > 0.0:
-        return 0.0, 0.0
-    product = float(expected @ moved)
-    return product / power, product / max(math.sqrt(power * float(expected @ expected)), 1e-300)

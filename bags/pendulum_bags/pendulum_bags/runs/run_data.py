@@ -1,18 +1,23 @@
-"""From a bag to the arrays of one plant during the noise phase."""
+"""From a recording to the arrays of one plant: of a run of an experiment during its noise, of others all of it."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.recordings.mapping import Drive
+from pendulum_bags.recordings.reading import Reading, holds_states
 from pendulum_bags.runs.correlation import effective_size
+from pendulum_bags.runs.datasets import data_notes, recording_of, unwrap
 from pendulum_bags.runs.moving_reference import follows_reference, recorded_reference
 from pendulum_bags.runs.run_record import STAND_IN, run_record, stands_in
 from pendulum_bags.runs.series import Series, Signal, unwrap_near_upright
@@ -38,6 +43,7 @@ __all__ = [
     "missed_share",
     "plant_summary",
     "read_run",
+    "shared_joints",
     "stand_in_of",
     "timing_warning",
 ]
@@ -74,6 +80,10 @@ class RunData:
         follows_reference: Whether the controller followed a reference that moved.
         reference: That reference from upright, at the times of the window [rad]; None where it is not known.
         joint: Joint whose motion this is, of a plant of several; empty of a plant of one.
+        followed: Reference of a file, over the whole recording, None of a bag [rad or m].
+        recorded: Disturbance of a file; ``disturbance`` may be another signal that two files share.
+        of_file: Whether it is a recording that says nothing of an experiment.
+        unit_assumed: Whether nothing shows the unit of its angle.
     """
 
     label: str
@@ -92,6 +102,10 @@ class RunData:
     follows_reference: bool = False
     reference: NDArray[np.float64] | None = None
     joint: str = ""
+    followed: Signal | None = None
+    recorded: Signal | None = None
+    of_file: bool = False
+    unit_assumed: bool = False
 
     @property
     def is_disturbed(self) -> bool:
@@ -101,7 +115,25 @@ class RunData:
     @property
     def is_whole(self) -> bool:
         """Whether the recording has neither a disturbance nor events, so that all of it is the window."""
-        return self.disturbance is None and self.event_time(START_EVENT) is None
+        return not self.of_file and self.disturbance is None and self.event_time(START_EVENT) is None
+
+    def moved(self, shift: float) -> RunData:
+        """Return the run with all of its stamps later by a time [s]."""
+
+        def later(signal: Signal | None) -> Signal | None:
+            return None if signal is None else Signal(signal.t + shift, signal.value, signal.name)
+
+        signals: dict[str, Any] = {
+            name: later(getattr(self, name)) for name in ("disturbance", "applied", "measured", "followed")
+        }
+        window, whole = self.window.shifted(-shift), self.whole.shifted(-shift)
+        events = [{**event, "t": event["t"] + shift} for event in self.events]
+        return replace(self, window=window, whole=whole, events=events, **signals)
+
+    def between(self, start: float, stop: float) -> RunData:
+        """Return the run with the window cut to a span [s]."""
+        window = self.window.between(start, stop)
+        return replace(self, window=window, arrival=np.diff(window.t), rate_hz=window.rate)
 
     @property
     def tracking_error(self) -> NDArray[np.float64] | None:
@@ -147,9 +179,47 @@ def joints_of(
         BagError: The bag cannot be read.
         DataError: It lacks the states.
     """
-    with open_bag(path) as bag:
-        found = bag.joint_names(f"{find_prefix(bag, prefix)}/{names.JOINT_STATES}")
-        return found if len(found) > 1 else ()
+    reading = Reading.of(path)
+    bag_of: AbstractContextManager[Bag | None] = open_bag(path) if reading.is_bag else nullcontext()
+    with bag_of as bag:
+        if bag is not None and (prefix is not None or holds_states(bag)):
+            found = bag.joint_names(f"{find_prefix(bag, prefix)}/{names.JOINT_STATES}")
+            return found if len(found) > 1 else ()
+    joints = reading.motion.joints
+    return tuple(joint.name for joint in joints) if len(joints) > 1 else ()
+
+
+def shared_joints(
+    readings: Sequence[Reading], prefixes: tuple[str | None, str | None] = (None, None), *, open_bag: OpenBag = read_bag
+) -> dict[str, str | None]:
+    """Return the joints that a simulation and its hardware have both, and their names at the hardware if others.
+
+    Args:
+        readings: The simulation's recording, then those of the hardware.
+        prefixes: Namespaces of simulation and hardware.
+        open_bag: How bags are opened.
+
+    Raises:
+        DataError: The recordings have no joint in common.
+    """
+    ours = joints_of(readings[0], prefixes[0], open_bag=open_bag)
+    every = [joints_of(reading, prefixes[1], open_bag=open_bag) for reading in readings[1:]]
+    theirs = every[0]
+    for reading, found in zip(readings[1:], every, strict=True):
+        if set(found) != set(theirs):
+            raise DataError(
+                f"{reading} has the joints {', '.join(found) or 'of a plant of one'} and {readings[1]} "
+                f"{', '.join(theirs) or 'that of a plant of one'}; expected repeated runs of one machine"
+            )
+    common: dict[str, str | None] = {joint: None for joint in ours if joint in theirs}
+    if common or not (ours or theirs):
+        return common
+    if len(ours) == len(theirs):
+        return dict(zip(ours, theirs, strict=True))
+    raise DataError(
+        f"{readings[0]} has the joints {', '.join(ours) or 'of a plant of one'} and {readings[1]} "
+        f"{', '.join(theirs) or 'that of a plant of one'}; expected the same: a mapping file names the columns of each"
+    )
 
 
 def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
@@ -194,10 +264,10 @@ def read_run(
     or_all: bool = False,
     open_bag: OpenBag = read_bag,
 ) -> RunData:
-    """Read one plant's part of a bag.
+    """Read one plant's part of a recording.
 
     Args:
-        path: The bag.
+        path: A bag, or any recording as a :class:`~pendulum_bags.recordings.reading.Reading` describes it.
         prefix: Namespace of the plant's topics; None for that of its only plant.
         label: Name for tables; by default that of the bag's folder.
         joint: Joint of a plant of several, see :func:`joints_of`. Its disturbance is the joint's own,
@@ -210,7 +280,12 @@ def read_run(
         BagError: The bag cannot be read.
         DataError: It lacks the states or the window, or has other joints.
     """
+    reading = Reading.of(path)
+    if not reading.is_bag:
+        return _run_of(reading, label or reading.name, joint)
     with open_bag(path) as bag:
+        if prefix is None and not holds_states(bag):
+            return _run_of(reading, label or reading.name, joint)
         space = find_prefix(bag, prefix)
         topic = f"{space}/{names.JOINT_STATES}"
         states = _increasing(bag.array(topic) if joint is None else bag.joints(topic).of(joint))
@@ -247,7 +322,7 @@ def read_run(
     if commands is not None:
         first_answer = float(commands["stamp_ns"][0] - start) / NANOSECONDS
         reference = recorded_reference(metadata, space, window.t, first_answer)
-    return RunData(
+    run = RunData(
         label=name,
         window=window,
         whole=whole,
@@ -265,6 +340,80 @@ def read_run(
         reference=reference,
         joint=joint or "",
     )
+    if reading.start is None and reading.stop is None:
+        return run
+    # The part that was chosen counts from the beginning of the recording, as of a file.
+    begin, last = float(times[0]), math.inf if reading.stop is None else reading.stop
+    return run.between(begin + (reading.start or 0.0), begin + last)
+
+
+def _run_of(reading: Reading, name: str, joint: str | None) -> RunData:
+    """Return a joint of a file as a run; all of it is the window, or the part that was chosen."""
+    motion = reading.motion
+    found = next((one for one in motion.joints if one.name == (joint or motion.joints[0].name)), None)
+    if found is None or (joint is None and len(motion.joints) > 1):
+        raise DataError(
+            f"joint is {joint or 'not chosen'} of {reading.path}; expected one of "
+            f"{', '.join(one.name for one in motion.joints)}"
+        )
+    recording = recording_of(motion, found)
+    recording = recording if found.slides else unwrap(recording)
+    times = recording.time - recording.time[0]
+    position = recording.position if found.slides else unwrap_near_upright(recording.position)
+    velocity = _slope(times, position) if recording.velocity is None else recording.velocity
+    drive, begin = found.drive, float(recording.time[0])
+
+    def signal(drive: Drive | None, what: str) -> Signal | None:
+        return None if drive is None else Signal(drive.time - begin, drive.values, f"{what} {name}")
+
+    applied = signal(drive, "input of")
+    units = {"voltage": "V", "command": "-", "angle": "rad"}
+    whole = Series(
+        times,
+        position,
+        velocity,
+        np.zeros_like(times) if applied is None else applied.held_at(times),
+        name,
+        "m" if found.slides else "rad",
+        "" if drive is None else units.get(drive.quantity, ""),
+    )
+    last = math.inf if reading.stop is None else reading.stop
+    window = whole if reading.start is None and reading.stop is None else whole.between(reading.start or 0.0, last)
+    followed, disturbance = signal(found.reference, "reference of"), signal(found.disturbance, "disturbance on")
+    stamps = np.round(window.t * NANOSECONDS).astype(np.int64)
+    return RunData(
+        label=name,
+        window=window,
+        whole=whole,
+        disturbance=disturbance,
+        applied=applied,
+        measured=None,
+        arrival=np.diff(window.t),
+        rate_hz=window.rate,
+        missed_deadlines=missed_periods(stamps),
+        source=str(reading.path),
+        damage=[sentence.rstrip(".") for sentence in data_notes(recording)],
+        joint=joint or "",
+        followed=followed,
+        recorded=disturbance,
+        of_file=True,
+        unit_assumed=reading.rules.guessed,
+    )
+
+
+def _slope(times: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the velocity of a position that is quantised: slopes of parabolas through 20 ms, or five samples."""
+    period = float(np.median(np.diff(times)))
+    width = 2 * max(2, round(0.5 * _SMOOTHED / period)) + 1
+    if times.size <= width:
+        return np.gradient(position, times)
+    even = times[0] + period * np.arange(int((times[-1] - times[0]) / period) + 1)
+    slopes = scipy.signal.savgol_filter(np.interp(even, times, position), width, 2, deriv=1, delta=period)
+    return np.asarray(np.interp(times, even, slopes))
+
+
+_SMOOTHED = 0.02
+"""Time over which an angle without a velocity is smoothed [s]."""
 
 
 def plant_summary(run: RunData) -> dict[str, Any]:

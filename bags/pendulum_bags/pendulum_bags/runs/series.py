@@ -82,6 +82,7 @@ class Series:
         effort: Torque of the controller in answer to each state, shape (n,) [N m or N]; 0 of a joint without a motor.
         name: For messages and legends.
         unit: Of the position, ``rad`` or ``m``.
+        drive_unit: Of the effort, where it is no torque or force; else empty.
     """
 
     t: Array
@@ -90,6 +91,7 @@ class Series:
     effort: Array
     name: str = "series"
     unit: str = "rad"
+    drive_unit: str = ""
 
     def __post_init__(self) -> None:
         """Convert and check."""
@@ -108,8 +110,8 @@ class Series:
 
     @property
     def effort_unit(self) -> str:
-        """Unit of the effort: of a force where the joint slides."""
-        return "N" if self.slides else "N m"
+        """Unit of the effort: of a force where the joint slides; of a file, that of its input."""
+        return self.drive_unit or ("N" if self.slides else "N m")
 
     @property
     def period(self) -> float:

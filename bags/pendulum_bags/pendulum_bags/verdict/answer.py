@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from pendulum_bags.comparison import Comparison
 from pendulum_bags.verdict.layers import Answer, Layer, LayerResult, Mark, read_layers, sum_up
-from pendulum_bags.verdict.same_run import how_to_measure, same_run_layer
+from pendulum_bags.verdict.same_run import how_to_measure, layers_of_files, same_run_layer
 
 __all__ = ["answer_of", "join_joints"]
 
@@ -43,6 +43,9 @@ def answer_of(
     known = {Layer.SAME_RUN, *(one.layer for one in anew)}
     others = [one for folder in folders for one in read_layers(folder, first.case) if one.layer not in known]
     commands = {**how_to_measure(comparison), **how}
+    if comparison.of_files:
+        found = {one.layer for one in (*anew, *others)}
+        others += [one for one in layers_of_files(comparison) if one.layer not in found]
     emulated = all(one.is_emulated for one in results.values())
     return sum_up([first, *anew, *others], emulated=emulated, how=commands)
 

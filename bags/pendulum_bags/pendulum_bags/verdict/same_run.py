@@ -15,7 +15,16 @@ from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
 
-__all__ = ["case_of", "how_to_measure", "in_words", "recordings_of", "same_run_layer", "seen_note", "simulated_plant"]
+__all__ = [
+    "case_of",
+    "how_to_measure",
+    "in_words",
+    "layers_of_files",
+    "recordings_of",
+    "same_run_layer",
+    "seen_note",
+    "simulated_plant",
+]
 
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
@@ -51,7 +60,7 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
         steps = _remedies(comparison, failed)
     else:
         reason = verdict.sentence.removeprefix("Undecided: ").rstrip(".")
-        if comparison.is_paired and not comparison.unlike_references:
+        if tests and comparison.is_paired and not comparison.unlike_references:
             open_tests = [test for test in tests if test.outcome is Outcome.UNDECIDED]
             reason = f"{runs} cannot tell yet in {', '.join(test.quantity for test in open_tests)}"
         steps = (_what_it_takes(comparison, more),)
@@ -95,6 +104,29 @@ def how_to_measure(comparison: Comparison) -> dict[Layer, str]:
         Layer.WHICH_CONTROLLERS: in_frequency,
         Layer.SAME_CHOICE: choice,
     }
+
+
+def layers_of_files(comparison: Comparison) -> list[LayerResult]:
+    """Return the other layers of a comparison of recordings, each with what the recordings lack for it."""
+    runs = comparison.pairs[0].simulation, comparison.pairs[0].hardware
+    lacks = []
+    for run in runs:
+        what = [name for name, signal in (("disturbance", run.recorded), ("input", run.applied)) if signal is None]
+        if run.applied is not None and run.window.effort_unit not in {"N m", "N"}:
+            what.append(f"input in N m (it is in {run.window.effort_unit})")
+        if what:
+            lacks.append(f"{Path(run.source).name} has no {' and no '.join(what)}")
+    names = " ".join(shlex.quote(run.source) for run in runs)
+    response = (
+        f"Not computed: it needs what was added to the torque, and the torque, of both plants, and {'; '.join(lacks)}."
+        if lacks
+        else f"Not computed yet: python -m pendulum_bags frequency_response {names} --plant FILE does, for that plant."
+    )
+    choice = (
+        "Not computed: it needs runs of several controllers on both plants (python -m pendulum_bags ranking FOLDER)."
+    )
+    sentences = {Layer.SAME_PLANT: response, Layer.WHICH_CONTROLLERS: response, Layer.SAME_CHOICE: choice}
+    return [LayerResult(layer, Mark.NOT_MEASURED, sentence) for layer, sentence in sentences.items()]
 
 
 def in_words(test: EquivalenceTest) -> str:
@@ -266,6 +298,8 @@ def _foreign_simulation(comparison: Comparison) -> str:
 
 
 def _what_it_takes(comparison: Comparison, more: str) -> str:
+    if comparison.advice:
+        return comparison.advice
     if comparison.unlike_references:
         return (
             "Hold a set-point while both plants are compared, as lqr does with the same q and r; or record each side "
@@ -279,4 +313,6 @@ def _what_it_takes(comparison: Comparison, more: str) -> str:
     if runs is None:
         return "More runs would hardly decide it: a difference sits on its margin; state another margin, or mend it."
     what = f"about {runs} more run{'s' if runs != 1 else ''} of {comparison.pairs[0].hardware.window.duration:.0f} s"
+    if comparison.operating is not None:
+        return f"Record {what} of the machine under the same {comparison.shared}."
     return f"Record {what}" + (f": {more}." if more else ", each with a seed of its own.")

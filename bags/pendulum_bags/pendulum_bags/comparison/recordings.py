@@ -1,0 +1,420 @@
+"""Compare recordings of which nothing is known but what is in them: what they share decides what may be said.
+
+Two runs are brought to one clock by a signal that both recorded: the disturbance, the reference, or the input; two free
+swings by the motion itself. Then:
+
+- a shared signal that acts throughout, on motions that go on alike, has the statistics of an experiment;
+- runs of a machine that were repeated are independent of each other: each quantity is taken from each run, and
+  Student's t of the runs gives its interval, for this input;
+- one run of each under an input that acts once is described and not judged: by how much the machine differs from itself
+  is not in the files.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from pendulum_bags.arrays import Array, Complex
+from pendulum_bags.comparison.compare import Comparison, PathArgument, compare, read_own
+from pendulum_bags.comparison.equivalence import EquivalenceTest, Outcome, Verdict, conclude, equivalence_test
+from pendulum_bags.comparison.margins import Margin, MarginArgument, Margins
+from pendulum_bags.comparison.operating_band import Band
+from pendulum_bags.comparison.pairs import Pair, interpolated_difference
+from pendulum_bags.comparison.same_run import Looks
+from pendulum_bags.comparison.same_signal import AMPLITUDE, compare_signals
+from pendulum_bags.comparison.statistics import Interval, rms
+from pendulum_bags.distributions import student_quantile
+from pendulum_bags.runs.run_data import OpenBag, RunData, read_run
+from pendulum_bags.runs.series import Signal, uniform_times
+from pendulum_msgs_py.errors import DataError
+from pendulum_rosbag.reader import read_bag
+
+__all__ = ["Shared", "compare_recordings", "compare_runs", "find_shared"]
+
+_ALIKE = 0.95
+"""Correlation from which on two inputs are one: loops of a good simulation and its machine have like commands, too."""
+_LEAST_OVERLAP = 0.5
+_MOST_SAMPLES = 200_000
+_PARTS = 5
+_NEAR_DEGREES = 0.3
+"""Largest logarithm of the ratio of spreads to 180 / pi that is taken for degrees."""
+_DISTURBANCE, _REFERENCE, _INPUT, _MOTION = "disturbance", "reference", "input", "motion"
+_SIGNALS: dict[str, Callable[[RunData], Signal | None]] = {
+    _DISTURBANCE: lambda run: run.disturbance,
+    _REFERENCE: lambda run: run.followed,
+    _INPUT: lambda run: run.applied,
+}
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What two recordings have in common.
+
+    Attributes:
+        kind: ``disturbance``, ``reference``, ``input`` or ``motion``; empty for nothing.
+        shift: By how much the second has to be moved to later [s].
+        correlation: Of the two, there.
+        why: Why it is no more, as text; empty where it is a signal.
+    """
+
+    kind: str
+    shift: float
+    correlation: float
+    why: str = ""
+
+
+def compare_runs(
+    simulation: PathArgument,
+    *hardware: PathArgument,
+    sim_prefix: str | None = None,
+    hw_prefix: str | None = None,
+    own_protocol: PathArgument | None = None,
+    margin: MarginArgument = None,
+    joint: str | None = None,
+    joints: Mapping[str, str | None] | None = None,
+    open_bag: OpenBag = read_bag,
+) -> Comparison:
+    """Compare the recording of a simulation with that of hardware, of an experiment during its noise.
+
+    Args:
+        simulation: Recording of the simulation: a bag, or any other as a ``Reading``.
+        hardware: Recording of the hardware; several of a run that was repeated.
+        sim_prefix: Namespace of the simulation's topics; None for that of the bag's only plant.
+        hw_prefix: Namespace of the hardware's topics.
+        own_protocol: Bag of a simulation with noise of its own, for the thesis's analysis.
+        margin: What difference does not matter; see :meth:`Margins.parse`.
+        joint: Joint of plants of several.
+        joints: All joints, and their names in the hardware's recordings where those have others.
+        open_bag: How bags are opened.
+
+    Raises:
+        BagError: A bag cannot be read.
+        DataError: A recording lacks states.
+        ParameterError: A margin is out of domain.
+    """
+    margins = Margins.parse(margin)
+
+    def side(path: PathArgument, prefix: str | None, label: str | None, one: str | None) -> RunData:
+        return read_run(path, prefix=prefix, label=label, joint=one, or_all=True, open_bag=open_bag)
+
+    label = "hardware" if len(hardware) == 1 else None
+    joints = dict(joints or ({} if joint is None else {joint: None}))
+    ours = side(simulation, sim_prefix, "simulation", joint)
+    theirs = [side(path, hw_prefix, label, joints.get(joint or "") or joint) for path in hardware]
+    if len(theirs) == 1 and not any(run.of_file or run.is_whole for run in (ours, *theirs)):
+        own = [] if own_protocol is None else [read_own(own_protocol, joint, open_bag)]
+        return compare([(ours, theirs[0])], own=own, margin=margins)
+    # The input of one joint brings all of them to one clock.
+    every = [side(simulation, sim_prefix, "simulation", one) for one in joints] or [ours]
+    shared = [
+        find_shared(every, [side(path, hw_prefix, label, other or one) for one, other in joints.items()] or [run])
+        for path, run in zip(hardware, theirs, strict=True)
+    ]
+    return compare_recordings(ours, theirs, shared, margins)
+
+
+def compare_recordings(
+    simulation: RunData,
+    hardware: Sequence[RunData],
+    shared: Sequence[Shared] | None = None,
+    margins: Margins | None = None,
+) -> Comparison:
+    """Compare a simulation with one run of a machine, or with some that were repeated.
+
+    Args:
+        simulation: All of it, or the part that was chosen.
+        hardware: At least one run.
+        shared: What each has in common with the simulation; None to find it.
+        margins: What difference does not matter; None for the defaults.
+
+    Raises:
+        DataError: There is nothing to compare, a plant did not move, or the recordings have no time in common.
+    """
+    margins = margins or Margins.parse()
+    if not hardware:
+        raise DataError(f"{simulation.source} has nothing to be compared with; expected a recording of the machine")
+    shared = shared or [find_shared([simulation], [run]) for run in hardware]
+    kinds = {one.kind for one in shared}
+    if len(kinds) > 1:
+        found = ", ".join(f"{run.label} {one.kind or 'nothing'}" for run, one in zip(hardware, shared, strict=True))
+        raise DataError(
+            f"the runs of the machine do not share one thing with {simulation.label} ({found}); expected repeated runs "
+            "under one input: compare them one at a time"
+        )
+    kind = kinds.pop()
+    pairs = [_on_one_clock(simulation, run, one) for run, one in zip(hardware, shared, strict=True)]
+    notes = [_note(run, one) for run, one in zip(hardware, shared, strict=True)]
+    steady = kind in _SIGNALS and all(_goes_on(ours, theirs) for ours, theirs in pairs)
+    if len(pairs) == 1 and steady:
+        result = replace(compare(pairs, margin=margins, on_one_clock=True), shared=kind)
+    else:
+        result = _described(pairs, kind, shared[0], margins)
+    return replace(result, left_out=(*result.left_out, *dict.fromkeys(notes)))
+
+
+def _described(pairs: Sequence[tuple[RunData, RunData]], kind: str, shared: Shared, margins: Margins) -> Comparison:
+    compared = [Pair.of(*pair, on_one_clock=kind in _SIGNALS) for pair in pairs]
+    first = compared[0]
+    thesis = interpolated_difference(first.simulation.window, first.hardware.window)
+    operating, advice = None, ""
+    if len(pairs) > 1 and kind in _SIGNALS:
+        operating = Band.of(first.simulation.window, [pair.hardware.window for pair in compared])
+        verdict = conclude(_tests_of_runs(compared, margins), margins, "simulation", "hardware")
+    else:
+        apart = rms(first.difference.position)
+        size = apart / max(float(first.difference.hardware.position.std()), 1e-300)
+        unit = first.hardware.window.unit
+        far = f"the motions are {apart:.3g} {unit} apart (rms, {size:.0%} of the hardware's spread)"
+        varies = "how much the machine varies from run to run is not in the files"
+        if kind in _SIGNALS:
+            sentence = f"Undecided: both recordings have one {kind}, and {far}; {varies}."
+        elif kind:
+            sentence = f"Undecided: {shared.why}, and aligned by themselves {far}; {varies}."
+        else:
+            sentence = f"Undecided: {shared.why}, so that the motions say nothing of the plants."
+        verdict, advice = Verdict(Outcome.UNDECIDED, sentence, (), margins, None), _ADVICE[kind]
+    return Comparison(
+        compared,
+        [first.simulation],
+        thesis,
+        verdict,
+        verdict,
+        compared,
+        shared=kind or "nothing",
+        advice=advice,
+        operating=operating,
+    )
+
+
+_AGAIN = "Record the machine's run again, three times or more, and give all files: compare SIMULATION RUN1 RUN2 RUN3"
+_ADVICE = {
+    _DISTURBANCE: f"{_AGAIN}.",
+    _REFERENCE: f"{_AGAIN}.",
+    _INPUT: f"{_AGAIN}; or record both under an input that acts throughout, as noise or a multisine does.",
+    _MOTION: "Record what drives both plants as a column of both files (--topic input=COLUMN names it).",
+    "": "Record both under one input, reference or disturbance, and write it as a column of both files.",
+}
+
+
+# -- what is shared ----------------------------------------------------------------------------------------------
+
+
+def find_shared(simulation: Sequence[RunData], hardware: Sequence[RunData]) -> Shared:
+    """Return what two recordings have in common, and by how much the second has to be moved for it.
+
+    Args:
+        simulation: Its joints.
+        hardware: The same joints, in the same order.
+    """
+    reasons = []
+    joints = list(zip(simulation, hardware, strict=True))
+    for kind, signal in _SIGNALS.items():
+        for ours, theirs in joints:
+            one, other = signal(ours), signal(theirs)
+            if one is None or other is None or not np.any(one.value) or not np.any(other.value):
+                continue
+            shift, correlation = _best_shift([(one, other)], ours, theirs)
+            moved = Signal(other.t + shift, other.value, other.name)
+            period = min(ours.window.period, theirs.window.period)
+            if not (reason := _unlike(kind, one, moved, correlation, period)):
+                return Shared(kind, shift, correlation)
+            reasons.append(reason)
+    free = not any(run.applied is not None and np.any(run.applied.value) for run in (*simulation, *hardware))
+    if free or not reasons:
+        moving = [
+            (
+                Signal(ours.window.t, ours.window.velocity, ours.label),
+                Signal(theirs.window.t, theirs.window.velocity, theirs.label),
+            )
+            for ours, theirs in joints
+            if np.ptp(ours.window.velocity) > 0.0 and np.ptp(theirs.window.velocity) > 0.0
+        ]
+        shift, correlation = _best_shift(moving, *joints[0])
+        missing = "neither has an input" if free else "no input, reference or disturbance is in both"
+        return Shared(_MOTION, shift, correlation, missing)
+    return Shared("", 0.0, 0.0, "; ".join(dict.fromkeys(reasons)))
+
+
+def _unlike(kind: str, ours: Signal, theirs: Signal, correlation: float, period: float) -> str:
+    """Return why two signals on one clock are not one, as text; empty where they are."""
+    if kind == _DISTURBANCE:
+        found = compare_signals(ours, theirs, period)
+        return "the disturbances are too short to be compared" if found is None else found.reason
+    if correlation <= _ALIKE:
+        return f"the {kind}s of both differ: their correlation is {correlation:.2f} at best, expected above {_ALIKE:g}"
+    start, stop = max(ours.t[0], theirs.t[0]), min(ours.t[-1], theirs.t[-1])
+    at = np.linspace(start, stop, 2000) if stop > start else np.array([start])
+    size = rms(theirs.held_at(at)) / max(rms(ours.held_at(at)), 1e-300)
+    if not 1.0 / AMPLITUDE <= size <= AMPLITUDE:
+        return (
+            f"the {kind}s of both differ in size: the hardware's is {size:.3g} times the simulation's, expected "
+            f"{1.0 / AMPLITUDE:.2f} to {AMPLITUDE:.2f}"
+        )
+    return ""
+
+
+def _best_shift(signals: Sequence[tuple[Signal, Signal]], ours: RunData, theirs: RunData) -> tuple[float, float]:
+    """Return by how much the second of each pair has to be later to be most like the first [s], and the correlation.
+
+    The correlation is the mean over the pairs, of the samples that overlap: at least half of the shorter recording.
+    """
+    period = max(
+        min(ours.window.period, theirs.window.period),
+        ours.window.duration / _MOST_SAMPLES,
+        theirs.window.duration / _MOST_SAMPLES,
+    )
+    times = [uniform_times(float(run.window.t[0]), float(run.window.t[-1]), period) for run in (ours, theirs)]
+    reach = np.arange(-(times[1].size - 1), times[0].size)  # sample of the first on which the second begins
+    curves, overlap = [], np.ones(reach.size)
+    for first, second in signals:
+        curve, overlap = _correlations(first.held_at(times[0]), second.held_at(times[1]), reach)
+        curves.append(curve)
+    curve = np.mean(curves, axis=0) if curves else np.zeros(reach.size)
+    curve[overlap < _LEAST_OVERLAP * min(times[0].size, times[1].size)] = -1.0
+    # Of shifts that fit as well, the one with most in common.
+    good = np.flatnonzero(curve > curve.max() - 1e-3)
+    longest = good[overlap[good] > 0.98 * overlap[good].max()]
+    top = int(longest[np.argmax(curve[longest])])
+    offset = 0.0
+    if 0 < top < curve.size - 1:
+        left, middle, right = curve[top - 1 : top + 2]
+        bend = left - 2.0 * middle + right
+        offset = float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5)) if bend < 0.0 else 0.0
+    return float(times[0][0] - times[1][0]) + period * (float(reach[top]) + offset), float(curve[top])
+
+
+def _correlations(a: Array, b: Array, reach: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return the correlation coefficient of the samples that overlap, and their number, at each shift."""
+    count = scipy.fft.next_fast_len(a.size + b.size)
+    a, b = a - a.mean(), b - b.mean()
+    ones = [np.fft.rfft(values, count) for values in (a, a * a, np.ones_like(a))]
+    others = [np.conj(np.fft.rfft(values, count)) for values in (b, b * b, np.ones_like(b))]
+
+    def summed(one: Complex, other: Complex) -> Array:
+        return np.fft.irfft(one * other, count)[reach % count]
+
+    n = np.maximum(np.round(summed(ones[2], others[2])), 1.0)
+    sum_a, sum_b = summed(ones[0], others[2]), summed(ones[2], others[0])
+    covariance = summed(ones[0], others[0]) - sum_a * sum_b / n
+    spread_a = np.maximum(summed(ones[1], others[2]) - sum_a**2 / n, 0.0)
+    spread_b = np.maximum(summed(ones[2], others[1]) - sum_b**2 / n, 0.0)
+    # What hardly moves in the overlap shows nothing of the shift.
+    seen = (spread_a > 0.02 * float(a @ a)) & (spread_b > 0.02 * float(b @ b))
+    curve = np.asarray(covariance / np.sqrt(np.maximum(spread_a * spread_b, 1e-300)), dtype=float)
+    return np.where(seen, curve, 0.0), n
+
+
+def _on_one_clock(simulation: RunData, hardware: RunData, shared: Shared) -> tuple[RunData, RunData]:
+    """Return both with the shared signal as their disturbance, over the time that they have in common."""
+    hardware = hardware.moved(shared.shift)
+    start = max(float(simulation.window.t[0]), float(hardware.window.t[0]))
+    stop = min(float(simulation.window.t[-1]), float(hardware.window.t[-1]))
+    found = []
+    for run in (simulation, hardware):
+        signal = _SIGNALS[shared.kind](run) if shared.kind in _SIGNALS else None
+        found.append(replace(run.between(start, stop + 1e-9), disturbance=signal))
+    ours, theirs = (run.moved(-start) for run in found)
+    _check_units(ours, theirs)
+    return replace(ours, label="simulation"), replace(theirs, label="hardware")
+
+
+def _check_units(simulation: RunData, hardware: RunData) -> None:
+    """Refuse a guess that takes degrees for radians on one side: it alone would make the verdict."""
+    if not (simulation.unit_assumed or hardware.unit_assumed) or hardware.window.slides:
+        return
+    ratio = float(hardware.window.position.std()) / max(float(simulation.window.position.std()), 1e-300)
+    for factor, degrees in ((180.0 / math.pi, hardware), (math.pi / 180.0, simulation)):
+        if abs(math.log(max(ratio, 1e-300) / factor)) < _NEAR_DEGREES:
+            raise DataError(
+                f"the hardware's angle of {hardware.source} moves {ratio:.3g} times as much as the simulation's of "
+                f"{simulation.source}, as degrees taken for radians would; expected one unit: write the guess with "
+                f"--write-mapping, correct the unit of {Path(degrees.source).name} to deg, and give it as --mapping"
+            )
+
+
+def _note(run: RunData, shared: Shared) -> str:
+    if not shared.kind:
+        return f"{run.label}: {shared.why}."
+    what = f"the {shared.kind}s of both" if shared.kind in _SIGNALS else f"{shared.why}: the motions"
+    return (
+        f"{run.label} is moved by {shared.shift:.3f} s, where {what} are most alike (correlation "
+        f"{shared.correlation:.3f})."
+    )
+
+
+def _goes_on(ours: RunData, theirs: RunData) -> bool:
+    """Return whether a signal acts throughout, and the motions are alike throughout: no transient, no drift."""
+    for run in (ours, theirs):
+        signal, window = run.disturbance, run.window
+        assert signal is not None
+        edges = np.linspace(window.t[0], window.t[-1], _PARTS + 1)
+        parts = [signal.held_at(np.linspace(a, b, 400)) for a, b in pairwise(edges)]
+        whole = np.concatenate(parts)
+        if any(np.var(part) < 0.2 * np.var(whole) or np.count_nonzero(np.diff(part)) < 3 for part in parts):
+            return False
+        pieces = np.array_split(window.position, _PARTS)
+        spread = float(window.position.std())
+        if float(np.std([piece.mean() for piece in pieces])) > 0.7 * spread:
+            return False
+    return True
+
+
+# -- repeated runs -----------------------------------------------------------------------------------------------
+
+
+def _tests_of_runs(pairs: Sequence[Pair], margins: Margins) -> list[EquivalenceTest]:
+    """Test repeated runs: each quantity from each run, with Student's t of the runs."""
+    slides = pairs[0].hardware.window.slides
+    what, mean = ("position", margins.mean_position) if slides else ("angle", margins.mean_angle)
+    tests = [
+        _of_runs(f"mean {what} difference", mean, [float(pair.difference.position.mean()) for pair in pairs]),
+        _of_runs("delay", margins.delay, [pair.delay for pair in pairs]),
+    ]
+    for name, margin in ((what, margins.spread_angle), ("velocity", margins.spread_velocity)):
+        key = "velocity" if name == "velocity" else "position"
+        if margin.is_share:
+            logs = [
+                math.log(max(float(getattr(pair.difference.hardware, key).std()), 1e-300))
+                - math.log(max(float(getattr(pair.difference.simulation, key).std()), 1e-300))
+                for pair in pairs
+            ]
+            tests.append(_of_runs(f"spread of {name} (ratio)", margin, logs, ratio=True))
+    for name, margin in ((what, margins.path_angle), ("velocity", margins.path_velocity)):
+        key = "velocity" if name == "velocity" else "position"
+        plural = {"angle": "angles", "position": "positions", "velocity": "velocities"}[name]
+        distances = [
+            rms(getattr(pair.difference, key))
+            / (float(getattr(pair.difference.hardware, key).std()) if margin.is_share else 1.0)
+            for pair in pairs
+        ]
+        tests.append(_of_runs(f"distance of {plural}", margin, distances, one_sided=True))
+    return tests
+
+
+def _of_runs(
+    name: str, margin: Margin, values: Sequence[float], *, ratio: bool = False, one_sided: bool = False
+) -> EquivalenceTest:
+    looks = Looks()
+    runs = np.array(values)
+    error = float(runs.std(ddof=1)) / math.sqrt(runs.size)
+    scale: Callable[[float], float] = math.exp if ratio else lambda value: value * margin.per_si
+
+    def interval(level: float) -> Interval:
+        reach = float(student_quantile(0.5 + 0.5 * level, runs.size - 1)) * error
+        mean = float(runs.mean())
+        return Interval(scale(mean), scale(mean - reach), scale(mean + reach), level, error, runs.size)
+
+    inside, outside = interval(looks.level), interval(looks.level_of_each)
+    if ratio:
+        top = 1.0 + margin.si
+        return equivalence_test(name, "-", inside, 1.0 / top, top, outside=outside, runs=runs.size, ratio=True)
+    low = -math.inf if one_sided else -margin.value
+    return equivalence_test(name, margin.unit, inside, low, margin.value, outside=outside, runs=runs.size)

@@ -1,0 +1,1 @@
+"""Any recording as named columns, and what they are: by a mapping file, or guessed and tested."""

@@ -1,0 +1,330 @@
+"""Files of arrays: NumPy's, and MATLAB's of versions 5 and 7.3 with structs, timeseries exports and cells.
+
+Names are paths as one would write them in MATLAB: ``data.theta.values``; ``x[0]`` is a row or column of an array of two
+dimensions. A cell or an array of structs with one entry for each run is one recording for each entry.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.recordings.columns import Column, Columns, columns_of_array, grouped_parts, need
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["read_matlab", "read_numpy"]
+
+_PERIODS = frozenset({"dt", "ts", "delta_t", "sampletime", "sample_time", "samplingtime", "period", "tsample"})
+"""Names of a single number that is a sampling period."""
+_RATES = frozenset({"fs", "rate", "sample_rate", "samplerate", "fps", "frequency"})
+_DEEPEST = 6
+_OPAQUE = "an object of MATLAB (such as a timeseries, a table or a Simulink dataset), which no open reader takes apart"
+_HOW = "save its arrays instead: t = ts.Time; x = ts.Data; save('run.mat', 't', 'x')"
+
+
+def read_numpy(path: Path, part: int = 0) -> Columns:
+    """Return the arrays of an ``.npz`` or ``.npy`` file, or of all ``.npy`` files of a folder, as columns.
+
+    Arrays that stand in files of their own beside the one that was named belong to it where they are as long.
+
+    Raises:
+        DataError: There is no array of numbers.
+    """
+    files = {path: ""} if path.suffix == ".npz" else {}
+    if not files:
+        folder = path if path.is_dir() else path.parent
+        files = {path: path.stem} if path.is_file() else {}
+        files |= {file: file.stem for file in sorted(folder.glob("*.npy")) if file != path}
+    found: list[Column] = []
+    numbers: dict[str, float] = {}
+    for file, stem in files.items():
+        try:
+            loaded = np.load(file, mmap_mode="r" if stem else None, allow_pickle=False)
+            for name in [stem] if stem else loaded.files:
+                _take(name, loaded if stem else loaded[name], found, numbers)
+        except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+            if file == path or path.is_dir():
+                raise DataError(f"{file} cannot be read as arrays: {str(error).splitlines()[0]}") from error
+    if path.suffix == ".npy" and path.is_file():
+        own = {column.size for column in found if column.name.partition("[")[0] == path.stem}
+        found = [column for column in found if column.size in own]
+    return _columns(path, "file of arrays", found, numbers, {}, part, named=path.suffix == ".npz")
+
+
+def _take(name: str, array: Any, found: list[Column], numbers: dict[str, float]) -> None:
+    if array.dtype.names:
+        for field in array.dtype.names:
+            _take(f"{name}.{field}", array[field], found, numbers)
+    elif array.dtype.kind in "biuf":
+        if array.size == 1:
+            numbers[name] = float(array.reshape(()))
+        else:
+            found += columns_of_array(name, array.shape, lambda: array)
+
+
+def read_matlab(path: Path, part: int = 0) -> Columns:
+    """Return the variables of a MATLAB file as columns.
+
+    Raises:
+        DataError: It is no such file, or has no array of numbers.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(128)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
+    is_hdf = head.startswith(b"\x89HDF") or b"MATLAB 7.3" in head[:64]
+    found: list[Column] = []
+    numbers: dict[str, float] = {}
+    lists: dict[str, list[list[Column]]] = {}
+    opaque: list[str] = []
+    walk = _hdf_variables if is_hdf else _variables
+    for name, node in walk(path, opaque):
+        entries = _entries(node)
+        if entries is None:
+            _gather(name, node, found, numbers, opaque)
+            continue
+        parts: list[list[Column]] = []
+        for entry in entries:
+            parts.append([])
+            _gather(name, entry, parts[-1], {}, opaque)
+        if any(parts):
+            lists[name] = parts
+    kind = "MATLAB file"
+    if not found and not lists and opaque:
+        raise DataError(f"{path} holds {_OPAQUE}: {', '.join(opaque)}; {_HOW}")
+    result = _columns(path, kind, found, numbers, lists, part)
+    if opaque:
+        result.notes.append(f"left out, as {_OPAQUE}: {', '.join(opaque)}")
+    return result
+
+
+class _Node:
+    """A value of a MATLAB file, of either version.
+
+    Attributes:
+        shape: Of an array of numbers; empty of other things.
+        read: Returns the numbers.
+        fields: Of a struct.
+        entries: Of a cell, or of an array of structs.
+        opaque: Whether it is an object.
+    """
+
+    def __init__(
+        self,
+        *,
+        shape: Sequence[int] = (),
+        read: Callable[[], Any] | None = None,
+        fields: Mapping[str, Callable[[], _Node]] | None = None,
+        entries: Sequence[Callable[[], _Node]] | None = None,
+        opaque: bool = False,
+    ) -> None:
+        self.shape, self.read, self.fields, self.entries, self.opaque = shape, read, fields, entries, opaque
+
+
+def _entries(node: _Node) -> list[_Node] | None:
+    """Return what a list of runs holds; None for anything else. A cell of one entry is that entry."""
+    if node.entries is None or len(node.entries) < 2:
+        return None
+    return [entry() for entry in node.entries]
+
+
+def _gather(
+    name: str, node: _Node, found: list[Column], numbers: dict[str, float], opaque: list[str], depth: int = 0
+) -> None:
+    if depth > _DEEPEST:
+        return
+    if node.opaque:
+        opaque.append(name)
+    elif node.fields is not None:
+        for field, get in node.fields.items():
+            _gather(f"{name}.{field}", get(), found, numbers, opaque, depth + 1)
+    elif node.entries is not None:
+        several = len(node.entries) > 1
+        for index, entry in enumerate(node.entries):
+            _gather(f"{name}{{{index + 1}}}" if several else name, entry(), found, numbers, opaque, depth + 1)
+    elif node.read is not None:
+        size = int(np.prod(node.shape))
+        if size == 1:
+            numbers[name] = float(np.asarray(node.read(), dtype=float).reshape(()))
+        elif size > 1:
+            found += columns_of_array(name, node.shape, node.read)
+
+
+def _columns(
+    path: Path,
+    kind: str,
+    found: list[Column],
+    numbers: Mapping[str, float],
+    lists: Mapping[str, list[list[Column]]],
+    part: int,
+    *,
+    named: bool = True,
+) -> Columns:
+    notes = []
+    parts = grouped_parts(lists)
+    chosen = 0
+    if parts:
+        if not 0 <= part <= len(parts):
+            raise DataError(f"{path}#{part}: part is {part}; expected 1 to {len(parts)} ({parts[0][0]}, ...)")
+        chosen = part or 1
+        what, chosen_columns = parts[chosen - 1]
+        found = [*chosen_columns, *found]
+        if not part:
+            notes.append(f"part 1 of {len(parts)} is read, {what}; {path.name}#2 is the next")
+    elif part > 1:
+        raise DataError(f"{path}#{part}: part is {part}, and the file holds one recording")
+    if not found:
+        raise DataError(f"{path} holds no array of numbers; expected those of a recording")
+    period = None
+    for name, value in numbers.items():
+        last = name.rpartition(".")[2].casefold()
+        if value > 0.0 and (last in _PERIODS or last in _RATES):
+            period = value if last in _PERIODS else 1.0 / value
+    clocks = {column.name.rpartition(".")[0]: column for column in found if _is_clock(column.name)}
+    columns = {}
+    for column in found:
+        # A struct with a time holds signals with that time: `Scope.time` and `Scope.signals.values`.
+        own = next((clocks[name] for name in _places(column.name) if name in clocks), None)
+        belongs = own is not None and own is not column and own.size == column.size
+        columns[column.name] = replace(column, clock=own.name) if own is not None and belongs else column
+    return Columns(path, kind, columns, notes, chosen, [what for what, _ in parts], period, named=named)
+
+
+def _is_clock(name: str) -> bool:
+    place, _, last = name.rpartition(".")
+    return bool(place) and last.casefold() in {"time", "t", "tout"}
+
+
+def _places(name: str) -> Iterator[str]:
+    """Yield the structs that a column stands in, the nearest first."""
+    while "." in name:
+        name = name.rpartition(".")[0]
+        yield name
+
+
+# -- version 5 ---------------------------------------------------------------------------------------------------
+
+
+def _variables(path: Path, opaque: list[str]) -> Iterator[tuple[str, _Node]]:
+    """Yield the variables of a file of version 5; arrays of numbers are read when they are asked for."""
+    import scipy.io
+
+    try:
+        listed = scipy.io.whosmat(str(path))
+    except TypeError:
+        # An object has no name there: a file of objects alone, as Simulink logs its datasets.
+        opaque.append("data")
+        return
+    except (OSError, ValueError, NotImplementedError, KeyError, IndexError, MemoryError) as error:
+        raise DataError(f"{path} is no MATLAB file: {str(error).splitlines()[0]}") from error
+
+    @cache
+    def load(name: str) -> Any:
+        try:
+            return scipy.io.loadmat(str(path), variable_names=[name], mat_dtype=True)[name]
+        except Exception as error:  # scipy raises what a damaged file makes it stumble over
+            raise DataError(f"{path}: variable {name!r} cannot be read: {type(error).__name__}: {error}") from error
+
+    for name, shape, kind in listed:
+        if kind in {"unknown", "opaque", "object", "function"}:
+            opaque.append(name)
+        elif kind in {"struct", "cell"}:
+            yield name, _node(load(name))
+        elif kind not in {"char", "sparse"}:
+            yield name, _Node(shape=shape, read=partial(_loaded, path, name))
+
+
+def _loaded(path: Path, name: str) -> Any:
+    """Return one variable; it is not kept, for the columns that are taken from it are."""
+    import scipy.io
+
+    try:
+        return scipy.io.loadmat(str(path), variable_names=[name], mat_dtype=True)[name]
+    except Exception as error:
+        raise DataError(f"{path}: variable {name!r} cannot be read: {type(error).__name__}: {error}") from error
+
+
+def _node(value: Any) -> _Node:
+    """Return a value of scipy's as a node."""
+    if not isinstance(value, np.ndarray) or type(value).__name__ in {"MatlabOpaque", "MatlabFunction"}:
+        return _Node(opaque=type(value).__name__ == "MatlabOpaque")
+    if value.dtype.names:
+        rows = [_Node(fields={field: partial(_node, row[field]) for field in value.dtype.names}) for row in value.flat]
+        return rows[0] if len(rows) == 1 else _Node(entries=[partial(_same, row) for row in rows])
+    if value.dtype == object:
+        return _Node(entries=[partial(_node, entry) for entry in value.flat])
+    if value.dtype.kind in "biuf":
+        return _Node(shape=value.shape, read=partial(_same_array, value))
+    return _Node()
+
+
+def _same(node: _Node) -> _Node:
+    return node
+
+
+def _same_array(array: Any) -> Any:
+    return array
+
+
+# -- version 7.3 -------------------------------------------------------------------------------------------------
+
+
+def _hdf_variables(path: Path, _: list[str]) -> Iterator[tuple[str, _Node]]:
+    """Yield the variables of a file of version 7.3, which is HDF5, or of any file of HDF5."""
+    try:
+        import h5py
+    except ImportError as error:
+        raise need(error, f"{path}, a MATLAB file of version 7.3 (HDF5),") from error
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise DataError(f"{path} is no file of HDF5: {str(error).splitlines()[0]}") from error
+
+    def node(item: Any) -> _Node:
+        kind = item.attrs.get("MATLAB_class", b"")
+        kind = kind.decode() if isinstance(kind, bytes) else str(kind)
+        if isinstance(item, h5py.Group):
+            return _Node(fields={field: partial(node, item[field]) for field in item})
+        if "MATLAB_object_decode" in item.attrs:
+            return _Node(opaque=True)
+        if item.attrs.get("MATLAB_empty", 0) or kind == "char":
+            return _Node()
+        if h5py.check_ref_dtype(item.dtype):
+            # A cell, or a field of an array of structs: one reference for each entry.
+            return _Node(entries=[partial(follow, ref) for ref in item[()].T.flat])
+        if item.dtype.kind not in "biuf":
+            return _Node()
+        # MATLAB's arrays lie in the file transposed.
+        return _Node(shape=item.shape[::-1], read=lambda: item[()].T)
+
+    def follow(reference: Any) -> _Node:
+        return node(file[reference])
+
+    for name in file:
+        if name.startswith("#"):
+            continue
+        found = node(file[name])
+        yield name, _struct_array(found) or found
+
+
+def _struct_array(node: _Node) -> _Node | None:
+    """Return an array of structs, which the file holds as one struct of lists, as a list of structs."""
+    if not node.fields:
+        return None
+    fields = {name: get() for name, get in node.fields.items()}
+    counts = {len(field.entries) for field in fields.values() if field.entries is not None}
+    if len(counts) != 1 or any(field.entries is None for field in fields.values()) or min(counts) < 2:
+        return None
+
+    def entry(index: int) -> _Node:
+        return _Node(fields={name: field.entries[index] for name, field in fields.items() if field.entries})
+
+    return _Node(entries=[partial(entry, index) for index in range(counts.pop())])

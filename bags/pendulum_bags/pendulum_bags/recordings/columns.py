@@ -1,0 +1,152 @@
+"""A recording as named columns, whatever its format; a column is read when it is asked for."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.arrays import Array
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.programs.extras import how_to_install
+
+__all__ = ["Column", "Columns", "columns_of_array", "grouped_parts", "need", "part_of"]
+
+_PART = re.compile(r"^(.+)#(\d+)$")
+_MOST_COLUMNS = 64
+"""Columns of one array of two dimensions; what has more on both sides is no recording."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One quantity of a recording.
+
+    Attributes:
+        name: Where it is in the file: the name of a column, or a path such as ``data.theta.values``.
+        size: Number of values.
+        read: Returns the values, as floating-point numbers of 64 bits whatever the file stores, shape (size,).
+        clock: Name of the column with its stamps, where the file says which; empty otherwise.
+        unit: As the file gives it; empty otherwise.
+    """
+
+    name: str
+    size: int
+    read: Callable[[], NDArray[Any]]
+    clock: str = ""
+    unit: str = ""
+
+
+@dataclass
+class Columns:
+    """A recording.
+
+    Attributes:
+        path: The file or folder.
+        kind: Its format, for messages.
+        columns: By name, in the order of the file.
+        notes: What reading has found out, one sentence each.
+        part: Number of the part that was read, from 1; 0 where the file holds one recording.
+        parts: What each part is, as text.
+        period: Sampling period that the file states [s].
+        is_table: Whether the values in one row were measured together.
+        named: Whether the columns have names that an author gave.
+        header: How many lines are above the first row, for messages.
+    """
+
+    path: Path
+    kind: str
+    columns: Mapping[str, Column]
+    notes: list[str] = field(default_factory=list)
+    part: int = 0
+    parts: Sequence[str] = ()
+    period: float | None = None
+    is_table: bool = False
+    named: bool = True
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    _values: dict[str, Array] = field(default_factory=dict)
+
+    def values(self, name: str) -> Array:
+        """Return a column as floating-point numbers, shape (size,)."""
+        if name not in self._values:
+            # Not one operation in the type of the file: MATLAB stores 200.0 in eight bits, and 3 * 200 is 88 there.
+            self._values[name] = np.ascontiguousarray(self.columns[name].read(), dtype=float).reshape(-1)
+        return self._values[name]
+
+    def find(self, candidates: Iterable[str]) -> str | None:
+        """Return the first column of some names; capital letters do not matter where only one can be meant."""
+        wanted = [str(one) for one in candidates]
+        found = next((one for one in wanted if one in self.columns), None)
+        if found is None:
+            folded = {one.casefold() for one in wanted}
+            alike = [name for name in self.columns if name.casefold() in folded]
+            found = alike[0] if len(alike) == 1 else None
+        return found
+
+
+def part_of(path: str | Path) -> tuple[Path, int]:
+    """Return a path without the ``#N`` behind it that chooses a part, and the part, 0 for none."""
+    source = Path(path)
+    found = _PART.match(source.name)
+    if found is None or source.exists():
+        return source, 0
+    return source.with_name(found[1]), int(found[2])
+
+
+def columns_of_array(name: str, shape: Sequence[int], read: Callable[[], Any]) -> list[Column]:
+    """Return an array of one or two dimensions as columns; the longer side is time.
+
+    Args:
+        name: Of the array.
+        shape: Its shape; sides of length 1 do not count.
+        read: Returns the array.
+    """
+    sides = [side for side in shape if side != 1]
+    if len(sides) == 1:
+        return [Column(name, sides[0], lambda: np.asarray(read()).reshape(-1))]
+    if len(sides) != 2 or min(sides) > _MOST_COLUMNS:
+        return []
+
+    def column(index: int) -> NDArray[Any]:
+        table = np.asarray(read()).squeeze()
+        return table[:, index] if sides[0] > sides[1] else table[index]
+
+    return [Column(f"{name}[{index}]", max(sides), partial(column, index)) for index in range(min(sides))]
+
+
+def grouped_parts(
+    arrays: Mapping[str, Sequence[Sequence[Column]]],
+) -> list[tuple[str, list[Column]]]:
+    """Return the recordings of a file whose arrays stand in lists, one entry for each recording.
+
+    Lists belong together where they have as many entries, of the same lengths.
+
+    Args:
+        arrays: Name of a list -> columns of each entry.
+    """
+    groups: dict[tuple[int, ...], list[str]] = {}
+    for name, entries in arrays.items():
+        lengths = tuple(max((column.size for column in entry), default=0) for entry in entries)
+        groups.setdefault(lengths, []).append(name)
+    parts = []
+    for lengths, names in groups.items():
+        for index in range(len(lengths)):
+            what = ", ".join(f"{name}{{{index + 1}}}" for name in names)
+            parts.append((what, [column for name in names for column in arrays[name][index]]))
+    return parts
+
+
+def need(error: ImportError, what: str) -> DataError:
+    """Return the error of a file whose library is missing.
+
+    Args:
+        error: What the import raised.
+        what: The file.
+    """
+    reason = how_to_install(error) or f"{error.name or 'a library'} cannot be imported: {str(error).splitlines()[0]}"
+    return DataError(f"{what} cannot be read: {reason}")

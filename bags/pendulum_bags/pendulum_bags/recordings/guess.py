@@ -1,0 +1,702 @@
+"""What the columns of a recording are, guessed by their names and tested against the data.
+
+A name proposes; the data decide. A velocity is one only if its integral follows the position; that test also gives
+units, sign, and the columns of arrays without names. The equation of motion shows whether an angle is 0 hanging or
+upright. What no test can show is assumed, and says so.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pendulum_bags.arrays import Array
+from pendulum_bags.recordings.columns import Columns
+from pendulum_bags.recordings.mapping import Rules
+from pendulum_bags.recordings.physics import (
+    ALIKE,
+    FASTEST,
+    Balance,
+    balance_of,
+    derivative,
+    moves,
+    turn_of,
+    units_by_slope,
+)
+from pendulum_bags.recordings.units import INPUTS, UNITS, quantity_of
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["Guess", "guess_rules"]
+
+_WORDS: Mapping[str, frozenset[str]] = {
+    "time": frozenset({"t", "time", "times", "timestamp", "timestamps", "stamp", "tout", "elapsed", "zeit", "sec"}),
+    "velocity": frozenset({"vel", "velocity", "speed", "omega", "dot", "qd", "dq", "angvel", "geschwindigkeit"}),
+    "angle": frozenset(
+        {"theta", "th", "angle", "angles", "alpha", "phi", "psi", "beta", "pos", "position", "q", "qpos", "winkel",
+         "angular", "encoder", "y"}
+    ),
+    "place": frozenset({"x", "cart", "distance", "place", "slider"}),
+    "input": frozenset(
+        {"u", "torque", "tau", "effort", "voltage", "volt", "volts", "pwm", "input", "command", "cmd", "action", "duty",
+         "current", "control", "motor", "force", "actuator", "moment"}
+    ),
+    "reference": frozenset({"ref", "reference", "target", "desired", "des", "setpoint", "goal", "sp", "soll"}),
+    "disturbance": frozenset({"disturbance", "dist", "perturbation", "pert", "noise"}),
+}  # fmt: skip
+_NEVER = frozenset(
+    {"raw", "err", "error", "squared", "cos", "sin", "latency", "index", "frame", "fric", "friction", "acc", "accel",
+     "acceleration", "ddot", "tf", "rotation", "translation", "quaternion", "orientation", "layout", "parameter",
+     "events", "imu", "temp", "temperature", "saturation", "feedforward", "offset", "episode", "reward", "done", "id",
+     "count", "covariance", "delta", "frequency", "log"}
+)  # fmt: skip
+_WEAK = frozenset({"y", "q", "x", "th", "control", "motor", "current", "encoder", "angular", "action", "force", "cart"})
+"""Words that mean something else where a plainer one is there."""
+_NAMING = frozenset({"theta", "alpha", "phi", "psi", "beta", "x", "cart", "distance", "angle", "slider"})
+"""Words that are the name of a joint, too."""
+_MEASURED, _FILTERED = frozenset({"meas", "measured", "actual"}), frozenset({"filt", "filtered", "est", "estimated"})
+_COMMANDED = frozenset({"con", "cmd", "command", "commanded", "controller", "u"})
+_PLAIN = frozenset(
+    {"joint", "joints", "states", "state", "observation", "values", "value", "signals", "data", "sim", "hw"}
+)
+_UNIT_WORDS = {
+    "deg": "deg", "degrees": "deg", "rad": "rad", "ms": "ms", "us": "us", "ns": "ns", "rpm": "rpm", "nm": "N m",
+    "volt": "V", "volts": "V", "voltage": "V", "v": "V", "torque": "N m", "tau": "N m", "effort": "N m",
+    "moment": "N m", "pwm": "-", "duty": "-",
+}  # fmt: skip
+_TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_]+")
+_MOST_PAIRS = 24
+_ASSUMED = "assumed, for the file does not say, and small angles in degrees move alike"
+
+
+@dataclass(frozen=True)
+class Guess:
+    """One row of what was guessed.
+
+    Attributes:
+        quantity: What it is, such as ``position of elbow``.
+        column: Its column.
+        unit: Its unit.
+        how: By what it was found, and what tests say.
+        assumed: Whether something of it is shown by no test.
+    """
+
+    quantity: str
+    column: str
+    unit: str
+    how: str
+    assumed: bool = False
+
+
+@dataclass
+class _Candidate:
+    """A column with the role that its name proposes."""
+
+    name: str
+    role: str
+    stem: str
+    rank: int
+    weak: bool
+    unit: str
+    label: str
+    chosen: bool = False
+
+    @property
+    def how(self) -> str:
+        return "as given" if self.chosen else "by its name"
+
+
+@dataclass
+class _Found:
+    """A joint that was found."""
+
+    name: str
+    stem: str
+    position: str
+    sections: dict[str, dict[str, Any]] = field(default_factory=dict)
+    rows: list[Guess] = field(default_factory=list)
+
+    def of(self, quantity: str) -> str:
+        return f"{quantity} of {self.name}" if self.name else quantity
+
+
+def guess_rules(
+    columns: Columns, *, period: float | None = None, only: Mapping[str, str] | None = None
+) -> tuple[Rules, list[Guess]]:
+    """Return the mapping of a recording, and how each of its entries was found.
+
+    Args:
+        columns: The recording.
+        period: Sampling period, where the caller knows it [s].
+        only: Role (``position``, ``velocity``, ``input``, ``reference``, ``disturbance``, ``time``, or ``states`` for
+                        first two) -> column, topic or beginning of a path that it is taken from.
+
+    Raises:
+        DataError: No time, no position, or more than one way to read the file.
+    """
+    return _Guesser(columns, period, dict(only or {})).rules()
+
+
+class _Guesser:
+    def __init__(self, columns: Columns, period: float | None, only: dict[str, str]) -> None:
+        self.columns, self.only, self.period = columns, only, period
+        self.guesses: list[Guess] = []
+        self.candidates = [one for name in columns.columns if (one := self._candidate(name)) is not None]
+
+    def rules(self) -> tuple[Rules, list[Guess]]:
+        time = self._time()
+        joints = self._joints()
+        for joint in joints:
+            self._velocity(joint, alone=len(joints) == 1)
+        self._name_joints(joints)
+        self._drives(joints)
+        for joint in joints:
+            self._zero(joint, joints)
+        further: dict[str, Any] = {}
+        if self.columns.is_table and any(
+            np.isnan(self.columns.values(str(section["column"]))).any()
+            for joint in joints
+            for section in joint.sections.values()
+        ):
+            further["drop_nan"] = True
+        rules = Rules(
+            time,
+            {joint.name: joint.sections for joint in joints},
+            "the guess from names and data",
+            further,
+            guessed=True,
+        )
+        return rules, [
+            *self.guesses,
+            *(replace(row, quantity=joint.of(row.quantity)) for joint in joints for row in joint.rows),
+        ]
+
+    # -- names -----------------------------------------------------------------------------------------------------
+
+    def _candidate(self, name: str) -> _Candidate | None:
+        for role, start in self.only.items():
+            if name == start or name.startswith((f"{start}/", f"{start}.", f"{start}[")):
+                wanted = role
+                break
+        else:
+            wanted = ""
+        words = _tokens(name)
+        present = {word.casefold() for word in words}
+        stated = self.columns.columns[name].unit
+        if wanted == "" and present & _NEVER:
+            return None
+        role = self._role(words, present, stated) if wanted in {"", "states"} else wanted
+        weak = not (present - _WEAK) & _WORDS.get(_WORD_OF.get(role, role), frozenset())
+        if weak and not wanted and re.search(r"\[\d+\]$", name):
+            return None  # rows of an array such as x or y are states, of which the data say more
+        if not role or (not wanted and self._is_taken(role)) or (wanted == "states" and role not in _STATES):
+            return None
+        naming = [word for word in words if self._names_joint(word.casefold())]
+        stem = "_".join(naming)
+        measured, filtered = bool(present & _MEASURED), bool(present & _FILTERED)
+        rank = 0 if measured else 2 if filtered else 3 if role == "input" and present & {"con", "commanded"} else 1
+        unit = stated or next((_UNIT_WORDS[word.casefold()] for word in words if word.casefold() in _UNIT_WORDS), "")
+        return _Candidate(
+            name, role, stem.casefold(), rank, weak and not wanted, unit, _label(name, stem), bool(wanted)
+        )
+
+    def _is_taken(self, role: str) -> bool:
+        """Return whether the caller chose another column for a role."""
+        return role in self.only or (role in _STATES and "states" in self.only)
+
+    def _role(self, words: Sequence[str], present: set[str], stated: str) -> str:
+        quantity = quantity_of(stated)
+        if words and words[-1].casefold() in _WORDS["time"] and len(words) > 1:
+            return "time"
+        if quantity in {"velocity", "speed"}:
+            return "velocity"
+        has = {role for role, known in _WORDS.items() if present & known}
+        if "disturbance" in has:
+            return "disturbance"
+        if "velocity" in has or _is_derivative(words):
+            return "" if "reference" in has else "velocity"
+        if "reference" in has:
+            return "reference"
+        if quantity == "time" or ("time" in has and not has - {"time"}):
+            return "time"
+        if quantity in INPUTS and quantity != "angle":
+            return "input"
+        if quantity in {"angle", "place"}:
+            return "input" if "input" in has - {"angle"} and not has & {"angle", "place"} else "position"
+        if "Q" in words and not present & {"theta", "angle", "position"}:
+            return "input"
+        if has & {"angle", "place"} and not (present & {"effort", "torque", "tau"}):
+            return "position"
+        return "input" if "input" in has else "time" if "time" in has else ""
+
+    @staticmethod
+    def _names_joint(word: str) -> bool:
+        known = set().union(*_WORDS.values()) | _MEASURED | _FILTERED | _COMMANDED | _PLAIN | {"d", "dot"}
+        return word in _NAMING or (word not in known and word not in _UNIT_WORDS)
+
+    # -- time ------------------------------------------------------------------------------------------------------
+
+    def _time(self) -> dict[str, Any]:
+        if self.period is not None:
+            self.guesses.append(Guess("time", f"every {self.period:g} s", "s", "as given"))
+            return {"period": self.period, "unit": "s"}
+        states = [self.columns.columns[one.name] for one in self.candidates if one.role in {"position", "velocity"}]
+        if states and all(column.clock for column in states):
+            clocks = dict.fromkeys(column.clock for column in states)
+            self.guesses.append(Guess("time", ", ".join(clocks), "s", "the stamps of each quantity"))
+            return {"own": True}
+        named = [one.name for one in self.candidates if one.role == "time"]
+        # A plain name goes before one inside a path.
+        named.sort(key=lambda name: (len(_tokens(name)), name))
+        names = [name for name in named if _increases(self.columns.values(name))]
+        how = "by its name; it increases"
+        if not names and not self.columns.named:
+            names = [name for name in self.columns.columns if self._may_be_time(name)]
+            how = "the only column that increases, and by unequal steps or fractions"
+            if len(names) > 1:
+                raise self._ambiguous("time", names)
+        if not names and self.columns.period is not None:
+            self.guesses.append(Guess("time", f"every {self.columns.period:g} s", "s", "the file states it"))
+            return {"period": self.columns.period, "unit": "s"}
+        if not names:
+            refused = f" ({', '.join(named)} does not increase)" if named else ""
+            raise DataError(
+                f"{self.columns.path} has no column of time{refused}; it has {self._listed()}: --dt SECONDS gives the "
+                "time between two rows, --topic time=COLUMN names the column"
+            )
+        return self._time_section(names[0], how)
+
+    def _time_section(self, name: str, how: str) -> dict[str, Any]:
+        column = self.columns.columns[name]
+        word = next((_UNIT_WORDS[token] for token in _tokens(name) if token in UNITS["time"]), "")
+        stated = column.unit or word
+        values = self.columns.values(name)
+        step = float(np.median(np.diff(values[np.isfinite(values)])))
+        unit = stated if stated in UNITS["time"] else _time_unit(step)
+        assumed = not stated and unit != "s"
+        note = f"; steps of {step:.4g} are taken for {unit}" if assumed else ""
+        self.guesses.append(Guess("time", name, unit, how + note, assumed))
+        return {"column": name, "unit": unit}
+
+    def _may_be_time(self, name: str) -> bool:
+        values = self.columns.values(name)
+        steps = np.diff(values)
+        is_index = bool(steps.size and np.all(steps == 1.0))
+        return _increases(values) and not is_index
+
+    # -- motion ----------------------------------------------------------------------------------------------------
+
+    def _joints(self) -> list[_Found]:
+        found = [one for one in self.candidates if one.role == "position"]
+        if any(not one.weak for one in found):
+            places = _WORDS["place"]
+            found = [one for one in found if not one.weak or set(one.label.casefold().split("_")) & places]
+        chosen: dict[str, _Candidate] = {}
+        for one in sorted(found, key=lambda one: one.rank):
+            values = self.columns.values(one.name)
+            if one.stem in chosen:
+                if one.rank == chosen[one.stem].rank:
+                    self.guesses.append(Guess("left out", one.name, "", f"{chosen[one.stem].name} has that name too"))
+                continue
+            if not moves(values):
+                self.guesses.append(Guess("left out", one.name, "", "it has one value throughout"))
+                continue
+            chosen[one.stem] = one
+        if chosen:
+            order = list(self.columns.columns)
+            ordered = sorted(chosen.values(), key=lambda one: order.index(one.name))
+            return [self._joint(one.label, one.stem, one.name, one.unit, one.how) for one in ordered]
+        return self._joints_by_data()
+
+    def _joint(self, label: str, stem: str, column: str, unit: str, how: str) -> _Found:
+        joint = _Found(label, stem, column)
+        joint.sections["position"] = {"column": column, "unit": unit}
+        joint.rows.append(Guess("position", column, unit, how))
+        return joint
+
+    def _joints_by_data(self) -> list[_Found]:
+        """Return the joints of columns without names: those of which another column is the derivative."""
+        taken = {guess.column for guess in self.guesses}
+        names = [
+            name
+            for name, column in self.columns.columns.items()
+            if name not in taken and moves(self.columns.values(name)) and not _increases(self.columns.values(name))
+        ]
+        pairs = []
+        if len(names) <= _MOST_PAIRS:
+            for one in names:
+                for other in names:
+                    time = self._stamps(one)
+                    a, b = self.columns.values(one), self.columns.values(other)
+                    if one == other or time is None or a.size != b.size or not np.isfinite(a + b).all():
+                        continue
+                    slope = derivative(time, a, b)
+                    if slope.alike > 0.95 and units_by_slope(slope.slope, "", ""):
+                        pairs.append((slope.alike, one, other))
+        joints: list[_Found] = []
+        used: set[str] = set()
+        for alike, one, other in sorted(pairs, reverse=True):
+            if not used & {one, other}:
+                used |= {one, other}
+                how = f"{other} is its derivative (correlation {alike:.3f})"
+                joints.append(self._joint(one, one, one, "", how))
+                self.candidates.append(_Candidate(other, "velocity", one, 0, False, "", one))
+        if joints:
+            order = list(self.columns.columns)
+            return sorted(joints, key=lambda joint: order.index(joint.position))
+        if len(names) == 1:
+            return [self._joint("", "", names[0], "", "the only column that moves")]
+        raise self._ambiguous("position", names)
+
+    def _ambiguous(self, role: str, names: Sequence[str]) -> DataError:
+        rows = []
+        for name in self.columns.columns:
+            values = self.columns.values(name)
+            known = values[np.isfinite(values)]
+            span = f"{known.min():.4g} to {known.max():.4g}" if known.size else "no number"
+            rows.append(f"{name} ({span})")
+        several = "none of its columns is plainly" if len(names) != 1 else "it is not plain that its columns hold"
+        return DataError(
+            f"{self.columns.path}: {several} the {role}; expected names such as time, position, velocity, torque, or "
+            f"--topic {role}=COLUMN with one of {', '.join(rows)}"
+        )
+
+    def _stamps(self, column: str) -> Array | None:
+        """Return the stamps of a column [s], all of them in order; None where they are not."""
+        clock = self.columns.columns[column].clock
+        guess = next(guess for guess in self.guesses if guess.quantity == "time")
+        if self.period or (self.columns.period and guess.column not in self.columns.columns and not clock):
+            return np.arange(self.columns.columns[column].size) * float(self.period or self.columns.period or 0.0)
+        name = clock or guess.column
+        size = UNITS["time"].get(self.columns.columns[name].unit or guess.unit, 1.0)
+        stamps = self.columns.values(name) * size
+        return stamps if np.all(np.diff(stamps[np.isfinite(stamps)]) >= 0.0) else None
+
+    def _together(self, one: str, other: str) -> tuple[Array, Array, Array] | None:
+        """Return stamps and values of two columns at those of the first; None where they share too little."""
+        stamps, others = self._stamps(one), self._stamps(other)
+        if stamps is None or others is None:
+            return None
+        a, b = self.columns.values(one), self.columns.values(other)
+        if a.size != stamps.size or b.size != others.size:
+            return None
+        known, known_other = np.isfinite(a) & np.isfinite(stamps), np.isfinite(b) & np.isfinite(others)
+        if min(known.sum(), known_other.sum()) < 20:
+            return None
+        time, a = stamps[known], a[known]
+        first = np.append(True, np.diff(time) > 0.0)
+        time, a = time[first], a[first]
+        return time, a, np.interp(time, others[known_other], b[known_other])
+
+    def _velocity(self, joint: _Found, *, alone: bool) -> None:
+        """Take the velocity that the data confirm, and the units and sign that they give."""
+        section = joint.sections["position"]
+        tried: list[str] = []
+        best: tuple[bool, float, _Candidate, float, Array, Array] | None = None
+        for one in (one for one in self.candidates if one.role == "velocity"):
+            shared = self._together(joint.position, one.name)
+            if shared is None:
+                continue
+            stamps, position, velocity = shared
+            turn = turn_of(position)
+            if turn:
+                position = np.unwrap(position, period=turn)
+            slope = derivative(stamps, position, velocity)
+            own = alone or one.stem == joint.stem
+            if abs(slope.alike) >= ALIKE:
+                score = (own, abs(slope.alike) - 0.001 * one.rank)
+                if best is None or score > best[:2]:
+                    best = (*score, one, slope.slope, position, velocity)
+            elif own:
+                tried.append(f"{one.name} is not its derivative (correlation {slope.alike:.2f})")
+        how = joint.rows[0].how
+        stated = bool(section["unit"]) or (best is not None and bool(best[2].unit))
+        wanted, why = ("", "") if stated else self._angle_unit(joint.position, alone=alone)
+        if best is not None:
+            _, _, one, size, _, _ = best
+            ways = units_by_slope(size, str(section["unit"]), one.unit)
+            if not ways and stated:
+                raise DataError(
+                    f"{self.columns.path}: column {one.name!r} [{one.unit or 'unit not stated'}] is {size:.3g} times "
+                    f"the derivative of {joint.position!r} [{section['unit'] or 'unit not stated'}]; expected the "
+                    "derivative in the unit that the file states: correct the units in a mapping file"
+                )
+            if ways:
+                # Both in degrees have the slope of both in radians.
+                unit, speed, sign = next((way for way in ways if way[0] == wanted), ways[0])
+                if unit != wanted and not stated:
+                    why = "the only unit in which the velocity fits"
+                section["unit"] = unit
+                joint.sections["velocity"] = {"column": one.name, "unit": speed} | ({"sign": -1} if sign < 0 else {})
+                words = f"tested: {size:.3g} times the derivative of the column of the position"
+                words += ", of which it is therefore the negative" * (sign < 0)
+                joint.rows.append(Guess("velocity", one.name, speed, words))
+            else:
+                tried.append(f"{one.name} is {size:.3g} times its derivative, which is no unit")
+        section["unit"] = section["unit"] or wanted
+        if why:
+            how += f"; {section['unit']}: {why}"
+        turn = self._turn(joint.position)
+        if turn:
+            how += f"; it is wrapped (jumps of {turn:.4g}), and is unwrapped"
+        how += "".join(f"; {text}, left out" for text in tried)
+        joint.rows[0] = Guess("position", joint.position, str(section["unit"]), how, _ASSUMED in how)
+
+    def _turn(self, column: str) -> float:
+        values = self.columns.values(column)
+        turn = turn_of(values[np.isfinite(values)])
+        return turn if any(abs(turn / one - 1.0) < 0.1 for one in (2.0 * math.pi, 360.0, 1.0)) else 0.0
+
+    def _angle_unit(self, column: str, *, alone: bool) -> tuple[str, str]:
+        """Return the unit of an angle, and what shows it: jumps where it is wrapped, its speed, or its equation.
+
+        Args:
+            column: The angle.
+            alone: Whether it is the only joint.
+        """
+        turn = self._turn(column)
+        if turn:
+            units = {"rad": 2.0 * math.pi, "deg": 360.0, "rev": 1.0}
+            unit = min(units, key=lambda unit: abs(math.log(turn / units[unit])))
+            return unit, f"by the jumps of {turn:.4g}"
+        values, stamps = self.columns.values(column), self._stamps(column)
+        if stamps is None or values.size != stamps.size:
+            return "rad", _ASSUMED
+        known = np.isfinite(values) & np.isfinite(stamps)
+        time, values = stamps[known], values[known]
+        first = np.append(True, np.diff(time) > 0.0)
+        time, values = time[first], values[first]
+        if time.size < 50:
+            return "rad", _ASSUMED
+        stride = max(1, round(0.1 / float(np.median(np.diff(time)))))
+        speeds = np.abs(np.diff(values[::stride])) / np.diff(time[::stride])
+        if speeds.size and float(speeds.max()) > FASTEST:
+            return "deg", f"{float(speeds.max()):.3g} rad/s would be faster than any pendulum"
+        if not alone:
+            return "rad", _ASSUMED  # joints pull at each other, and periodic motions fit linear equations
+        drives = [
+            (own[has], drive[has])
+            for one in self.candidates
+            if one.role == "input" and moves(drive := self.columns.values(one.name))
+            if (own := self._stamps(one.name)) is not None and own.size == drive.size
+            for has in [np.isfinite(drive) & np.isfinite(own)]
+        ]
+        left = {}
+        for unit in ("rad", "deg"):
+            balance = balance_of(time, values * UNITS["angle"][unit], drives)
+            left[unit] = 1.0 if balance is None else 1.0 - balance.explained
+        unit, other = sorted(left, key=lambda one: left[one])
+        if left[unit] < 0.5 and left[unit] < 0.25 * left[other]:
+            shares = f"{1.0 - left[unit]:.0%} of its acceleration against {1.0 - left[other]:.0%} in {other}"
+            return unit, f"tested: gravity and input explain {shares}"
+        return "rad", _ASSUMED
+
+    # -- drives ----------------------------------------------------------------------------------------------------
+
+    def _drives(self, joints: Sequence[_Found]) -> None:
+        for role in ("input", "reference", "disturbance"):
+            found = [one for one in self.candidates if one.role == role]
+            moving = [
+                one
+                for one in found
+                if one.chosen or moves(self.columns.values(one.name)) or self._steps_in(one, joints)
+            ]
+            for one in found:
+                if one not in moving and role != "input":
+                    self.guesses.append(Guess("left out", one.name, "", "it has one value throughout"))
+            if role == "input" and any(not one.weak for one in moving):
+                moving = [one for one in moving if not one.weak]
+            moving.sort(key=lambda one: one.rank)
+            free = list(joints)
+            for one in moving:
+                joint = next((joint for joint in free if joint.stem and joint.stem == one.stem), None)
+                if joint is not None:
+                    free.remove(joint)
+                    self._drive(joint, role, one, one.how)
+            stems = {joint.stem for joint in joints if joint.stem}
+            rest = [one for one in moving if one.stem not in stems or len(joints) == 1]
+            taken = {str(joint.sections[role]["column"]) for joint in joints if role in joint.sections}
+            rest = [one for one in rest if one.name not in taken]
+            if rest and free and not taken:
+                # A motor moves the cart or the arm, which come first.
+                sliding = [joint for joint in free if joint.sections["position"]["unit"] in UNITS["place"]]
+                joint = (sliding or free)[0]
+                others = ", ".join(one.name for one in rest[1:])
+                how = rest[0].how + (f", for {joint.name}" if len(joints) > 1 else "")
+                how += f"; not taken: {others}" * bool(others)
+                self._drive(joint, role, rest[0], how)
+
+    def _drive(self, joint: _Found, role: str, one: _Candidate, how: str) -> None:
+        unit, assumed = one.unit, False
+        position = str(joint.sections["position"]["unit"])
+        if role == "reference":
+            if not unit or quantity_of(unit) != quantity_of(position):
+                unit, assumed = position, True
+        elif quantity_of(unit) not in INPUTS or quantity_of(unit) == "angle":
+            unit, assumed = "-", True
+        elif unit == "N m" and not self.columns.columns[one.name].unit and "effort" in one.name.casefold():
+            how, assumed = f"{how}; an effort is taken for a torque", True
+        if position in UNITS["place"] and unit == "N m":
+            unit = "N"
+        section: dict[str, Any] = {"column": one.name, "unit": unit}
+        if role == "input":
+            measured = unit in {"N m", "N"} and (one.rank == 0 or (one.rank == 1 and not _is_command(one.name)))
+            section["hold"] = "linear" if measured and not self._is_apart(one.name, joint.position) else "zero"
+            how += f"; taken as {'a measurement' if section['hold'] == 'linear' else 'a command'}"
+        if assumed and "taken for" not in how:
+            how += "; its unit is not stated"
+        joint.sections[role] = section
+        joint.rows.append(Guess(role, one.name, unit, how, assumed))
+
+    def _steps_in(self, one: _Candidate, joints: Sequence[_Found]) -> bool:
+        """Return whether a column of one value begins after the motion, so that it is a step from 0."""
+        stamps, motion = self._stamps(one.name), self._stamps(joints[0].position)
+        values = self.columns.values(one.name)
+        if one.role != "input" or stamps is None or motion is None or stamps.size != values.size:
+            return False
+        known = np.isfinite(values) & np.isfinite(stamps)
+        apart = self._is_apart(one.name, joints[0].position)
+        return bool(known.any() and apart and values[known][0] != 0.0 and stamps[known][0] > np.nanmin(motion))
+
+    def _is_apart(self, one: str, other: str) -> bool:
+        """Return whether two columns have values at other times."""
+        if self.columns.columns[one].clock != self.columns.columns[other].clock:
+            return True
+        a, b = self.columns.values(one), self.columns.values(other)
+        if a.size != b.size:
+            return True
+        both, least = np.sum(np.isfinite(a) & np.isfinite(b)), min(np.sum(np.isfinite(a)), np.sum(np.isfinite(b)))
+        return bool(2 * both < least)
+
+    # -- zero ------------------------------------------------------------------------------------------------------
+
+    def _zero(self, joint: _Found, joints: Sequence[_Found]) -> None:
+        """Give an angle that is 0 upright the offset by which it is 0 hanging, where the motion shows it."""
+        section = joint.sections["position"]
+        unit = str(section["unit"])
+        if unit in UNITS["place"]:
+            return
+        balance = self._balance(joint, joints)
+        row = joint.rows[0]
+        assumed = row.assumed
+        if balance is None or not balance.hangs_at:
+            words, assumed = "that 0 hangs down is assumed", True
+        elif balance.hangs_at == "0":
+            words = f"tested: 0 hangs down (t = {balance.t:.0f})"
+        else:
+            section["offset"] = round(math.pi / UNITS["angle"][unit], 9)
+            followed = joint.sections.get("reference", {})
+            if quantity_of(str(followed.get("unit"))) == "angle":
+                followed["offset"] = round(math.pi / UNITS["angle"][str(followed["unit"])], 9)
+            words = f"tested: 0 is upright (t = {balance.t:.0f}), so that {section['offset']:.6g} is added"
+        joint.rows[0] = Guess(row.quantity, row.column, row.unit, f"{row.how}; {words}", assumed)
+
+    def _balance(self, joint: _Found, joints: Sequence[_Found]) -> Balance | None:
+        alone = self._angle(joint, None)
+        if alone is None or alone[0].size < 50:
+            return None
+        time, angle = alone
+        drives = []
+        for one in joints:
+            if "input" not in one.sections:
+                continue
+            column = str(one.sections["input"]["column"])
+            stamps, values = self._stamps(column), self.columns.values(column)
+            if stamps is None or stamps.size != values.size:
+                return None
+            has = np.isfinite(values) & np.isfinite(stamps)
+            drives.append((stamps[has], values[has]))
+        if not drives and np.ptp(angle) < 1.0:
+            return None  # a controller whose commands are not here may hold it anywhere
+        others = [found[1] for one in joints if one is not joint and (found := self._angle(one, time)) is not None]
+        return balance_of(time, angle, drives, others)
+
+    def _angle(self, joint: _Found, at: Array | None) -> tuple[Array, Array] | None:
+        """Return stamps and position of a joint in SI, unwrapped, at some times; None where it has none in order."""
+        unit = str(joint.sections["position"]["unit"])
+        stamps, values = self._stamps(joint.position), self.columns.values(joint.position)
+        if stamps is None or values.size != stamps.size:
+            return None
+        known = np.isfinite(values) & np.isfinite(stamps)
+        time, position = stamps[known], values[known] * UNITS[quantity_of(unit)][unit]
+        first = np.append(True, np.diff(time) > 0.0)
+        time, position = time[first], position[first]
+        if unit in UNITS["angle"]:
+            position = np.unwrap(position)
+        return (time, position) if at is None else (at, np.interp(at, time, position))
+
+    def _name_joints(self, joints: Sequence[_Found]) -> None:
+        """Give joints names that differ; a plant of one needs none."""
+        if len(joints) == 1:
+            joints[0].name = ""
+        labels = [joint.name or f"joint{index}" for index, joint in enumerate(joints)]
+        for index, joint in enumerate(joints):
+            if len(joints) > 1:
+                joint.name = labels[index] if labels.count(labels[index]) == 1 else f"{labels[index]}_{index}"
+
+    def _listed(self) -> str:
+        return ", ".join(self.columns.columns)
+
+
+_STATES = ("position", "velocity")
+_WORD_OF = {"position": "angle"}
+
+
+def _tokens(name: str) -> list[str]:
+    """Return the words of a name: parts of paths, of camel case, and numbers."""
+    found: list[str] = []
+    for word in _TOKENS.findall(re.sub(r"[\[(][^\[\]()]*[A-Za-z°][^\[\]()]*[\])]", " ", name)):
+        low = word.casefold()
+        for ending in ("dot", "velocity", "vel"):
+            if low.endswith(ending) and low != ending and not low.startswith("d"):
+                found += [word[: -len(ending)], ending]
+                break
+        else:
+            if low[:1] == "d" and low[1:] in {"theta", "alpha", "phi", "th", "q", "x", "angle", "beta"}:
+                found += [word[1:], "dot"]
+            else:
+                found.append(word)
+    return found
+
+
+def _is_derivative(words: Sequence[str]) -> bool:
+    """Return whether a capital or a separate d marks the derivative of an angle: ``angleD``, ``d_theta``."""
+    angles = _WORDS["angle"] | _WORDS["place"]
+    folded = [word.casefold() for word in words]
+    beside = [
+        (folded[index - 1 : index], folded[index + 1 : index + 2]) for index, one in enumerate(folded) if one == "d"
+    ]
+    return any(angles & {*before, *behind} for before, behind in beside)
+
+
+def _is_command(name: str) -> bool:
+    return bool({word.casefold() for word in _tokens(name)} & {"con", "cmd", "command", "u", "control", "action"})
+
+
+def _label(name: str, stem: str) -> str:
+    """Return a name of a joint that a reader recognises."""
+    parts = [part for part in re.split(r"[/.]", name) if part]
+    if len(parts) > 1 and parts[-1].casefold() in {"position", "pos", "angle", "q"}:
+        return parts[-2]
+    return f"joint{stem}" if stem.isdecimal() else stem or name
+
+
+def _increases(values: Array) -> bool:
+    """Return whether stamps go on, but for a clock that stepped back a few times."""
+    known = values[np.isfinite(values)]
+    if known.size < 3 or known[-1] == known[0]:
+        return False
+    steps = np.diff(known)
+    return bool(np.mean(steps >= 0.0) > 0.99 and np.mean(steps > 0.0) > 0.5)
+
+
+def _time_unit(step: float) -> str:
+    """Return the unit in which a step is the period of a recording: 0.1 ms to a second."""
+    for unit in ("s", "ms", "us", "ns"):
+        if step * UNITS["time"][unit] < 1.0:
+            return unit
+    return "s"

@@ -1,0 +1,161 @@
+"""Parquet files and LeRobot datasets as columns; only what is asked for is read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pendulum_bags.recordings.columns import Column, Columns, need
+from pendulum_msgs_py.errors import DataError
+
+__all__ = ["is_lerobot", "read_lerobot", "read_parquet"]
+
+_INFO = Path("meta", "info.json")
+_MOST_ENTRIES = 256
+_BOOKKEEPING = frozenset({"frame_index", "episode_index", "index", "task_index", "timestamp"})
+
+
+def is_lerobot(folder: Path) -> bool:
+    """Return whether a folder is a LeRobot dataset."""
+    return (folder / _INFO).is_file()
+
+
+def read_parquet(path: Path) -> Columns:
+    """Return the columns of a Parquet file; lists and structs have one for each of their entries.
+
+    Raises:
+        DataError: It cannot be read, or pyarrow is missing.
+    """
+    parquet = _pyarrow(path, "parquet")
+    try:
+        file = parquet.ParquetFile(path)
+    except Exception as error:
+        raise DataError(f"{path} is no Parquet file: {str(error).splitlines()[0]}") from error
+
+    def read(name: str) -> Any:
+        return file.read(columns=[name]).column(name.split(".", maxsplit=1)[0])
+
+    count = file.metadata.num_rows
+    columns = {
+        column.name: column
+        for entry in file.schema_arrow
+        for column in _arrow_columns(entry.name, entry.type, count, partial(read, entry.name))
+    }
+    return Columns(path, "Parquet file", columns, is_table=True)
+
+
+def read_lerobot(folder: Path, part: int = 0) -> Columns:
+    """Return an episode of a LeRobot dataset of version 2 or 3.
+
+    Args:
+        folder: The dataset.
+        part: Number of the episode, from 1; 0 for the first.
+
+    Raises:
+        DataError: It is damaged, has no such episode, or pyarrow is missing.
+    """
+    arrow = _pyarrow(folder, "dataset")
+    try:
+        info = json.loads((folder / _INFO).read_text(encoding="utf-8"))
+        episodes, rate = int(info["total_episodes"]), float(info["fps"])
+        features: Mapping[str, Mapping[str, Any]] = info["features"]
+        data = arrow.dataset(sorted(map(str, (folder / "data").rglob("*.parquet"))), format="parquet")
+        if not 0 <= part <= episodes:
+            raise DataError(f"{folder}#{part}: episode is {part}; expected 1 to {episodes}")
+        chosen = arrow.field("episode_index") == max(part - 1, 0)
+        count = data.count_rows(filter=chosen)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{folder} is no LeRobot dataset that can be read: {type(error).__name__}: {error}") from error
+
+    def read(name: str) -> Any:
+        return data.to_table(columns=[name], filter=chosen).column(name)
+
+    columns = {}
+    for entry in data.schema:
+        if entry.name in _BOOKKEEPING:
+            continue
+        labels = list(_labels((features.get(entry.name) or {}).get("names")))
+        for index, column in enumerate(_arrow_columns(entry.name, entry.type, count, partial(read, entry.name))):
+            name = f"{entry.name}.{labels[index]}" if index < len(labels) else column.name
+            columns[name] = Column(name, column.size, column.read)
+    notes = [f"episode 1 of {episodes} is read; {folder.name}#2 is the next"] if episodes > 1 and not part else []
+    names = [f"episode {index + 1}" for index in range(episodes)]
+    # Stamps are stored in 32 bits; the frames of an episode are equally spaced.
+    return Columns(folder, "LeRobot dataset", columns, notes, max(part, 1), names, 1.0 / rate, is_table=True)
+
+
+def _labels(names: Any) -> Iterator[str]:
+    """Yield the names of a vector's entries, which version 2 may nest under a heading."""
+    if isinstance(names, Mapping):
+        for value in names.values():
+            yield from _labels(value)
+    elif isinstance(names, Sequence) and not isinstance(names, str):
+        yield from map(str, names)
+
+
+def _arrow_columns(name: str, kind: Any, count: int, read: Callable[[], Any]) -> Iterator[Column]:
+    import pyarrow as pa
+
+    if pa.types.is_struct(kind):
+        for index in range(kind.num_fields):
+            entry = kind.field(index)
+            yield from _arrow_columns(f"{name}.{entry.name}", entry.type, count, partial(_field, read, entry.name))
+    elif pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        if count and _is_number(kind.value_type):
+            size = kind.list_size if pa.types.is_fixed_size_list(kind) else len(read()[0].as_py() or ())
+            for index in range(min(size, _MOST_ENTRIES)):
+                yield Column(f"{name}[{index}]", count, partial(_entry, read, index))
+    elif _is_number(kind) or pa.types.is_timestamp(kind):
+        yield Column(name, count, lambda: _numbers(read()), unit=_unit(kind))
+
+
+def _is_number(kind: Any) -> bool:
+    import pyarrow as pa
+
+    return bool(
+        pa.types.is_floating(kind)
+        or pa.types.is_integer(kind)
+        or pa.types.is_boolean(kind)
+        or pa.types.is_decimal(kind)
+    )
+
+
+def _unit(kind: Any) -> str:
+    import pyarrow as pa
+
+    return str(kind.unit) if pa.types.is_timestamp(kind) else ""
+
+
+def _field(read: Callable[[], Any], key: str) -> Any:
+    import pyarrow.compute as pc
+
+    return pc.struct_field(read(), key)
+
+
+def _entry(read: Callable[[], Any], index: int) -> NDArray[Any]:
+    import pyarrow.compute as pc
+
+    return _numbers(pc.list_element(read(), index))
+
+
+def _numbers(values: Any) -> NDArray[Any]:
+    import pyarrow as pa
+
+    if pa.types.is_timestamp(values.type):
+        values = values.cast(pa.int64())
+    return np.asarray(values.cast(pa.float64()).to_numpy())
+
+
+def _pyarrow(path: Path, module: str) -> Any:
+    try:
+        import pyarrow.dataset
+        import pyarrow.parquet
+    except ImportError as error:
+        raise need(error, str(path)) from error
+    return getattr(pyarrow, module)

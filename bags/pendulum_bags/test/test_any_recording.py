@@ -1,0 +1,371 @@
+"""Recordings of every format, written by the format's own library: what is guessed, what is shown, what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.io
+
+from pendulum_bags.commands.compare_cli import main as compare_main
+from pendulum_bags.recordings.reading import Reading, write_mapping
+from pendulum_bags.runs.read_recording import read_recording
+from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.errors import DataError
+from pendulum_rosbag.storage import BagWriter
+
+DT = 0.01
+BEGIN = 1_700_000_000 * 10**9
+
+
+def swing(duration: float = 12.0, *, damping: float = 0.5, noise: float = 0.0, seed: int = 0) -> dict[str, np.ndarray]:
+    """Return a pendulum under held noise, 0 hanging, by small steps of Euler."""
+    generator = np.random.default_rng(seed)
+    torque = np.repeat(np.random.default_rng(99).normal(0.0, 1.0, int(duration / 0.1)), 10)
+    angle, speed, rows = 0.3, 0.0, []
+    for u in torque:
+        rows.append((angle, speed))
+        push = generator.normal(0.0, noise) if noise else 0.0
+        for _ in range(20):
+            speed += (-20.0 * np.sin(angle) - damping * speed + 8.0 * u + push) * DT / 20.0
+            angle += speed * DT / 20.0
+    position, velocity = np.array(rows).T
+    return {"t": DT * np.arange(torque.size), "position": position, "velocity": velocity, "torque": torque}
+
+
+RUN = swing()
+
+
+def struct_with_time(path: Path) -> None:
+    """Write what a To Workspace block saves as "structure with time"."""
+    signals = {
+        name: {"time": RUN["t"][:, None], "signals": {"values": RUN[key][:, None], "dimensions": 1.0}}
+        for name, key in (("theta", "position"), ("omega", "velocity"), ("torque", "torque"))
+    }
+    scipy.io.savemat(path, signals)
+
+
+def rows_across(path: Path) -> None:
+    scipy.io.savemat(path, {"theta": RUN["position"], "dtheta": RUN["velocity"], "tau": RUN["torque"], "dt": DT})
+
+
+def cell_of_runs(path: Path) -> None:
+    runs = np.empty((3, 1), object)
+    for index in range(3):
+        runs[index, 0] = np.stack([RUN["position"], RUN["velocity"]]) * (1.0 - 0.2 * index)
+    scipy.io.savemat(path, {"Y": runs, "dt": DT})
+
+
+def version_73(path: Path) -> None:
+    """Write a struct and a cell as MATLAB 7.3 does: transposed, cells by reference, names in attributes."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w", userblock_size=512) as file:
+        group = file.create_group("out")
+        group.attrs["MATLAB_class"] = np.bytes_("struct")
+        for name, key in (("time", "t"), ("theta", "position"), ("omega", "velocity"), ("torque", "torque")):
+            data = group.create_dataset(name, data=RUN[key][None, :])
+            data.attrs["MATLAB_class"] = np.bytes_("double")
+        text = file.create_dataset("note", data=np.array([[104, 105]], np.uint16))
+        text.attrs["MATLAB_class"] = np.bytes_("char")
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(116) + bytes(8) + b"\x00\x02IM")
+
+
+def npz(path: Path) -> None:
+    np.savez(path, time=RUN["t"], theta=RUN["position"], theta_dot=RUN["velocity"], torque=RUN["torque"])
+
+
+def npy_pair(path: Path) -> None:
+    np.save(path, np.stack([RUN["position"], RUN["velocity"]], axis=1))
+    np.save(path.with_name("times.npy"), RUN["t"])
+
+
+def parquet(path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet
+
+    states = pa.FixedSizeListArray.from_arrays(np.stack([RUN["position"], RUN["velocity"]], axis=1).reshape(-1), 2)
+    table = {"stamp_ns": (1e9 * RUN["t"]).astype(np.int64), "state": states, "torque": RUN["torque"].astype(np.float32)}
+    pyarrow.parquet.write_table(pa.table(table), path)
+
+
+def plotjuggler(path: Path) -> None:
+    rows = ["__time,/cmd/data.0,/joint_states/hinge/position,/joint_states/hinge/velocity"]
+    for t, q, v, u in zip(*RUN.values(), strict=True):
+        rows += [f"{1.7e9 + t:.6f},,{q:.9f},{v:.9f}", f"{1.7e9 + t + 0.002:.6f},{u:.6f},,"]
+    path.write_text("\n".join(rows) + "\n")
+
+
+def foreign_bag(path: Path) -> None:
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    array = store.types["std_msgs/msg/Float64MultiArray"]
+    layout = store.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    with BagWriter(path) as writer:
+        writer.add_topic("/robot/state", "sensor_msgs/msg/JointState")
+        writer.add_topic("/cmd", "std_msgs/msg/Float64MultiArray")
+        for t, q, v, u in zip(*RUN.values(), strict=True):
+            now = BEGIN + round(1e9 * t)
+            writer.write("/robot/state", now, encode_joint_state(now, position=q, velocity=v))
+            message = array(layout=layout, data=np.array([u]))
+            writer.write("/cmd", now + 1000, bytes(store.serialize_cdr(message, "std_msgs/msg/Float64MultiArray")))
+
+
+def ros1_bag(path: Path) -> None:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    state, header, time = (store.types[name] for name in (
+        "sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
+    ))  # fmt: skip
+    with Writer(path) as writer:
+        states = writer.add_connection("/joint_states", state.__msgtype__, typestore=store)
+        for t, q, v, u in zip(*RUN.values(), strict=True):
+            now = BEGIN + round(1e9 * t)
+            stamp = header(0, time(*divmod(now, 10**9)), "")
+            message = state(stamp, ["hinge"], *(np.array([value]) for value in (q, v, u)))
+            writer.write(states, now, bytes(store.serialize_ros1(message, state.__msgtype__)))
+
+
+FORMATS: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "struct with time": ("a.mat", struct_with_time),
+    "rows across, dt in the file": ("b.mat", rows_across),
+    "cells": ("c.mat", cell_of_runs),
+    "version 7.3": ("d.mat", version_73),
+    "npz": ("e.npz", npz),
+    "npy": ("state.npy", npy_pair),
+    "parquet": ("f.parquet", parquet),
+    "sparse": ("g.csv", plotjuggler),
+    "foreign bag": ("h", foreign_bag),
+    "ROS 1": ("i.bag", ros1_bag),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_gives_the_same_motion_without_a_mapping(tmp_path: Path, name: str) -> None:
+    file, write = FORMATS[name]
+    write(tmp_path / file)
+    motion = Reading(tmp_path / file).motion
+    (joint,) = motion.joints
+    np.testing.assert_allclose(motion.time - motion.time[0], RUN["t"], atol=1e-6)
+    np.testing.assert_allclose(joint.position, RUN["position"], atol=1e-6)
+    assert joint.velocity is not None
+    np.testing.assert_allclose(joint.velocity, RUN["velocity"], atol=1e-6)
+    if name not in {"cells", "npy"}:
+        assert joint.drive is not None
+        np.testing.assert_allclose(joint.drive.values, RUN["torque"], atol=1e-6)
+
+
+def test_a_mapping_that_was_written_is_read_again_and_guesses_nothing(tmp_path: Path) -> None:
+    for file, write in (FORMATS["struct with time"], FORMATS["npz"]):
+        write(tmp_path / file)
+    guessed = [Reading(tmp_path / "a.mat"), Reading(tmp_path / "e.npz")]
+    write_mapping(tmp_path / "m.yaml", guessed)
+    for one in guessed:
+        again = Reading(one.path, tmp_path / "m.yaml")
+        assert not again.guesses
+        np.testing.assert_array_equal(again.motion.joints[0].position, one.motion.joints[0].position)
+
+
+def test_a_part_of_a_file_of_several_runs_is_chosen_by_its_number(tmp_path: Path) -> None:
+    cell_of_runs(tmp_path / "c.mat")
+    third = Reading(tmp_path / "c.mat#3").motion.joints[0]
+    np.testing.assert_allclose(third.position, 0.6 * RUN["position"])
+    assert "part 1 of 3" in " ".join(Reading(tmp_path / "c.mat").columns.notes)
+    with pytest.raises(DataError, match=r"part is 4; expected 1 to 3"):
+        Reading(tmp_path / "c.mat#4").columns  # noqa: B018
+
+
+def test_small_integers_and_logicals_of_matlab_are_numbers(tmp_path: Path) -> None:
+    counts = np.clip(np.round(100.0 + 90.0 * np.sin(RUN["t"])), 0, 255).astype(np.uint8)
+    scipy.io.savemat(tmp_path / "m.mat", {"pos": counts, "enabled": RUN["torque"] > 0.0, "dt": 0.01})
+    values = Reading(tmp_path / "m.mat").columns.values("pos")
+    assert values.max() * 3.0 == 3.0 * int(counts.max())  # (570 does not fit the file's type)
+    assert set(Reading(tmp_path / "m.mat").columns.values("enabled")) == {0.0, 1.0}
+
+
+@pytest.mark.parametrize(
+    ("scale", "rate", "units"),
+    [
+        (1.0, 1.0, ("rad", "rad/s", None)),
+        (1.0, 180.0 / np.pi, ("rad", "deg/s", None)),
+        (180.0 / np.pi, 1.0, ("deg", "rad/s", None)),
+        (180.0 / np.pi, 180.0 / np.pi, ("deg", "deg/s", None)),
+        (1.0, 30.0 / np.pi, ("rad", "rpm", None)),
+        (1.0, -1.0, ("rad", "rad/s", -1)),
+    ],
+)
+def test_units_and_sign_are_found_by_the_data(
+    tmp_path: Path, scale: float, rate: float, units: tuple[str, str, int | None]
+) -> None:
+    np.savez(
+        tmp_path / "run.npz",
+        t=RUN["t"],
+        angle=scale * RUN["position"],
+        speed=rate * RUN["velocity"],
+        torque=RUN["torque"],
+    )
+    reading = Reading(tmp_path / "run.npz")
+    sections = reading.rules.joints[""]
+    assert (sections["position"]["unit"], sections["velocity"]["unit"], sections["velocity"].get("sign")) == units
+    np.testing.assert_allclose(reading.motion.joints[0].position, RUN["position"], atol=1e-9)
+
+
+def test_an_angle_from_upright_and_one_that_is_wrapped_are_brought_to_0_hanging(tmp_path: Path) -> None:
+    wrapped = (RUN["position"] % (2.0 * np.pi)) - np.pi
+    np.savez(tmp_path / "run.npz", t=RUN["t"], theta=wrapped, torque=RUN["torque"])
+    recording = read_recording(Reading(tmp_path / "run.npz"))
+    turns = (recording.position - RUN["position"]) / (2.0 * np.pi)
+    np.testing.assert_allclose(turns, np.round(turns[0]), atol=1e-9)
+    guesses = {guess.quantity: guess for guess in Reading(tmp_path / "run.npz").guesses}
+    assert "tested: 0 is upright" in guesses["position"].how
+
+
+def test_what_no_test_shows_is_assumed_and_marked(tmp_path: Path) -> None:
+    small = 1e-3 * RUN["position"]
+    np.savez(tmp_path / "run.npz", t=RUN["t"], theta=small, u=RUN["torque"])
+    guesses = {guess.quantity: guess for guess in Reading(tmp_path / "run.npz").guesses}
+    assert guesses["position"].assumed
+    assert "rad: assumed" in guesses["position"].how
+    assert (guesses["input"].unit, guesses["input"].assumed) == ("-", True)
+
+
+def test_a_velocity_that_is_not_the_derivative_is_left_out_and_named(tmp_path: Path) -> None:
+    wrong = np.random.default_rng(0).normal(0.0, 1.0, RUN["t"].size)
+    np.savez(tmp_path / "run.npz", t=RUN["t"], theta=RUN["position"], omega=wrong, torque=RUN["torque"])
+    reading = Reading(tmp_path / "run.npz")
+    assert reading.motion.joints[0].velocity is None
+    assert any("omega is not its derivative" in guess.how for guess in reading.guesses)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "words"),
+    [
+        ({"theta": RUN["position"]}, r"has no column of time; it has theta: --dt SECONDS"),
+        ({"a": RUN["position"], "b": RUN["torque"], "t": RUN["t"]}, r"plainly the position; expected names .*a \("),
+    ],
+)
+def test_what_cannot_be_told_is_refused_with_what_there_is(tmp_path: Path, arrays: Any, words: str) -> None:
+    np.savez(tmp_path / "run.npz", **arrays)
+    with pytest.raises(DataError, match=words):
+        Reading(tmp_path / "run.npz").rules  # noqa: B018
+
+
+def test_options_name_what_a_file_does_not(tmp_path: Path) -> None:
+    np.savez(tmp_path / "run.npz", a=RUN["position"], b=RUN["torque"])
+    reading = Reading(tmp_path / "run.npz", topics=("position=a", "input=b"), dt=DT)
+    np.testing.assert_allclose(reading.motion.time, RUN["t"])
+    assert reading.motion.joints[0].drive is not None
+    foreign_bag(tmp_path / "bag")
+    chosen = Reading(tmp_path / "bag", topics=("joint_states=/robot/state", "effort=/cmd/data.0"))
+    np.testing.assert_allclose(chosen.motion.joints[0].position, RUN["position"])
+    with pytest.raises(DataError, match=r"--topic is 'angle=a'; expected ROLE=NAME"):
+        Reading(tmp_path / "run.npz", topics=("angle=a",)).rules  # noqa: B018
+
+
+def test_damaged_files_are_refused_in_a_sentence(tmp_path: Path) -> None:
+    for name in ("a.mat", "b.npz", "c.npy", "d.parquet", "e.bag", "f.h5", "g.json"):
+        (tmp_path / name).write_bytes(b"nothing of that kind")
+        with pytest.raises(DataError, match=name):
+            Reading(tmp_path / name).columns  # noqa: B018
+
+
+def test_recordings_of_real_labs_are_read_without_a_mapping(shared_data: Path) -> None:
+    arm = Reading(shared_data / "dynamicslab_multiarm" / "SinglePendulumDataForParameterEstimation.mat")
+    assert len(arm.motion.joints) == 1
+    assert any("tested: 0 is upright" in guess.how for guess in arm.guesses)
+    with pytest.raises(DataError, match=r"holds an object of MATLAB .*save its arrays instead"):
+        Reading(shared_data / "dynamicslab_multiarm" / "SinglePendulumArm_RawData_1.mat").columns  # noqa: B018
+    qube = Reading(next((shared_data / "qube_upright").glob("*.csv")))
+    theta, alpha = qube.motion.joints
+    assert (theta.name, alpha.name) == ("theta", "alpha")
+    assert np.median(alpha.position) == pytest.approx(np.pi, abs=0.05)  # balanced upright
+    double = Reading(shared_data / "dfki_double_pendulum" / "c1_143339.csv")
+    assert [joint.drive is not None for joint in double.motion.joints] == [True, True]
+
+
+# -- compare -----------------------------------------------------------------------------------------------------
+
+
+def save(path: Path, run: dict[str, np.ndarray], *, scale: float = 1.0, later: int = 0, torque: float = 1.0) -> Path:
+    part = {key: values[later:] for key, values in run.items()}
+    np.savez(path, t=part["t"], theta=scale * part["position"], torque=torque * part["torque"])
+    return path
+
+
+def compared(capsys: pytest.CaptureFixture[str], *paths: Path, code: int = 0) -> dict[str, Any]:
+    assert compare_main([*map(str, paths), "--json"]) == code
+    said = capsys.readouterr()
+    return json.loads(said.out) if code == 0 else {"error": " ".join(said.err.split())}
+
+
+def test_one_input_that_acts_throughout_has_the_tests_of_an_experiment(tmp_path: Path, capsys: Any) -> None:
+    struct_with_time(tmp_path / "sim.mat")
+    hardware = save(tmp_path / "hw.npz", swing(damping=0.55, noise=0.5, seed=1), later=150)
+    found = compared(capsys, tmp_path / "sim.mat", hardware)
+    assert any("is moved by 1.500 s, where the inputs of both" in note for note in found["notes"])
+    assert {test["quantity"] for test in found["verdict"]["tests"]} >= {"delay", "distance of angles"}
+    same = found["answer"]["layers"]
+    assert [layer["mark"] for layer in same[1:]] == ["not measured"] * 3
+    assert "hw.npz has no disturbance" in same[1]["sentence"]
+    wrong = compared(capsys, tmp_path / "sim.mat", save(tmp_path / "no.npz", swing(damping=4.0, noise=0.5, seed=1)))
+    assert wrong["answer"]["mark"] == "no"
+
+
+def test_degrees_that_were_taken_for_radians_make_no_verdict(tmp_path: Path, capsys: Any) -> None:
+    run = swing()
+    small = {**run, "position": 0.01 * run["position"], "torque": 0.01 * run["torque"]}
+    sim, hardware = save(tmp_path / "sim.npz", small, scale=180.0 / np.pi), save(tmp_path / "hw.npz", small)
+    said = compared(capsys, sim, hardware, code=2)["error"]
+    assert "moves 0.0175 times as much" in said
+    assert "correct the unit of sim.npz to deg" in said
+
+
+def step(seed: int, *, damping: float = 0.5) -> dict[str, np.ndarray]:
+    """Return a swing after one step of the input, from a start that differs a little."""
+    generator = np.random.default_rng(seed)
+    torque = np.where(np.arange(800) < 100, 0.0, 1.0)
+    angle, speed, rows = 0.005 * generator.normal(), 0.0, []
+    for u in torque:
+        rows.append((angle, speed))
+        for _ in range(20):
+            speed += (-20.0 * np.sin(angle) - damping * speed + 8.0 * u) * DT / 20.0
+            angle += speed * DT / 20.0
+    position, velocity = np.array(rows).T
+    noise = generator.normal(0.0, 1e-3, position.size)
+    return {"t": DT * np.arange(800), "position": position + noise, "velocity": velocity, "torque": torque}
+
+
+def test_one_run_under_a_step_is_described_and_not_judged(tmp_path: Path, capsys: Any) -> None:
+    sim, hardware = save(tmp_path / "sim.npz", step(0)), save(tmp_path / "hw.npz", step(1), later=30)
+    found = compared(capsys, sim, hardware)
+    assert found["answer"]["mark"] == "undecided"
+    assert not found["verdict"]["tests"]
+    assert "how much the machine varies from run to run is not in the files" in found["answer"]["sentence"]
+    assert "three times or more" in " ".join(found["answer"]["next_steps"])
+
+
+def test_repeated_runs_are_judged_by_what_they_vary_and_have_a_band(tmp_path: Path, capsys: Any) -> None:
+    runs = [save(tmp_path / f"run{seed}.npz", step(seed)) for seed in range(1, 6)]
+    good = compared(capsys, save(tmp_path / "sim.npz", step(0)), *runs)
+    assert good["answer"]["mark"] == "yes"
+    assert good["operating_band"]["coverage"] > 0.8
+    assert all(test["blocks"] == 5 for test in good["verdict"]["tests"])
+    bad = compared(capsys, save(tmp_path / "bad.npz", step(0, damping=3.0)), *runs)
+    assert bad["answer"]["mark"] == "no"
+    assert bad["operating_band"]["coverage"] < 0.6
+
+
+def test_inputs_that_differ_say_nothing_of_the_plants(tmp_path: Path, capsys: Any) -> None:
+    sim, hardware = save(tmp_path / "sim.npz", step(0)), save(tmp_path / "hw.npz", step(1), torque=2.0)
+    found = compared(capsys, sim, hardware)
+    assert found["answer"]["mark"] == "undecided"
+    assert (
+        "the inputs of both differ in size: the hardware's is 2 times the simulation's" in found["answer"]["sentence"]
+    )
