@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 import scipy.io
 
+from pendulum_bags.commands.analyse_cli import main as analyse_main
 from pendulum_bags.commands.compare_cli import main as compare_main
+from pendulum_bags.commands.identify_cli import main as identify_main
+from pendulum_bags.commands.replay_cli import main as replay_main
 from pendulum_bags.recordings.reading import Reading, write_mapping
 from pendulum_bags.runs.read_recording import read_recording
-from pendulum_msgs_py.contract.cdr import encode_joint_state
+from pendulum_msgs_py.contract.cdr import encode_joint_state, encode_joints
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.storage import BagWriter
 
@@ -369,3 +372,29 @@ def test_inputs_that_differ_say_nothing_of_the_plants(tmp_path: Path, capsys: An
     assert (
         "the inputs of both differ in size: the hardware's is 2 times the simulation's" in found["answer"]["sentence"]
     )
+
+
+@pytest.mark.parametrize("command", [identify_main, replay_main])
+def test_no_command_guesses_silently(tmp_path: Path, capsys: Any, command: Callable[[list[str]], int]) -> None:
+    struct_with_time(tmp_path / "run.mat")
+    written = tmp_path / "columns.yaml"
+    command([str(tmp_path / "run.mat"), "--write-mapping", str(written), "--json"])
+    shown = capsys.readouterr()
+    assert "theta.signals.values" in shown.err
+    json.loads(shown.out)  # the table is not among the numbers
+    command([str(tmp_path / "run.mat"), "--mapping", str(written), "--json"])
+    assert "Guessed" not in capsys.readouterr().err
+
+
+def test_a_bag_of_two_joints_has_figures_of_both(tmp_path: Path, capsys: Any) -> None:
+    with BagWriter(tmp_path / "bags" / "two") as writer:
+        writer.add_topic("/joint_states", "sensor_msgs/msg/JointState")
+        for t, q, v in zip(RUN["t"], RUN["position"], RUN["velocity"], strict=True):
+            now = BEGIN + round(1e9 * t)
+            writer.write(
+                "/joint_states", now, encode_joints(now, "", ("arm", "rod"), (2.0 * q, q), (2.0 * v, v), (0.0, 0.0))
+            )
+    out = tmp_path / "out"
+    assert analyse_main([str(tmp_path / "bags"), "--ask", "metrics", "-o", str(out)]) == 0
+    (row,) = json.loads((out / "bags.json").read_text())
+    assert row["arm.std_theta"] == pytest.approx(2.0 * row["rod.std_theta"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,12 +13,14 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from pendulum_bags.commands.recording_options import Dt, Mappings, Topics, WriteMapping, readings_of, show_guesses
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
 from pendulum_msgs_py.programs.executables import cli_main, typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
+from pendulum_msgs_py.programs.terminal import make_console
 from pendulum_msgs_py.programs.typed_commands import as_typed
 
 if TYPE_CHECKING:
@@ -31,8 +34,9 @@ Hold = Annotated[
     str | None,
     typer.Option(help="Input of a CSV between its samples: zero (a held command) or linear (measured)."),
 ]
-_FOR_SEVERAL_JOINTS = frozenset({"plant", "mapping", "window", "held_out", "out", "name", "page", "as_json"})
-_FOR_REGRESSION = frozenset({"method", "mapping", "hold", "experiment", "skew", "out", "page", "as_json", "verbose"})
+_OF_READING = frozenset({"mapping", "write_mapping", "topic", "dt"})
+_FOR_SEVERAL_JOINTS = frozenset({"plant", *_OF_READING, "window", "held_out", "out", "name", "page", "as_json"})
+_FOR_REGRESSION = frozenset({"method", *_OF_READING, "hold", "experiment", "skew", "out", "page", "as_json", "verbose"})
 _FOR_REGRESSION_ALONE = frozenset({"experiment", "skew", "verbose"})
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -41,17 +45,12 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 @app.command()
 def identify(
     context: typer.Context,
-    data: Annotated[
-        list[Path], typer.Argument(help="Bags, CSV files, HEBI logs or friction-study JSON logs of one pendulum.")
-    ],
+    data: Annotated[list[Path], typer.Argument(help="Recordings of one plant, of any format.")],
     method: Annotated[str, typer.Option(help="output_error, or thesis (two linear regressions).")] = "output_error",
-    mapping: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Mapping file for CSV columns, or pendulum, voltage_40hz, free_swing; once for all recordings, "
-            "or once for each."
-        ),
-    ] = None,
+    mapping: Mappings = None,
+    write_mapping: WriteMapping = None,
+    topic: Topics = None,
+    dt: Dt = None,
     hold: Hold = None,
     effort: Annotated[str, typer.Option(help="Of a bag: applied (what the plant received) or measured.")] = "applied",
     experiment: Annotated[
@@ -105,6 +104,9 @@ def identify(
     from pendulum_bags.runs.read_recording import read_recording
 
     paths = [*data, *(held_out or [])]
+    readings = readings_of(paths, _mappings(mapping, len(data), len(paths)), topic, dt)
+    # What was guessed is shown where it ends in an error, too.
+    context.call_on_close(partial(show_guesses, make_console(stderr=True), readings, write_mapping))
     if plant is not None:
         _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS)
         from pendulum_bags.identification.identify_mechanism import identify_mechanism
@@ -114,8 +116,7 @@ def identify(
         start = load_mechanism(plant)
         if len(start.joints) == 1:
             raise DataError(f"plant {start.name!r} has one joint; expected a mechanism, or no --plant for one joint")
-        rules_of = _mappings(mapping, len(data), len(paths))
-        logs = [read_joints(path, start.coordinates, rules) for path, rules in zip(paths, rules_of, strict=True)]
+        logs = [read_joints(reading, start.coordinates) for reading in readings]
         joints = identify_mechanism(start, logs[: len(data)], held_out=logs[len(data) :], window=window)
         _finish(joints, joints.write(out, name=name) if out and not joints.refused else None, page, as_json)
         return
@@ -125,10 +126,7 @@ def identify(
         raise DataError(f"effort is {effort!r}; expected applied or measured")
     if method == "thesis":
         _refuse_unheeded(context, "--method thesis", _FOR_REGRESSION)
-        recordings = [
-            read_recording(path, rules, effort="measured", hold=hold)
-            for path, rules in zip(data, _mappings(mapping, len(data)), strict=True)
-        ]
+        recordings = [read_recording(reading, effort="measured", hold=hold) for reading in readings]
         result = _thesis(recordings, experiment, skew, out, page)
         if as_json:
             typer.echo(json_text(result.to_dict()))
@@ -143,10 +141,7 @@ def identify(
     from pendulum_bags.identification.options import Geometry, Options
 
     options = Options(window=window, friction=friction, geometry=Geometry(mass, length, inertia), fix_scale=fix_scale)
-    everything = [
-        read_recording(path, rules, effort=effort, hold=hold)
-        for path, rules in zip(paths, _mappings(mapping, len(data), len(paths)), strict=True)
-    ]
+    everything = [read_recording(reading, effort=effort, hold=hold) for reading in readings]
     found = run(everything[: len(data)], options, held_out=everything[len(data) :])
     written = found.write(out, name=name, effort_limit=effort_limit) if out and not found.refused else None
     _finish(found, written, page, as_json, contradicts=found.geometry is not None and found.geometry.contradicts)
@@ -219,7 +214,7 @@ def _thesis(
 
 def _print_thesis(result: ThesisResult, *, verbose: bool) -> None:
     from pendulum_bags.identification.model import UNITS
-    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+    from pendulum_msgs_py.programs.terminal import WholeTable
 
     console = make_console()
     title = f"Average over {len(result.trials)} trial{'s' if len(result.trials) != 1 else ''}"
@@ -259,7 +254,7 @@ def _narrow(summary: str, width: int = 78) -> str:
 
 
 def _print_result(result: IdentificationResult, out: Path | None) -> None:
-    from pendulum_msgs_py.programs.terminal import WholeTable, make_console
+    from pendulum_msgs_py.programs.terminal import WholeTable
 
     console = make_console()
     style = "bold red" if result.refused else "bold"

@@ -43,7 +43,7 @@ Stop = Annotated[float | None, typer.Option(help="Leave out what comes after [s]
 
 def readings_of(
     paths: Sequence[Path],
-    mappings: Sequence[str] | None = None,
+    mappings: Sequence[str | None] | None = None,
     topics: Sequence[str] | None = None,
     dt: float | None = None,
     start: float | None = None,

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pendulum_bags.commands.identify_cli import Hold
+from pendulum_bags.commands.recording_options import Dt, Mappings, Topics, WriteMapping, readings_of, show_guesses
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, is_mechanism
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
+from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.replay.controller_replay import ControllerReplay
@@ -27,7 +29,8 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 @app.command()
 def replay(
-    recording: Annotated[Path, typer.Argument(help="CSV file of a pendulum, or a bag.")],
+    context: typer.Context,
+    recording: Annotated[Path, typer.Argument(help="Recording of any format.")],
     params: Annotated[
         str,
         typer.Option(
@@ -45,7 +48,10 @@ def replay(
     window: Annotated[float, typer.Option(help="Length of the windows whose initial state is fitted [s].")] = 1.0,
     start: Annotated[float | None, typer.Option(help="Leave out what comes before [s].")] = None,
     stop: Annotated[float | None, typer.Option(help="Leave out what comes after [s].")] = None,
-    mapping: Annotated[str, typer.Option(help="Mapping file of a CSV with other columns or units.")] = "",
+    mapping: Mappings = None,
+    write_mapping: WriteMapping = None,
+    topic: Topics = None,
+    dt: Dt = None,
     hold: Hold = None,
     effort: Annotated[str, typer.Option(help="Torque of a bag: applied (said by the plant) or measured.")] = "applied",
     prefix: Annotated[str, typer.Option(help="Namespace of a bag's topics, where it holds several plants: /sim.")] = "",
@@ -60,6 +66,9 @@ def replay(
     from pendulum_bags.runs.run_folder import write_json
 
     result: InputReplay | ControllerReplay | JointReplay
+    (reading,) = readings_of([recording], mapping, topic, dt)
+    # What was guessed is shown where it ends in an error, too.
+    context.call_on_close(partial(show_guesses, make_console(stderr=True), [reading], write_mapping))
     if controller:
         from pendulum_bags.replay.controller_replay import parse_values, replay_controller
 
@@ -76,15 +85,14 @@ def replay(
         given = {"--hold": hold, "--start": start, "--stop": stop, "--prefix": prefix}
         if unheeded := [name for name, value in given.items() if value not in (None, "")]:
             raise DataError(f"{', '.join(unheeded)} has no effect with a plant of several joints; expected none of it")
-        result = replay_joints(recording, params, window=window, mapping=mapping or None)
+        result = replay_joints(reading, params, window=window)
     else:
         from pendulum_bags.replay.input_replay import replay_recording
 
         result = replay_recording(
-            recording,
+            reading,
             params or "thesis",
             window=window,
-            mapping=mapping or None,
             hold=hold,
             effort=effort,
             start=start,
@@ -109,7 +117,6 @@ def replay(
 
 def _print(result: InputReplay | ControllerReplay | JointReplay, content: dict[str, Any], *, chosen: bool) -> None:
     from pendulum_bags.figures.terminal_table import number_table
-    from pendulum_msgs_py.programs.terminal import make_console
 
     console = make_console()
     if content["objection"] is not None:

@@ -11,9 +11,11 @@ from typing import Annotated
 import typer
 
 from pendulum_bags.commands.compare_cli import DesignOption, LayersOption, MachineOption
+from pendulum_bags.commands.recording_options import Mappings, readings_of, show_guesses
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option
+from pendulum_msgs_py.programs.terminal import make_console
 from pendulum_rosbag.reader.open_source import is_bag_folder, is_storage_file
 
 __all__ = ["main"]
@@ -23,9 +25,10 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 @app.command()
 def report(
+    context: typer.Context,
     folders: Annotated[
         list[Path],
-        typer.Argument(help="Run folders (each with sim and hw), or two bags; folders of trials join in."),
+        typer.Argument(help="Run folders (each with sim and hw), or two recordings; folders of trials join in."),
     ],
     out: Annotated[
         Path | None,
@@ -43,6 +46,7 @@ def report(
         list[Path] | None,
         typer.Option(help="Recording of a real pendulum to replay in the report (CSV or bag)."),
     ] = None,
+    mapping: Mappings = None,
     png_only: Annotated[bool, typer.Option("--png-only", help="Leave out the PDF figures.")] = False,
 ) -> None:
     """Write report.html and figures/ for one run, or for several runs pooled; joint by joint where there are several.
@@ -70,7 +74,9 @@ def report(
     if pooled := all((folder / "sim").exists() and (folder / "hw").exists() for folder in folders):
         run = partial(compare_folders, folders)
     elif len(folders) == 2:
-        run = partial(compare_runs, *folders)
+        readings = readings_of(folders, mapping)
+        context.call_on_close(partial(show_guesses, make_console(stderr=True), readings, None))
+        run = partial(compare_runs, *readings)
     else:
         bad = next(folder for folder in folders if not ((folder / "sim").exists() and (folder / "hw").exists()))
         if not bad.exists():

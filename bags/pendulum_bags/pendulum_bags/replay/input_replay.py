@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +29,7 @@ SMOOTHING = 0.02
 
 
 def replay_recording(
-    path: str | Path,
+    path: str | os.PathLike[str],
     plant: str | Path | PlantParameters,
     *,
     window: float = 1.0,

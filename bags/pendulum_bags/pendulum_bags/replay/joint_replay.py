@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -94,7 +94,7 @@ class JointReplay:
 
 
 def replay_joints(
-    path: str | Path,
+    path: str | os.PathLike[str],
     plant: str | MechanismParameters,
     *,
     window: float = 1.0,
