@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from collections.abc import Sequence
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +43,8 @@ _STYLE: dict[Any, Any] = {
 }
 _WIDTH = 6.6
 _RESOLUTION = 150
+_MANY = 12
+"""Figures from which on a second process, which takes a second to start, draws half of them."""
 
 
 def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
@@ -56,23 +61,50 @@ def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str
     Raises:
         BagError: The folder cannot be written.
     """
+    with writing(f"figures in {folder}", BagError):
+        folder.mkdir(parents=True, exist_ok=True)
+        if not formats:
+            return []
+        if len(figures) < _MANY:
+            return _write(figures, folder, formats)
+        # The largest alternate between the two.
+        ordered = sorted(figures, key=lambda figure: -len(figure.panels))
+        ours, theirs = ordered[::2], ordered[1::2]
+        other = get_context("spawn").Process(target=_write_aside, args=(theirs, folder, formats), daemon=True)
+        other.start()
+        try:
+            written = _write(ours, folder, formats)
+            other.join()
+        finally:
+            other.terminate()
+        if other.exitcode != 0:  # it was ended, or has what this one reports
+            return written + _write(theirs, folder, formats)
+        return written + [folder / f"{figure.name}.{suffix}" for figure in theirs for suffix in formats]
+
+
+def _write_aside(figures: Sequence[Figure], folder: Path, formats: Sequence[str]) -> None:
+    """Write figures in a process of their own, which its parent ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        _write(figures, folder, formats)
+    except OSError:
+        sys.exit(1)
+
+
+def _write(figures: Sequence[Figure], folder: Path, formats: Sequence[str]) -> list[Path]:
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
     written = []
-    with writing(f"figures in {folder}", BagError):
-        folder.mkdir(parents=True, exist_ok=True)
-        if not formats:
-            return []
-        with mpl.rc_context(_STYLE):
-            for figure in figures:
-                canvas = _draw(figure, Canvas)
-                FigureCanvasAgg(canvas)
-                for suffix in formats:
-                    path = folder / f"{figure.name}.{suffix}"
-                    canvas.savefig(path, dpi=_RESOLUTION, metadata=_metadata(figure, suffix))
-                    written.append(path)
+    with mpl.rc_context(_STYLE):
+        for figure in figures:
+            canvas = _draw(figure, Canvas)
+            FigureCanvasAgg(canvas)
+            for suffix in formats:
+                path = folder / f"{figure.name}.{suffix}"
+                canvas.savefig(path, dpi=_RESOLUTION, metadata=_metadata(figure, suffix))
+                written.append(path)
     return written
 
 

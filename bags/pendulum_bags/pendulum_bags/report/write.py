@@ -16,7 +16,7 @@ from pendulum_bags.report.page import Page, page_of, render_page
 from pendulum_bags.report.tables import make_tables
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_bags.verdict.naming import name_in
-from pendulum_msgs_py.errors import BagError, PendulumError
+from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.whole_file import write_whole, writing
 from pendulum_rosbag.reader import read_bag
 
@@ -24,13 +24,10 @@ if TYPE_CHECKING:
     from pendulum_bags.comparison import Comparison
     from pendulum_bags.comparison.margins import MarginArgument
     from pendulum_bags.frequency_response.result import Analysis
-    from pendulum_bags.replay.result import InputReplay
     from pendulum_bags.runs.run_data import OpenBag
     from pendulum_bags.verdict import Answer
 
-__all__ = ["find_real_recording", "margin_of", "title_of", "write_joint_report", "write_report"]
-
-REAL_RECORDING = Path("dfki_torque_limited_simple_pendulum", "ddp_measured.csv")
+__all__ = ["margin_of", "title_of", "write_joint_report", "write_report"]
 
 
 def write_report(
@@ -40,7 +37,7 @@ def write_report(
     comparison: Comparison | None = None,
     folders: Sequence[str | os.PathLike[str]] = (),
     trials: Sequence[str | os.PathLike[str]] = (),
-    recordings: Sequence[Path] | None = (),
+    recordings: Sequence[Path] = (),
     formats: Sequence[str] = ("png", "pdf"),
     answer: Answer | None = None,
     certified: Analysis | None = None,
@@ -56,8 +53,7 @@ def write_report(
         comparison: A comparison that has been made already.
         folders: Run folders to pool.
         trials: Folders of the thesis's identification experiments, each with bags ``trial_1``, ``trial_2``, ...
-        recordings: Recordings of real pendulums to replay; ``None`` for the one next to the project, if any:
-            the project's own experiment shows that one, a report of other runs only those given.
+        recordings: Recordings of real pendulums to replay.
         formats: Formats of the figures.
         answer: The sum of all layers; by default of the comparison and of the run folder.
         certified: Which designs carry over to the measured machine; by default by the run folder's response.
@@ -73,15 +69,13 @@ def write_report(
     """
     from pendulum_bags.comparison import compare_folders
     from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
+    from pendulum_bags.replay.input_replay import replay_recording
 
     out = Path(run_folder)
     if comparison is None:
         comparison = compare_folders(list(folders) or [out], margin=margin_of(summary), open_bag=open_bag)
     content = {**comparison.to_json(), **(summary or {})}
-    found = [find_real_recording()] if recordings is None else list(recordings)
-    replays = [
-        replay for path in found if path is not None for replay in _replay(path, required=recordings is not None)
-    ]
+    replays = [replay_recording(path, "dfki") for path in recordings]
     names = [Path(folder).name for folder in folders] or [out.resolve().name]
     kept = [Path(folder) for folder in folders] if len(folders) == 1 else [] if folders else [out]
     certified = certified or carry_over(comparison, kept)
@@ -159,29 +153,6 @@ def title_of(folders: Sequence[Path], runs: int) -> str:
     if len(set(names)) < len(names):
         names = [f"{folder.resolve().parent.name}/{name}" for folder, name in zip(folders, names, strict=True)]
     return " and ".join(names)
-
-
-def find_real_recording() -> Path | None:
-    """Return the recording of a real pendulum next to the project, None where there is none.
-
-    ``PENDULUM_SHARED_DATA`` names the folder of recordings; by default it is ``shared/data`` next to
-    the folder that holds this checkout.
-    """
-    path = os.environ.get("PENDULUM_SHARED_DATA")
-    places = [Path(path)] if path else [parent / "shared" / "data" for parent in Path(__file__).resolve().parents[4:6]]
-    return next((place / REAL_RECORDING for place in places if (place / REAL_RECORDING).is_file()), None)
-
-
-def _replay(path: Path, *, required: bool) -> list[InputReplay]:
-    from pendulum_bags.replay.input_replay import replay_recording
-
-    try:
-        return [replay_recording(path, "dfki")]
-    except PendulumError:
-        # A recording that happens to be there must not break the report; a requested one must.
-        if required:
-            raise
-        return []
 
 
 def margin_of(summary: Mapping[str, Any] | None) -> MarginArgument:

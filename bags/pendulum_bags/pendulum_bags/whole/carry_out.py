@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TypeVar
 
@@ -427,6 +428,9 @@ class _Run:
         assert self.identification is not None
         deadline, file, place = self.found.deadline, self.folder / PLANT_FILE, self.folder / IDENTIFIED
         self._phase("identifying the plant", 12.0)
+        # While it waits: what writes the page takes a second or two to load.
+        import_module("pendulum_bags.whole.page")
+        import_module("matplotlib.backends.backend_pdf")
         while (code := self.identification.process.poll()) is None:
             deadline.require()
             time.sleep(_POLL)

@@ -63,7 +63,6 @@ def write_whole_report(
         folder,
         summary,
         comparison=given.comparison,
-        recordings=None,
         answer=answer,
         certified=given.analysis,
         extend=extend,
