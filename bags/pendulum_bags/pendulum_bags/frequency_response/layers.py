@@ -21,6 +21,7 @@ GAP_MARGIN = 0.2
 _CLOSE = {True: "close enough for feedback, not identical", False: "close enough for feedback"}
 """By whether a difference at single frequencies was found."""
 _WEAK_COHERENCE = 0.5
+_FEW = 2
 _UNSTABLE = 1e-6
 """Real part above which a pole of a model counts as unstable [1/s]: poles at 0 are computed with an error."""
 LONGER = "python -m pendulum_bags experiment frequency_response --periods 40"
@@ -53,7 +54,7 @@ def same_plant(
         if difference.found
         else f"no difference above {100.0 * SMALLEST:g} % was found at any frequency"
     )
-    size = f"nu-gap {gap.value:.3f}, 95 % interval {gap.low:.3f} to {gap.high:.3f}, {margin:g} allowed"
+    size = f"nu-gap {gap.value:.3f}, 95 % interval {gap.low:.3f} to {gap.high:.3f}, {margin:.2g} allowed"
     heads = {
         Mark.YES: f"Simulation and hardware are {_CLOSE[difference.found]} ({size})",
         Mark.NO: f"Simulation and hardware are not close enough for feedback ({size})",
@@ -63,7 +64,9 @@ def same_plant(
     delay, gain = difference.delay, difference.gain
     shown = Mark.YES if mark is Mark.YES else Mark.UNDECIDED
     evidence = [
-        Evidence("nu-gap", "", gap.value, gap.low, gap.high, f"below {margin:g}", mark, difference.scaling.sentence()),
+        Evidence(
+            "nu-gap", "", gap.value, gap.low, gap.high, f"below {margin:.2g}", mark, difference.scaling.sentence()
+        ),
         Evidence(
             "extra delay of the hardware", "ms", 1e3 * delay.value, 1e3 * delay.low, 1e3 * delay.high, "", shown,
             "slope of the phase over all frequencies; lag and spring count too",
@@ -94,9 +97,9 @@ def same_plant(
     elif mark is Mark.UNDECIDED:
         steps = (f"measure longer: {longer}",)
     reasons = {
-        Mark.YES: f"the plants are {_CLOSE[difference.found]} (nu-gap at most {gap.high:.2g}, {margin:g} allowed)",
-        Mark.NO: f"the plants are {gap.value:.2f} apart in the nu-gap ({margin:g} allowed), {where}",
-        Mark.UNDECIDED: f"the nu-gap, {gap.low:.2f} to {gap.high:.2f}, is measured too roughly ({margin:g} allowed)",
+        Mark.YES: f"the plants are {_CLOSE[difference.found]} (nu-gap at most {gap.high:.2g}, {margin:.2g} allowed)",
+        Mark.NO: f"the plants are {gap.value:.2f} apart in the nu-gap ({margin:.2g} allowed), {where}",
+        Mark.UNDECIDED: f"the nu-gap, {gap.low:.2f} to {gap.high:.2f}, is measured too roughly ({margin:.2g} allowed)",
     }
     return LayerResult(Layer.SAME_PLANT, mark, sentence, tuple(evidence), steps, reasons[mark])
 
@@ -159,10 +162,13 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
     open_ = [design for design in bad if design.certificate.undecided and not design.unknown]
     if any(not (one.certificate.far or one.certificate.unseen or one.certificate.resonance) for one in open_):
         steps += (f"measure longer: {longer}",)
+    resonant: dict[str, list[str]] = {}
+    for one in open_:
+        if one.certificate.resonance:
+            resonant.setdefault(f"{one.certificate.resonance:.2g} Hz", []).append(one.name)
     steps += tuple(
-        f"find out what resonates near {one.certificate.resonance:.2g} Hz, or choose less gain there than {one.name}"
-        for one in open_
-        if one.certificate.resonance
+        f"find out what resonates near {where}, or choose less gain there than {', '.join(names)}"
+        for where, names in resonant.items()
     )
     far = [one.name for one in open_ if one.certificate.far]
     if far:
@@ -178,12 +184,17 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
         f"{math.ceil(1e3 * damping) / 10.0:g} %; torque limits and friction at rest are outside it.",
         tuple(evidence),
         steps,
-        limit if mark is Mark.YES else f"{', '.join(d.name for d in bad)} not certified for the hardware",
+        limit if mark is Mark.YES else f"{_named(bad, count)} not certified for the hardware",
         f"{limit}; {', '.join(d.name for d in good)} certified to be stable there, which tells nothing of how "
         "closely it moves as simulated"
         if good
         else "",
     )
+
+
+def _named(some: Sequence[DesignResult], count: int) -> str:
+    """Return a few designs by name, more by their number: the table has them all."""
+    return ", ".join(one.name for one in some) if len(some) <= _FEW else f"{len(some)} of {count} designs"
 
 
 def _row(design: DesignResult, limit: float) -> Evidence:

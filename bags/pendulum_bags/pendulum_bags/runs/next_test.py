@@ -89,7 +89,8 @@ def plant_file_of(records: Sequence[Mapping[str, Any]]) -> str:
 def question_of(command: str) -> str:
     """Return the sentence to set behind a command that may move a machine; empty behind one that moves an emulator."""
     hardware = set(_values_of("--hardware", shlex.split(command)))
-    return " Where that moves a machine, it asks first." if hardware - {"emulator"} else ""
+    moves = {one for one in hardware - {"emulator"} if Path(one).suffix not in _PLANT_FILES}
+    return " Where that moves a machine, it asks first." if moves else ""
 
 
 def _again(record: Mapping[str, Any], plant: str, seen: Set[str]) -> str:

@@ -259,7 +259,8 @@ class _Run:
     ) -> None:
         settings = order.settings
         self.folder, self.order, self.progress, self.on_first = folder, order, progress, on_first
-        self.found = Findings(Simulated(settings.plant, settings, folder, 0.0 if order.alone else 4.0 * order.budget))
+        name = Path(settings.plant if settings.foreign is None else settings.foreign.name).name
+        self.found = Findings(Simulated(name, settings, folder, 0.0 if order.alone else 4.0 * order.budget))
         self.now = ""
         self.programs = ProcessSet(folder / "logs" / "identify", {})
         self.identification: Child | None = None
@@ -519,7 +520,7 @@ def _of(plant: Simulated, spec: RunSpec) -> RunSpec:
 def _refusal(identification: Child) -> str:
     """Return why an identification refused its recordings, or its last output."""
     try:
-        result = json.loads(identification.log.read_text(encoding="utf-8"))
-        return str(result.get("refused") or result["verdict"])
-    except (ValueError, KeyError, AttributeError):
+        # What refuses comes first.
+        return str(json.loads(identification.log.read_text(encoding="utf-8"))["sentences"][0])
+    except (ValueError, LookupError, TypeError):
         return identification.last_words(1).removeprefix("error: ")
