@@ -398,3 +398,14 @@ def test_a_bag_of_two_joints_has_figures_of_both(tmp_path: Path, capsys: Any) ->
     assert analyse_main([str(tmp_path / "bags"), "--ask", "metrics", "-o", str(out)]) == 0
     (row,) = json.loads((out / "bags.json").read_text())
     assert row["arm.std_theta"] == pytest.approx(2.0 * row["rod.std_theta"])
+
+
+def test_one_recording_in_two_formats_is_no_pair_and_no_repetition(tmp_path: Path, capsys: Any) -> None:
+    struct_with_time(tmp_path / "sim.mat")
+    npz(tmp_path / "copy.npz")
+    assert (
+        "hold one and the same recording"
+        in compared(capsys, tmp_path / "sim.mat", tmp_path / "copy.npz", code=2)["error"]
+    )
+    sim, one, again = (save(tmp_path / f"{name}.npz", step(seed)) for name, seed in (("s", 0), ("a", 1), ("b", 1)))
+    assert "hold one and the same recording" in compared(capsys, sim, one, again, code=2)["error"]

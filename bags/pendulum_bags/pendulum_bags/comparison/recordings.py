@@ -41,6 +41,8 @@ __all__ = ["Shared", "compare_recordings", "compare_runs", "find_shared"]
 
 _ALIKE = 0.95
 """Correlation from which on two inputs are one: loops of a good simulation and its machine have like commands, too."""
+_LEAST_LIKE = 0.5
+"""Correlation of two motions below which no shift of one is better than another."""
 _LEAST_OVERLAP = 0.5
 _MOST_SAMPLES = 200_000
 _PARTS = 5
@@ -141,6 +143,7 @@ def compare_recordings(
     margins = margins or Margins.parse()
     if not hardware:
         raise DataError(f"{simulation.source} has nothing to be compared with; expected a recording of the machine")
+    _refuse_copies((simulation, *hardware))
     shared = shared or [find_shared([simulation], [run]) for run in hardware]
     kinds = {one.kind for one in shared}
     if len(kinds) > 1:
@@ -239,6 +242,10 @@ def find_shared(simulation: Sequence[RunData], hardware: Sequence[RunData]) -> S
         ]
         shift, correlation = _best_shift(moving, *joints[0])
         missing = "neither has an input" if free else "no input, reference or disturbance is in both"
+        if correlation < _LEAST_LIKE:
+            return Shared(
+                "", 0.0, correlation, f"{missing}, and the motions fit nowhere (correlation {correlation:.2f})"
+            )
         return Shared(_MOTION, shift, correlation, missing)
     return Shared("", 0.0, 0.0, "; ".join(dict.fromkeys(reasons)))
 
@@ -324,6 +331,26 @@ def _on_one_clock(simulation: RunData, hardware: RunData, shared: Shared) -> tup
     ours, theirs = (run.moved(-start) for run in found)
     _check_units(ours, theirs)
     return replace(ours, label="simulation"), replace(theirs, label="hardware")
+
+
+def _refuse_copies(runs: Sequence[RunData]) -> None:
+    """Refuse a recording that is given twice, in whatever format: it is like itself, and varies by nothing.
+
+    This has to be seen before the runs are moved and cut, which leaves a sample more of one than of the other.
+    """
+    for index, run in enumerate(runs):
+        for other in runs[:index]:
+            a, b = other.whole.position, run.whole.position
+            # Another zero, and the digits of a text file, make no other recording.
+            if (
+                a.size == b.size
+                and np.ptp(a) > 0.0
+                and np.allclose(a - a[0], b - b[0], rtol=0.0, atol=1e-9 * float(np.ptp(a)))
+            ):
+                raise DataError(
+                    f"{other.source} and {run.source} hold one and the same recording; expected one of each plant, and "
+                    "independent runs of the machine"
+                )
 
 
 def _check_units(simulation: RunData, hardware: RunData) -> None:
