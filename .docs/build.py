@@ -152,8 +152,8 @@ def reference() -> str:
     from pendulum_lqr.controller_interface.controller import COMMON_PARAMETERS, controller_class, controller_names
     from pendulum_lqr.nodes.bringup import ARGUMENTS
     from pendulum_msgs_py.parameters import markdown_table
-    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-    from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS
+    from pendulum_msgs_py.plants.joint_parameters import DRIVETRAIN_SPECS
+    from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, load_mechanism
 
     def table_rows(specs: Iterable[ParameterSpec]) -> list[str]:
         return markdown_table(specs).splitlines()[2:]

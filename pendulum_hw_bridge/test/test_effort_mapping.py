@@ -12,7 +12,7 @@ from pendulum_hw_bridge.drive.motor_state import MotorState
 from pendulum_hw_bridge.port.actuator import Command, Strategy, no_torque
 from pendulum_hw_bridge.port.gains import GainSet, PidGains
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 
 DRIVETRAIN = SeriesElasticParameters(
     gear_ratio=4.0, torque_constant=0.5, back_emf_constant=0.25, winding_resistance=16.0, supply_voltage=32.0

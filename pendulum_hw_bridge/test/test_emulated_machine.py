@@ -15,7 +15,7 @@ from pendulum_hw_bridge.port.actuator import ActuatorError, ActuatorPort, Comman
 from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_testing.joint_plants import without_friction
 
 MILLISECOND = 1_000_000

@@ -48,7 +48,7 @@ def test_a_link_turned_by_hand_feels_that_damping(temperature: float) -> None:
     flat = replace(
         parameters,
         flat=True,
-        plant=replace(parameters.plant, damping=0.0, coulomb_friction=0.0, static_friction=0.0),
+        plant=parameters.plant.with_values(damping=0.0, coulomb_friction=0.0, static_friction=0.0),
     )
     actuator = x5(flat)
     speed = turned_by(actuator, 6.0, 2.0)
@@ -245,7 +245,7 @@ def steady_rise(power: float, ladder: ThermalParameters) -> float:
 def test_motor_warms_to_what_its_thermal_resistances_say() -> None:
     thermal = ThermalParameters(winding_capacity=0.02, housing_capacity=0.02, body_capacity=0.02, ambient=22.0)
     parameters = replace(load_emulator("x5_9"), thermal=thermal, flat=True)
-    locked = replace(parameters, plant=replace(parameters.plant, inertia=1e9))
+    locked = replace(parameters, plant=parameters.plant.with_values(inertia=1e9))
     actuator = EmulatedX5(locked)
     actuator.configure(strategy=Strategy.DIRECT_PWM, command_lifetime=5.0)
     actuator.deliver(Command(pwm=0.1), 0)

@@ -21,7 +21,7 @@ from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.port.actuator import ActuatorError, Strategy
 from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_msgs_py.parameters import validate
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
 
 class Punctual:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from pendulum_hw_bridge.drive.motor_state import MOTOR_SPEED_LIMIT, MotorState, MotorWatch
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 from pendulum_testing.feedback_records import feedback_record
 
 GEAR = 64.0

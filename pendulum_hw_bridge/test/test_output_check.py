@@ -13,7 +13,7 @@ from pendulum_hw_bridge.drive.motor_state import MOTOR_SPEED_LIMIT
 from pendulum_hw_bridge.drive.output_check import OutputCheck
 from pendulum_hw_bridge.port.actuator import Command, Strategy
 from pendulum_hw_bridge.port.gains import GainSet, PidGains
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 from pendulum_testing.feedback_records import feedback_record
 
 # R / (N V K_t) is 1/4 per newton metre at 32 V, K_e N / V is 1/32 per rad/s.

@@ -11,7 +11,7 @@ from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrateg
 from pendulum_hw_bridge.drive.output_check import OutputCheck
 from pendulum_hw_bridge.drive.safety import SafetyMonitor
 from pendulum_hw_bridge.port.actuator import Command, Strategy
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 from pendulum_testing.feedback_records import feedback_record
 from pendulum_testing.watched_monitor import DRIVETRAIN, LIMITS, MILLISECOND, PERIOD, STEP, Watched
 

@@ -23,7 +23,7 @@ from pendulum_msgs_py.contract.joints import ONE_JOINT
 from pendulum_msgs_py.contract.plant_specs import in_units_of
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_testing.feedback_records import feedback_record
 
 CART_POLE = load_mechanism("cart_pole").coordinates

@@ -20,10 +20,10 @@ from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.parameter_box import ParameterBox, parse_box, worst_case
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant, write_plant
 
 DFKI = load_plant("dfki")
-PLAIN = PlantParameters(inertia=0.5, damping=0.0, gravity=2.0)
+PLAIN = pendulum_plant(inertia=0.5, damping=0.0, gravity=2.0)
 
 
 @given(w=st.floats(0.5, 50.0), zeta=st.floats(0.2, 0.9))
@@ -108,7 +108,7 @@ def test_the_band_counts_friction_that_grows_with_the_weight_at_the_true_angle(s
 
 def test_margins_of_a_loop_with_delay_are_those_of_its_frequency_response():
     """Against closed forms: an integrator with delay, k exp(-s d) / s, crosses at k and turns at pi / (2 d)."""
-    plant = PlantParameters(inertia=1e-3, damping=1.0, gravity=0.0, transport_delay=0.1)
+    plant = pendulum_plant(inertia=1e-3, damping=1.0, gravity=0.0, transport_delay=0.1)
     margins = loop_margins(linearise(plant), (3.0, 0.0))
     assert margins.crossover == pytest.approx(3.0, rel=1e-4)
     assert margins.phase == pytest.approx(math.pi / 2.0 - 0.3 - math.atan(0.003), abs=1e-4)

@@ -16,14 +16,14 @@ from pendulum_lqr.swing_up.mechanism_catch import make_mechanism_catch
 from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, pump_gains
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 PERIOD = 0.01
 
 
 def _swing(
-    controller: Controller, plant: MechanismParameters, start: Vector, duration: float
+    controller: Controller, plant: PlantParameters, start: Vector, duration: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions, deviations from upright, and efforts."""
     simulated = MechanismPlant(plant, dt=PERIOD)

@@ -17,7 +17,7 @@ from pendulum_lqr.nodes.answering import ControlLoop
 from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_testing.joint_plants import lagging_plant
 

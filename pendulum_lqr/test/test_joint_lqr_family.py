@@ -18,7 +18,7 @@ from pendulum_lqr.linear.design import DesignError, kalman_gain
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_testing.joint_plants import delayed_plant, lagging_plant, near_upright
 
@@ -31,7 +31,7 @@ class _Run:
 
     def __init__(
         self,
-        plant: MechanismParameters,
+        plant: PlantParameters,
         controller: Controller,
         *,
         noise: tuple[float, float] = (0.0, 0.0),

@@ -14,8 +14,7 @@ from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.policies.onnx_file import observation_names
 from pendulum_lqr.policies.policy_file import dumps_policy, load_policy, loads_policy, write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant
 from pendulum_testing.joint_plants import delayed_plant
 from pendulum_testing.policies import random_policy
 

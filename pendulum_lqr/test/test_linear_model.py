@@ -18,11 +18,11 @@ from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.equilibrium import fixed_points, overdamped_velocity, torque_gain
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant
 from pendulum_sim.stepping.plants import make_plant
 
 PLANTS = st.builds(
-    PlantParameters,
+    pendulum_plant,
     inertia=st.floats(1e-3, 10.0),
     damping=st.floats(0.0, 20.0),
     gravity=st.floats(0.0, 20.0),

@@ -23,12 +23,12 @@ from pendulum_lqr.linear.design import (
 )
 from pendulum_lqr.linear.model import LinearModel, linearise
 from pendulum_lqr.linear.sampled_design import DiscreteModel, discrete_lqr, discretise, sampled_cost
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant
 
 THESIS = load_plant("thesis")
 UPRIGHT = linearise(THESIS)
 PLANTS = st.builds(
-    PlantParameters,
+    pendulum_plant,
     inertia=st.floats(0.01, 1.0),
     damping=st.floats(0.0, 12.0),
     gravity=st.floats(0.1, 5.0),

@@ -35,7 +35,7 @@ from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajecto
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.runge_kutta import along_2, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_testing.joint_plants import delayed_plant
 
@@ -43,7 +43,7 @@ DT = 0.002
 Q, R = (10.0, 10.0, 1.0, 1.0), 1.0
 
 
-def step(plant: MechanismParameters, x: Vector, effort: Vector) -> Vector:
+def step(plant: PlantParameters, x: Vector, effort: Vector) -> Vector:
     """Return the state one period later, without friction."""
     torque = plant.coordinates.spread(effort)
     q, v = rk4_joints(plant.mechanism.forward, along_2, x[:2], x[2:], torque, torque, torque, DT, plant.packed)

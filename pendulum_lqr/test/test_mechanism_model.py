@@ -17,8 +17,7 @@ from pendulum_lqr.linear.design import DesignError, continuous_lqr, output_lqr
 from pendulum_lqr.linear.model import holding_effort, linearise
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant, write_plant
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_testing.joint_plants import lagging_plant, near_upright, without_friction
 
@@ -143,7 +142,7 @@ def test_the_command_shows_the_lag_and_which_row_does_not_settle_with_the_delay(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plant = lagging_plant(load_mechanism("cart_pole"), 0.03).with_values({"cart.transport_delay": 0.06})
-    file = str(write_mechanism(tmp_path / "late.yaml", plant))
+    file = str(write_plant(tmp_path / "late.yaml", plant))
     weights = ["--q", "10,100,1,1", "--r", "0.1", "--r", "100"]
     assert main(["--plant", file, *weights]) == 0
     shown = " ".join(capsys.readouterr().out.split())

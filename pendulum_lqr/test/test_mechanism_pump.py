@@ -16,7 +16,7 @@ from pendulum_lqr.swing_up.mechanism_catch import CaughtRegion, MechanismCatch
 from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, PumpGains, pump_gains
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.joints import Vector
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 
 NAMES = ("cart_pole", "furuta", "pendubot_frictionless")
 PLANTS = {name: load_mechanism(name) for name in NAMES}
@@ -29,23 +29,23 @@ STRONG = 1e9
 angles, speeds = st.floats(-10.0, 10.0), st.floats(-30.0, 30.0)
 
 
-def _pump(plant: MechanismParameters, limit: float | None = None, **changes: float) -> EnergyPump:
+def _pump(plant: PlantParameters, limit: float | None = None, **changes: float) -> EnergyPump:
     return EnergyPump(plant, replace(pump_gains(plant), **changes), limit or plant.effort_limits[0])
 
 
-def _controller(plant: MechanismParameters) -> JointEnergySwingUp:
+def _controller(plant: PlantParameters) -> JointEnergySwingUp:
     """Return a controller whose LQR catches from next to upright: nothing is sampled."""
     gain = output_lqr(linearise(plant), *plant.mechanism.weights)
     return JointEnergySwingUp(plant, _pump(plant), 0.01, MechanismCatch(plant, gain, CaughtRegion(1e-4, 1)))
 
 
-def _accelerations(plant: MechanismParameters, pump: EnergyPump, position: Vector, velocity: Vector, margin: float):
+def _accelerations(plant: PlantParameters, pump: EnergyPump, position: Vector, velocity: Vector, margin: float):
     """Return what the law does to both joints, by the mechanism's own equations, which have no dry friction."""
     effort = plant.coordinates.spread((pump.effort(position, velocity, margin),))
     return plant.mechanism.forward(position, velocity, effort, plant.packed)
 
 
-def _states(plant: MechanismParameters, gains: PumpGains, angle: float, speed: float) -> tuple[Vector, Vector]:
+def _states(plant: PlantParameters, gains: PumpGains, angle: float, speed: float) -> tuple[Vector, Vector]:
     """Return a state with the driven joint at rest at its goal: the pendulum so far from upright, so fast."""
     driven = plant.coordinates.driven[0]
     position, velocity = list(plant.coordinates.goal), [0.0, 0.0]

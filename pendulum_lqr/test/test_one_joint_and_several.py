@@ -12,13 +12,14 @@ from pendulum_lqr.linear.analysis import delayed_spectral_radius
 from pendulum_lqr.linear.design import DesignError, continuous_lqr, output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import mechanism_from_pendulum
 from pendulum_msgs_py.plants.plant_parameters import PRESETS, load_plant
 from pendulum_sim.stepping.plants import make_plant
 
 PERIOD = 0.01
 LATE = {"lag": {"actuator_time_constant": 0.02}, "delay": {"transport_delay": 0.013}}
 CHANGES: dict[str, dict[str, float]] = {"": {}, **LATE, "lag and delay": {**LATE["lag"], **LATE["delay"]}}
+STOP = {"upper_stop": 1e3}
+"""An end stop, out of reach, with which a pendulum is a mechanism like any other."""
 WEIGHTS: dict[str, Any] = {"q": [100.0, 0.01], "r": 0.1}
 
 
@@ -28,9 +29,9 @@ def test_a_pendulum_has_the_same_linear_model_as_either_plant(late: str) -> None
         plant = load_plant(preset).with_values(**CHANGES[late])
         if plant.drivetrain is not None:
             with pytest.raises(ParameterError, match="series elastic"):
-                mechanism_from_pendulum(plant)
+                plant.with_values(**STOP)
             continue
-        one, many = linearise(plant), linearise(mechanism_from_pendulum(plant))
+        one, many = linearise(plant), linearise(plant.with_values(**STOP))
         for name in ("A", "B", "C", "E"):
             np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
         assert (one.delay, one.position, one.efforts) == (many.delay, many.position, many.efforts)
@@ -64,7 +65,7 @@ def test_both_are_refused_from_the_same_delay_on_and_that_is_where_the_sampled_l
     def verdicts(delay: float) -> set[bool]:
         plant = load_plant("dfki").with_values(actuator_time_constant=lag, transport_delay=delay)
         found = set()
-        for each in (plant, mechanism_from_pendulum(plant)):
+        for each in (plant, plant.with_values(**STOP)):
             try:
                 make_controller(name, each, PERIOD, {**WEIGHTS, **integral})
                 found.add(True)

@@ -11,7 +11,7 @@ from pendulum_lqr.disturbances.disturbance import make_disturbance
 from pendulum_lqr.linear.design import DesignError
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")
@@ -141,7 +141,7 @@ def test_every_swing_up_ends_at_its_set_point_on_a_plant_with_offsets(name, valu
 
 @pytest.mark.parametrize("start", [0.2, -0.2, 0.0, 1.0, 3.0])
 def test_energy_swing_up_breaks_away_wherever_dry_friction_holds_it(start, simulate):
-    sticky = PlantParameters(
+    sticky = pendulum_plant(
         inertia=0.055, damping=0.05, gravity=1.678, coulomb_friction=0.3, static_friction=0.39, effort_limit=1.2
     )
     run = simulate(sticky, make_controller("energy_swing_up", sticky, 0.01), theta=start, duration=6.0)

@@ -31,11 +31,11 @@ from pendulum_lqr.policies.policy_import import ActorSpec, policy_of_actor
 from pendulum_lqr.policies.sb3_archive import LARGEST_ARCHIVE, load_actor
 from pendulum_lqr.policies.torch_state import read_state
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant, write_plant
 from pendulum_testing.policies import random_policy
 
 IMPORTED = Path(__file__).with_name("imported")
-PENDULUM_V1 = PlantParameters(inertia=1.0 / 3.0, damping=0.0, gravity=5.0, effort_limit=2.0, name="Pendulum-v1")
+PENDULUM_V1 = pendulum_plant(inertia=1.0 / 3.0, damping=0.0, gravity=5.0, effort_limit=2.0, name="Pendulum-v1")
 PLANTS = {"ppo": load_plant("dfki"), "sac": PENDULUM_V1, "tqc": PENDULUM_V1}
 
 

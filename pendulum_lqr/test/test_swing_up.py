@@ -12,10 +12,10 @@ import pytest
 from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.swing_up.minimum_time import minimum_time
 from pendulum_lqr.swing_up.trajectory_optimisation import swing_up_trajectory
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant
 
 DFKI = load_plant("dfki")
-BENCHMARK = PlantParameters(
+BENCHMARK = pendulum_plant(
     inertia=0.57288 * 0.5**2, damping=0.10, gravity=0.57288 * 0.5 * 9.81, effort_limit=2.5, name="benchmark"
 )
 """Plant of the public benchmark: software/python/examples/benchmark_controller.py of its repository."""

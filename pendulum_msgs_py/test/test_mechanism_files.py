@@ -9,14 +9,19 @@ import pytest
 import yaml
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import (
-    MechanismParameters,
+from pendulum_msgs_py.plants.plant_parameters import (
+    MECHANISM_PRESETS,
+    PLANT_SPECS,
+    PRESETS,
+    PlantParameters,
+    is_mechanism,
     load_mechanism,
-    load_mechanism_file,
-    mechanism_from_pendulum,
-    write_mechanism,
+    load_plant,
+    load_plant_file,
+    pack_joints,
+    resolve_plant,
+    write_plant,
 )
-from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PLANT_SPECS, PRESETS, load_plant, resolve_plant
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_testing.joint_plants import without_friction
 
@@ -34,8 +39,8 @@ def test_every_preset_loads_bears_its_name_and_is_read_back_to_the_last_bit(pres
     plant = load_mechanism(preset)
     assert plant.name == preset
     interval = {plant.mechanism.parameters[0].name: (0.1, 0.9), f"{plant.coordinates.names[1]}.damping": (0.0, 1.0)}
-    path = write_mechanism(tmp_path / "copy.yaml", plant, provenance={"method": "by hand"}, intervals=interval)
-    copy, provenance = load_mechanism_file(path)
+    path = write_plant(tmp_path / "copy.yaml", plant, provenance={"method": "by hand"}, intervals=interval)
+    copy, provenance = load_plant_file(path)
     assert copy == plant
     assert copy.name == plant.name
     assert provenance == {"method": "by hand", "intervals": {key: list(value) for key, value in interval.items()}}
@@ -128,30 +133,36 @@ def test_end_stops_the_wrong_way_round_are_refused(tmp_path: Path) -> None:
         load_mechanism(path)
 
 
-def test_a_plant_of_one_joint_with_what_no_mechanism_has_says_what(tmp_path: Path) -> None:
+def test_a_pendulum_with_what_the_equations_of_any_joints_have_not_says_what(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="series elastic; expected a rigid one"):
-        load_mechanism("x5_9")
+        pack_joints(load_mechanism("x5_9"))
     path = _changed(tmp_path, "parameters:\n", "parameters:\n  angle_offset: {value: 0.1, unit: rad}\n", "thesis")
     with pytest.raises(ParameterError, match=r"angle_offset of plant 'thesis' is 0.1 rad; expected 0"):
-        load_mechanism(path)
+        pack_joints(load_mechanism(path))
 
 
 @pytest.mark.parametrize("name", [spec.name for spec in PLANT_SPECS])
-def test_a_plant_of_one_joint_loses_nothing_when_it_is_read_as_a_mechanism(name: str) -> None:
+def test_a_pendulum_with_an_end_stop_is_a_mechanism_and_loses_nothing(name: str, tmp_path: Path) -> None:
     plant = load_plant("dfki")
-    changed = plant.with_values(**{name: getattr(plant, name) + 0.5})
+    changed = plant.with_values({name: plant.value(name) + 0.5})
     if name in {"load_friction", "torque_offset", "angle_offset"}:
-        with pytest.raises(ParameterError, match=f"{name} of plant 'dfki' is 0.5.*; expected 0 to be read"):
-            mechanism_from_pendulum(changed)
-    else:
-        assert mechanism_from_pendulum(changed) != mechanism_from_pendulum(plant)
+        with pytest.raises(ParameterError, match=f"{name} of plant 'dfki' is 0.5.*; expected 0 for the equations"):
+            changed.with_values(upper_stop=3.0)
+        return
+    stopped = changed.with_values(upper_stop=3.0)
+    assert (changed.is_pendulum, stopped.is_pendulum) == (True, False)
+    path = write_plant(tmp_path / "stopped.yaml", stopped, intervals={name: (0.0, 9.0)})
+    copy, provenance = load_plant_file(path)
+    assert (copy, provenance["intervals"]) == (stopped, {name: [0.0, 9.0]})
+    assert is_mechanism(path)
+    assert copy.with_values(upper_stop=None) == changed
 
 
 def test_a_program_for_one_joint_says_that_a_plant_has_several() -> None:
-    # Simulators read files by themselves, since they alone open sealed ones.
-    for load in (load_plant, load_plant_to_run):
-        with pytest.raises(ParameterError, match=r"describes a mechanism \(double_pendulum\); expected a plant of one"):
-            load("acrobot")
+    with pytest.raises(ParameterError, match=r"describes a mechanism \(double_pendulum\); expected a plant of one"):
+        load_plant("acrobot")
+    # Simulators run any, and they alone open sealed ones.
+    assert load_plant_to_run("acrobot") == (load_mechanism("acrobot"), False)
 
 
 def test_values_are_changed_by_name_and_checked() -> None:
@@ -166,4 +177,4 @@ def test_values_are_changed_by_name_and_checked() -> None:
     with pytest.raises(ParameterError, match=r"static_friction is 0.01 N m; expected >= coulomb_friction = 0.12"):
         plant.with_values({"elbow.static_friction": 0.01})
     with pytest.raises(ParameterError, match="12 values and 2 joints; expected 11 and 2"):
-        MechanismParameters(plant.mechanism, (*plant.values, 1.0), plant.joints)
+        PlantParameters(plant.mechanism, (*plant.values, 1.0), plant.joints)

@@ -13,23 +13,23 @@ from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.dynamics.rigid import rigid_acceleration
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import MECHANISMS
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 
 _PLANTS = ("thesis", "cart_pole", "acrobot", "furuta")
 
 
-def _plant(name: str) -> MechanismParameters:
+def _plant(name: str) -> PlantParameters:
     plant = load_mechanism(name)
     return plant.with_values({f"{joint}.damping": 0.01 * (1 + n) for n, joint in enumerate(plant.coordinates.names)})
 
 
-def _states(plant: MechanismParameters, count: int = 20) -> list[tuple[tuple[float, ...], ...]]:
+def _states(plant: PlantParameters, count: int = 20) -> list[tuple[tuple[float, ...], ...]]:
     n = len(plant.joints)
     values = np.random.default_rng(1).uniform(-6.0, 6.0, (count, 3, n))
     return [tuple(tuple(row) for row in state.tolist()) for state in values]
 
 
-def _lagrange(plant: MechanismParameters, q: tuple, v: tuple, torque: tuple) -> np.ndarray:
+def _lagrange(plant: PlantParameters, q: tuple, v: tuple, torque: tuple) -> np.ndarray:
     """q'' of d/dt (M v) - dT/dq + dV/dq + D v = torque, from mass matrix and potential alone."""
     mechanism, p, n = plant.mechanism, plant.packed, len(q)
     mass = in_arithmetic(mechanism.mass, cmath)

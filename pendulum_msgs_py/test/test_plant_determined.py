@@ -6,12 +6,11 @@ import pytest
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.determined import require_determined, undetermined
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, pendulum_plant, write_plant
 
-ARM = PlantParameters(inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05)
-FLAT = PlantParameters(inertia=0.05, damping=0.03, gravity=0.0, effort_limit=2.0)
-SLOW = PlantParameters(inertia=0.12, damping=12.0, gravity=2.3)
+ARM = pendulum_plant(inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05)
+FLAT = pendulum_plant(inertia=0.05, damping=0.03, gravity=0.0, effort_limit=2.0)
+SLOW = pendulum_plant(inertia=0.12, damping=12.0, gravity=2.3)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +43,7 @@ def test_a_plant_file_of_one_joint_and_of_several_is_refused_by_its_own_interval
     one = write_plant(tmp_path / "one.yaml", ARM, intervals={"gravity": (0.0, 2.3e7)})
     with pytest.raises(ParameterError, match=r"one.yaml: gravity is 1.5 with the interval 0 to 2.3e\+07"):
         require_determined(one)
-    several = write_mechanism(
+    several = write_plant(
         tmp_path / "several.yaml", load_mechanism("cart_pole"), intervals={"pole_inertia": (0.0, 0.1)}
     )
     with pytest.raises(ParameterError, match="pole_inertia is"):

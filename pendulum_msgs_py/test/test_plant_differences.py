@@ -8,20 +8,14 @@ import pytest
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_differences import (
-    describe_plants,
-    plant_differences,
-    plant_mismatch,
-    read_plants,
-)
+from pendulum_msgs_py.plants.joint_parameters import DRIVETRAIN_SPECS, SeriesElasticParameters
+from pendulum_msgs_py.plants.plant_differences import describe_plants, plant_differences, plant_mismatch, read_plants
 from pendulum_msgs_py.plants.plant_parameters import (
-    DRIVETRAIN_SPECS,
     PLANT_SPECS,
     PRESETS,
-    PlantParameters,
-    SeriesElasticParameters,
+    load_mechanism,
     load_plant,
+    pendulum_plant,
 )
 
 THESIS = load_plant("thesis")
@@ -40,7 +34,7 @@ def test_a_plant_that_says_what_it_is_is_read_back_as_it_is(preset: str) -> None
 @pytest.mark.parametrize("spec", PLANT_SPECS, ids=lambda spec: spec.name)
 def test_every_parameter_of_the_plant_is_compared(spec: ParameterSpec) -> None:
     # Static friction is at least the sliding one: both go up from the same side.
-    base = PlantParameters(0.05, 0.1, 1.0, coulomb_friction=0.1, static_friction=0.2, actuator_time_constant=0.01)
+    base = pendulum_plant(0.05, 0.1, 1.0, coulomb_friction=0.1, static_friction=0.2, actuator_time_constant=0.01)
     other = base.with_values(**{spec.name: getattr(base, spec.name) * 1.1 + 1e-3})
     (found,) = plant_differences(base, other)
     assert (found.name, found.designed, found.running, found.unit) == (

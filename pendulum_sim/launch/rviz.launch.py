@@ -14,8 +14,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES
-from pendulum_sim.exports.model_files import any_urdf
+from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, load_mechanism
+from pendulum_sim.exports.model_files import urdf
 
 
 def arguments() -> list[DeclareLaunchArgument]:
@@ -48,7 +48,7 @@ def show(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             package="robot_state_publisher",
             executable="robot_state_publisher",
             namespace=space,
-            parameters=[{"robot_description": any_urdf(value["model"]), "frame_prefix": prefix}],
+            parameters=[{"robot_description": urdf(load_mechanism(value["model"])), "frame_prefix": prefix}],
         ),
         Node(
             package="tf2_ros",

@@ -11,7 +11,7 @@ import pytest
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import from_upright, wrap
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, pendulum_plant
 from pendulum_sim.batches import vector_math
 from pendulum_sim.batches.batch import simulate_batch
 from pendulum_sim.batches.compiling import compile_tree
@@ -63,7 +63,7 @@ def test_each_pendulum_of_a_batch_equals_the_single_plant_to_1e_12(
         parameters,
         steps=800,
         method=method,
-        theta=math.pi + 0.3,
+        position=math.pi + 0.3,
         gain=gain,
         seeds=seeds,
         amplitude=2.5,
@@ -94,8 +94,8 @@ def test_200_seeds_reproduce_the_statistics_of_the_thesis(
         hold=hold,
     )
     assert np.percentile(result.max_effort, [50, 5, 95]) == pytest.approx([median, low, high], rel=0.08)
-    assert np.median(result.std_theta) == pytest.approx(std_theta, rel=0.04)
-    assert np.median(result.std_theta_dot) == pytest.approx(std_theta_dot, rel=0.04)
+    assert np.median(result.std_deviation) == pytest.approx(std_theta, rel=0.04)
+    assert np.median(result.std_velocity) == pytest.approx(std_theta_dot, rel=0.04)
 
 
 def test_each_pendulum_has_its_own_parameters_gain_start_seed_and_amplitude() -> None:
@@ -103,8 +103,8 @@ def test_each_pendulum_has_its_own_parameters_gain_start_seed_and_amplitude() ->
     together = simulate_batch(
         plants,
         steps=300,
-        theta=[3.0, 3.1, 3.2],
-        theta_dot=[0.0, 0.1, 0.2],
+        position=[3.0, 3.1, 3.2],
+        velocity=[0.0, 0.1, 0.2],
         seeds=[1, 2, 3],
         gain=[(30.0, 0.1), (33.0, 0.15), (36.0, 0.2)],
         amplitude=[1.0, 2.0, 2.5],
@@ -113,26 +113,26 @@ def test_each_pendulum_has_its_own_parameters_gain_start_seed_and_amplitude() ->
         alone = simulate_batch(
             plants[i],
             steps=300,
-            theta=3.0 + 0.1 * i,
-            theta_dot=0.1 * i,
+            position=3.0 + 0.1 * i,
+            velocity=0.1 * i,
             seeds=i + 1,
             gain=[(30.0, 0.1), (33.0, 0.15), (36.0, 0.2)][i],
             amplitude=[1.0, 2.0, 2.5][i],
         )
-        assert alone.theta[0] == together.theta[i]
+        assert alone.position[0, 0] == together.position[i, 0]
         assert alone.max_effort[0] == together.max_effort[i]
 
 
 @pytest.mark.parametrize("static", [None, [0.05, 0.3, 0.4]])
 def test_a_batch_over_dry_friction_moves_like_plants_of_their_own(static: list[float] | None) -> None:
     # Where static friction is not said, it is the Coulomb friction, as in a plant file.
-    plain = PlantParameters(inertia=0.055, damping=0.02, gravity=1.678, effort_limit=13.0)
+    plain = pendulum_plant(inertia=0.055, damping=0.02, gravity=1.678, effort_limit=13.0)
     coulomb = [0.0, 0.1, 0.3]
     variations = {"coulomb_friction": coulomb} | ({"static_friction": static} if static else {})
-    together = simulate_batch(plain, variations=variations, steps=500, method="etd2", theta=1.0, hold=1, substeps=1)
+    together = simulate_batch(plain, variations=variations, steps=500, method="etd2", position=1.0, hold=1, substeps=1)
     for i, tau in enumerate(coulomb):
         single = RigidPlant(
-            PlantParameters(
+            pendulum_plant(
                 inertia=0.055,
                 damping=0.02,
                 gravity=1.678,
@@ -146,8 +146,8 @@ def test_a_batch_over_dry_friction_moves_like_plants_of_their_own(static: list[f
         single.reset(1.0)
         for _ in range(500):
             single.step(0.0)
-        assert together.theta[i] == pytest.approx(single.theta, abs=1e-12)
-    assert len(set(np.round(together.theta, 6))) == 3
+        assert together.position[i, 0] == pytest.approx(single.theta, abs=1e-12)
+    assert len(set(np.round(together.position[:, 0], 6))) == 3
 
 
 def test_results_do_not_depend_on_the_size_of_the_batch_or_the_threads() -> None:
@@ -159,7 +159,7 @@ def test_results_do_not_depend_on_the_size_of_the_batch_or_the_threads() -> None
             seeds=np.arange(size),
             amplitude=2.5,
             threads=threads,
-        ).theta
+        ).position
 
     large = run(600, None)
     assert np.array_equal(run(600, 1), large)
@@ -228,16 +228,16 @@ def test_the_branchless_wrap_equals_that_of_the_vocabulary_to_the_last_bit_of_it
         ({"steps": 5, "threads": -3}, "threads is -3; expected a whole number >= 1"),
         ({"steps": 5, "gain": (math.nan, 0.0)}, "gain has a value that is not finite"),
         ({"steps": 5, "gain": (math.inf, 0.0)}, "gain has a value that is not finite"),
-        ({"steps": 5, "target": math.nan}, "target is nan rad; expected a finite number"),
-        ({"steps": 5, "amplitude": [1.0, -1.0]}, "amplitude has a value of -1.0 N m; expected >= 0"),
+        ({"steps": 5, "goal": math.nan}, r"goal is \[nan\]; expected 1 finite numbers"),
+        ({"steps": 5, "amplitude": [1.0, -1.0]}, "amplitude has a value of -1.0; expected >= 0"),
         (
             {"steps": 5, "variations": {"coulomb_friction": [0.1, 0.3], "static_friction": [0.2]}},
-            "static_friction of pendulum 1 is 0.2 N m; expected >= coulomb_friction = 0.3 N m",
+            "static_friction of pendulum_joint of plant 1 is 0.2; expected >= coulomb_friction = 0.3",
         ),
-        ({"steps": 5, "theta": [0.0, 1.0], "seeds": [1, 2, 3]}, "theta has 2 entries; expected 1 or 3"),
-        ({"steps": 5, "gain": (1.0, 2.0, 3.0)}, r"gain has shape \(1, 3\); expected \(2,\) or \(B, 2\)"),
+        ({"steps": 5, "position": [0.0, 1.0], "seeds": [1, 2, 3]}, "position has 2 entries; expected 1 or 3"),
+        ({"steps": 5, "gain": (1.0, 2.0, 3.0)}, r"gain has shape \(3,\); expected \(1, 2\) or \(B, 1, 2\)"),
         ({"steps": 5, "method": "adaptive"}, "method is 'adaptive' in a batch; expected a compiled one"),
-        ({"steps": 5, "theta": math.nan}, "theta has shape .*; expected finite numbers"),
+        ({"steps": 5, "position": math.nan}, "position has a value that is not finite"),
     ],
 )
 def test_what_makes_no_batch_is_refused(kwargs: dict, message: str) -> None:

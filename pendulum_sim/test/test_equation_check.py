@@ -12,8 +12,12 @@ import numpy as np
 import pytest
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import (
+    load_mechanism,
+    load_plant,
+    pendulum_plant,
+    write_plant,
+)
 from pendulum_sim.exports.model_files import mjcf
 from pendulum_sim.foreign.equation_check import TOLERANCE, EquationCheck, check_equation
 from pendulum_sim.simulator.engines import open_simulation
@@ -288,7 +292,7 @@ def test_a_delay_that_the_search_for_an_equation_cannot_see_is_told_and_then_nam
         ParameterError, match=rf"moves it only in step {delay + 1} \(a delay\); expected equation: FILE"
     ):
         open_simulation("gymnasium:Odd-v0", str(adapter))
-    plant = PlantParameters(inertia=0.05, damping=0.02, gravity=1.5, effort_limit=5.0)
+    plant = pendulum_plant(inertia=0.05, damping=0.02, gravity=1.5, effort_limit=5.0)
     adapter.write_text(f"{text}equation: {write_plant(tmp_path / 'plant.yaml', plant)}\n", encoding="utf-8")
     made = open_simulation("gymnasium:Odd-v0", str(adapter))
     assert made.check is not None

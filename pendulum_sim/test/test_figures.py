@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.equilibrium import overdamped_velocity
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.pictures.drawing import PendulumPicture, rotation_matrix, save_gif, save_png
+from pendulum_sim.pictures.drawing import save_gif, save_png
 from pendulum_sim.pictures.figures import overdamped_points
 from pendulum_sim.pictures.phase_plot import main
+from pendulum_sim.pictures.plant_picture import PlantPicture
 from pendulum_sim.stepping.plants import make_plant
 
 
@@ -84,18 +86,13 @@ def test_phase_plot_writes_a_figure_and_prints_the_points(tmp_path: Path, capsys
     assert "ends in '.bmp'; expected .png, .svg or .pdf" in capsys.readouterr().err
 
 
-def test_the_rotation_matrix_turns_counter_clockwise() -> None:
-    assert rotation_matrix(math.pi / 2) @ [0.0, -1.0] == pytest.approx([1.0, 0.0])
-    assert np.linalg.det(rotation_matrix(1.234)) == pytest.approx(1.0)
-
-
 def test_pictures_become_png_and_gif_that_can_be_read_again(tmp_path: Path) -> None:
     from PIL import Image
 
-    picture = PendulumPicture((160, 120), 13.0)
+    picture = PlantPicture(load_plant("thesis"), (160, 120))
     frames = []
     for theta in (0.0, 1.0, 2.0):
-        picture.draw(theta, 0.5, 3.0, disturbance=-1.0, time=theta, note="test")
+        picture.draw((theta,), velocity=(0.5,), effort={JOINT: 3.0}, disturbance={JOINT: -1.0}, time=theta, note="test")
         frames.append(picture.array())
     with Image.open(save_png(tmp_path / "a.png", frames[0])) as image:
         assert image.size == (160, 120)
@@ -107,4 +104,4 @@ def test_pictures_become_png_and_gif_that_can_be_read_again(tmp_path: Path) -> N
 
 def test_a_screen_size_that_makes_no_picture_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"screen size is \(10, 99999\) px; expected two numbers from 120 to 4096"):
-        PendulumPicture((10, 99999), 13.0)
+        PlantPicture(load_plant("thesis"), (10, 99999))

@@ -17,11 +17,11 @@ from pendulum_sim.batches.batch import simulate_batch
 SCRIPT = """
 import dataclasses, json, sys
 import numpy as np
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.batches import cuda_kernels
 from pendulum_sim.batches.batch import simulate_batch
-from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
+from pendulum_sim.batches.batch import simulate_batch
 
 cuda_kernels._PART = 2  # three parts, the last one not full
 full = load_plant("dfki").with_values(
@@ -35,14 +35,14 @@ batches = {
         gain=(33.3, 0.16), amplitude=2.5, device=device, **common,
     ),
     "dry link": lambda device: simulate_batch(
-        [full, *(full.with_values(transport_delay=0.002 * k) for k in range(4))], steps=60, method="etd2", theta=3.4,
+        [full, *(full.with_values(transport_delay=0.002 * k) for k in range(4))], steps=60, method="etd2", position=3.4,
         gain=(6.0, 0.6), amplitude=2.5, substeps=2, device=device, **common,
     ),
-    "joints": lambda device: simulate_mechanisms(
+    "joints": lambda device: simulate_batch(
         load_mechanism("double_pendulum_frictionless"), variations={"mass_2": np.linspace(0.6, 0.65, 5)}, steps=60,
         gain=[[30.0, 5.0, 5.0, 1.0], [4.0, 20.0, 1.0, 3.0]], amplitude=(0.5, 0.25), device=device, **common,
     ),
-    "dry joints": lambda device: simulate_mechanisms(
+    "dry joints": lambda device: simulate_batch(
         acrobot, steps=60, gain=[[-295.0, -124.0, -63.0, -28.5]], amplitude=0.5, device=device, **common
     ),
 }
@@ -79,7 +79,7 @@ def test_without_a_gpu_one_sentence_says_so_and_auto_takes_the_processor() -> No
         "from pendulum_msgs_py.plants.plant_parameters import load_plant\n"
         "from pendulum_sim.batches.batch import simulate_batch\n"
         "run = lambda device: simulate_batch(load_plant('thesis'), steps=5, seeds=1, amplitude=2.5, device=device)\n"
-        "assert run('auto').theta == run('cpu').theta\n"
+        "assert run('auto').position == run('cpu').position\n"
         "run('cuda')\n"
     )
     environment = {**os.environ, "NUMBA_DISABLE_CUDA": "1", "NUMBA_ENABLE_CUDASIM": "0"}

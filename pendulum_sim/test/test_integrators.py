@@ -11,11 +11,11 @@ from scipy.integrate import solve_ivp
 
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, pendulum_plant
 from pendulum_sim.stepping.integrators import INTEGRATORS, METHODS, get_integrator, phi_functions
 from pendulum_sim.stepping.plant import RigidPlant
 
-_SWINGING = PlantParameters(inertia=0.15, damping=0.1, gravity=3.0)
+_SWINGING = pendulum_plant(inertia=0.15, damping=0.1, gravity=3.0)
 _FIXED_STEP = [name for name in METHODS if name != "adaptive"]
 
 
@@ -74,7 +74,7 @@ def test_regulation_under_noise_stays_within_the_measured_error(method: str, bou
 
 
 def test_exponential_methods_are_exact_without_gravity_at_any_step() -> None:
-    parameters = PlantParameters(inertia=0.055, damping=11.77, gravity=0.0)
+    parameters = pendulum_plant(inertia=0.055, damping=11.77, gravity=0.0)
     rate, dt = 11.77 / 0.055, 0.05
     for method in ("etd2", "etd4"):
         plant = RigidPlant(parameters, dt, method=method)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_sim.stepping.joint_plant import joint_plant, random_start
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 

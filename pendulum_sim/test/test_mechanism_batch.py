@@ -7,13 +7,13 @@ import pytest
 
 from pendulum_msgs_py.contract.noise import scramble, stream_key, unit_interval
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
+from pendulum_sim.batches.batch import simulate_batch
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 
 def _alone(
-    plant: MechanismParameters, gain: np.ndarray, start: tuple, seed: int, steps: int, amplitude: tuple, hold: int
+    plant: PlantParameters, gain: np.ndarray, start: tuple, seed: int, steps: int, amplitude: tuple, hold: int
 ) -> np.ndarray:
     """The same loop, step by step, in Python."""
     single, coordinates = MechanismPlant(plant, 2e-3), plant.coordinates
@@ -40,7 +40,7 @@ def test_a_plant_of_a_batch_moves_as_it_does_alone(name: str, gain: list, amplit
     starts = np.full((size, 2), (3.1, 0.02))
     starts[0], starts[-1] = (3.15, -0.01), (3.14 - 2.0 * np.pi, 0.0)
     masses, seeds = np.linspace(0.6, 0.65, size), np.arange(size)
-    batch = simulate_mechanisms(
+    batch = simulate_batch(
         plant,
         variations={"mass_2": masses},
         steps=100,
@@ -68,7 +68,7 @@ def test_a_plant_of_a_batch_moves_as_it_does_alone(name: str, gain: list, amplit
 def test_compiled_steps_are_those_of_python_at_large_efforts() -> None:
     plant = load_mechanism("acrobot")
     start, limit = (1.0, 0.5, 2.0, -1.0), plant.effort_limits[0]
-    batch = simulate_mechanisms(
+    batch = simulate_batch(
         plant, steps=200, position=start[:2], velocity=start[2:], seeds=3, amplitude=limit, hold=20, record=True
     )
     assert batch.trajectories is not None
@@ -102,4 +102,4 @@ def test_compiled_steps_are_those_of_python_at_large_efforts() -> None:
 )
 def test_what_makes_no_batch_is_refused(arguments: dict, message: str) -> None:
     with pytest.raises(ParameterError, match=message):
-        simulate_mechanisms(load_mechanism("acrobot"), **{"steps": 1, **arguments})
+        simulate_batch(load_mechanism("acrobot"), **{"steps": 1, **arguments})

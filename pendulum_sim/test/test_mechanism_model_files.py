@@ -11,11 +11,9 @@ import pytest
 
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, load_mechanism
 from pendulum_sim.batches.compiling import compile_tree
-from pendulum_sim.exports.mechanism_files import mechanism_mjcf, mechanism_urdf
-from pendulum_sim.exports.model_files import main
+from pendulum_sim.exports.model_files import main, mjcf, urdf
 
 mujoco = pytest.importorskip("mujoco")
 _SMOOTH = ("cart_pole", "double_pendulum", "acrobot", "pendubot", "furuta")
@@ -24,7 +22,7 @@ _SMOOTH = ("cart_pole", "double_pendulum", "acrobot", "pendubot", "furuta")
 @pytest.mark.parametrize("name", _SMOOTH)
 def test_mujoco_reads_the_mjcf_and_finds_the_same_acceleration(name: str) -> None:
     plant = load_mechanism(name).with_values({})
-    model = mujoco.MjModel.from_xml_string(mechanism_mjcf(plant))
+    model = mujoco.MjModel.from_xml_string(mjcf(plant))
     # Dry friction and end stops are no part of the smooth equations.
     model.dof_frictionloss[:] = 0.0
     model.jnt_limited[:] = 0
@@ -44,7 +42,7 @@ def test_mujoco_reads_the_mjcf_and_finds_the_same_acceleration(name: str) -> Non
 @pytest.mark.parametrize("name", _SMOOTH)
 def test_the_tip_that_is_drawn_is_where_mujoco_has_it(name: str) -> None:
     plant = load_mechanism(name)
-    model = mujoco.MjModel.from_xml_string(mechanism_mjcf(plant))
+    model = mujoco.MjModel.from_xml_string(mjcf(plant))
     data = mujoco.MjData(model)
     for q in np.random.default_rng(3).uniform(-3.0, 3.0, (10, len(plant.joints))):
         data.qpos[:] = q
@@ -55,7 +53,7 @@ def test_the_tip_that_is_drawn_is_where_mujoco_has_it(name: str) -> None:
 @pytest.mark.parametrize("name", MECHANISM_PRESETS)
 def test_a_urdf_is_read_by_mujoco_with_the_joints_of_the_model_in_their_order(name: str) -> None:
     plant = load_mechanism(name)
-    text = mechanism_urdf(plant)
+    text = urdf(plant)
     model = mujoco.MjModel.from_xml_string(text)
     assert [model.joint(index).name for index in range(model.njnt)] == list(plant.coordinates.names)
     efforts = [float(limit.get("effort", "")) for limit in ElementTree.fromstring(text).iter("limit")]
@@ -64,7 +62,7 @@ def test_a_urdf_is_read_by_mujoco_with_the_joints_of_the_model_in_their_order(na
 
 def test_without_rotors_the_urdf_moves_as_the_equations_do() -> None:
     plant = load_mechanism("double_pendulum_frictionless")
-    model = mujoco.MjModel.from_xml_string(mechanism_urdf(plant))
+    model = mujoco.MjModel.from_xml_string(urdf(plant))
     model.opt.gravity[:] = 0.0, 0.0, -9.81
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = (0.5, 1.0), (2.0, -3.0)
@@ -74,7 +72,7 @@ def test_without_rotors_the_urdf_moves_as_the_equations_do() -> None:
 
 def test_the_command_exports_a_mechanism(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--plant", "acrobot", "--format", "mjcf"]) == 0
-    assert capsys.readouterr().out == mechanism_mjcf(load_mechanism("acrobot"))
+    assert capsys.readouterr().out == mjcf(load_mechanism("acrobot"))
     assert main(["--plant", "cart_pole"]) == 0
     assert 'type="prismatic"' in capsys.readouterr().out
     assert main(["--plant", "acrobot", "--ros2-control", "gz"]) == 2
@@ -84,7 +82,7 @@ def test_the_command_exports_a_mechanism(capsys: pytest.CaptureFixture[str]) -> 
 def test_a_link_that_no_body_can_have_is_simulated_but_not_exported() -> None:
     plant = load_mechanism("acrobot").with_values({"inertia_2": 0.038})
     with pytest.raises(ParameterError, match=r"lower_link of plant 'acrobot' has -0.0029 kg m\^2 about its centre"):
-        mechanism_mjcf(plant)
+        mjcf(plant)
 
 
 @pytest.mark.parametrize("name", ["thesis", "cart_pole", "acrobot", "furuta"])

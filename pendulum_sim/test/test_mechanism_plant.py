@@ -9,9 +9,8 @@ import pytest
 import scipy.integrate
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.exports.mechanism_files import mechanism_mjcf
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant
+from pendulum_sim.exports.model_files import mjcf
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_sim.stepping.plant import RigidPlant
 from pendulum_testing.joint_plants import without_friction
@@ -108,7 +107,7 @@ def test_dry_friction_takes_energy_until_everything_rests() -> None:
 def test_sliding_friction_agrees_with_mujoco_where_its_regularised_one_is_stiff() -> None:
     mujoco = pytest.importorskip("mujoco")
     parameters = load_mechanism("double_pendulum")
-    model = mujoco.MjModel.from_xml_string(mechanism_mjcf(parameters))
+    model = mujoco.MjModel.from_xml_string(mjcf(parameters))
     model.opt.timestep = 1e-4
     model.dof_solimp[:], model.dof_solref[:] = (0.9999, 0.9999, 1e-3, 0.5, 2.0), (2e-3, 1.0)
     data = mujoco.MjData(model)

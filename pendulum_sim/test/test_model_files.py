@@ -11,7 +11,7 @@ import pytest
 
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.plants.plant_parameters import PRESETS, PlantParameters, load_plant
-from pendulum_sim.exports.model_files import link_shape, main, mjcf, urdf
+from pendulum_sim.exports.model_files import main, mjcf, urdf
 from pendulum_sim.stepping.plants import make_plant
 
 mujoco = pytest.importorskip("mujoco")
@@ -27,9 +27,10 @@ def test_mujoco_loads_mjcf_and_urdf(name: str) -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_drawn_link_has_the_inertia_and_weight_of_the_parameters(name: str) -> None:
     parameters = load_plant(name)
-    shape = link_shape(parameters)
-    assert shape.inertia + shape.mass * shape.length**2 == pytest.approx(parameters.inertia, rel=1e-12)
-    assert shape.mass * 9.80665 * shape.length == pytest.approx(parameters.gravity, rel=1e-12)
+    (link,) = parameters.mechanism.bodies(parameters.packed)
+    length = -link.centre[2]
+    assert link.inertia[0] + link.mass * length**2 == pytest.approx(parameters.inertia, rel=1e-12)
+    assert link.mass * 9.81 * length == pytest.approx(parameters.gravity, rel=1e-12)
 
 
 def test_positive_angles_turn_the_bob_towards_plus_x() -> None:
@@ -38,7 +39,9 @@ def test_positive_angles_turn_the_bob_towards_plus_x() -> None:
     data = mujoco.MjData(model)
     data.qpos[0] = math.pi / 2
     mujoco.mj_forward(model, data)
-    assert data.xipos[1] == pytest.approx([link_shape(parameters).length, 0.0, 0.0], abs=1e-12)
+    assert data.xipos[1] == pytest.approx(
+        [parameters.mechanism.chain((math.pi / 2,), parameters.packed)[1][0], 0.0, 0.0], abs=1e-12
+    )
 
 
 def _smooth(parameters: PlantParameters) -> PlantParameters:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,14 +14,14 @@ from scipy.special import ellipk
 
 from pendulum_msgs_py.dynamics import rigid_acceleration
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant
 from pendulum_sim.stepping.dry_friction import acceleration_with_friction
 from pendulum_sim.stepping.integrators import METHODS
 from pendulum_sim.stepping.plant import RigidPlant, pack, period_segments
 from pendulum_sim.stepping.plants import make_plant
 
-_FREE = PlantParameters(inertia=0.15, damping=0.0, gravity=3.0)
-_DRY = PlantParameters(
+_FREE = pendulum_plant(inertia=0.15, damping=0.0, gravity=3.0)
+_DRY = pendulum_plant(
     inertia=0.15,
     damping=0.02,
     gravity=3.0,
@@ -90,7 +89,7 @@ def test_energy_is_conserved_without_friction(method: str, bound: float) -> None
 def test_energy_never_grows_without_torque(
     theta: float, theta_dot: float, coulomb: float, excess: float, damping: float, load: float
 ) -> None:
-    parameters = PlantParameters(
+    parameters = pendulum_plant(
         inertia=0.15,
         damping=damping,
         gravity=3.0,
@@ -143,7 +142,7 @@ def test_slip_begins_when_the_torque_exceeds_static_friction() -> None:
 
 def test_coulomb_friction_stops_a_flat_pendulum_where_mechanics_says() -> None:
     # Flat on a table: M v^2 / 2 = tau_C s.
-    parameters = PlantParameters(inertia=0.15, damping=0.0, gravity=0.0, coulomb_friction=0.2)
+    parameters = pendulum_plant(inertia=0.15, damping=0.0, gravity=0.0, coulomb_friction=0.2)
     for method in ("rk4", "etd4"):
         plant = RigidPlant(parameters, 0.013, method=method)
         plant.reset(0.0, 1.0)
@@ -154,7 +153,7 @@ def test_coulomb_friction_stops_a_flat_pendulum_where_mechanics_says() -> None:
 
 
 def test_friction_that_grows_with_load_holds_a_steeper_pendulum() -> None:
-    loaded = replace(_DRY, load_friction=0.5)
+    loaded = _DRY.with_values(load_friction=0.5)
     # |sin| <= (0.35 + 0.5 * 3 |sin|) / 3  <=>  |sin| <= 0.2333
     for angle, holds in ((math.asin(0.233), True), (math.asin(0.234), False)):
         plant = RigidPlant(loaded, 1e-3)
@@ -215,7 +214,7 @@ def test_one_step_equals_the_matrix_exponential_near_the_upright_state() -> None
 @pytest.mark.parametrize("delay", [0.0, 0.002, 0.0033, 0.0071])
 def test_a_delayed_command_acts_exactly_that_much_later(delay: float) -> None:
     # Flat and frictionless: theta_dot counts the torque that has arrived.
-    parameters = PlantParameters(inertia=1.0, damping=0.0, gravity=0.0, transport_delay=delay)
+    parameters = pendulum_plant(inertia=1.0, damping=0.0, gravity=0.0, transport_delay=delay)
     plant = RigidPlant(parameters, 2e-3, method="rk4")
     plant.reset()
     for step in range(1, 11):
@@ -224,7 +223,7 @@ def test_a_delayed_command_acts_exactly_that_much_later(delay: float) -> None:
 
 
 def test_the_actuator_lag_is_the_exact_exponential() -> None:
-    parameters = PlantParameters(inertia=1.0, damping=0.0, gravity=0.0, actuator_time_constant=0.01)
+    parameters = pendulum_plant(inertia=1.0, damping=0.0, gravity=0.0, actuator_time_constant=0.01)
     plant = RigidPlant(parameters, 5e-3, method="etd4", substeps=4)
     plant.reset()
     for step in range(1, 9):
@@ -235,7 +234,7 @@ def test_the_actuator_lag_is_the_exact_exponential() -> None:
 
 
 def test_lag_delay_and_push_together_agree_with_an_independent_integration() -> None:
-    parameters = replace(_FREE, damping=0.3, actuator_time_constant=0.004, transport_delay=0.0033)
+    parameters = _FREE.with_values(damping=0.3, actuator_time_constant=0.004, transport_delay=0.0033)
     plant = RigidPlant(parameters, 2e-3, method="etd4", substeps=4)
     plant.reset(0.4)
     commands = [math.sin(0.05 * k) for k in range(250)]
@@ -265,7 +264,7 @@ def test_lag_delay_and_push_together_agree_with_an_independent_integration() -> 
 
 
 def test_commands_are_clamped_to_the_effort_limit_and_pushes_are_not() -> None:
-    parameters = PlantParameters(inertia=1.0, damping=0.0, gravity=0.0, effort_limit=2.0)
+    parameters = pendulum_plant(inertia=1.0, damping=0.0, gravity=0.0, effort_limit=2.0)
     plant = RigidPlant(parameters, 0.01)
     plant.reset()
     assert plant.step(50.0).effort == 2.0
@@ -273,7 +272,7 @@ def test_commands_are_clamped_to_the_effort_limit_and_pushes_are_not() -> None:
 
 
 def test_offsets_shift_angle_and_torque() -> None:
-    parameters = replace(_FREE, angle_offset=0.1, torque_offset=0.3)
+    parameters = _FREE.with_values(angle_offset=0.1, torque_offset=0.3)
     plant = RigidPlant(parameters, 1e-3)
     plant.reset(0.1 + math.asin(0.1))
     plant.step(0.0)

@@ -16,20 +16,19 @@ from std_srvs.srv import Trigger
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_differences import describe_plants
-from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, load_mechanism
 from pendulum_msgs_py.ros import qos
 from pendulum_sim.pictures.joint_frames import joint_frames
 from pendulum_sim.pictures.markers_node import arrow_points, joint_marker
-from pendulum_sim.pictures.mechanism_drawing import MechanismPicture
-from pendulum_sim.pictures.shown_plant import ShownPlant
+from pendulum_sim.pictures.plant_picture import PlantPicture
+from pendulum_sim.pictures.shown_plant import ShownPlant, shown_pendulum
 from pendulum_testing.graph_peer import GraphPeer
 
 _SIZE = (200, 200)
 
 
-@pytest.mark.parametrize("name", MECHANISM_PRESETS)
+@pytest.mark.parametrize("name", [*MECHANISM_PRESETS, "dfki"])
 def test_joints_are_where_the_links_of_the_picture_meet(name: str) -> None:
     plant = load_mechanism(name)
     for q in np.random.default_rng(3).uniform(-4.0, 4.0, (20, len(plant.joints))).tolist():
@@ -56,7 +55,7 @@ def test_a_positive_angle_turns_from_right_to_up(name: str) -> None:
 def test_each_effort_changes_the_picture_and_is_written_in_the_unit_of_its_joint() -> None:
     for name in ("cart_pole", "double_pendulum", "furuta"):
         plant = load_mechanism(name)
-        picture = MechanismPicture(plant, _SIZE)
+        picture = PlantPicture(plant, _SIZE)
         seen = []
         for joint in (None, *plant.coordinates.names):
             picture.draw((0.1, 0.2), effort={joint: 0.5 * plant.effort_limits[0]} if joint else {})
@@ -65,9 +64,10 @@ def test_each_effort_changes_the_picture_and_is_written_in_the_unit_of_its_joint
             seen.append(picture.array())
         assert np.array_equal(seen[0], seen[1])
         assert all(not np.array_equal(seen[0], other) for other in seen[2:])
-    rows = MechanismPicture(load_mechanism("cart_pole"), _SIZE)._rows(
-        (0.1, 3.0), (1.0, 2.0), {"cart": -2.0}, {"pole": 1}
-    )
+    rows = PlantPicture(load_mechanism("dfki"), _SIZE)._rows((3.0,), (1.0,), {names.JOINT: -2.0}, {names.JOINT: 0.5})
+    written = ["theta +3.0000 rad", "from upright -0.1416 rad", "theta' +1.000 rad/s", "torque -2.000 N m"]
+    assert [text for text, _ in rows] == [*written, "disturbance +0.500 N m"]
+    rows = PlantPicture(load_mechanism("cart_pole"), _SIZE)._rows((0.1, 3.0), (1.0, 2.0), {"cart": -2.0}, {"pole": 1})
     assert [text for text, _ in rows] == [
         "cart +0.1000 m, +1.000 m/s",
         "pole +3.0000 rad, +2.000 rad/s",
@@ -79,7 +79,7 @@ def test_each_effort_changes_the_picture_and_is_written_in_the_unit_of_its_joint
 def test_the_rail_ends_at_the_stops() -> None:
     plant = load_mechanism("cart_pole")
     (low, high), _ = plant.stops
-    inside = MechanismPicture(plant, _SIZE)
+    inside = PlantPicture(plant, _SIZE)
     inside.draw((0.0, 0.0))
     dark = (inside.array().max(axis=2) < 90)[60:150]
     left, right = dark.any(axis=0).nonzero()[0][[0, -1]]
@@ -104,7 +104,8 @@ def test_markers_are_in_frames_of_the_urdf() -> None:
 
 
 def test_a_plant_is_known_by_names_and_parameters_and_nothing_else_is_drawn() -> None:
-    shown = ShownPlant("/sim/joint_states")
+    pendulum = shown_pendulum(13.0)
+    shown = ShownPlant("/sim/joint_states", pendulum)
     shown.take_names(("cart", "pole"))
     assert shown.missing == "waiting for the parameters of cart, pole"
     shown.take_description(describe_plants([load_mechanism("furuta")]))
@@ -112,7 +113,7 @@ def test_a_plant_is_known_by_names_and_parameters_and_nothing_else_is_drawn() ->
     shown.take_description(describe_plants([load_mechanism("cart_pole")]))
     assert shown.parameters == load_mechanism("cart_pole")
     shown.take_names((names.JOINT, "other"))
-    assert (shown.joints, shown.missing, shown.parameters) == ((names.JOINT,), "", None)
+    assert (shown.joints, shown.missing, shown.parameters) == ((names.JOINT,), "", pendulum)
     for wrong in (("pole", "cart"), ("cart",), ("cart", "cart"), ("left", "right"), ()):
         with pytest.raises(ParameterError, match=r"/sim/joint_states tells of .*, which cannot be drawn; expected"):
             shown.take_names(wrong)
@@ -133,7 +134,7 @@ def test_the_window_shows_whichever_plant_runs_and_refuses_what_it_cannot_draw(
     try:
         for name in ("cart_pole", "acrobot", "furuta"):
             plant = load_mechanism(name)
-            picture = MechanismPicture(plant, _SIZE)
+            picture = PlantPicture(plant, _SIZE)
             picture.draw((0.0, 0.0))
             # Between the lines of text.
             between = picture.array()[80:180]

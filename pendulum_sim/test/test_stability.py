@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, pendulum_plant
 from pendulum_sim.batches.batch import simulate_batch
-from pendulum_sim.environments.environment import PendulumEnv
-from pendulum_sim.environments.vector_environment import PendulumVectorEnv
+from pendulum_sim.environments.environment import PlantEnv, PlantVectorEnv
 from pendulum_sim.stepping.integrators import METHODS, get_integrator
 from pendulum_sim.stepping.plant import RigidPlant
 from pendulum_sim.stepping.plants import make_plant
@@ -23,8 +22,8 @@ _THESIS = load_plant("thesis")
 _PLANTS = {
     "thesis": _THESIS,
     "dfki": load_plant("dfki"),
-    "stiff": PlantParameters(inertia=1e-4, damping=1e-5, gravity=3.0),
-    "undamped": PlantParameters(inertia=0.1, damping=0.0, gravity=2.0),
+    "stiff": pendulum_plant(inertia=1e-4, damping=1e-5, gravity=3.0),
+    "undamped": pendulum_plant(inertia=0.1, damping=0.0, gravity=2.0),
 }
 _FIXED_STEP = [name for name in METHODS if name != "adaptive"]
 
@@ -84,9 +83,9 @@ def test_an_unstable_method_is_refused_with_the_way_out_wherever_it_is_chosen(
     with pytest.raises(ParameterError, match=message):
         simulate_batch(_THESIS, steps=10, dt=dt, method=method)
     with pytest.raises(ParameterError, match=f"method '{method}' is unstable on plant 'thesis'"):
-        PendulumEnv(dt=dt, method=method)
+        PlantEnv(dt=dt, method=method)
     with pytest.raises(ParameterError, match=f"method '{method}' is unstable on plant 'thesis'"):
-        PendulumVectorEnv(2, dt=dt, method=method)
+        PlantVectorEnv(2, dt=dt, method=method)
     plant = RigidPlant(_THESIS, dt, method=method, substeps=substeps)
     plant.reset(2.0)
     energies = []

@@ -183,7 +183,7 @@ from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import markdown_table, validate
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, load_plant
-from pendulum_sim.environments.environment_kernel import is_smooth
+from pendulum_sim.stepping.mechanism_plant import is_smooth
 from pendulum_sim.stepping.plants import make_plant
 from pendulum_sim.stepping.series_elastic import pack_series_elastic, series_elastic_step
 from pendulum_sim.simulator.simulator_node import main as simulator
@@ -214,7 +214,7 @@ def with_drag():
     speeds = [free.step(0.0).theta_dot for _ in range(100)]
     geared = load_plant("x5_9")
     steps = []
-    for own in (geared, replace(geared, drag=plant.drag)):
+    for own in (geared, geared.with_values(drag=plant.drag)):
         link = (0.0, 0.0, 0.0, 2.0, 0.0)
         (_, _, _, elastic, _) = series_elastic_step(*link, 0.0, 0.0, STEP, pack_series_elastic(own))
         state = np.zeros(len(STATES))
@@ -229,7 +229,7 @@ def with_drag():
     return {
         "table": markdown_table(PLANT_SPECS), "speeds": speeds, "steps": steps, "inertia": geared.inertia,
         "kept": to_plant(model).drag, "slopes": [*slopes_of, *slopes[[*map(PARAMETER_NAMES.index, plant_terms)]]],
-        "wrong": refused(lambda: replace(plant, drag=-1.0)), "dry": is_smooth(plant),
+        "wrong": refused(lambda: plant.with_values(drag=-1.0)), "dry": is_smooth(plant),
     }
 
 

@@ -21,7 +21,7 @@ from pendulum_lqr.linear.design import continuous_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.swing_up.trajectory_optimisation import swing_up_trajectory
 from pendulum_msgs_py.contract.angles import from_upright
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, pendulum_plant
 from pendulum_sim.stepping.plants import make_plant
 from tests.benchmarks import Peer, Row, measured, peer
 
@@ -31,7 +31,7 @@ PERIOD = 0.01
 SWING_UP = ("energy_swing_up", "time_optimal", "tvlqr", "nmpc")
 PUBLISHED = {"energy shaping": 2.91, "fastest (SAC)": 2.04}
 """Swing-up times of the public benchmark [s], on its own plant."""
-BENCHMARK_PLANT = PlantParameters(
+BENCHMARK_PLANT = pendulum_plant(
     inertia=0.57288 * 0.5**2,
     damping=0.10,
     gravity=0.57288 * 0.5 * 9.81,

@@ -253,7 +253,7 @@ def _double_pendulum_of_two_joints() -> Iterator[Row]:
     from pendulum_bags.identification.joint_recordings import JointRecording
     from pendulum_bags.identification.mechanism_fit import prepare_windows, scores
     from pendulum_bags.identification.mechanism_model import MechanismModel
-    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+    from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
     start = load_mechanism("double_pendulum")
     logs = []

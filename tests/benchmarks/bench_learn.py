@@ -31,9 +31,7 @@ from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_lqr.controllers.policy import START_TIME, LearnedPolicy
 from pendulum_lqr.policies.policy import Policy
 from pendulum_lqr.policies.policy_file import load_policy
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism, load_plant
 from tests.benchmarks import Peer, Row, measured
 from tests.benchmarks.emulated_trials import emulated_trials
 from tests.benchmarks.prediction import judge_prediction
@@ -161,7 +159,7 @@ def _cart_pole_trials(policy: Policy, trials: list[Trial]) -> dict[str, list[Tri
     def near(trial: Trial) -> Trial:
         position, velocity = (tuple(_NEAR * each for each in start) for start in (trial.position, trial.velocity))
         plant = trial.plant
-        assert isinstance(plant, MechanismParameters)
+        assert not plant.is_pendulum
         prompt = plant.with_values({f"{joint}.transport_delay": 0.0 for joint in plant.coordinates.driven_names})
         return replace(trial, position=position, velocity=velocity, plant=prompt)
 
@@ -180,7 +178,7 @@ def _cart_pole_trials(policy: Policy, trials: list[Trial]) -> dict[str, list[Tri
     }
 
 
-def _stand_ins(plant: AnyPlant, randomised: Path, bare: Path) -> Iterator[Row]:
+def _stand_ins(plant: PlantParameters, randomised: Path, bare: Path) -> Iterator[Row]:
     """Yield what machines take off the score of a policy: second simulations, drawn as ``experiment joints`` does."""
     _train("--plant", plant.name, *_BARE_WORDS, out=bare)
     machines = [_stand_in(plant, seed) for seed in range(1, 21)]
@@ -198,9 +196,9 @@ def _stand_ins(plant: AnyPlant, randomised: Path, bare: Path) -> Iterator[Row]:
         )
 
 
-def _stand_in(plant: AnyPlant, seed: int) -> AnyPlant:
+def _stand_in(plant: PlantParameters, seed: int) -> PlantParameters:
     """Return a second simulation in the place of a machine."""
-    if isinstance(plant, MechanismParameters):
+    if not plant.is_pendulum:
         return stand_in_for(plant, share=_OFF, delay=_LATE, seed=seed)
     drawn = np.random.default_rng(seed)
     values = {name: value_of(plant, name) * (1.0 + float(drawn.uniform(-_OFF, _OFF))) for name in VARIED}
@@ -210,7 +208,7 @@ def _stand_in(plant: AnyPlant, seed: int) -> AnyPlant:
     return plant.with_values(**values, transport_delay=_LATE)
 
 
-def _time_up(policy: Policy, plant: AnyPlant) -> float:
+def _time_up(policy: Policy, plant: PlantParameters) -> float:
     """Return the share of 10 s from hanging that a policy spends up, 0 where it leaves its travel."""
     n = len(policy.joints)
     trial = Trial(plant, (0.0,) * n, (0.0,) * n, np.zeros((round(10.0 / policy.period), n)), SwingUpTask().travel)

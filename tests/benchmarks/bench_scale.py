@@ -8,11 +8,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant
 from pendulum_sim.batches.batch import simulate_batch
 from pendulum_sim.batches.devices import resolve_device
-from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
 from tests.benchmarks import Peer, Row, measured, peer
 from tests.benchmarks.bench_sim import GAIN
 
@@ -55,14 +53,14 @@ def _link(method: str) -> Callable[..., np.ndarray]:
             seeds=seeds,
             amplitude=2.5,
             **options,  # type: ignore[arg-type]
-        ).theta
+        ).position
 
     return run
 
 
 def _acrobot(count: int, **options: object) -> np.ndarray:
     plant = load_mechanism("acrobot_frictionless")
-    return simulate_mechanisms(
+    return simulate_batch(
         plant,
         steps=STEPS,
         gain=_ACROBOT_GAIN,

@@ -12,9 +12,8 @@ import numpy as np
 
 from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.contract.angles import from_upright
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.exports.mechanism_files import mechanism_mjcf
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant
+from pendulum_sim.exports.model_files import mjcf
 from tests.benchmarks import Peer, Row, measured, peer
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ def _batch() -> Iterator[Row]:
     yield measured(what, speed, "steps/s", peer=numpy_peer, at_least_times_peer=4.0)
     for method in ("etd2", "etd4"):
         yield measured(f"batch, the same with {method}", _batch_speed(method), "steps/s", peer=numpy_peer)
-    acrobots = peer("mujoco.rollout", lambda: _mujoco_rollout(mechanism_mjcf(load_mechanism(_ACROBOT)), 2))
+    acrobots = peer("mujoco.rollout", lambda: _mujoco_rollout(mjcf(load_mechanism(_ACROBOT)), 2))
     what = "batch, closed loop with noise, 10 240 acrobots, RK4 2 ms"
     yield measured(what, _acrobot_speed(), "steps/s", peer=acrobots, at_least_times_peer=50.0)
 
@@ -94,21 +93,21 @@ def _batch_speed(method: str) -> float:
 
 
 def _acrobot_speed() -> float:
-    from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
+    from pendulum_sim.batches.batch import simulate_batch
     from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
     plant, seeds = load_mechanism(_ACROBOT), np.arange(PENDULUMS)
     gain = np.array([[-295.0, -124.0, -63.0, -28.5]])
 
     def run(steps: int) -> None:
-        simulate_mechanisms(plant, steps=steps, gain=gain, seeds=seeds, amplitude=0.5)
+        simulate_batch(plant, steps=steps, gain=gain, seeds=seeds, amplitude=0.5)
 
     single = MechanismPlant(plant, 2e-3)
     state = single.reset(plant.coordinates.goal)
     for k in range(100):
         x = np.array([*plant.coordinates.deviation(state.position), *state.velocity])
         state = single.step((float((-gain @ x)[0]) + noise.uniform(PENDULUMS - 1, k, 0.5),))
-    batch = simulate_mechanisms(plant, steps=100, gain=gain, seeds=seeds, amplitude=0.5)
+    batch = simulate_batch(plant, steps=100, gain=gain, seeds=seeds, amplitude=0.5)
     worst = float(np.abs(batch.position[-1] - state.position).max())
     if not worst < 1e-8:
         raise AssertionError(f"batch and plant differ by {worst} rad; expected less than 1e-8")
@@ -134,8 +133,6 @@ def _mujoco_rollout(file: str | None = None, joints: int = 1) -> float:
     """Return the steps a second of MuJoCo's own batch; of the thesis's pendulum, or of another file."""
     import mujoco
     from mujoco import rollout
-
-    from pendulum_sim.exports.model_files import mjcf
 
     model = mujoco.MjModel.from_xml_string(file or mjcf(load_plant("thesis")))
     data = [mujoco.MjData(model) for _ in range(2)]
@@ -212,8 +209,6 @@ def _envpool_speed() -> float:
 
 def _mujoco_single() -> float:
     import mujoco
-
-    from pendulum_sim.exports.model_files import mjcf
 
     model = mujoco.MjModel.from_xml_string(mjcf(load_plant("thesis")))
     data = mujoco.MjData(model)

@@ -19,7 +19,7 @@ from pendulum_bags.comparison.same_run import paired_tests, unpaired_tests
 from pendulum_bags.identification.identify_mechanism import identify_mechanism
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.runs.series import Series, Signal
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_testing.balanced_machine import PRESETS, run_balanced
 from tests.benchmarks import Row, counted
 from tests.truth_loops import FAMILIES, certificates

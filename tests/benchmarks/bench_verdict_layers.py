@@ -131,8 +131,7 @@ def certify_pairs(pairs: Iterable[int] = range(PAIRS), gains: int = GAINS) -> Co
 
 def _other(base: PlantParameters, generator: np.random.Generator) -> PlantParameters:
     gain = generator.uniform(0.8, 1.25)
-    return replace(
-        base,
+    return base.with_values(
         inertia=base.inertia / gain * generator.uniform(0.9, 1.1),
         damping=base.damping / gain * generator.uniform(0.5, 2.0),
         gravity=base.gravity / gain * generator.uniform(0.9, 1.1),

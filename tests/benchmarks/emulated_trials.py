@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from pendulum_bags.experiments.lockstep import record_run
-from pendulum_msgs_py.plants.mechanism_parameters import mechanism_from_pendulum, write_mechanism
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_rosbag.reader import read_bag
@@ -21,7 +20,7 @@ __all__ = ["emulated_trials"]
 
 _OFF, _LATE = 0.25, 0.004
 """How far each machine is off, as a share, and its longest delay beside that of drive and bus [s]."""
-_VARIED = ("inertia", "gravity", "pendulum_joint.damping", "pendulum_joint.coulomb_friction")
+_VARIED = ("inertia", "gravity", "damping", "coulomb_friction")
 _KICK, _KICK_LENGTH, _KICKS_A_SECOND = 0.7, 0.05, 0.5
 """Size of a kick as a share of the torque limit, its length [s], and how many come in a second."""
 
@@ -101,14 +100,15 @@ def emulated_trials(folder: Path, policy: Path, plant: str, count: int) -> Itera
         FaultError: A plant faulted, or a program ended.
     """
     parameters = load_plant(plant)
-    believed = mechanism_from_pendulum(parameters)
+    # With an end stop, out of reach, it is a machine with motors of its own, and no link on an X5-9.
+    believed = parameters.with_values(upper_stop=1e3)
     for number in range(count):
         drawn = np.random.default_rng(1000 + number)
         changes = {name: believed.value(name) * (1.0 + drawn.uniform(-_OFF, _OFF)) for name in _VARIED}
-        changes["pendulum_joint.transport_delay"] = drawn.uniform(0.0, _LATE)
+        changes["transport_delay"] = drawn.uniform(0.0, _LATE)
         place = folder / f"trial_{number}"
         place.mkdir(parents=True)
-        machine = write_mechanism(place / "machine.yaml", believed.with_values(changes), provenance={})
+        machine = write_plant(place / "machine.yaml", believed.with_values(changes), provenance={})
         theta = float(drawn.uniform(-math.pi, math.pi))
         trial = _Trial(machine, policy, plant, theta, number + 1, _KICK * parameters.effort_limit)
         bag = record_run(place / "hw", trial)  # type: ignore[arg-type]  # it has what a run over DDS needs

@@ -25,7 +25,7 @@ from pendulum_msgs_py.contract.supervisor import Input, Mode, PlantSupervisor
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.contract.values import JointCommand, JointSample, Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, write_plant
 
 SECOND = 1_000_000_000
 MILLISECOND = 1_000_000
@@ -128,7 +128,7 @@ def test_a_machine_whose_drives_have_a_delay_or_a_lag_raises_no_false_alarm(
 ) -> None:
     slow = load_mechanism("cart_pole")
     slow = slow.with_values({f"{name}.{key}": value for name in slow.coordinates.driven_names})
-    machine = held(str(write_mechanism(tmp_path / "slow.yaml", slow)), upright=0.02)
+    machine = held(str(write_plant(tmp_path / "slow.yaml", slow)), upright=0.02)
     machine.cycles(200)
     assert machine.bridge.faults == {}
     assert machine.driving()
@@ -242,7 +242,7 @@ def test_drives_that_cannot_be_watched_or_differ_in_their_delay_are_refused(
     plant: str, changes: dict[str, float], sentence: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "plant.yaml"
-    write_mechanism(file, load_mechanism(plant).with_values(changes), provenance={})
+    write_plant(file, load_mechanism(plant).with_values(changes), provenance={})
     with pytest.raises(ParameterError, match=re.escape(sentence)):
         Machine(str(file))
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -107,7 +106,7 @@ def test_predicted_margin_is_where_the_simulated_loop_turns_unstable() -> None:
     K = continuous_lqr(linearise(LIGHT), Q, R).K
     ends = []
     for delay in (0.93 * predicted, 1.07 * predicted):
-        plant = make_plant(replace(LIGHT, transport_delay=delay), PERIOD, method="etd4")
+        plant = make_plant(LIGHT.with_values(transport_delay=delay), PERIOD, method="etd4")
         state = plant.reset(UPRIGHT + 1e-4, 0.0)
         for _ in range(2000):
             state = plant.step(-float(K[0] * (state.theta - UPRIGHT) + K[1] * state.theta_dot))

@@ -12,7 +12,7 @@ from pendulum_hw_bridge.emulation.machine import EmulatedMachine
 from pendulum_hw_bridge.port.actuator import Command, Strategy, no_torque
 from pendulum_hw_bridge.port.clocks import SteppedClock
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from tests.tools.faults.bridge_rig import Rig
 from tests.tools.faults.motor import driving_torque
 from tests.tools.faults.ways_out import (

@@ -7,7 +7,7 @@ import pytest
 
 from pendulum_hw_bridge.emulation.machine import EmulatedMachine
 from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 _MILLISECOND = 1_000_000

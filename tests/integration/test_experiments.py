@@ -30,8 +30,7 @@ from pendulum_bags.verdict import Layer, read_layers
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_lqr.responses.measured_response import read_response
 from pendulum_msgs_py.errors import FaultError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant
 from pendulum_msgs_py.programs.executables import run_package
 from pendulum_rosbag.reader import read_bag, same_messages
 from pendulum_testing.policies import linear_policy

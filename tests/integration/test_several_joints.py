@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_msgs_py.ros import qos
 from pendulum_rosbag.reader import read_bag
 from pendulum_testing.policies import lqr_policy

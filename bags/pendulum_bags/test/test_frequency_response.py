@@ -66,7 +66,7 @@ def record(
 def measured() -> dict[str, MeasuredResponse]:
     """Two measurements of one plant at two rates, with noises of their own, and one of a later and weaker plant."""
     weaker = {name: getattr(THESIS, name) / 1.2 for name in ("inertia", "damping", "gravity")}
-    other = replace(THESIS, transport_delay=0.01, **weaker)
+    other = THESIS.with_values(transport_delay=0.01, **weaker)
     return {
         "sim": estimate(record(THESIS, "sim", 11)),
         "hw": estimate(record(THESIS, "hw", 12)),
@@ -135,7 +135,7 @@ def test_a_delay_and_a_gain_are_found_and_told_apart(measured):
 
 
 def test_dry_friction_shows_on_lines_that_were_not_excited():
-    stiff = replace(THESIS, coulomb_friction=0.3, static_friction=0.3)
+    stiff = THESIS.with_values(coulomb_friction=0.3, static_friction=0.3)
     smooth, rough = (estimate(record(p, noise={}, periods=3)).distortion[1] for p in (THESIS, stiff))
     assert smooth < 2e-3
     assert rough > 10.0 * smooth
@@ -147,7 +147,7 @@ def test_layers_say_yes_for_the_same_plant_and_name_the_designs_that_do_not_carr
     same = analyse_responses([measured["sim"], measured["hw"]], "thesis")
     assert [layer.layer for layer in same.layers] == [Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS]
     assert [layer.mark for layer in same.layers] == [Mark.YES, Mark.YES]
-    late = estimate(record(replace(THESIS, transport_delay=0.08), periods=4))
+    late = estimate(record(THESIS.with_values(transport_delay=0.08), periods=4))
     other = analyse_responses(
         [measured["sim"], replace(late, label="hw")], "thesis", ["q=100,0.01 r=0.1", "k=400,0.1", "lqi"]
     )

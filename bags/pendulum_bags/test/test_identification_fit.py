@@ -16,10 +16,10 @@ from pendulum_bags.identification.result import load_fit_model
 from pendulum_bags.identification.uncertainty import profile_interval
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant_file
+from pendulum_msgs_py.plants.plant_parameters import load_plant_file, pendulum_plant
 from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
-TRUTH = PlantParameters(
+TRUTH = pendulum_plant(
     inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05, angle_offset=0.01, transport_delay=0.006
 )
 

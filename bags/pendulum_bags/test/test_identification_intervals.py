@@ -18,7 +18,7 @@ from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.uncertainty import unresolved_offset
 from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.runs.read_recording import read_recording
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import pendulum_plant
 from pendulum_testing.identification_truths import OUTSIDE, TRUTHS, covered, outside
 from pendulum_testing.synthetic_recordings import synthetic_recording
 
@@ -177,7 +177,7 @@ def test_noise_alone_raises_no_alarm(name):
 
 
 def test_friction_that_falls_with_speed_is_integrated_to_the_sensor_s_noise():
-    plant = PlantParameters(
+    plant = pendulum_plant(
         inertia=0.05,
         damping=0.03,
         gravity=1.5,

@@ -9,10 +9,10 @@ from pendulum_bags.identification.problem import cut_windows, prepare, simulate
 from pendulum_bags.identification.window_score import free_run, window_score
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import pendulum_plant
 from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
-PLANT = PlantParameters(
+PLANT = pendulum_plant(
     inertia=0.05,
     damping=0.03,
     gravity=1.5,
@@ -52,9 +52,9 @@ def test_a_linear_pendulum_follows_its_closed_form():
 
 
 def test_the_integrator_is_of_second_order():
-    recording = clean_run(PlantParameters(inertia=0.05, damping=0.03, gravity=1.5))
+    recording = clean_run(pendulum_plant(inertia=0.05, damping=0.03, gravity=1.5))
     piece = prepare(recording, None)
-    model = from_plant(PlantParameters(inertia=0.05, damping=0.03, gravity=1.5))
+    model = from_plant(pendulum_plant(inertia=0.05, damping=0.03, gravity=1.5))
     start = np.array([[0.0, 0.0]])
     fine = simulate(model, piece, start, step=1e-4).theta
     errors = [np.max(np.abs(simulate(model, piece, start, step=h).theta - fine)) for h in (5e-3, 2.5e-3, 1.25e-3)]
@@ -164,5 +164,5 @@ def test_the_score_of_the_geometry_on_the_real_swing_up_is_the_published_one(sha
     from pendulum_bags.runs.read_recording import read_recording
 
     recording = read_recording(shared_data / "dfki_torque_limited_simple_pendulum" / "ddp_measured.csv")
-    plant = PlantParameters(inertia=0.1495, damping=0.1, gravity=0.3055 * 9.81, coulomb_friction=0.093)
+    plant = pendulum_plant(inertia=0.1495, damping=0.1, gravity=0.3055 * 9.81, coulomb_friction=0.093)
     assert window_score(plant, recording).rms == pytest.approx(0.038, rel=0.1)

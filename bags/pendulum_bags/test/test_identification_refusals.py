@@ -15,11 +15,11 @@ from pendulum_bags.identification.problem import prepare
 from pendulum_bags.runs.datasets import Recording, distinct_names
 from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import pendulum_plant
 from pendulum_testing.bag_messages import joint_state, write_bag
 from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
-TRUTH = PlantParameters(inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05, transport_delay=0.006)
+TRUTH = pendulum_plant(inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05, transport_delay=0.006)
 QUICK = Options(friction="coulomb", multi_start=False, folds=2)
 
 
@@ -99,7 +99,7 @@ def test_an_input_that_has_nothing_to_do_with_the_motion_is_refused():
 
 @pytest.mark.parametrize("scale", [1.0, 1e-4])
 def test_two_constant_torques_that_lift_a_pendulum_determine_it(scale):
-    plant = PlantParameters(inertia=0.02 * scale, damping=0.01 * scale, gravity=0.6 * scale)
+    plant = pendulum_plant(inertia=0.02 * scale, damping=0.01 * scale, gravity=0.6 * scale)
     rng = np.random.default_rng(5)
     runs = [synthetic_recording(plant, np.full(1200, level * scale), 0.005, rng) for level in (0.3, 0.2)]
     result = identify(runs, QUICK, profiles=0)
@@ -270,7 +270,7 @@ def test_no_window_reaches_across_a_gap_and_the_gap_is_said(known):
 
 
 def test_a_held_command_that_was_read_as_a_measurement_is_asked_about(tmp_path, capsys):
-    truth = replace(TRUTH, transport_delay=0.0)
+    truth = TRUTH.with_values(transport_delay=0.0)
     rng = np.random.default_rng(1)
     time = np.arange(0.0, 6.0, 0.01)
     recording = synthetic_recording(truth, multisine(time, 1.2, rng), 0.01, rng)
@@ -331,7 +331,7 @@ def test_no_page_is_taken_where_there_is_none_and_named_as_typed_where_it_is_ref
 
 @pytest.mark.parametrize("name", ["angle_offset", "torque_offset"])
 def test_each_recording_may_have_a_zero_of_its_own(name):
-    plants = [replace(TRUTH, **{name: value}) for value in (0.05, -0.03)]
+    plants = [TRUTH.with_values(**{name: value}) for value in (0.05, -0.03)]
     pair = [run(seed, seconds=4.0, plant=plant) for seed, plant in enumerate(plants, 1)]
     result = identify(pair, QUICK, profiles=0)
     zeros = result.fit.zeros
@@ -348,7 +348,7 @@ def test_each_recording_may_have_a_zero_of_its_own(name):
 
 
 def test_recordings_of_one_zero_keep_it_and_another_one_to_score_is_said_to_be_elsewhere():
-    other = run(3, seconds=4.0, plant=replace(TRUTH, angle_offset=0.05))
+    other = run(3, seconds=4.0, plant=TRUTH.with_values(angle_offset=0.05))
     result = identify([run(1, seconds=4.0), run(2, seconds=4.0)], QUICK, profiles=0, held_out=[other])
     assert result.fit.zeros is None
     offset, rms = result.moved_zeros["synthetic"]
@@ -359,7 +359,7 @@ def test_recordings_of_one_zero_keep_it_and_another_one_to_score_is_said_to_be_e
 
 @pytest.mark.parametrize(("gravity", "excluding"), [(1.05, True), (1.5, False)])
 def test_recordings_of_two_machines_in_one_fit_are_said_to_exclude_each_other(gravity, excluding):
-    pair = [run(1, seconds=4.0), run(2, seconds=4.0, plant=replace(TRUTH, gravity=gravity))]
+    pair = [run(1, seconds=4.0), run(2, seconds=4.0, plant=TRUTH.with_values(gravity=gravity))]
     said = identify(pair, QUICK, profiles=0).sentences()
     assert any(one.startswith("The recordings exclude each other: fitted alone, natural") for one in said) == excluding
 

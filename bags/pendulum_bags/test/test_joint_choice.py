@@ -15,7 +15,7 @@ from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings
 from pendulum_bags.ranking.joint_choice import joint_cost_parts
 from pendulum_bags.whole.contenders import contender_specs, keep_run, place_of, rank_folders, simulate_contenders
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, write_plant
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 
@@ -37,7 +37,7 @@ def test_contenders_of_several_joints_differ_in_what_they_command(plant: str) ->
 
 def test_a_plant_near_the_simulated_one_picks_the_same_controller_and_one_that_fell_is_none(tmp_path: Path) -> None:
     drawn = stand_in_for(load_mechanism("cart_pole"), share=0.02, delay=0.0, seed=1)
-    machine = write_mechanism(tmp_path / "machine.yaml", drawn, provenance={})
+    machine = write_plant(tmp_path / "machine.yaml", drawn, provenance={})
     run = settings_of("cart_pole").run("sim")
     # Simulated, the machine's side is read as one that has run.
     specs = contender_specs(run, replace(run, plant=str(machine)), 4, 1)

@@ -28,7 +28,7 @@ from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_rosbag.reader import Bag
 from pendulum_rosbag.reader import bag as bag_module
 from pendulum_rosbag.reader.joint_table import JointTable, joint_table
@@ -41,7 +41,7 @@ EPOCH_NS = 1_700_000_000_000_000_000
 JOINTS = ("cart", "pole")
 
 
-def regulate(plant: MechanismParameters, sensor_seed: int, *, duration: float = 8.0) -> dict[str, np.ndarray]:
+def regulate(plant: PlantParameters, sensor_seed: int, *, duration: float = 8.0) -> dict[str, np.ndarray]:
     """Hold the cart-pole upright under noise on the cart; rows of position, velocity, command and noise."""
     period = 0.01
     model = MechanismPlant(plant, period)

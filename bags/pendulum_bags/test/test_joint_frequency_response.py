@@ -32,7 +32,7 @@ from pendulum_lqr.responses.sampled_response import model_response
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 
 PERIOD = 0.002
@@ -68,7 +68,7 @@ def _record(name: str, *, periods: int = 3, noise: float = 0.0, label: str = "si
     return Record(label, PERIOD, r, u, y, parameters, joints=coordinates.names, driven=coordinates.driven[0])
 
 
-def _exact(model: LinearModel, plant: MechanismParameters, label: str, lowest: float = 0.25) -> MeasuredResponse:
+def _exact(model: LinearModel, plant: PlantParameters, label: str, lowest: float = 0.25) -> MeasuredResponse:
     """Return what a faultless measurement of a linear plant would tell."""
     lines = np.unique(2 * np.round((np.geomspace(1, 100 / lowest, 48) - 1) / 2) + 1) * lowest
     response = model_response(model, lines, PERIOD)
@@ -88,7 +88,7 @@ def _exact(model: LinearModel, plant: MechanismParameters, label: str, lowest: f
     )
 
 
-def _scaling(plant: MechanismParameters, model: LinearModel) -> JointScaling:
+def _scaling(plant: PlantParameters, model: LinearModel) -> JointScaling:
     q, r = plant.mechanism.weights
     return JointScaling.of_weights(model.states, ["-"] * len(q), q, r, "-")
 

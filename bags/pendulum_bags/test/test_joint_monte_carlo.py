@@ -19,8 +19,7 @@ from pendulum_bags.studies.random_runs import replay, run_chunk, run_monte_carlo
 from pendulum_bags.studies.region_map import RegionMap
 from pendulum_bags.studies.start_grid import run_map
 from pendulum_msgs_py.errors import BagError, ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
-from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant, write_plant
 
 SHARES = {"cart_mass": 0.1, "pole.damping": 0.5}
 SMALL = JointMonteCarlo("cart_pole", runs=250, chunk=100, duration=0.5, shares=SHARES, start=0.02)
@@ -53,7 +52,7 @@ def test_studies_of_one_joint_and_of_several_refuse_a_gain_whose_sampled_loop_gr
 ) -> None:
     several = load_mechanism("cart_pole").with_values({"cart.transport_delay": 0.15, "cart.time_constant": 0.05})
     one = load_plant("dfki").with_values(transport_delay=0.15, actuator_time_constant=0.05)
-    files = [str(write_mechanism(tmp_path / "several.yaml", several)), str(write_plant(tmp_path / "one.yaml", one))]
+    files = [str(write_plant(tmp_path / "several.yaml", several)), str(write_plant(tmp_path / "one.yaml", one))]
     runs: list[Callable[[], object]] = [
         lambda: run_chunk(replace(SMALL, plant=files[0], shares={}), 0),
         lambda: run_chunk(MonteCarlo(plant=files[1], runs=10, chunk=10), 0),
@@ -70,7 +69,7 @@ def test_studies_of_one_joint_and_of_several_refuse_a_gain_whose_sampled_loop_gr
 @pytest.mark.parametrize("lag", [0.0, 0.03])
 def test_maps_and_runs_of_a_lagging_plant_are_those_of_the_gain_that_knows_the_lag(tmp_path: Path, lag: float) -> None:
     several = load_mechanism("cart_pole").with_values({"cart.time_constant": lag})
-    file = str(write_mechanism(tmp_path / "several.yaml", several))
+    file = str(write_plant(tmp_path / "several.yaml", several))
     columns = run_chunk(replace(SMALL, plant=file, shares={}, amplitude=0.0, duration=8.0, runs=20), 0)
     assert np.abs(columns["end_pole"] - np.pi).max() < 1e-3
     region = JointRegion(plant=file, plants=1, points=5, spans=(0.05, 0.02))
@@ -132,7 +131,7 @@ def test_shares_are_read_by_name_for_all_or_from_intervals(tmp_path: Path) -> No
     assert not [name for name in every if "gravity" in name or "effort_limit" in name or "delay" in name]
     assert all(plant.value(name) for name in every)
     assert joint_shares("cart_mass=0.1, pole.damping=0.5", "cart_pole") == SHARES
-    file = write_mechanism(tmp_path / "found.yaml", plant, intervals={"cart_mass": [0.902, 1.098]})
+    file = write_plant(tmp_path / "found.yaml", plant, intervals={"cart_mass": [0.902, 1.098]})
     assert joint_shares("identified", str(file)) == {"cart_mass": pytest.approx(0.05, rel=1e-3)}
 
 

@@ -15,7 +15,7 @@ from pendulum_bags.studies.joint_region import JointRegion, JointRegionResult
 from pendulum_bags.studies.start_grid import run_map
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import BagError, ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
 pytest.importorskip("pyarrow")
 

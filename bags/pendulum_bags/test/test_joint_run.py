@@ -29,7 +29,7 @@ from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.errors import FaultError, ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.storage import BagWriter
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
@@ -116,7 +116,7 @@ def test_a_machine_with_other_values_is_taken() -> None:
     assert load_stand_in("acrobot_frictionless", load_mechanism("acrobot")).name == "acrobot_frictionless"
 
 
-def _longest_time_upright(plant: MechanismParameters, design: MechanismParameters, amplitude: float) -> float:
+def _longest_time_upright(plant: PlantParameters, design: PlantParameters, amplitude: float) -> float:
     """Return for how long an LQR holds a plant upright under seeded noise, at most 3 s."""
     mechanism, step = plant.mechanism, 4e-3
     gain = output_lqr(linearise(design), *mechanism.weights).rows

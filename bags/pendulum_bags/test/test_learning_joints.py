@@ -17,7 +17,7 @@ from pendulum_bags.learning.ppo import PpoSettings
 from pendulum_bags.learning.task import SwingUpTask, ranges_of
 from pendulum_bags.learning.training import Training, checkpoint_path, train
 from pendulum_lqr.policies.policy_file import load_policy
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, write_plant
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_testing.policies import random_policy
 
@@ -231,10 +231,10 @@ def test_one_seed_is_one_file_for_several_joints_also_when_it_was_interrupted(tm
 
 
 def test_a_plant_that_cannot_be_trained_is_refused_in_a_sentence(tmp_path, capsys):
-    late = write_mechanism(tmp_path / "late.yaml", CART_POLE.with_values({"cart.transport_delay": 0.004}))
+    late = write_plant(tmp_path / "late.yaml", CART_POLE.with_values({"cart.transport_delay": 0.004}))
     loose = load_mechanism("cart_pole")
     loose = replace(loose, joints=(replace(loose.joints[0], actuator=None), loose.joints[1]))
-    free = write_mechanism(tmp_path / "free.yaml", loose)
+    free = write_plant(tmp_path / "free.yaml", loose)
     for plant, told in (
         (late, "transport_delay of plant 'cart_pole' is 0.004 s; expected none in the plant: a training draws delays"),
         (free, "plant 'cart_pole' has no driven joint; expected an actuator at one of them"),

@@ -16,7 +16,7 @@ from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismMo
 from pendulum_bags.recordings.mapping import FORMAT
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, load_mechanism_file, write_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant_file, write_plant
 from pendulum_rosbag.storage import BagWriter
 from pendulum_testing.balanced_machine import run_balanced
 from pendulum_testing.mechanism_recordings import NOISE, OFF, PERIOD, motion, truth
@@ -223,7 +223,7 @@ def test_a_held_out_run_that_straight_lines_predict_as_well_is_a_refusal_with_it
     assert identify_cli.main([*command, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert "Free run over windows" in (out.with_suffix("") / "index.html").read_text(encoding="utf-8")
-    plant, provenance = load_mechanism_file(out)
+    plant, provenance = load_plant_file(out)
     assert plant.value("inertia_2") == pytest.approx(said["parameters"]["inertia_2"])
     assert set(tellable(plant)) <= set(provenance["intervals"])
     assert plant.coordinates.driven_names == names
@@ -336,10 +336,10 @@ def test_a_bag_of_a_plant_is_identified_by_the_efforts_that_it_says_it_applied(t
     np.testing.assert_allclose(read.effort, told.effort)
     np.testing.assert_allclose(read.time, told.time, atol=1e-9)
     start = tmp_path / "start.yaml"
-    write_mechanism(start, plant.with_values(OFF["cart_pole"]), provenance={})
+    write_plant(start, plant.with_values(OFF["cart_pole"]), provenance={})
     out = tmp_path / "found.yaml"
     assert identify_cli.main([str(bag), "--plant", str(start), "--out", str(out)]) == 0
-    found, _ = load_mechanism_file(out)
+    found, _ = load_plant_file(out)
     for key in ("cart_mass", "pole_inertia"):
         assert found.value(key) == pytest.approx(plant.value(key), rel=0.03), key
 
@@ -448,7 +448,7 @@ def test_a_csv_of_several_joints_is_replayed_and_the_plant_of_another_machine_is
     assert max(joint["rms"] for joint in found["joints"].values()) < 20.0 * NOISE
     assert [file.name for file in tmp_path.iterdir()] == ["run.csv"]
     other = tmp_path / "other.yaml"
-    write_mechanism(other, plant.with_values({"inertia_2": 0.4, "inertia_1": 0.3}))
+    write_plant(other, plant.with_values({"inertia_2": 0.4, "inertia_1": 0.3}))
     assert replay_cli.main([str(path), "--params", str(other), "--out", str(tmp_path / "out")]) == 3
     assert "does not describe run.csv" in capsys.readouterr().out
     assert (tmp_path / "out" / "replay.png").exists()

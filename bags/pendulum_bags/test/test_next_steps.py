@@ -22,7 +22,7 @@ from pendulum_bags.pages.terms import Terms
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.next_test import measurement_of, next_test_of, question_of, with_budget
 from pendulum_bags.verdict.same_run import same_run_layer
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import pendulum_plant
 from pendulum_testing.plant_pairs import SIMULATED, pair
 from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
@@ -225,7 +225,7 @@ def test_a_file_that_was_fitted_is_left_alone_by_the_next_fit_and_no_third_is_pr
 def swing() -> Recording:
     rng = np.random.default_rng(1)
     effort = multisine(np.arange(0.0, 6.0, 0.01), 1.2, rng)
-    return synthetic_recording(PlantParameters(inertia=0.05, damping=0.03, gravity=1.5), effort, 0.01, rng)
+    return synthetic_recording(pendulum_plant(inertia=0.05, damping=0.03, gravity=1.5), effort, 0.01, rng)
 
 
 def test_identify_ends_with_the_test_of_the_file_that_it_wrote(

@@ -10,10 +10,10 @@ from pendulum_bags.commands.identify_cli import main as identify_main
 from pendulum_bags.commands.replay_cli import main as replay_main
 from pendulum_bags.replay.input_replay import replay_recording
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant, write_plant
 from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
-TRUTH = PlantParameters(inertia=0.05, damping=0.05, gravity=1.5, coulomb_friction=0.02)
+TRUTH = pendulum_plant(inertia=0.05, damping=0.05, gravity=1.5, coulomb_friction=0.02)
 VOLTAGE = """format: pendulum_columns/1
 time: {column: time, unit: s}
 position: {column: position, unit: rad}

@@ -18,7 +18,7 @@ from pendulum_bags.studies.uncertain import Uncertainty
 from pendulum_lqr.linear.roa import rigid_rollout
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import BagError, FaultError, ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
+from pendulum_msgs_py.plants.plant_parameters import pendulum_plant, write_plant
 
 pytest.importorskip("pyarrow")
 
@@ -27,7 +27,7 @@ pytest.importorskip("pyarrow")
 def weak(tmp_path_factory: pytest.TempPathFactory) -> RegionMap:
     """Return a map of a light pendulum whose motor cannot hold it level: from most starts it falls."""
     file = tmp_path_factory.mktemp("plant") / "weak.yaml"
-    plant = PlantParameters(inertia=0.15, damping=0.1, gravity=3.0, effort_limit=1.5)
+    plant = pendulum_plant(inertia=0.15, damping=0.1, gravity=3.0, effort_limit=1.5)
     write_plant(file, plant)
     return RegionMap(
         plant=str(file), uncertainty=Uncertainty({"gravity": 0.1}), plants=5, points=21, duration=6.0, dt=0.01

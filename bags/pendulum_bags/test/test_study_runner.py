@@ -183,7 +183,7 @@ def test_a_plant_file_that_changed_makes_another_study(tmp_path: Path, key: str)
     folder = tmp_path / "out"
     open_study_folder(folder, load_study(path))
     open_study_folder(folder, load_study(path))
-    write_plant(plant, replace(load_plant("thesis"), name="mine", inertia=0.06))
+    write_plant(plant, load_plant("thesis").with_values(name="mine", inertia=0.06))
     with pytest.raises(BagError, match="the files that it names included"):
         open_study_folder(folder, load_study(path))
 

@@ -28,9 +28,13 @@ from pendulum_msgs_py.contract.plant_specs import in_units_of
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, load_mechanism
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
-from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, is_mechanism
+from pendulum_msgs_py.plants.plant_parameters import (
+    MECHANISM_PRESETS,
+    PlantParameters,
+    common_delay,
+    is_mechanism,
+    load_mechanism,
+)
 
 __all__ = ["CURRENT_LOOP", "Assembly", "assemble", "for_plant"]
 
@@ -100,7 +104,7 @@ class Assembly:
 
     coordinates: Coordinates
     limits: PlantLimits
-    described: list[AnyPlant]
+    described: list[PlantParameters]
     hardware: str
     effort_strategy: str
     mapping: EffortMapping
@@ -274,13 +278,13 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
     return Assembly(coordinates, limits, [plant], f"emulated machine {plant.name}", CURRENT_LOOP, mappings[0], modules)
 
 
-def _group(values: Mapping[str, Any], plant: MechanismParameters, limits: PlantLimits, *, lockstep: bool) -> Assembly:
+def _group(values: Mapping[str, Any], plant: PlantParameters, limits: PlantLimits, *, lockstep: bool) -> Assembly:
     bridge_parameters.require_real_time(values, lockstep=lockstep)
     if values["initial_positions"] != [0.0]:
         raise ParameterError("initial_positions is for the emulator; expected it left out with backend 'hebi'")
     group = GroupAssembly(values, plant.coordinates, limits)
     # A preset is no measurement of the machine that stands here.
-    described: list[AnyPlant] = [] if values["plant"] in MECHANISM_PRESETS else [plant]
+    described: list[PlantParameters] = [] if values["plant"] in MECHANISM_PRESETS else [plant]
     return Assembly(
         plant.coordinates,
         limits,

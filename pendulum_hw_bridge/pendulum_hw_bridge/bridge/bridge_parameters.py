@@ -21,11 +21,7 @@ from pendulum_msgs_py.contract.plant_specs import limits_from_parameters
 from pendulum_msgs_py.contract.values import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import (
-    PRESETS,
-    PlantParameters,
-    load_plant,
-)
+from pendulum_msgs_py.plants.plant_parameters import PRESETS, PlantParameters, load_plant
 
 __all__ = [
     "BRIDGE_SPECS",

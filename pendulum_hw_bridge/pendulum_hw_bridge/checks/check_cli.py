@@ -20,8 +20,7 @@ from pendulum_hw_bridge.checks.nudge import hand_of
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.port.clocks import WallClock
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import is_mechanism
+from pendulum_msgs_py.plants.plant_parameters import is_mechanism, load_mechanism
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.graph import ParameterArgument
 from pendulum_msgs_py.programs.options import Json

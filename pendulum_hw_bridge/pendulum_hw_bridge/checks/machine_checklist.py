@@ -28,7 +28,7 @@ from pendulum_hw_bridge.drive.safety import SafetyMonitor
 from pendulum_hw_bridge.port.actuator import Feedback
 from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["names_problem", "run_machine_checklist"]
 
@@ -40,7 +40,7 @@ _EFFORT_TOLERANCE = 0.05
 
 def run_machine_checklist(
     modules: Sequence[Module],
-    parameters: MechanismParameters,
+    parameters: PlantParameters,
     windows: Sequence[tuple[float, float]],
     *,
     host: Callable[[], Punctuality] = HostWatch,
@@ -123,7 +123,7 @@ def _connect(modules: Sequence[Module], found: Checklist, progress: Callable[[st
 def _check(
     module: Module,
     index: int,
-    parameters: MechanismParameters,
+    parameters: PlantParameters,
     window: tuple[float, float],
     found: Checklist,
     host: Punctuality,
@@ -160,7 +160,7 @@ def _rest_items(
     module: Module,
     records: Sequence[Feedback],
     index: int,
-    parameters: MechanismParameters,
+    parameters: PlantParameters,
     window: tuple[float, float],
 ) -> list[CheckItem]:
     """Judge position and effort of a joint that nobody drives."""
@@ -199,7 +199,7 @@ def _rest_items(
     return items
 
 
-def _largest_weight(parameters: MechanismParameters, index: int, joint: Joint) -> float:
+def _largest_weight(parameters: PlantParameters, index: int, joint: Joint) -> float:
     """Return the largest torque of gravity about a hinge, the others at 0; 0 where none acts or it slides [N m]."""
     if joint.unit == "m":
         return 0.0

@@ -25,7 +25,7 @@ from pendulum_hw_bridge.port.actuator import PEAK_EFFORT, Command, Strategy
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GainSet, limit_output
 from pendulum_msgs_py.contract.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 
 __all__ = ["EffortMapping", "EffortStrategy"]
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from pendulum_hw_bridge.port.actuator import Feedback
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 
 __all__ = ["MOTOR_SPEED_LIMIT", "MotorState", "MotorWatch"]
 

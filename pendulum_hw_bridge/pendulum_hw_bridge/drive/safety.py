@@ -25,7 +25,7 @@ from pendulum_hw_bridge.port.actuator import (
 from pendulum_msgs_py.contract.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.series_elastic import winding_current, winding_resistance_at
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 
 __all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]
 

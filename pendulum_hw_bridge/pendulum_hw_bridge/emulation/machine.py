@@ -21,7 +21,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.dynamics.joint_steps import LAG, advance_joints, joint_functions
 from pendulum_msgs_py.dynamics.series_elastic import winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_delay, pack_joints
 
 __all__ = ["EmulatedMachine"]
 
@@ -74,7 +74,7 @@ class EmulatedMachine:
 
     def __init__(
         self,
-        plant: MechanismParameters,
+        plant: PlantParameters,
         hardware: QuasiDirectDrive | None = None,
         *,
         seed: int = 0,

@@ -18,12 +18,8 @@ from pendulum_hw_bridge.port.actuator import HardwareLimits
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, terms_of
-from pendulum_msgs_py.plants.plant_parameters import (
-    PRESETS,
-    PlantParameters,
-    SeriesElasticParameters,
-    load_plant,
-)
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.plant_parameters import PRESETS, PlantParameters, load_plant
 
 __all__ = [
     "FIRMWARE_EFFICIENCY",
@@ -124,7 +120,7 @@ class EmulatorParameters:
 
     def with_drivetrain(self, **changes: float) -> EmulatorParameters:
         """Return a copy with some drivetrain constants changed."""
-        return replace(self, plant=replace(self.plant, drivetrain=replace(self.drivetrain, **changes)))
+        return replace(self, plant=self.plant.with_values(drivetrain=replace(self.drivetrain, **changes)))
 
     def shorted_winding_damping(self, temperature: float) -> float:
         """Return the back-EMF damping with the whole motor at a temperature [N m s/rad].

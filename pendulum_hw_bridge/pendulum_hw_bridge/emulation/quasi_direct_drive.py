@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 from pendulum_msgs_py.contract.joints import Joint
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 
 __all__ = ["QuasiDirectDrive"]
 

@@ -29,7 +29,7 @@ from pendulum_hw_bridge.port.actuator import (
 )
 from pendulum_hw_bridge.port.settings import BridgeSettings, write_limits
 from pendulum_msgs_py.contract.values import NANOSECONDS
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 
 __all__ = ["PROOF_DUTY", "prove_lifetime", "prove_m_stop"]
 

@@ -19,8 +19,6 @@ from pendulum_msgs_py.contract.angles import UPRIGHT, wrap_angle
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec, suggestion, validate
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.extras import how_to_install
 
@@ -280,7 +278,7 @@ def controller_names(*, several: bool = False) -> list[str]:
     return [name for name, row in CONTROLLERS.items() if _target(row, several=several)]
 
 
-def controller_class(name: str, plant: AnyPlant | None = None) -> type[Controller]:
+def controller_class(name: str, plant: PlantParameters | None = None) -> type[Controller]:
     """Return the class behind a name of ``CONTROLLERS``.
 
     Args:
@@ -291,7 +289,7 @@ def controller_class(name: str, plant: AnyPlant | None = None) -> type[Controlle
         ParameterError: No such controller for this plant; the message lists those there are. Or a library of it is not
             installed.
     """
-    several = isinstance(plant, MechanismParameters)
+    several = plant is not None and not plant.is_pendulum
     if not isinstance(name, str) or name not in CONTROLLERS:  # a file may say 7
         raise ParameterError(f"controller is {name!r}; {suggestion(name, controller_names(several=several))}")
     row = CONTROLLERS[name]
@@ -302,7 +300,7 @@ def controller_class(name: str, plant: AnyPlant | None = None) -> type[Controlle
             f"{name} is for plants of {row.needs[0]}{has}; expected one of "
             f"{', '.join(controller_names(several=several))}"
         )
-    if RIGID in row.needs and isinstance(plant, PlantParameters) and plant.drivetrain is not None:
+    if RIGID in row.needs and plant is not None and plant.drivetrain is not None:
         others = [other for other in controller_names() if RIGID not in CONTROLLERS[other].needs]
         raise ParameterError(
             f"{name} knows rigid plants alone, and plant {plant.name!r} is series elastic; expected one of "
@@ -324,7 +322,7 @@ def _target(row: Row, *, several: bool) -> str:
     return "" if (ONE_JOINT if several else SEVERAL_JOINTS) in row.needs else row.target
 
 
-def controller_parameters(name: str, plant: AnyPlant | None = None) -> tuple[ParameterSpec, ...]:
+def controller_parameters(name: str, plant: PlantParameters | None = None) -> tuple[ParameterSpec, ...]:
     """Return the specs of a controller: common ones first, but for those of which it has its own.
 
     Args:
@@ -333,14 +331,14 @@ def controller_parameters(name: str, plant: AnyPlant | None = None) -> tuple[Par
     """
     kind = controller_class(name, plant)
     own = kind.parameters(plant)
-    common = (START_TIME,) if isinstance(plant, MechanismParameters) else COMMON_PARAMETERS
+    common = COMMON_PARAMETERS if plant is None or plant.is_pendulum else (START_TIME,)
     names = {spec.name for spec in own}
     return (*(spec for spec in common if spec.name not in names), *own)
 
 
 def make_controller(
     name: str,
-    plant: AnyPlant,
+    plant: PlantParameters,
     period: float,
     values: Mapping[str, object] | None = None,
     *,
@@ -364,23 +362,22 @@ def make_controller(
     p = validate(controller_parameters(name, plant), values or {})
     if not (math.isfinite(period) and period > 0.0):
         raise ParameterError(f"period is {period} s; expected a finite value > 0")
-    one_joint = plant if isinstance(plant, PlantParameters) else None
-    if one_joint is not None:
-        p["effort_limit"] = min(p["effort_limit"] or math.inf, one_joint.effort_limit)
+    if plant.is_pendulum:
+        p["effort_limit"] = min(p["effort_limit"] or math.inf, plant.effort_limit)
     designed = kind.design(plant, period, p)
     if checked:
         designed.check(period)
     controller: Controller = designed
     if p["start_time"] > 0.0 and not kind.STARTS_SOFTLY:
         controller = SoftStart(controller, p["start_time"])
-    if one_joint is None:
+    if not plant.is_pendulum:
         return controller
     if p["velocity"] != "measured":
-        controller = EstimatedVelocity(controller, VELOCITY_ESTIMATORS[p["velocity"]](one_joint, period))
+        controller = EstimatedVelocity(controller, VELOCITY_ESTIMATORS[p["velocity"]](plant, period))
     if checked and kind.FEEDBACK and p.get("tuning") != "manual":
         for changed in kind.judged_at(p):
             judged, at = controller, {**p, **changed}
             if changed:
                 judged = make_controller(name, plant, period, {**(values or {}), **changed}, checked=False)
-            require_stable(name, judged, one_joint, period, at["set_point"])
+            require_stable(name, judged, plant, period, at["set_point"])
     return controller

@@ -18,7 +18,7 @@ from pendulum_lqr.linear.model import RigidPlant, linearise
 from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.joints import Vector
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["growth", "require_settling", "require_stable", "settles", "settling_lqr"]
 
@@ -111,7 +111,7 @@ def require_stable(name: str, controller: Controller, plant: RigidPlant, period:
 
 def require_settling(
     name: str,
-    plant: RigidPlant | MechanismParameters,
+    plant: RigidPlant | PlantParameters,
     feedback: Feedback,
     period: float,
     remedy: str,
@@ -138,7 +138,7 @@ def require_settling(
         )
 
 
-def settling_lqr(plant: RigidPlant | MechanismParameters, q: ArrayLike, r: ArrayLike, period: float) -> Gain:
+def settling_lqr(plant: RigidPlant | PlantParameters, q: ArrayLike, r: ArrayLike, period: float) -> Gain:
     """Return the best gain on what is measured about upright, which holds at a sampling period [s].
 
     Arguments as of :func:`~pendulum_lqr.linear.design.output_lqr`.

@@ -17,7 +17,7 @@ from pendulum_lqr.linear.observer import Observer
 from pendulum_lqr.linear.sampled_design import discrete_lqr, discretise, sampled_cost
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["DiscreteLqr", "SampledFeedback", "discrete_lqr_law"]
 
@@ -45,7 +45,7 @@ class SampledFeedback(LinearFeedback):
     NOISE: ClassVar[Mapping[str, Any]] = {}
     """What the estimate expects of noise, where no parameter says so; empty to take what is measured as it is."""
 
-    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(plant, period, p)
         self.sampled = discretise(self.model, period, p["delay"])
         self.cost = sampled_cost(self.model, p["q"], p["r"], period, p["delay"])
@@ -117,7 +117,7 @@ class DiscreteLqr(SampledFeedback):
 
     SUMMARY = "discrete LQR for zero-order hold, with compensation of lag and delay"
 
-    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(plant, period, p)
         if (motor := "motor_angle") in self.model.states:
             raise DesignError(
@@ -142,7 +142,7 @@ class DiscreteLqr(SampledFeedback):
         self._be_law(discrete_lqr_law, (*numbers, *weights), [-equilibrium] * (1 + pending))
 
     @classmethod
-    def own(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+    def own(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
         """Return delay and kind of cost."""
         meaning = "sampled: the continuous cost collected over each period; sum: the cost at the samples alone."
         return (DELAY, ParameterSpec("cost", "sampled", "", meaning, choices=("sampled", "sum")))

@@ -16,7 +16,7 @@ from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, 
 from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, pump_gains
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["JointEnergySwingUp"]
 
@@ -42,14 +42,14 @@ class JointEnergySwingUp(Controller):
 
     DESIGNING = "tries out from where the LQR catches, which takes some seconds"
 
-    def __init__(self, plant: MechanismParameters, pump: EnergyPump, margin: float, catch: MechanismCatch) -> None:
+    def __init__(self, plant: PlantParameters, pump: EnergyPump, margin: float, catch: MechanismCatch) -> None:
         super().__init__((pump.limit,))
         self.pump, self.catch = pump, catch
         self.margin = EnergyMargin(margin, _REST)
         self._coordinates = plant.coordinates
 
     @classmethod
-    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+    def parameters(cls, plant: PlantParameters) -> tuple[ParameterSpec, ...]:
         """Return gains, with those of the mechanism as defaults, and what the LQR takes.
 
         Raises:
@@ -75,7 +75,7 @@ class JointEnergySwingUp(Controller):
         )  # fmt: skip
 
     @classmethod
-    def design(cls, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> JointEnergySwingUp:
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> JointEnergySwingUp:
         """Return the controller; its region takes a second to sample.
 
         Raises:
@@ -128,12 +128,12 @@ class JointEnergySwingUp(Controller):
             self.catch.active = previous.catch.active
 
 
-def _driven(plant: MechanismParameters) -> Any:
+def _driven(plant: PlantParameters) -> Any:
     (index,) = plant.coordinates.driven
     return plant.coordinates.joints[index]
 
 
-def _bounded(plant: MechanismParameters, reach: float) -> MechanismParameters:
+def _bounded(plant: PlantParameters, reach: float) -> PlantParameters:
     """Return the plant with stops where its driven joint may not go farther."""
     if not math.isfinite(reach):
         return plant

@@ -12,7 +12,7 @@ from pendulum_lqr.swing_up.mechanism_ilqr import IlqrWeights
 from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory, SwingUpSearch, cheapest_swing_up
 from pendulum_lqr.swing_up.stored_swing_up import refuse_passive_friction
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["JointIlqr"]
 
@@ -34,7 +34,7 @@ class JointIlqr(JointSwingUp):
     DESIGNING = "compiles its model and searches a swing-up, which takes some ten seconds"
 
     @classmethod
-    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+    def parameters(cls, plant: PlantParameters) -> tuple[ParameterSpec, ...]:
         """Return what the search takes, and the limit."""
         return (
             ParameterSpec(
@@ -44,7 +44,7 @@ class JointIlqr(JointSwingUp):
             JOINT_LIMIT,
         )
 
-    def _find(self, plant: MechanismParameters, p: Mapping[str, Any]) -> tuple[MechanismCatch, MechanismTrajectory]:
+    def _find(self, plant: PlantParameters, p: Mapping[str, Any]) -> tuple[MechanismCatch, MechanismTrajectory]:
         refuse_passive_friction("ilqr", plant)
         catch = make_mechanism_catch(plant, *plant.mechanism.weights, joint_limits(plant, p["effort_limit"]))
         search = SwingUpSearch(_WEIGHTS, duration=p["duration"])

@@ -8,7 +8,7 @@ from typing import Any
 from pendulum_lqr.controllers.joint_swing_up import CaughtController
 from pendulum_lqr.swing_up.mechanism_mpc import PLAN, MechanismMpc
 from pendulum_lqr.swing_up.stored_swing_up import default_catch, refuse_passive_friction
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["JointNmpc"]
 
@@ -27,7 +27,7 @@ class JointNmpc(CaughtController):
     EVERY_STATE = "nmpc plans for answers"
     DESIGNING = "compiles its model, which takes some ten seconds"
 
-    def __init__(self, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         refuse_passive_friction("nmpc", plant)
         inner = MechanismMpc(period, default_catch(plant))
         super().__init__(inner, period)

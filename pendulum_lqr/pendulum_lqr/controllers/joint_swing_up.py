@@ -16,7 +16,7 @@ from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
 from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajectory
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["CaughtController", "JointSwingUp"]
 
@@ -73,18 +73,18 @@ class JointSwingUp(CaughtController):
     EVERY_STATE = "the trajectory is followed"
     DESIGNING = "tries out from where the LQR catches, which takes some seconds"
 
-    def __init__(self, plant: MechanismParameters, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         catch, trajectory = self._find(plant, p)
         self._duration = trajectory.duration
         q, r = plant.mechanism.weights
         super().__init__(MechanismTvlqr(period, trajectory, catch, q=q, r=r), period)
 
     @classmethod
-    def parameters(cls, plant: MechanismParameters) -> tuple[ParameterSpec, ...]:
+    def parameters(cls, plant: PlantParameters) -> tuple[ParameterSpec, ...]:
         """Return the file."""
         return (_FILE,)
 
-    def _find(self, plant: MechanismParameters, p: Mapping[str, Any]) -> tuple[MechanismCatch, MechanismTrajectory]:
+    def _find(self, plant: PlantParameters, p: Mapping[str, Any]) -> tuple[MechanismCatch, MechanismTrajectory]:
         """Return the LQR that catches, and the swing-up that leads to it."""
         given = p["trajectory"]
         trajectory = load_trajectory(Path(given).expanduser()) if given else stored_trajectory(plant)

@@ -23,8 +23,7 @@ from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap_angle
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["JOINT_LIMIT", "LinearFeedback", "gain_text", "joint_limits", "require_catching"]
 
@@ -37,7 +36,7 @@ JOINT_LIMIT = ParameterSpec(
 _SMALLER_Q = "a faster plant, or a smaller q"
 
 
-def joint_limits(plant: AnyPlant, limit: float) -> Vector:
+def joint_limits(plant: PlantParameters, limit: float) -> Vector:
     """Return the largest effort of each driven joint: its own, and the controller's where that is not 0 [N m or N]."""
     return tuple(min(limit or math.inf, own) for own in plant.effort_limits)
 
@@ -79,7 +78,7 @@ class LinearFeedback(LawController):
 
     gain: Gain
 
-    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         Controller.__init__(self, joint_limits(plant, p["effort_limit"]))
         self._plant, self.period = plant, period
         self._offsets = tuple(map(float, np.ravel(p["set_point"])))
@@ -93,14 +92,14 @@ class LinearFeedback(LawController):
         self._use(None, ())
 
     @classmethod
-    def own(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+    def own(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
         """Return the parameters of this controller beyond weights, feed-forward, set-point and limit."""
         return ()
 
     @classmethod
-    def parameters(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+    def parameters(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
         """Return weights, with those of the plant as defaults, what is its own, feed-forward, set-point and limit."""
-        if not isinstance(plant, MechanismParameters):
+        if plant is None or plant.is_pendulum:
             return (Q, R, *cls.own(plant), FEEDFORWARD)
         q, r = plant.mechanism.weights
         names = ", ".join(plant.coordinates.names)
@@ -119,7 +118,7 @@ class LinearFeedback(LawController):
 
         A plant of one joint is judged with all that stands around the controller, by who makes it.
         """
-        if not isinstance(self._plant, MechanismParameters):
+        if self._plant.is_pendulum:
             return
         if self.SETTLES_BY:
             require_period(self.SETTLES_BY, self.period, period)

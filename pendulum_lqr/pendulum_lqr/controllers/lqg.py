@@ -10,8 +10,7 @@ from pendulum_lqr.controllers.linear_feedback import gain_text
 from pendulum_lqr.controllers.specs import DELAY, OFFSET_NOISE
 from pendulum_lqr.linear.observer import Observer
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Lqg"]
 
@@ -28,9 +27,9 @@ class Lqg(SampledFeedback):
         return super()._make_observer({**p, **{name: p[own] for name, own in _ONE_JOINT.items() if own in p}})
 
     @classmethod
-    def own(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+    def own(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
         """Return the noise that is expected, and the delay."""
-        several = isinstance(plant, MechanismParameters)
+        several = plant is not None and not plant.is_pendulum
         position, speed, effort = ("", "", "") if several else ("rad", "rad/s", "N m")
         names = list(_ONE_JOINT) if several else list(_ONE_JOINT.values())
         where, each = (" [rad or m]", " on every joint") if several else ("", "")

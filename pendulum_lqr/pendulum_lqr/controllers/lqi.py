@@ -14,8 +14,7 @@ from pendulum_lqr.linear.analysis import Feedback
 from pendulum_lqr.linear.design import output_lqr, with_integrals
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Lqi", "lqi_law"]
 
@@ -50,7 +49,7 @@ class Lqi(LinearFeedback):
     SETTLES_BY = "it is integrated"
     SUMMARY = "LQR with an integral of each driven joint: no offset of theirs under a constant effort"
 
-    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(plant, period, p)
         self._driven = list(plant.coordinates.driven)
         weights = [*p["q"], *(p["q_integral"],) * len(self._driven)]
@@ -62,9 +61,9 @@ class Lqi(LinearFeedback):
         self._be_law(lqi_law, numbers, (0.0,) * len(self._driven))
 
     @classmethod
-    def own(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+    def own(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
         """Return the weight of the integrals."""
-        several = isinstance(plant, MechanismParameters)
+        several = plant is not None and not plant.is_pendulum
         default, unit, whose = (10.0, "", "each driven joint's deviation") if several else (
             100.0, "1/(rad s)^2", "the angle")  # fmt: skip
         meaning = f"Weight of the integral of {whose}."

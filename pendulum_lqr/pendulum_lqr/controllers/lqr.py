@@ -10,7 +10,7 @@ from pendulum_lqr.controllers.linear_feedback import LinearFeedback
 from pendulum_lqr.linear.analysis import Feedback
 from pendulum_lqr.linear.design import output_lqr
 from pendulum_msgs_py.contract.joints import Vector
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Lqr", "lqr_law"]
 
@@ -34,7 +34,7 @@ class Lqr(LinearFeedback):
     SAMPLED = False
     SUMMARY = "linear quadratic regulator of the thesis, u = u* - K (x - x*)"
 
-    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(plant, period, p)
         self.gain = output_lqr(self.model, p["q"], p["r"])
         self.feedback = Feedback(self.gain.K)

@@ -17,7 +17,7 @@ from pendulum_lqr.swing_up.mechanism_planned import PlannedSwingUp
 from pendulum_lqr.swing_up.stored_swing_up import CALM_WEIGHTS, default_catch, tracked_swing_up
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["DifferencedVelocity", "make_mechanism_controller", "mechanism_controller_names"]
 
@@ -33,7 +33,7 @@ class DifferencedVelocity(Controller):
     period come through as noise.
     """
 
-    def __init__(self, plant: MechanismParameters, inner: Controller) -> None:
+    def __init__(self, plant: PlantParameters, inner: Controller) -> None:
         super().__init__(plant.effort_limits)
         self.plant = plant
         self.inner: Controller = inner
@@ -59,11 +59,11 @@ class DifferencedVelocity(Controller):
         return self._effort
 
 
-def _tvlqr_mpc(plant: MechanismParameters, period: float) -> Controller:
+def _tvlqr_mpc(plant: PlantParameters, period: float) -> Controller:
     return DifferencedVelocity(plant, tracked_swing_up(plant, period, recovers=True))
 
 
-_CONTROLLERS: dict[str, Callable[[MechanismParameters, float], Controller]] = {
+_CONTROLLERS: dict[str, Callable[[PlantParameters, float], Controller]] = {
     "tvlqr": tracked_swing_up,
     "ilqr": lambda plant, period: PlannedSwingUp(period, default_catch(plant)),
     "mpc": lambda plant, period: DifferencedVelocity(plant, MechanismMpc(period, default_catch(plant))),
@@ -76,7 +76,7 @@ def mechanism_controller_names() -> tuple[str, ...]:
     return tuple(_CONTROLLERS)
 
 
-def make_mechanism_controller(name: str, plant: MechanismParameters, period: float) -> Controller:
+def make_mechanism_controller(name: str, plant: PlantParameters, period: float) -> Controller:
     """Design a controller; ilqr and mpc compile for some ten seconds the first time.
 
     Args:

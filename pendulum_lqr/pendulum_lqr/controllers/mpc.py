@@ -17,8 +17,7 @@ from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.linear.observer import Observer
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["LinearMpc"]
 
@@ -46,7 +45,7 @@ class LinearMpc(SampledFeedback):
 
     SUMMARY = "linear MPC with limits of efforts and states (OSQP)"
 
-    def __init__(self, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> None:
+    def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(plant, period, p)
         self.failures = 0
         for name, hold, limit in zip(plant.coordinates.driven_names, self.hold, self.effort_limits, strict=True):
@@ -72,16 +71,16 @@ class LinearMpc(SampledFeedback):
         self._warn()
 
     def _make_observer(self, p: Mapping[str, Any]) -> Observer | None:
-        if isinstance(self._plant, MechanismParameters):
+        if not self._plant.is_pendulum:
             return super()._make_observer({**p, **_NOISE} if p["offset_noise"] > 0.0 else p)
         # Measured states need no filter: what they show is then what counts.
         needed = self.model.hidden or self.sampled.pending or p["offset_noise"] > 0.0
         return super()._make_observer({**p, **_NOISE}) if needed else None
 
     @classmethod
-    def own(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+    def own(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
         """Return horizon, limits of states, where the plant has end stops by default, and what is estimated."""
-        if not isinstance(plant, MechanismParameters):
+        if plant is None or plant.is_pendulum:
             return (
                 ParameterSpec("horizon", 20, "-", "Samples of the horizon.", minimum=1, maximum=200),
                 ParameterSpec("angle_limit", 0.5, "rad", "Largest deviation from the set-point; 0 for none.",
@@ -137,7 +136,7 @@ def _enough_samples(A: Array) -> int:
     return math.floor(1.0 / math.log(growth)) if growth > 1.0 else 0
 
 
-def _within_stops(plant: MechanismParameters) -> list[float]:
+def _within_stops(plant: PlantParameters) -> list[float]:
     """Return how far each joint may go from upright to keep clear of its stops; 0 where it has none."""
     widths = []
     for goal, joint in zip(plant.coordinates.goal, plant.joints, strict=True):

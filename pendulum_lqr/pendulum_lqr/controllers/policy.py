@@ -23,8 +23,6 @@ from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, 
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["START_TIME", "LearnedPolicy"]
@@ -65,7 +63,7 @@ class LearnedPolicy(Controller):
         *,
         start_time: float = START_TIME,
         catch: MechanismCatch | None = None,
-        plant: AnyPlant | None = None,
+        plant: PlantParameters | None = None,
     ) -> None:
         self._answers = PolicyRunner(policy, hold, effort_limits, start_time)
         super().__init__(self._answers.limits)
@@ -74,15 +72,15 @@ class LearnedPolicy(Controller):
         self._deviation = policy.coordinates.deviation
 
     @classmethod
-    def parameters(cls, plant: AnyPlant | None) -> tuple[ParameterSpec, ...]:
+    def parameters(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
         """Return the file and the fallback; of several joints also the catching controller, and the limit."""
-        if not isinstance(plant, MechanismParameters):
+        if plant is None or plant.is_pendulum:
             return policy_specs((*_LQR, "pd_gravity", "energy_swing_up"))
         meaning = "Who takes over near upright, in the region from which it catches: zero for nobody, or lqr."
         return (*policy_specs(_LQR), ParameterSpec("catch", ZERO, "", meaning, choices=_LQR), JOINT_LIMIT)
 
     @classmethod
-    def design(cls, plant: AnyPlant, period: float, p: Mapping[str, Any]) -> LearnedPolicy:
+    def design(cls, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> LearnedPolicy:
         """Return the controller of the parameter ``policy``.
 
         Raises:
@@ -94,7 +92,7 @@ class LearnedPolicy(Controller):
         if p.get("set_point", 0.0) != 0.0:
             raise ParameterError(f"set_point is {p['set_point']:g} rad; a policy holds upright alone, expected 0 rad")
         policy = load_policy(p["policy"])
-        if isinstance(plant, PlantParameters) and len(policy.joints) != 1:
+        if plant.is_pendulum and len(policy.joints) != 1:
             raise ParameterError(f"policy {policy.name!r} is for joints {', '.join(policy.joints)}; expected one joint")
         require_plant(policy, plant)
         fallback = None
@@ -104,7 +102,7 @@ class LearnedPolicy(Controller):
         own = joint_limits(plant, p["effort_limit"])
         limits = tuple(min(both) for both in zip(own, policy.effort_limit, strict=True))
         catch = None
-        if isinstance(plant, MechanismParameters) and p["catch"] != ZERO:
+        if not plant.is_pendulum and p["catch"] != ZERO:
             catch = make_mechanism_catch(plant, *plant.mechanism.weights, limits)
         hold = states_to_hold(policy, period)
         return cls(policy, hold, limits, fallback, start_time=p["start_time"], catch=catch, plant=plant)
@@ -125,7 +123,7 @@ class LearnedPolicy(Controller):
             require_catching("policy", self.catch, period)
         if self.fallback is not None:
             self.fallback.check(period)
-            if isinstance(self.plant, PlantParameters):
+            if self.plant.is_pendulum:
                 require_stable("the fallback", self.fallback, self.plant, period)
 
     def reset(self) -> None:
@@ -153,7 +151,7 @@ class LearnedPolicy(Controller):
 
     def describe(self) -> str:
         """Return which policy it is, what catches, and whether it gave up."""
-        nothing = "zero torque" if isinstance(self.plant, PlantParameters) else "no effort"
+        nothing = "zero torque" if self.plant.is_pendulum else "no effort"
         text = self._answers.describe(nothing if self.fallback is None else self.fallback.describe())
         return text if self.catch is None else f"{text}; LQR within {self.catch.region.describe()}"
 

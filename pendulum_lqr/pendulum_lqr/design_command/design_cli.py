@@ -36,13 +36,12 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.determined import require_determined
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import (
     MECHANISM_PRESETS,
     PRESET_NAMES,
     PlantParameters,
     is_mechanism,
+    load_mechanism,
     load_plant,
 )
 from pendulum_msgs_py.programs.executables import cli_main
@@ -185,7 +184,7 @@ def _limit(given: float, plants_own: float) -> float:
 class _Table:
     """Gains of a plant, one for each pair of weights, and their figures, those without feedback first."""
 
-    plant: AnyPlant
+    plant: PlantParameters
     model: LinearModel
     weights: Sequence[tuple[tuple[float, ...], float]]
     gains: Sequence[Gain]
@@ -273,7 +272,7 @@ class _Table:
             a, b = model.A[1], model.B[1, 0]
             what = f"A = [[0, 1], [{a[0]:.2f}, {a[1]:.2f}]], B = [0, {b:.2f}],"
         lines = [f"plant {self.plant.name} at {at}: {what} u* = {held}", *hidden_and_late(model)]
-        if isinstance(self.plant, MechanismParameters) and self.plant.has_dry_friction:
+        if not self.plant.is_pendulum and self.plant.has_dry_friction:
             lines.append(
                 "dry friction has no derivative at rest and is not in the model: simulate the loop to see its cost"
             )
@@ -281,7 +280,7 @@ class _Table:
 
 
 def _designed(
-    plant: AnyPlant,
+    plant: PlantParameters,
     model: LinearModel,
     q: Sequence[str] | None,
     r: Sequence[float] | None,

@@ -47,8 +47,8 @@ from pendulum_msgs_py.plants.equilibrium import (
     offset_of,
     resistance_of,
 )
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "LinearModel",
@@ -162,7 +162,7 @@ class _Body(NamedTuple):
     delay: float
 
 
-def linearise(plant: RigidPlant | MechanismParameters, at: float | Sequence[float] | None = None) -> LinearModel:
+def linearise(plant: RigidPlant | PlantParameters, at: float | Sequence[float] | None = None) -> LinearModel:
     """Return the linear model about the fixed point at an angle, of the plant that the simulator runs.
 
     A rigid plant of n joints has 2n states, a series-elastic one four; a first-order lag adds one for each actuator
@@ -183,7 +183,7 @@ def linearise(plant: RigidPlant | MechanismParameters, at: float | Sequence[floa
         :mod:`pendulum_msgs_py.dynamics`.
     """
     position: Vector = ()
-    if isinstance(plant, MechanismParameters):
+    if isinstance(plant, PlantParameters) and not plant.is_pendulum:
         position = _checked_position(plant, at)
         body, theta = _mechanism_body(plant, position), position[-1]
     else:
@@ -219,7 +219,7 @@ def linearise(plant: RigidPlant | MechanismParameters, at: float | Sequence[floa
     )
 
 
-def holding_effort(plant: MechanismParameters, position: Sequence[float] | None = None) -> Vector:
+def holding_effort(plant: PlantParameters, position: Sequence[float] | None = None) -> Vector:
     """Return the efforts of the driven joints that hold a mechanism at a position, m values [N m or N].
 
     Args:
@@ -376,7 +376,7 @@ def _pendulum_body(plant: RigidPlant, theta: float) -> _Body:
     return _Body(states, at, rates, efforts, lags, ("torque",), 2, 1, offset_of(plant, "transport_delay"))
 
 
-def _mechanism_body(plant: MechanismParameters, q: Vector) -> _Body:
+def _mechanism_body(plant: PlantParameters, q: Vector) -> _Body:
     coordinates, actuators = plant.coordinates, plant.actuators
     if not actuators:
         raise ParameterError(f"plant {plant.name!r} has no driven joint; expected an actuator at one of them")
@@ -402,7 +402,7 @@ def _mechanism_body(plant: MechanismParameters, q: Vector) -> _Body:
     )
 
 
-def _checked_position(plant: MechanismParameters, position: float | Sequence[float] | None) -> Vector:
+def _checked_position(plant: PlantParameters, position: float | Sequence[float] | None) -> Vector:
     coordinates = plant.coordinates
     given = coordinates.goal if position is None else np.atleast_1d(position)
     q = tuple(float(value) for value in given)

@@ -36,12 +36,7 @@ from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import JointSample, Vector
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_differences import load_any_plant
-from pendulum_msgs_py.plants.plant_parameters import (
-    MECHANISM_PRESETS,
-    PRESET_NAMES,
-    PlantParameters,
-)
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, load_mechanism
 from pendulum_msgs_py.programs.realtime import as_ordinary
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.compiled_answers import AnsweredInput
@@ -115,7 +110,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._loop: ControlLoop | None = None
         kind, plant = self._choose("controller"), self._choose("plant")
         self._own = {spec.name for spec in NODE_SPECS}
-        self._plant = load_any_plant(plant)
+        self._plant = load_mechanism(plant)
         self._coordinates = self._plant.coordinates
         self._kind = controller_class(kind, self._plant)
         own = controller_parameters(kind, self._plant)
@@ -321,7 +316,7 @@ class ControllerNode(LifecycleNode, PollingNode):
                 self._design(values)
             if self._loop is not None:
                 unwrapped(self._loop.controller).check(measured)
-            if isinstance(plant, PlantParameters):
+            if plant.is_pendulum:
                 self._refusal = rate_problem(
                     self._kind, values["controller"], lambda: self._design(values), plant, self._period, measured,
                     uses=self._uses_period(), set_point=values["set_point"],

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.joints import Coordinates, Joint
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant, describe_plants
-from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS, PlantParameters
+from pendulum_msgs_py.plants.joint_parameters import DRIVETRAIN_SPECS
+from pendulum_msgs_py.plants.plant_differences import describe_plants
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "ACTIVATIONS",
@@ -149,7 +149,7 @@ class Policy:
     task: str
     joints: tuple[str, ...]
     period: float
-    plant: AnyPlant
+    plant: PlantParameters
     ranges: Mapping[str, tuple[float, float]]
     effort_limit: tuple[float, ...]
     effort_rate: tuple[float, ...]
@@ -186,7 +186,7 @@ class Policy:
             raise DataError(f"signals are {list(self.signals)}; expected some of {', '.join(SIGNALS)}, in this order")
         if self.history < 1:
             raise DataError(f"history is {self.history}; expected >= 1")
-        known = _numbers_of(self.plant)
+        known = self.plant.numbers
         for name, (low, high) in self.ranges.items():
             if name not in known or not low <= known[name] <= high:
                 raise DataError(f"range of {name} is {low} to {high}; expected a parameter whose value lies in it")
@@ -213,9 +213,9 @@ class Policy:
         return self.history * len(self.layout)
 
 
-def model_of(plant: AnyPlant) -> str:
+def model_of(plant: PlantParameters) -> str:
     """Return which of ``MODELS`` a plant is."""
-    return MODELS[isinstance(plant, MechanismParameters)]
+    return MODELS[not plant.is_pendulum]
 
 
 def default_signals(coordinates: Coordinates) -> tuple[str, ...]:
@@ -255,28 +255,29 @@ def _has(joint: Joint, driven: bool, signal: str) -> bool:
     return signal == "velocity" or joint.turns != (signal == "position")
 
 
-def fingerprint(plant: AnyPlant) -> str:
+def fingerprint(plant: PlantParameters) -> str:
     """Return 64 hexadecimal digits that two plants share if all their parameters are the same, names apart."""
     entry = json.loads(describe_plants([plant]))[0]
     del entry["name"]
     return hashlib.sha256(json.dumps(entry, sort_keys=True).encode()).hexdigest()
 
 
-def plant_problem(policy: Policy, plant: AnyPlant) -> str:
+def plant_problem(policy: Policy, plant: PlantParameters) -> str:
     """Return as text why a policy is not for a plant; empty where it is.
 
     Each parameter has to lie within the range that was trained, or be that of the policy's plant within 0.1 %. A larger
     effort limit is accepted: the policy applies its own; so is an end stop that its box does not reach.
     """
     own = policy.plant
-    if isinstance(own, MechanismParameters) or isinstance(plant, MechanismParameters):
+    if not own.is_pendulum or not plant.is_pendulum:
         mine, other = _kind_of(own), _kind_of(plant)
         if mine != other:
             return f"it was trained on {mine}, and this one is {other}"
     elif (plant.drivetrain is None) != (own.drivetrain is None):
         rigid, other = ("rigid" if one.drivetrain is None else "series elastic" for one in (own, plant))
         return f"it was trained on a plant that is {rigid}, and this one is {other}"
-    trained, runs, units = _numbers_of(own), _numbers_of(plant), _units_of(plant)
+    trained, runs = own.numbers, plant.numbers
+    units = {name: spec.unit for name, spec in plant.specs.items()}
     found = []
     for name in (*trained, *(name for name in runs if name not in trained)):
         joint, _, key = name.rpartition(".")
@@ -298,7 +299,7 @@ def plant_problem(policy: Policy, plant: AnyPlant) -> str:
             unit = "" if units[name] == "-" else f" {units[name]}"
             span = f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
             found.append(f"{name} is {value:.6g}{unit}, trained {span}")
-    if isinstance(own, PlantParameters) and isinstance(plant, PlantParameters) and own.drivetrain and plant.drivetrain:
+    if own.drivetrain and plant.drivetrain:
         for spec in DRIVETRAIN_SPECS:
             own_value = float(getattr(own.drivetrain, spec.name))
             value = float(getattr(plant.drivetrain, spec.name))
@@ -307,25 +308,13 @@ def plant_problem(policy: Policy, plant: AnyPlant) -> str:
     return "; ".join(found)
 
 
-def _kind_of(plant: AnyPlant) -> str:
-    if not isinstance(plant, MechanismParameters):
+def _kind_of(plant: PlantParameters) -> str:
+    if plant.is_pendulum:
         return "a plant of one joint"
     return f"a {plant.mechanism.name} driven at {', '.join(plant.coordinates.driven_names) or 'no joint'}"
 
 
-def _numbers_of(plant: AnyPlant) -> dict[str, float]:
-    if isinstance(plant, MechanismParameters):
-        return plant.numbers
-    return {spec.name: float(getattr(plant, spec.name)) for spec in PLANT_SPECS}
-
-
-def _units_of(plant: AnyPlant) -> dict[str, str]:
-    specs = plant.specs.values() if isinstance(plant, MechanismParameters) else PLANT_SPECS
-    names = plant.specs if isinstance(plant, MechanismParameters) else [spec.name for spec in PLANT_SPECS]
-    return {name: spec.unit for name, spec in zip(names, specs, strict=True)}
-
-
-def require_plant(policy: Policy, plant: AnyPlant) -> None:
+def require_plant(policy: Policy, plant: PlantParameters) -> None:
     """Refuse a plant that a policy is not for.
 
     Raises:

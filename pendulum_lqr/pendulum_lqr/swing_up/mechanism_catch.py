@@ -16,7 +16,7 @@ from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.joints import Coordinates, Vector
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "CaughtRegion",
@@ -60,7 +60,7 @@ def deviation_of(coordinates: Coordinates, x: Vector) -> Array:
     return np.array([*coordinates.deviation(x[:n]), *x[n:]])
 
 
-def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion:
+def sample_caught_region(plant: PlantParameters, gain: Gain) -> CaughtRegion:
     """Return the largest ellipsoid x' S x <= level from whose sampled states u = -K x, limited, comes to rest upright.
 
     The level grows until a sampled state is lost, or hits an end stop, and is bisected then; nine tenths of it are
@@ -78,7 +78,7 @@ def sample_caught_region(plant: MechanismParameters, gain: Gain) -> CaughtRegion
 
 
 @lru_cache(maxsize=32)
-def _sampled(plant: MechanismParameters, *numbers: tuple[Any, ...]) -> CaughtRegion:
+def _sampled(plant: PlantParameters, *numbers: tuple[Any, ...]) -> CaughtRegion:
     """Return the result of :func:`sample_caught_region`, by the numbers of K, S and poles."""
     gain = Gain(*map(np.array, numbers))
     n = len(plant.joints)
@@ -107,7 +107,7 @@ def _samples_of_level_1(gain: Gain, n: int) -> Array:
     return unit
 
 
-def _all_caught(plant: MechanismParameters, gain: Gain, deviations: Array, known: float) -> bool:
+def _all_caught(plant: PlantParameters, gain: Gain, deviations: Array, known: float) -> bool:
     """Return whether all deviations, shape (2n, samples), come to rest, or within a level from which others did."""
     n, driven = len(plant.joints), plant.coordinates.driven
     forward = in_arithmetic(plant.mechanism.forward, np)
@@ -155,7 +155,7 @@ class MechanismCatch:
         active: Whether it is in charge.
     """
 
-    plant: MechanismParameters
+    plant: PlantParameters
     gain: Gain
     region: CaughtRegion
     leave: float = 2.0
@@ -182,7 +182,7 @@ class MechanismCatch:
 
 
 def make_mechanism_catch(
-    plant: MechanismParameters, q: ArrayLike, r: ArrayLike, limits: Vector | None = None
+    plant: PlantParameters, q: ArrayLike, r: ArrayLike, limits: Vector | None = None
 ) -> MechanismCatch:
     """Return the LQR of a plant about upright with its sampled region (a second or so).
 

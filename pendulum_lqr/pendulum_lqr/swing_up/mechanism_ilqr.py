@@ -31,7 +31,7 @@ from pendulum_msgs_py.contract.values import written
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.loops.trees import WITHIN
 from pendulum_msgs_py.mechanisms import MECHANISMS
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 
 __all__ = ["IlqrPlan", "IlqrProblem", "IlqrWeights"]
@@ -91,7 +91,7 @@ class IlqrProblem:
         limit: Share of the effort limits that may be used.
     """
 
-    plant: MechanismParameters
+    plant: PlantParameters
     step: float
     weights: IlqrWeights
     terminal: Array

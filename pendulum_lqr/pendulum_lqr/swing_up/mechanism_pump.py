@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pendulum_lqr.linear.design import DesignError
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.joints import Vector
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["PUMPS", "EnergyPump", "PumpGains", "pump_gains"]
 
@@ -73,7 +73,7 @@ PUMPS: dict[tuple[str, str], PumpGains] = {
 """Which mechanisms can be swung up so, with which joint driven, and by which gains."""
 
 
-def pump_gains(plant: MechanismParameters) -> PumpGains:
+def pump_gains(plant: PlantParameters) -> PumpGains:
     """Return the default gains of a plant.
 
     Raises:
@@ -112,7 +112,7 @@ class EnergyPump:
         of a class of underactuated mechanical systems, IFAC World Congress, 1996, for the partial linearisation.
     """
 
-    def __init__(self, plant: MechanismParameters, gains: PumpGains, limit: float) -> None:
+    def __init__(self, plant: PlantParameters, gains: PumpGains, limit: float) -> None:
         pump_gains(plant)
         (self._a,) = plant.coordinates.driven
         self._p = 1 - self._a

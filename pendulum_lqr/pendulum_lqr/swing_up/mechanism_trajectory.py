@@ -19,7 +19,7 @@ from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import read_text
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
@@ -144,7 +144,7 @@ def search_swing_up(catch: MechanismCatch, search: SwingUpSearch, seed: int) -> 
 
 
 def trajectory_of(
-    plant: MechanismParameters, plan: IlqrPlan, step: float, how: dict[str, Any] | None = None
+    plant: PlantParameters, plan: IlqrPlan, step: float, how: dict[str, Any] | None = None
 ) -> MechanismTrajectory:
     """Return a plan whose nodes lie a step apart [s] as a trajectory, with what made it."""
     names = plant.coordinates.names

@@ -16,7 +16,7 @@ from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["MechanismTvlqr", "tracking_gains", "whole_turns"]
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 def tracking_gains(
-    plant: MechanismParameters, states: Array, efforts: Array, period: float, q: ArrayLike, r: float, terminal: Array
+    plant: PlantParameters, states: Array, efforts: Array, period: float, q: ArrayLike, r: float, terminal: Array
 ) -> tuple[Array, Array]:
     """Return K (N, m, 2n) and the cost matrices P (N + 1, 2n, 2n) of u = u0 - K (x - x0) along N samples.
 
@@ -66,7 +66,7 @@ def tracking_gains(
     return K, P
 
 
-def whole_turns(plant: MechanismParameters, x: Vector) -> Array:
+def whole_turns(plant: PlantParameters, x: Vector) -> Array:
     """Return what a state [q, v] has of whole turns about hanging, shape (2n,): no motion depends on it [rad]."""
     turns = np.array([joint.turns for joint in plant.mechanism.joints] + [False] * len(plant.joints))
     return np.where(turns, 2.0 * math.pi * np.rint(np.array(x) / (2.0 * math.pi)), 0.0)

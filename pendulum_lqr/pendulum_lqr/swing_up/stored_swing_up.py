@@ -10,7 +10,7 @@ from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
 from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory, load_trajectory
 from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "CALM_WEIGHTS",
@@ -26,7 +26,7 @@ _TUBE = 10.0
 """Width of the tube about a swing-up: beyond it, replanning is better than tracking."""
 
 
-def stored_trajectory(plant: MechanismParameters) -> MechanismTrajectory:
+def stored_trajectory(plant: PlantParameters) -> MechanismTrajectory:
     """Return the swing-up that comes with the project for a preset.
 
     Raises:
@@ -40,12 +40,12 @@ def stored_trajectory(plant: MechanismParameters) -> MechanismTrajectory:
     return load_trajectory(path)
 
 
-def default_catch(plant: MechanismParameters) -> MechanismCatch:
+def default_catch(plant: PlantParameters) -> MechanismCatch:
     """Return the LQR that catches, with its sampled region."""
     return make_mechanism_catch(plant, *plant.mechanism.weights)
 
 
-def refuse_passive_friction(controller: str, plant: MechanismParameters) -> None:
+def refuse_passive_friction(controller: str, plant: PlantParameters) -> None:
     """Refuse a plant for a controller that plans without dry friction, if no effort can make up for it where it is.
 
     Raises:
@@ -61,7 +61,7 @@ def refuse_passive_friction(controller: str, plant: MechanismParameters) -> None
             )
 
 
-def tracked_swing_up(plant: MechanismParameters, period: float, *, recovers: bool = False) -> MechanismTvlqr:
+def tracked_swing_up(plant: PlantParameters, period: float, *, recovers: bool = False) -> MechanismTvlqr:
     """Return the controller that follows the stored swing-up of a plant by time-varying LQR.
 
     Args:

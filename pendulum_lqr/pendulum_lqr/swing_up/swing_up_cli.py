@@ -43,7 +43,7 @@ def swing_up(
     """
     from pendulum_lqr.swing_up.mechanism_trajectory import SwingUpSearch, cheapest_swing_up, write_trajectory
     from pendulum_lqr.swing_up.stored_swing_up import default_catch
-    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+    from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
     try:
         values = IlqrWeights(*(float(part) for part in weights.split(",")))

@@ -211,7 +211,7 @@ def advance_joints(
         push: Efforts on the joints themselves.
         h: Step [s].
         p: The mechanism's parameters.
-        table: What the joints have, of :func:`pendulum_msgs_py.plants.mechanism_parameters.pack_joints`.
+        table: What the joints have, of :func:`pendulum_msgs_py.plants.plant_parameters.pack_joints`.
     """
     left = h
     n = len(q)

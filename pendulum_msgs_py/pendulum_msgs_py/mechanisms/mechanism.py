@@ -105,7 +105,12 @@ class Mechanism:
     source: str
     rotors: Callable[[Any], tuple[Rotor, ...]] = _no_rotors
 
+    def __hash__(self) -> int:
+        """Return a hash that is quick: tables of mechanisms are looked up for each plant."""
+        return hash(self.name)
+
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the entries of ``p``: the parameters, then ``JOINT.damping`` of each joint."""
-        return (*(spec.name for spec in self.parameters), *(f"{joint.name}.damping" for joint in self.joints))
+        """Names of the entries of ``p``: the parameters, then ``JOINT.damping`` of each joint, of one ``damping``."""
+        damping = [f"{joint.name}.damping" for joint in self.joints] if len(self.joints) > 1 else ["damping"]
+        return (*(spec.name for spec in self.parameters), *damping)

@@ -11,6 +11,7 @@ import math
 from typing import Any
 
 from pendulum_msgs_py.contract.joints import ONE_JOINT
+from pendulum_msgs_py.contract.names import LINK
 from pendulum_msgs_py.dynamics.rigid import rigid_acceleration, rigid_energy
 from pendulum_msgs_py.mechanisms.mechanism import STANDARD_GRAVITY, Body, Mechanism, Point, positive
 from pendulum_msgs_py.parameters import ParameterSpec
@@ -56,7 +57,7 @@ def bodies(p: Any) -> tuple[Body, ...]:
     rest = p[0] - weight * length**2
     return (
         Body(
-            "link",
+            LINK,
             (0.0, 0.0, 0.0),
             (0.0, -1.0, 0.0),
             weight,
@@ -72,8 +73,14 @@ PENDULUM = Mechanism(
     title="One link on a driven hinge.",
     joints=ONE_JOINT.joints,
     parameters=(
-        positive("inertia", 0.055, "kg m^2", "Inertia about the joint, M."),
-        ParameterSpec("gravity", 1.678, "N m", "Gravity coefficient, G = m g l; 0 lies flat.", minimum=0.0),
+        positive("inertia", 0.055, "kg m^2", "Inertia about the joint, M_c."),
+        ParameterSpec(
+            "gravity",
+            1.678,
+            "N m",
+            "Gravity coefficient, G_c = m g l_c; 0 for a pendulum that lies flat.",
+            minimum=0.0,
+        ),
     ),
     forward=forward,
     mass=mass,

@@ -7,8 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism_file
-from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, PlantParameters, is_mechanism, load_plant_file
+from pendulum_msgs_py.plants.plant_parameters import (
+    PlantParameters,
+    load_plant_file,
+)
 
 __all__ = ["SPAN", "require_determined", "undetermined"]
 
@@ -25,9 +27,7 @@ _OVERDAMPED = 2.0
 """Damping ratio beyond which the inertia of a pendulum is a fast lag behind its damping, which decides instead."""
 
 
-def undetermined(
-    plant: PlantParameters | MechanismParameters, intervals: Mapping[str, Sequence[float]]
-) -> dict[str, tuple[float, float]]:
+def undetermined(plant: PlantParameters, intervals: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
     """Return the intervals that leave open what a design needs, by name.
 
     A size (inertia, gravity, mass, centre of mass) has to be positive and known to an order of magnitude; only the
@@ -38,14 +38,12 @@ def undetermined(
         plant: The estimates.
         intervals: 95 % intervals by the names of a plant file.
     """
-    if isinstance(plant, PlantParameters):
-        values = {spec.name: float(getattr(plant, spec.name)) for spec in PLANT_SPECS}
-        sizes = {"inertia", "gravity"}
+    values = plant.numbers
+    sizes = {spec.name for spec in plant.mechanism.parameters}
+    if plant.is_pendulum:
         largest = plant.gravity or plant.effort_limit
         critical = 2.0 * math.sqrt(plant.inertia * plant.gravity) or plant.effort_limit
     else:
-        values = dict(plant.numbers)
-        sizes = {spec.name for spec in plant.mechanism.parameters}
         largest = critical = max(plant.effort_limits) if plant.actuators else math.inf
     found = {}
     for name, (low, high) in intervals.items():
@@ -55,9 +53,9 @@ def undetermined(
         kind = name.rsplit(".", 1)[-1]
         if name in sizes:
             lost = (low <= 0.0 or high > SPAN * low) if value > 0.0 else high > _NONE * largest
-            if lost and name == "inertia" and isinstance(plant, PlantParameters) and high <= SPAN * value:
+            if lost and name == "inertia" and plant.is_pendulum and high <= SPAN * value:
                 lost = not plant.damping >= 2.0 * _OVERDAMPED * math.sqrt(high * plant.gravity) > 0.0
-        elif kind in {"transport_delay", "actuator_time_constant"}:
+        elif kind in {"transport_delay", "time_constant", "actuator_time_constant"}:
             lost = high - low > _LONGEST
         elif kind == "angle_offset":
             lost = high - low > math.pi
@@ -79,11 +77,11 @@ def require_determined(preset_or_path: str | Path) -> None:
     Raises:
         ParameterError: An interval holds 0 or spans orders of magnitude where that matters; or as ``load_plant``.
     """
-    plant, provenance = (load_mechanism_file if is_mechanism(preset_or_path) else load_plant_file)(preset_or_path)
+    plant, provenance = load_plant_file(preset_or_path)
     for name, (low, high) in undetermined(plant, provenance["intervals"]).items():
-        value = plant.numbers[name] if isinstance(plant, MechanismParameters) else getattr(plant, name)
         raise ParameterError(
-            f"plant file {preset_or_path}: {name} is {value:.4g} with the interval {low:.4g} to {high:.4g}, which does "
+            f"plant file {preset_or_path}: {name} is {plant.value(name):.4g} with the "
+            f"interval {low:.4g} to {high:.4g}, which does "
             "not determine it; expected a plant that its recordings determine: identify it from a recording with more "
             "motion, or measure this value and take its interval out of the file"
         )

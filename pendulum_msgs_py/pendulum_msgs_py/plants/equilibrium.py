@@ -19,7 +19,8 @@ from pendulum_msgs_py.dynamics.series_elastic import (
 )
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.friction_terms import friction_of_terms
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "FixedPoint",
@@ -73,7 +74,7 @@ class FixedPoint:
 
 def drivetrain_of(plant: RigidPlant) -> SeriesElasticParameters | None:
     """Return motor, gears and spring of a plant that has them."""
-    return plant.drivetrain if isinstance(plant, PlantParameters) else None
+    return getattr(plant, "drivetrain", None)
 
 
 def offset_of(plant: RigidPlant, name: str) -> float:

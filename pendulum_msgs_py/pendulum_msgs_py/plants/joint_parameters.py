@@ -1,21 +1,91 @@
-"""What each joint of a mechanism has: friction, ends of travel and an actuator."""
+"""What each joint of a plant has: friction, offsets, ends of travel, and an actuator with or without a drivetrain."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import ParameterSpec, reject_unknown, require_mapping
-from pendulum_msgs_py.plants.quantities import Quantity, read_quantities, specs_of
+from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, term_fields
+from pendulum_msgs_py.plants.quantities import Quantity, check_fields, specs_of
 
-__all__ = ["Actuator", "JointParameters", "actuator_specs", "check_joint", "joint_specs", "read_joint"]
+__all__ = [
+    "DRIVETRAIN_SPECS",
+    "OF_A_PENDULUM",
+    "Actuator",
+    "JointParameters",
+    "SeriesElasticParameters",
+    "actuator_specs",
+    "joint_specs",
+]
 
 
 _LARGEST_EFFORT = 1e4
 """More than any joint's drive gives, those of the largest robots included [N m or N]: beyond it a unit is wrong."""
+OF_A_PENDULUM = ("torque_offset", "angle_offset", *TERM_PARAMETERS)
+"""Quantities of a joint that only a pendulum's equation has."""
+
+
+@dataclass(frozen=True)
+class SeriesElasticParameters:
+    """Motor, gear train and spring of a series-elastic actuator.
+
+    Source: HEBI X5-9 datasheet values; friction and hysteresis from public logs of X5 actuators.
+    """
+
+    gear_ratio: Annotated[float, Quantity("-", "Motor turns per output turn, N.", positive=True)] = 1742.222
+    torque_constant: Annotated[
+        float, Quantity("N m/A", "Torque per winding current at the motor, K_t.", positive=True)
+    ] = 6.26e-3
+    back_emf_constant: Annotated[float, Quantity("V s/rad", "Voltage per motor speed, K_e.")] = 6.241e-3
+    winding_resistance: Annotated[
+        float, Quantity("ohm", "Winding resistance at 20 degrees Celsius, R.", positive=True)
+    ] = 9.99
+    winding_temperature: Annotated[float, Quantity("degC", "Winding temperature at the start.", signed=True)] = 22.0
+    resistance_temperature_coefficient: Annotated[float, Quantity("1/K", "Relative change of R per kelvin.")] = 0.004
+    supply_voltage: Annotated[float, Quantity("V", "Supply voltage, V.", positive=True)] = 36.0
+    efficiency: Annotated[
+        float, Quantity("-", "Share of motor torque that a command counts on at the output.", positive=True)
+    ] = 0.65
+    reflected_inertia: Annotated[
+        float, Quantity("kg m^2", "Rotor inertia seen at the output, J_r N^2.", positive=True)
+    ] = 0.19
+    motor_damping: Annotated[
+        float, Quantity("N m s/rad", "Viscous friction of motor and gears at the output, b_v.")
+    ] = 1.4
+    motor_coulomb_friction: Annotated[
+        float, Quantity("N m", "Dry friction of motor and gears at the output, tau_C.")
+    ] = 0.3
+    motor_static_friction: Annotated[
+        float, Quantity("N m", "Dry friction at which the motor starts to slide, tau_S.")
+    ] = 0.39
+    motor_stribeck_velocity: Annotated[
+        float, Quantity("rad/s", "Velocity over which tau_S falls to tau_C.", positive=True)
+    ] = 0.01
+    stiffness: Annotated[float, Quantity("N m/rad", "Spring stiffness at small deflection, k.", positive=True)] = 100.0
+    stiffness_hardening: Annotated[
+        float, Quantity("N m/rad^3", "Growth of the stiffness with the deflection squared.")
+    ] = 0.0
+    hysteresis_torque: Annotated[float, Quantity("N m", "Half width of the spring's hysteresis loop, tau_h.")] = 0.05
+    hysteresis_deflection: Annotated[
+        float, Quantity("rad", "Deflection over which the loop turns round.", positive=True)
+    ] = 2e-4
+
+    def __post_init__(self) -> None:
+        """Check every value; a static friction below the sliding one would feed energy in."""
+        check_fields(self, DRIVETRAIN_SPECS)
+        if self.motor_static_friction < self.motor_coulomb_friction:
+            raise ParameterError(
+                f"motor_static_friction is {self.motor_static_friction} N m; "
+                f"expected >= motor_coulomb_friction = {self.motor_coulomb_friction} N m"
+            )
+
+
+DRIVETRAIN_SPECS = specs_of(SeriesElasticParameters)
+"""Quantities of a plant file's section ``drivetrain``."""
 
 
 @dataclass(frozen=True)
@@ -26,27 +96,46 @@ class Actuator:
         float,
         Quantity("effort_unit", "Largest effort of the actuator.", positive=True, example=1.0, largest=_LARGEST_EFFORT),
     ]
-    time_constant: Annotated[float, Quantity("s", "First-order lag between command and effort.")] = 0.0
+    time_constant: Annotated[float, Quantity("s", "First-order lag between command and effort; 0 for none.")] = 0.0
     transport_delay: Annotated[float, Quantity("s", "Time between a command and its first effect.")] = 0.0
 
 
-@dataclass(frozen=True)
-class JointParameters:
-    """Friction, ends of travel and actuator of one joint; units such as ``effort_unit`` are the joint's.
+if TYPE_CHECKING:
 
-    Where ``static_friction`` is None it is the Coulomb friction; a stop or an actuator that is None is not there.
+    @dataclass(frozen=True, kw_only=True)
+    class _FrictionTerms:
+        """What type checkers see of the terms' parameters: those of the table of terms."""
+
+        load_friction: float = 0.0
+
+else:
+    _FrictionTerms = term_fields()
+
+
+@dataclass(frozen=True)
+class JointParameters(_FrictionTerms):
+    """Friction, offsets, ends of travel and actuator of one joint; units such as ``effort_unit`` are the joint's.
+
+    Where ``static_friction`` is None it is the Coulomb friction; a stop, an actuator or a drivetrain that is None is
+    not there. ``OF_A_PENDULUM`` and the drivetrain are a pendulum's.
     """
 
-    damping: Annotated[float, Quantity("damping_unit", "Viscous friction.")] = 0.0
-    coulomb_friction: Annotated[float, Quantity("effort_unit", "Dry friction while sliding fast.")] = 0.0
-    static_friction: Annotated[float | None, Quantity("effort_unit", "Dry friction at which sliding starts.")] = None
+    damping: Annotated[float, Quantity("damping_unit", "Viscous friction, b_c.")] = 0.0
+    coulomb_friction: Annotated[float, Quantity("effort_unit", "Dry friction while sliding fast, tau_C.")] = 0.0
+    static_friction: Annotated[
+        float | None, Quantity("effort_unit", "Dry friction at which sliding starts, tau_S >= tau_C.")
+    ] = None
     stribeck_velocity: Annotated[
-        float,
-        Quantity("velocity_unit", "Velocity over which the static friction falls to Coulomb.", positive=True),
+        float, Quantity("velocity_unit", "Velocity over which tau_S falls to tau_C.", positive=True)
     ] = 0.01
+    torque_offset: Annotated[
+        float, Quantity("effort_unit", "Constant torque that the sensor of effort misses.", signed=True)
+    ] = 0.0
+    angle_offset: Annotated[float, Quantity("unit", "Measured angle when hanging at rest.", signed=True)] = 0.0
     lower_stop: Annotated[float | None, Quantity("unit", "Lowest position, at an end stop.", signed=True)] = None
     upper_stop: Annotated[float | None, Quantity("unit", "Highest position, at an end stop.", signed=True)] = None
     actuator: Actuator | None = None
+    drivetrain: SeriesElasticParameters | None = None
 
     @property
     def breakaway(self) -> float:
@@ -56,65 +145,15 @@ class JointParameters:
 
 @cache
 def joint_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
-    """Return the table of a joint's entries in a plant file, in its units."""
+    """Return the table of a joint's quantities, in its units."""
     return _in_units_of(joint, JointParameters)
 
 
 @cache
 def actuator_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
-    """Return the table of an actuator's entries in a plant file, in its joint's units."""
+    """Return the table of an actuator's quantities, in its joint's units."""
     return _in_units_of(joint, Actuator)
 
 
 def _in_units_of(joint: Joint, kind: type) -> tuple[ParameterSpec, ...]:
     return tuple(replace(spec, unit=getattr(joint, spec.unit, spec.unit)) for spec in specs_of(kind))
-
-
-def read_joint(joint: Joint, entry: object, where: str) -> tuple[JointParameters, dict[str, list[float]]]:
-    """Return a joint's entries in a plant file, and the intervals in them by name.
-
-    Args:
-        joint: The joint.
-        entry: The entry as parsed.
-        where: Prefix of messages.
-
-    Raises:
-        ParameterError: An entry is unknown, missing or refused.
-    """
-    content = dict(require_mapping(entry if entry is not None else {}, where))
-    has_actuator = "actuator" in content
-    block = content.pop("actuator", None)
-    reject_unknown(content, (*(spec.name for spec in joint_specs(joint)), "actuator"), where=where)
-    values, intervals = read_quantities(content, joint_specs(joint), where)
-    actuator = None
-    if has_actuator:
-        drive, more = read_quantities(block, actuator_specs(joint), f"{where}.actuator")
-        if "effort_limit" not in drive:
-            raise ParameterError(f"{where}.actuator.effort_limit is missing; expected a value in {joint.effort_unit}")
-        actuator = Actuator(**drive)
-        intervals.update(more)
-    return JointParameters(**values, actuator=actuator), intervals
-
-
-def check_joint(joint: Joint, own: JointParameters) -> None:
-    """Refuse a value outside its domain, a static friction below the sliding one, and stops out of order.
-
-    Raises:
-        ParameterError: There is one.
-    """
-    for spec in joint_specs(joint):
-        value = getattr(own, spec.name)
-        if value is not None:
-            spec.check(value, where=joint.name)
-    if own.actuator is not None:
-        for spec in actuator_specs(joint):
-            spec.check(getattr(own.actuator, spec.name), where=f"{joint.name}.actuator")
-    if own.breakaway < own.coulomb_friction:
-        unit = joint.effort_unit
-        raise ParameterError(
-            f"{joint.name}: static_friction is {own.static_friction} {unit}; "
-            f"expected >= coulomb_friction = {own.coulomb_friction} {unit}"
-        )
-    low, high = own.lower_stop, own.upper_stop
-    if low is not None and high is not None and not low < high:
-        raise ParameterError(f"{joint.name}: lower_stop is {low} {joint.unit}; expected < upper_stop = {high}")

@@ -5,28 +5,24 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import MECHANISMS
-from pendulum_msgs_py.plants.joint_parameters import Actuator, JointParameters
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import (
+from pendulum_msgs_py.plants.joint_parameters import (
     DRIVETRAIN_SPECS,
-    PLANT_SPECS,
-    PlantParameters,
+    OF_A_PENDULUM,
+    Actuator,
+    JointParameters,
     SeriesElasticParameters,
-    is_mechanism,
-    load_plant,
 )
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
 
 __all__ = [
     "PLANT_PARAMETERS",
-    "AnyPlant",
     "PlantDifference",
     "describe_plants",
-    "load_any_plant",
     "plant_differences",
     "plant_mismatch",
     "read_plants",
@@ -63,31 +59,23 @@ class PlantDifference:
         return f"{self.name} {first}, runs {second}{unit}"
 
 
-AnyPlant = PlantParameters | MechanismParameters
-
-
-def load_any_plant(preset_or_path: str) -> AnyPlant:
-    """Return the plant of a preset or a file, of one joint or several.
-
-    Raises:
-        ParameterError: It cannot be read.
-    """
-    return load_mechanism(preset_or_path) if is_mechanism(preset_or_path) else load_plant(preset_or_path)
-
-
-def plant_differences(designed: AnyPlant, running: AnyPlant) -> tuple[PlantDifference, ...]:
+def plant_differences(designed: PlantParameters, running: PlantParameters) -> tuple[PlantDifference, ...]:
     """Return the parameters in which two plants differ, in the order of the plant file.
 
     Values within 0.1 % of each other count as the same. Of a rigid plant and a series-elastic one the link is compared,
     and the drivetrain named once.
     """
-    if not (isinstance(designed, PlantParameters) and isinstance(running, PlantParameters)):
-        return _joint_differences(designed, running)
-    found = [
-        PlantDifference(spec.name, *values, spec.unit)
-        for spec in PLANT_SPECS
-        if _differ(*(values := (getattr(designed, spec.name), getattr(running, spec.name))))
-    ]
+    first, second = (plant.mechanism.name for plant in (designed, running))
+    if first != second:
+        return (PlantDifference("model", first, second, ""),)
+    found = []
+    for name in {**designed.numbers, **running.numbers}:
+        mine, theirs = designed.numbers.get(name), running.numbers.get(name)
+        if mine is None or theirs is None:
+            first, second = ("none" if value is None else f"{value:.6g}" for value in (mine, theirs))
+            found.append(PlantDifference(name, first, second, ""))
+        elif _differ(mine, theirs):
+            found.append(PlantDifference(name, mine, theirs, designed.specs[name].unit))
     drives = designed.drivetrain, running.drivetrain
     if (drives[0] is None) != (drives[1] is None):
         first, second = ("rigid" if drive is None else "series elastic" for drive in drives)
@@ -101,24 +89,7 @@ def plant_differences(designed: AnyPlant, running: AnyPlant) -> tuple[PlantDiffe
     return tuple(found)
 
 
-def _joint_differences(designed: AnyPlant, running: AnyPlant) -> tuple[PlantDifference, ...]:
-    first, second = (
-        plant.mechanism.name if isinstance(plant, MechanismParameters) else "pendulum" for plant in (designed, running)
-    )
-    if first != second or not (isinstance(designed, MechanismParameters) and isinstance(running, MechanismParameters)):
-        return (PlantDifference("model", first, second, ""),)
-    found = []
-    for name in {**designed.numbers, **running.numbers}:
-        mine, theirs = designed.numbers.get(name), running.numbers.get(name)
-        if mine is None or theirs is None:
-            first, second = ("none" if value is None else f"{value:.6g}" for value in (mine, theirs))
-            found.append(PlantDifference(name, first, second, ""))
-        elif _differ(mine, theirs):
-            found.append(PlantDifference(name, mine, theirs, designed.specs[name].unit))
-    return tuple(found)
-
-
-def plant_mismatch(designed: AnyPlant, running: Sequence[AnyPlant]) -> str:
+def plant_mismatch(designed: PlantParameters, running: Sequence[PlantParameters]) -> str:
     """Return as text how the running plant differs from the one designed for; empty where it does not.
 
     Args:
@@ -138,12 +109,12 @@ def plant_mismatch(designed: AnyPlant, running: Sequence[AnyPlant]) -> str:
     )
 
 
-def describe_plants(plants: Sequence[AnyPlant]) -> str:
+def describe_plants(plants: Sequence[PlantParameters]) -> str:
     """Return a plant's descriptions, one or several, as text for its diagnostics."""
     return json.dumps([_as_mapping(plant) for plant in plants], separators=(",", ":"))
 
 
-def read_plants(text: str) -> tuple[AnyPlant, ...]:
+def read_plants(text: str) -> tuple[PlantParameters, ...]:
     """Return the plants of a text that :func:`describe_plants` wrote.
 
     Raises:
@@ -155,28 +126,28 @@ def read_plants(text: str) -> tuple[AnyPlant, ...]:
         raise ParameterError(f"{PLANT_PARAMETERS} is no description of plants: {error}") from error
 
 
-def _as_mapping(plant: AnyPlant) -> dict[str, Any]:
-    if isinstance(plant, MechanismParameters):
-        joints = [asdict(joint) for joint in plant.joints]
-        return {"name": plant.name, "model": plant.mechanism.name, "values": list(plant.values), "joints": joints}
-    drive = plant.drivetrain
-    values: dict[str, Any] = {"name": plant.name, **{spec.name: getattr(plant, spec.name) for spec in PLANT_SPECS}}
-    if drive is not None:
-        values["drivetrain"] = {each.name: getattr(drive, each.name) for each in fields(drive)}
-    return values
+def _as_mapping(plant: PlantParameters) -> dict[str, Any]:
+    if plant.is_pendulum:
+        drive = {} if plant.drivetrain is None else {"drivetrain": vars(plant.drivetrain)}
+        return {"name": plant.name, **plant.numbers, **drive}
+    joints = [
+        {key: value for key, value in asdict(joint).items() if key not in {*OF_A_PENDULUM, "drivetrain"}}
+        for joint in plant.joints
+    ]
+    return {"name": plant.name, "model": plant.mechanism.name, "values": list(plant.values), "joints": joints}
 
 
-def _from_mapping(entry: Any) -> AnyPlant:
-    if "model" in entry:
-        joints = []
-        for joint in entry["joints"]:
-            drive = joint.get("actuator")
-            joints.append(JointParameters(**{**joint, "actuator": None if drive is None else Actuator(**drive)}))
-        values = tuple(float(value) for value in entry["values"])
-        return MechanismParameters(MECHANISMS[entry["model"]], values, tuple(joints), str(entry.get("name", "unnamed")))
-    drive = entry.get("drivetrain")
-    built = None if drive is None else SeriesElasticParameters(**drive)
-    return PlantParameters(**{**entry, "drivetrain": built, "name": str(entry.get("name", "unnamed"))})
+def _from_mapping(entry: Any) -> PlantParameters:
+    name = str(entry.get("name", "unnamed"))
+    if "model" not in entry:
+        drive = entry.get("drivetrain")
+        built = None if drive is None else SeriesElasticParameters(**drive)
+        return pendulum_plant(**{**entry, "drivetrain": built, "name": name})
+    joints = []
+    for joint in entry["joints"]:
+        drive = joint.get("actuator")
+        joints.append(JointParameters(**{**joint, "actuator": None if drive is None else Actuator(**drive)}))
+    return PlantParameters(MECHANISMS[entry["model"]], tuple(entry["values"]), tuple(joints), name)
 
 
 def _differ(designed: float, running: float) -> bool:

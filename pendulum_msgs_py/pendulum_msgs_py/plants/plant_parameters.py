@@ -1,6 +1,21 @@
-"""Physical parameters of a pendulum: one dataclass, one YAML format, shared by plant, design and identification.
+"""Physical parameters of a plant: one type, one YAML format, shared by plant, design and identification.
 
-The file gives each value with its unit, so that a file in other units is refused rather than misread::
+A plant is a mechanism with its values, and what each of its joints has. A file gives each value with its unit, so that
+a file in other units is refused rather than misread. The format ``pendulum_plant/2`` names the mechanism and its
+joints; an ``actuator:`` block makes a joint driven::
+
+    format: pendulum_plant/2
+    name: acrobot
+    model: double_pendulum
+    parameters:
+      mass_1: {value: 0.523, unit: kg}
+    joints:
+      shoulder: {damping: {value: 0.001, unit: N m s/rad}}
+      elbow:
+        coulomb_friction: {value: 0.12, unit: N m}
+        actuator: {effort_limit: {value: 6.0, unit: N m}}
+
+The format ``pendulum_plant/1`` has the numbers of a pendulum, one driven hinge, in one list::
 
     format: pendulum_plant/1
     name: thesis
@@ -9,35 +24,52 @@ The file gives each value with its unit, so that a file in other units is refuse
       damping: {value: 11.77, unit: N m s/rad, interval: [11.70, 11.84]}
       gravity: {value: 1.678, unit: N m}
     drivetrain: {...}      # only for a series-elastic plant
-    provenance: {...}      # optional: data, method, date
+    provenance: {...}      # optional, in both: data, method, date
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from importlib import resources
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any, NamedTuple
 
-from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates, Vector
+from pendulum_msgs_py.contract.joints import Coordinates, Joint, Vector
+from pendulum_msgs_py.dynamics.joint_steps import FAR, JointTable
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown
-from pendulum_msgs_py.plants.friction_terms import term_fields
+from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
+from pendulum_msgs_py.parameters import (
+    ParameterSpec,
+    dump_yaml,
+    load_yaml,
+    reject_unknown,
+    require_mapping,
+    suggestion,
+)
+from pendulum_msgs_py.plants.friction_terms import STRENGTHS, TERM_PARAMETERS
+from pendulum_msgs_py.plants.joint_parameters import (
+    DRIVETRAIN_SPECS,
+    OF_A_PENDULUM,
+    Actuator,
+    JointParameters,
+    SeriesElasticParameters,
+    actuator_specs,
+    joint_specs,
+)
 from pendulum_msgs_py.plants.quantities import (
-    Quantity,
     build_plant,
-    check_fields,
     read_name,
     read_provenance,
     read_quantities,
-    specs_of,
     write_quantities,
 )
 from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
-    "DRIVETRAIN_SPECS",
     "FORMAT",
     "MECHANISM_FORMAT",
     "MECHANISM_PRESETS",
@@ -47,21 +79,22 @@ __all__ = [
     "SEALED_FORMAT",
     "SERIES_ELASTIC_PRESETS",
     "PlantParameters",
-    "SeriesElasticParameters",
+    "common_delay",
     "is_mechanism",
+    "load_mechanism",
     "load_plant",
     "load_plant_file",
+    "pack_joints",
+    "pendulum_plant",
     "plant_document",
     "read_plant_document",
     "require_one_joint",
     "resolve_plant",
-    "save_document",
     "write_plant",
 ]
 
 FORMAT = "pendulum_plant/1"
 MECHANISM_FORMAT = "pendulum_plant/2"
-"""Format of a plant file of several joints; see :mod:`pendulum_msgs_py.plants.mechanism_parameters`."""
 SEALED_FORMAT = "pendulum_plant_sealed/1"
 """Format of a plant file that only simulators read; see :mod:`pendulum_msgs_py.plants.sealed_plant`."""
 _PRESET_FOLDER = Path(str(resources.files("pendulum_msgs_py.plants") / "presets"))
@@ -80,143 +113,380 @@ PRESET_NAMES = ", ".join(PRESETS)
 SERIES_ELASTIC_PRESETS = tuple(name for name in PRESETS if "\ndrivetrain:" in _PRESET_TEXTS[name])
 """Those of them that have motor, gears and spring."""
 
+_PENDULUM = MECHANISMS["pendulum"]
+_REQUIRED = ("inertia", "damping", "gravity")
+"""What a file of a pendulum must give."""
+_EXAMPLES = {"damping": 11.77, "effort_limit": 13.0}
+"""Defaults of one joint where those of a joint among others differ; its effort has no largest value: a foreign
+simulation may have any."""
+_ANGLES = 16
+"""Angles of each turning joint at which the mass matrix must be positive definite."""
 
-@dataclass(frozen=True)
-class SeriesElasticParameters:
-    """Motor, gear train and spring of a series-elastic actuator.
 
-    Source: HEBI X5-9 datasheet values; friction and hysteresis from public logs of X5 actuators.
+class _Place(NamedTuple):
+    """Where a plant has one of its numbers.
+
+    Attributes:
+        spec: What it is.
+        part: ``values``, ``joint`` or ``actuator``.
+        number: Of the value, or of the joint.
+        key: Name of the joint's or the actuator's field.
+        where: Prefix of messages.
     """
 
-    gear_ratio: Annotated[float, Quantity("-", "Motor turns per output turn, N.", positive=True)] = 1742.222
-    torque_constant: Annotated[
-        float, Quantity("N m/A", "Torque per winding current at the motor, K_t.", positive=True)
-    ] = 6.26e-3
-    back_emf_constant: Annotated[float, Quantity("V s/rad", "Voltage per motor speed, K_e.")] = 6.241e-3
-    winding_resistance: Annotated[
-        float, Quantity("ohm", "Winding resistance at 20 degrees Celsius, R.", positive=True)
-    ] = 9.99
-    winding_temperature: Annotated[float, Quantity("degC", "Winding temperature at the start.", signed=True)] = 22.0
-    resistance_temperature_coefficient: Annotated[float, Quantity("1/K", "Relative change of R per kelvin.")] = 0.004
-    supply_voltage: Annotated[float, Quantity("V", "Supply voltage, V.", positive=True)] = 36.0
-    efficiency: Annotated[
-        float, Quantity("-", "Share of motor torque that a command counts on at the output.", positive=True)
-    ] = 0.65
-    reflected_inertia: Annotated[
-        float, Quantity("kg m^2", "Rotor inertia seen at the output, J_r N^2.", positive=True)
-    ] = 0.19
-    motor_damping: Annotated[
-        float, Quantity("N m s/rad", "Viscous friction of motor and gears at the output, b_v.")
-    ] = 1.4
-    motor_coulomb_friction: Annotated[
-        float, Quantity("N m", "Dry friction of motor and gears at the output, tau_C.")
-    ] = 0.3
-    motor_static_friction: Annotated[
-        float, Quantity("N m", "Dry friction at which the motor starts to slide, tau_S.")
-    ] = 0.39
-    motor_stribeck_velocity: Annotated[
-        float, Quantity("rad/s", "Velocity over which tau_S falls to tau_C.", positive=True)
-    ] = 0.01
-    stiffness: Annotated[float, Quantity("N m/rad", "Spring stiffness at small deflection, k.", positive=True)] = 100.0
-    stiffness_hardening: Annotated[
-        float, Quantity("N m/rad^3", "Growth of the stiffness with the deflection squared.")
-    ] = 0.0
-    hysteresis_torque: Annotated[float, Quantity("N m", "Half width of the spring's hysteresis loop, tau_h.")] = 0.05
-    hysteresis_deflection: Annotated[
-        float, Quantity("rad", "Deflection over which the loop turns round.", positive=True)
-    ] = 2e-4
-
-    def __post_init__(self) -> None:
-        """Check every value; a static friction below the sliding one would feed energy in."""
-        check_fields(self, DRIVETRAIN_SPECS)
-        if self.motor_static_friction < self.motor_coulomb_friction:
-            raise ParameterError(
-                f"motor_static_friction is {self.motor_static_friction} N m; "
-                f"expected >= motor_coulomb_friction = {self.motor_coulomb_friction} N m"
-            )
+    spec: ParameterSpec
+    part: str
+    number: int
+    key: str
+    where: str
 
 
-if TYPE_CHECKING:
+@cache
+def _places(mechanism: Mechanism) -> dict[str, _Place]:
+    """Return where the numbers of a mechanism's plants are, by name: ``elbow.damping``, or of one joint ``damping``."""
+    found = {spec.name: _Place(spec, "values", index, spec.name, "") for index, spec in enumerate(mechanism.parameters)}
+    several = len(mechanism.joints) > 1
+    for index, joint in enumerate(mechanism.joints):
+        for part, specs in (
+            ("joint", joint_specs(joint) if mechanism.name == _PENDULUM.name else _format_2(joint)),
+            ("actuator", actuator_specs(joint)),
+        ):
+            for spec in specs:
+                name, shown, where = _name(mechanism, joint, spec.name), spec, ""
+                if several:
+                    where = joint.name if part == "joint" else f"{joint.name}.actuator"
+                else:
+                    shown = replace(spec, name=name, default=_EXAMPLES.get(name, spec.default), maximum=None)
+                found[name] = _Place(shown, part, index, spec.name, where)
+    if several:
+        return found
+    # As in files: what a file must give first, and friction terms last.
+    order = {name: rank for rank, name in enumerate(_REQUIRED, -len(_REQUIRED))}
+    return dict(sorted(found.items(), key=lambda each: order.get(each[0], each[0] in TERM_PARAMETERS)))
 
-    @dataclass(frozen=True, kw_only=True)
-    class _FrictionTerms:
-        """What type checkers see of the terms' parameters: those of the table of terms."""
 
-        load_friction: float = 0.0
+def _name(mechanism: Mechanism, joint: Joint, key: str) -> str:
+    """Return the name of a joint's or an actuator's quantity."""
+    if len(mechanism.joints) > 1:
+        return f"{joint.name}.{key}"
+    return "actuator_time_constant" if key == "time_constant" else key
 
-else:
-    _FrictionTerms = term_fields()
+
+def _format_2(joint: Joint) -> tuple[ParameterSpec, ...]:
+    """Return what a joint may have in format 2."""
+    return tuple(spec for spec in joint_specs(joint) if spec.name not in OF_A_PENDULUM)
+
+
+PLANT_SPECS = tuple(
+    place.spec for name, place in _places(_PENDULUM).items() if name not in {"lower_stop", "upper_stop"}
+)
+"""Quantities of a pendulum, in the order of a plant file's section ``parameters``."""
+
+
+class _Pendulum:
+    """Numbers that a pendulum, ``is_pendulum``, has as attributes, too; of others :meth:`PlantParameters.value` takes.
+
+    ::
+
+        M_c theta'' + b_c theta' + friction + G_c sin(theta) = u + d
+    """
+
+    inertia: float
+    damping: float
+    gravity: float
+    coulomb_friction: float
+    static_friction: float
+    stribeck_velocity: float
+    torque_offset: float
+    angle_offset: float
+    effort_limit: float
+    actuator_time_constant: float
+    transport_delay: float
+    load_friction: float
 
 
 @dataclass(frozen=True)
-class PlantParameters(_FrictionTerms):
-    """Parameters of M_c theta'' + b_c theta' + friction + G_c sin(theta) = u + d.
+class PlantParameters(_Pendulum):
+    """A plant of n joints: a mechanism, its numbers, and what each joint has.
 
-    ``static_friction`` may be left out (None) and is then the Coulomb friction. Parameters of
-    :mod:`pendulum_msgs_py.plants.friction_terms` are given by name.
+    Attributes:
+        mechanism: Equations and joints.
+        values: Values of ``mechanism.parameters``, in their order.
+        joints: One entry per joint, in the order of the model.
+        name: Name of the plant.
+
+    Raises:
+        ParameterError: A value is outside its domain, or the masses give no positive inertia at some position.
     """
 
-    inertia: Annotated[float, Quantity("kg m^2", "Inertia about the joint, M_c.", positive=True, example=0.055)]
-    damping: Annotated[float, Quantity("N m s/rad", "Viscous friction, b_c.", example=11.77)]
-    gravity: Annotated[
-        float, Quantity("N m", "Gravity coefficient, G_c = m g l_c; 0 for a pendulum that lies flat.", example=1.678)
-    ]
-    coulomb_friction: Annotated[float, Quantity("N m", "Dry friction while sliding fast, tau_C.")] = 0.0
-    static_friction: Annotated[float, Quantity("N m", "Dry friction at which sliding starts, tau_S >= tau_C.")] = None  # type: ignore[assignment]  # filled in below
-    stribeck_velocity: Annotated[
-        float, Quantity("rad/s", "Velocity over which tau_S falls to tau_C.", positive=True)
-    ] = 0.01
-    torque_offset: Annotated[
-        float, Quantity("N m", "Constant torque that the sensor of effort misses.", signed=True)
-    ] = 0.0
-    angle_offset: Annotated[float, Quantity("rad", "Measured angle when hanging at rest.", signed=True)] = 0.0
-    effort_limit: Annotated[float, Quantity("N m", "Largest torque of the actuator.", positive=True)] = 13.0
-    actuator_time_constant: Annotated[
-        float, Quantity("s", "First-order lag between command and torque; 0 for none.")
-    ] = 0.0
-    transport_delay: Annotated[float, Quantity("s", "Time between a command and its first effect.")] = 0.0
-    drivetrain: SeriesElasticParameters | None = None
+    mechanism: Mechanism
+    values: Vector
+    joints: tuple[JointParameters, ...]
     name: str = field(default="unnamed", compare=False)
 
     def __post_init__(self) -> None:
-        """Check every value and fill in the static friction."""
-        if self.static_friction is None:
-            object.__setattr__(self, "static_friction", self.coulomb_friction)  # type: ignore[unreachable]
-        check_fields(self, PLANT_SPECS)
-        if self.static_friction < self.coulomb_friction:
+        """Check every value, and keep it as the number that it is."""
+        specs = self.mechanism.parameters
+        if len(self.values) != len(specs) or len(self.joints) != len(self.mechanism.joints):
             raise ParameterError(
-                f"static_friction is {self.static_friction} N m; "
-                f"expected >= coulomb_friction = {self.coulomb_friction} N m"
+                f"{self.mechanism.name} has {len(self.values)} values and {len(self.joints)} joints; "
+                f"expected {len(specs)} and {len(self.mechanism.joints)}"
             )
+        changes = {}
+        for place in self._places.values():
+            value = self._at(place)
+            if value is not None and (checked := place.spec.check(value, where=place.where)) is not value:
+                changes[place] = checked
+            if place.key == "static_friction" and value == self.joints[place.number].coulomb_friction:
+                # It follows the Coulomb friction: otherwise a change of that would add stiction.
+                changes[place] = None
+        if changes:
+            for name, part in zip(("values", "joints"), self._changed(changes), strict=True):
+                object.__setattr__(self, name, part)
+        for joint, own in zip(self.mechanism.joints, self.joints, strict=True):
+            self._check_joint(joint, own)
+        if self.is_pendulum:
+            vars(self).update(self.numbers)
+        else:
+            _require_rigid(self)
+            self._check_mass()
+
+    def _check_joint(self, joint: Joint, own: JointParameters) -> None:
+        where = f"{joint.name}: " if len(self.joints) > 1 else ""
+        if own.breakaway < own.coulomb_friction:
+            unit = joint.effort_unit
+            raise ParameterError(
+                f"{where}static_friction is {own.static_friction} {unit}; "
+                f"expected >= coulomb_friction = {own.coulomb_friction} {unit}"
+            )
+        low, high = own.lower_stop, own.upper_stop
+        if low is not None and high is not None and not low < high:
+            raise ParameterError(f"{where}lower_stop is {low} {joint.unit}; expected < upper_stop = {high}")
+
+    def _check_mass(self) -> None:
+        turns = [2.0 * math.pi * index / _ANGLES for index in range(_ANGLES)]
+        for q in product(*((turns if joint.turns else [0.0]) for joint in self.mechanism.joints)):
+            if not _positive_definite(self.mechanism.mass(q, self.packed)):
+                at = ", ".join(
+                    f"{joint.name} = {value:.3g} {joint.unit}"
+                    for joint, value in zip(self.mechanism.joints, q, strict=True)
+                )
+                raise ParameterError(
+                    f"the masses and inertias of {self.name!r} give no positive inertia at {at}; expected an inertia "
+                    "about the joint that its mass and centre can have, at least mass * centre^2"
+                )
+
+    @cached_property
+    def is_pendulum(self) -> bool:
+        """Whether it is one driven hinge without end stops, which the equations of a single pendulum describe."""
+        own = self.joints[0]
+        return (
+            self.mechanism.name == _PENDULUM.name
+            and own.actuator is not None
+            and own.lower_stop is own.upper_stop is None
+        )
 
     @property
+    def drivetrain(self) -> SeriesElasticParameters | None:
+        """Motor, gears and spring, of a pendulum that has them."""
+        return self.joints[0].drivetrain
+
+    @cached_property
     def coordinates(self) -> Coordinates:
-        """The only joint, which is driven."""
-        return ONE_JOINT
+        """Joints, and which of them are driven."""
+        driven = tuple(index for index, joint in enumerate(self.joints) if joint.actuator is not None)
+        return Coordinates(self.mechanism.joints, driven)
+
+    @cached_property
+    def packed(self) -> Vector:
+        """The ``p`` of the mechanism's functions: values, then the damping of each joint."""
+        return (*self.values, *(joint.damping for joint in self.joints))
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """Actuators of the driven joints, in the model's order."""
+        return tuple(joint.actuator for joint in self.joints if joint.actuator is not None)
 
     @property
     def effort_limits(self) -> Vector:
-        """Largest effort of each driven joint [N m]."""
-        return (self.effort_limit,)
+        """Largest effort of each driven joint [N m or N]."""
+        return tuple(actuator.effort_limit for actuator in self.actuators)
 
-    def with_values(self, **changes: Any) -> PlantParameters:
+    @property
+    def stops(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest position of each joint, infinite where nothing stops it [rad or m]."""
+        return tuple(
+            (
+                -math.inf if joint.lower_stop is None else joint.lower_stop,
+                math.inf if joint.upper_stop is None else joint.upper_stop,
+            )
+            for joint in self.joints
+        )
+
+    @property
+    def has_dry_friction(self) -> bool:
+        """Whether any joint has dry friction, by Coulomb or by a further term."""
+        strengths = [TERM_PARAMETERS[index] for index in STRENGTHS]
+        return any(own.breakaway > 0.0 or any(getattr(own, name) for name in strengths) for own in self.joints)
+
+    @cached_property
+    def _places(self) -> dict[str, _Place]:
+        return {
+            name: place
+            for name, place in _places(self.mechanism).items()
+            if place.part != "actuator" or self.joints[place.number].actuator is not None
+        }
+
+    def _at(self, place: _Place) -> Any:
+        if place.part == "values":
+            return self.values[place.number]
+        joint = self.joints[place.number]
+        return getattr(joint if place.part == "joint" else joint.actuator, place.key)
+
+    def _changed(self, changes: Mapping[_Place, Any]) -> tuple[Vector, tuple[JointParameters, ...]]:
+        values, joints = list(self.values), list(self.joints)
+        for place, value in changes.items():
+            if place.part == "values":
+                values[place.number] = value
+                continue
+            own, change = joints[place.number], {place.key: value}
+            if place.part == "actuator":
+                assert own.actuator is not None
+                change = {"actuator": replace(own.actuator, **change)}
+            joints[place.number] = replace(own, **change)
+        return tuple(values), tuple(joints)
+
+    @property
+    def specs(self) -> dict[str, ParameterSpec]:
+        """Table of what :meth:`with_values` takes, by name."""
+        return {name: place.spec for name, place in self._places.items()}
+
+    @cached_property
+    def numbers(self) -> dict[str, float]:
+        """All values that are given, by the names of :attr:`specs`; of a pendulum all that a file may give."""
+        found = {name: self._at(place) for name, place in self._places.items()}
+        if self.is_pendulum:
+            found["static_friction"] = self.joints[0].breakaway
+        return {name: value for name, value in found.items() if value is not None}
+
+    def value(self, name: str) -> float:
+        """Return a parameter by the name that :meth:`with_values` takes.
+
+        Raises:
+            ParameterError: There is none of that name, or it is not given.
+        """
+        if (key := self._plain(name)) not in self.numbers:
+            raise ParameterError(f"{name!r} is not given for plant {self.name!r}; expected {self._expected_names()}")
+        return self.numbers[key]
+
+    def with_values(self, changes: Mapping[str, Any] | None = None, /, **more: Any) -> PlantParameters:
         """Return a copy with some values changed, checked again.
 
-        A static friction equal to the Coulomb friction follows it: otherwise a change would add stiction.
+        Args:
+            changes: Values by name: ``mass_1``, ``elbow.damping``, ``elbow.effort_limit``; of one joint ``damping``.
+            more: The same; ``name`` and, of a pendulum, ``drivetrain``, too.
+
+        Raises:
+            ParameterError: A name is unknown, a joint is passive, or a value is outside its domain.
         """
-        if "coulomb_friction" in changes and self.static_friction == self.coulomb_friction:
-            changes = {"static_friction": None, **changes}
-        return replace(self, **changes)
+        wanted = {self._plain(name): value for name, value in {**(changes or {}), **more}.items()}
+        name = wanted.pop("name", self.name)
+        drivetrain = wanted.pop("drivetrain", self.drivetrain)
+        for unknown in [key for key in wanted if key not in self._places]:
+            raise ParameterError(f"unknown parameter {unknown!r}; expected {self._expected_names()}")
+        values, joints = self._changed({self._places[key]: value for key, value in wanted.items()})
+        if drivetrain is not self.drivetrain:
+            joints = (replace(joints[0], drivetrain=drivetrain), *joints[1:])
+        return PlantParameters(self.mechanism, values, joints, name)
+
+    def check_start(self, position: Sequence[float]) -> Vector:
+        """Return a start position as numbers.
+
+        Raises:
+            ParameterError: It has another length, is not finite, or lies beyond an end stop.
+        """
+        values = tuple(float(value) for value in position)
+        if len(values) != len(self.joints) or not all(map(math.isfinite, values)):
+            raise ParameterError(
+                f"initial position is {list(values)}; expected {len(self.joints)} finite numbers, for "
+                f"{self.coordinates.with_units}"
+            )
+        for joint, (low, high), value in zip(self.mechanism.joints, self.stops, values, strict=True):
+            if not low <= value <= high:
+                raise ParameterError(
+                    f"initial {joint.name} is {value} {joint.unit}; expected {low} to {high}, between its stops"
+                )
+        return values
+
+    def acceleration(self, position: Vector, velocity: Vector, torque: Vector) -> Vector:
+        """Return q'' under generalised forces at all n joints, dry friction apart [rad/s^2 or m/s^2].
+
+        Args:
+            position: q, n values [rad or m].
+            velocity: q', n values.
+            torque: n values [N m or N]; ``coordinates.spread`` makes them of those of the driven joints.
+        """
+        result: Vector = self.mechanism.forward(position, velocity, torque, self.packed)
+        return result
+
+    def energy(self, position: Vector, velocity: Vector) -> float:
+        """Return kinetic and potential energy, 0 at rest hanging down [J]."""
+        rows = self.mechanism.mass(position, self.packed)
+        kinetic = sum(
+            a * m * b for a, row in zip(velocity, rows, strict=True) for m, b in zip(row, velocity, strict=True)
+        )
+        return float(0.5 * kinetic + self.mechanism.potential(position, self.packed))
+
+    def _plain(self, name: str) -> str:
+        """Return a name as in :attr:`specs`: of one joint, ``pendulum_joint.damping`` is ``damping``."""
+        joint, _, key = name.partition(".")
+        return _name(self.mechanism, self.mechanism.joints[0], key) if [joint] == [*self.coordinates.names] else name
+
+    def _expected_names(self) -> str:
+        if len(self.joints) == 1:
+            return f"one of {', '.join(self.specs)}"
+        own = ", ".join(spec.name for spec in self.mechanism.parameters)
+        joints = " or ".join(self.coordinates.names)
+        return f"one of {own}, or JOINT.damping and the like with JOINT {joints}"
 
 
-DRIVETRAIN_SPECS = specs_of(SeriesElasticParameters)
-"""Quantities of a plant file's section ``drivetrain``."""
-PLANT_SPECS = specs_of(PlantParameters)
-"""Quantities of a plant file's section ``parameters``."""
+def pendulum_plant(
+    inertia: float,
+    damping: float,
+    gravity: float,
+    *,
+    drivetrain: SeriesElasticParameters | None = None,
+    name: str = "unnamed",
+    **numbers: float | None,
+) -> PlantParameters:
+    """Return a pendulum.
+
+    Args:
+        inertia: About the joint, M_c [kg m^2].
+        damping: b_c [N m s/rad].
+        gravity: G_c = m g l_c [N m].
+        drivetrain: Motor, gears and spring; None for a rigid one.
+        name: Name of the plant.
+        numbers: Others of ``PLANT_SPECS``; those left out have their defaults, and the static friction is then the
+            Coulomb friction.
+
+    Raises:
+        ParameterError: A name is unknown, or a value is outside its domain.
+    """
+    parts: dict[str, dict[str, Any]] = {"joint": {}, "actuator": {"effort_limit": _EXAMPLES["effort_limit"]}}
+    for key, value in numbers.items():
+        place = _places(_PENDULUM).get(key)
+        if place is None:
+            expected = ", ".join(spec.name for spec in PLANT_SPECS)
+            raise ParameterError(f"unknown parameter {key!r}; expected one of {expected}")
+        parts[place.part][place.key] = value
+    actuator = Actuator(**parts["actuator"])
+    joint = JointParameters(**parts["joint"], damping=damping, actuator=actuator, drivetrain=drivetrain)
+    return PlantParameters(_PENDULUM, (inertia, gravity), (joint,), name)
 
 
-def load_plant(preset_or_path: str | Path) -> PlantParameters:
-    """Return the parameters of a preset (one of ``PRESETS``) or of a plant file.
+def load_mechanism(preset_or_path: str | Path) -> PlantParameters:
+    """Return the plant of a preset or of a plant file, of one joint or more.
 
     Raises:
         ParameterError: No such preset or file, or the file is refused; the message names file and entry.
@@ -225,10 +495,10 @@ def load_plant(preset_or_path: str | Path) -> PlantParameters:
 
 
 def load_plant_file(preset_or_path: str | Path) -> tuple[PlantParameters, dict[str, Any]]:
-    """Return the parameters and the file's provenance (intervals included under ``intervals``).
+    """Return the plant and the file's provenance (intervals included under ``intervals``).
 
     Raises:
-        ParameterError: as :func:`load_plant`.
+        ParameterError: as :func:`load_mechanism`.
     """
     path = resolve_plant(preset_or_path)
     document = load_yaml(path, "plant file")
@@ -240,41 +510,123 @@ def load_plant_file(preset_or_path: str | Path) -> tuple[PlantParameters, dict[s
     return read_plant_document(document, path)
 
 
+def load_plant(preset_or_path: str | Path) -> PlantParameters:
+    """Return the pendulum of a preset (one of ``PRESETS``) or of a plant file.
+
+    Raises:
+        ParameterError: as :func:`load_mechanism`, or it is another mechanism.
+    """
+    parameters = load_mechanism(preset_or_path)
+    if not parameters.is_pendulum:
+        raise ParameterError(
+            f"plant file {resolve_plant(preset_or_path)} describes a mechanism ({parameters.mechanism.name}); expected "
+            f"a plant of one joint here, as {PRESET_NAMES}"
+        )
+    return parameters
+
+
 def read_plant_document(document: Mapping[str, Any], path: Path) -> tuple[PlantParameters, dict[str, Any]]:
-    """Return the parameters and the provenance of the content of a plant file.
+    """Return the plant and the provenance of the content of a plant file.
 
     Args:
         document: The content.
         path: The file, for messages and as a name.
 
     Raises:
-        ParameterError: as :func:`load_plant`.
+        ParameterError: as :func:`load_mechanism`.
     """
     where = str(path)
-    if document.get("format") == MECHANISM_FORMAT:
-        raise ParameterError(
-            f"plant file {path} describes a mechanism ({document.get('model')}); expected a plant of one joint here, "
-            f"as {PRESET_NAMES}"
-        )
     # What the other names may be depends on the format.
-    if document.get("format") != FORMAT:
-        raise ParameterError(f"{where}: format is {document.get('format')!r}; expected {FORMAT!r}")
+    if document.get("format") not in (FORMAT, MECHANISM_FORMAT):
+        raise ParameterError(
+            f"{where}: format is {document.get('format')!r}; expected {FORMAT!r} or {MECHANISM_FORMAT!r}"
+        )
+    read = _read_pendulum if document["format"] == FORMAT else _read_mechanism
+    make, parts, intervals = read(document, where)
+    parameters = build_plant(make, {**parts, "name": read_name(document, path)}, where)
+    return parameters, read_provenance(document, where, intervals)
+
+
+_Parts = tuple[Callable[..., PlantParameters], dict[str, Any], dict[str, list[float]]]
+
+
+def _read_pendulum(document: Mapping[str, Any], where: str) -> _Parts:
     reject_unknown(document, ("format", "name", "parameters", "drivetrain", "provenance"), where=where)
     if "parameters" not in document:
         names = ", ".join(spec.name for spec in PLANT_SPECS)
         raise ParameterError(f"{where}: parameters is missing; expected a mapping of {names}")
-    values, intervals = read_quantities(document["parameters"], PLANT_SPECS, f"{where}: parameters")
-    for required in ("inertia", "damping", "gravity"):
-        if required not in values:
-            unit = next(spec.unit for spec in PLANT_SPECS if spec.name == required)
-            raise ParameterError(f"{where}: parameters.{required} is missing; expected a value in {unit}")
-    drivetrain = None
+    parts: dict[str, Any]
+    parts, intervals = read_quantities(document["parameters"], PLANT_SPECS, f"{where}: parameters")
+    _require_values(parts, [_places(_PENDULUM)[name].spec for name in _REQUIRED], where)
     if document.get("drivetrain") is not None:
-        drivetrain_values, more = read_quantities(document["drivetrain"], DRIVETRAIN_SPECS, f"{where}: drivetrain")
-        intervals.update({f"drivetrain.{name}": interval for name, interval in more.items()})
-        drivetrain = build_plant(SeriesElasticParameters, drivetrain_values, where)
-    parts = {**values, "drivetrain": drivetrain, "name": read_name(document, path)}
-    return build_plant(PlantParameters, parts, where), read_provenance(document, where, intervals)
+        values, more = read_quantities(document["drivetrain"], DRIVETRAIN_SPECS, f"{where}: drivetrain")
+        intervals |= {f"drivetrain.{name}": interval for name, interval in more.items()}
+        parts["drivetrain"] = build_plant(SeriesElasticParameters, values, where)
+    return pendulum_plant, parts, intervals
+
+
+def _read_mechanism(document: Mapping[str, Any], where: str) -> _Parts:
+    reject_unknown(document, ("format", "name", "model", "parameters", "joints", "provenance"), where=where)
+    model = document.get("model")
+    # Lists and mappings are neither names nor hashable.
+    if not isinstance(model, str) or model not in MECHANISMS:
+        given = "missing" if model is None else repr(model)
+        raise ParameterError(f"{where}: model is {given}; {suggestion(model, MECHANISMS)}")
+    mechanism = MECHANISMS[model]
+    given_values, intervals = read_quantities(
+        document.get("parameters") or {}, mechanism.parameters, f"{where}: parameters"
+    )
+    # Those that have a natural value may be left out; a mass or a length has none.
+    natural = {"gravity", "rotor_inertia", "gear_ratio"}
+    _require_values(given_values, [spec for spec in mechanism.parameters if spec.name not in natural], where)
+    defaults: dict[str, Any] = {spec.name: spec.default for spec in mechanism.parameters}
+    values = tuple({**defaults, **given_values}.values())
+    entries = require_mapping(document.get("joints"), f"{where}: joints")
+    names = [joint.name for joint in mechanism.joints]
+    for name in entries:
+        if name not in names:
+            raise ParameterError(
+                f"{where}: joints has {name!r}; expected {', '.join(names)}, the joints of {mechanism.name}"
+            )
+    missing = [name for name in names if name not in entries]
+    if missing:
+        raise ParameterError(
+            f"{where}: joints.{missing[0]} is missing; expected an entry for each of {', '.join(names)}"
+        )
+    if list(entries) != names:
+        raise ParameterError(
+            f"{where}: joints are {', '.join(entries)}; expected them in the order of {mechanism.name}: "
+            f"{', '.join(names)}"
+        )
+    joints = []
+    for joint in mechanism.joints:
+        own, more = _read_joint(joint, entries[joint.name], f"{where}: joints.{joint.name}")
+        joints.append(own)
+        intervals |= {_name(mechanism, joint, key): interval for key, interval in more.items()}
+    return PlantParameters, {"mechanism": mechanism, "values": values, "joints": tuple(joints)}, intervals
+
+
+def _require_values(values: Mapping[str, float], specs: Sequence[ParameterSpec], where: str) -> None:
+    for spec in specs:
+        if spec.name not in values:
+            raise ParameterError(f"{where}: parameters.{spec.name} is missing; expected a value in {spec.unit}")
+
+
+def _read_joint(joint: Joint, entry: object, where: str) -> tuple[JointParameters, dict[str, list[float]]]:
+    content = dict(require_mapping(entry if entry is not None else {}, where))
+    has_actuator = "actuator" in content
+    block = content.pop("actuator", None)
+    specs = _format_2(joint)
+    reject_unknown(content, (*(spec.name for spec in specs), "actuator"), where=where)
+    values, intervals = read_quantities(content, specs, where)
+    parts: dict[str, Any] = {**values}
+    if has_actuator:
+        drive, more = read_quantities(block, actuator_specs(joint), f"{where}.actuator")
+        if "effort_limit" not in drive:
+            raise ParameterError(f"{where}.actuator.effort_limit is missing; expected a value in {joint.effort_unit}")
+        parts["actuator"] = Actuator(**drive)
+        intervals.update(more)
+    return JointParameters(**parts), intervals
 
 
 def write_plant(
@@ -284,31 +636,20 @@ def write_plant(
     provenance: Mapping[str, Any] | None = None,
     intervals: Mapping[str, Sequence[float]] | None = None,
 ) -> Path:
-    """Write a plant file that :func:`load_plant` reads back to the same values.
-
-    The file appears whole or not at all.
+    """Write a plant file that :func:`load_mechanism` reads back to the same values; it appears whole or not at all.
 
     Args:
         path: Where to write.
-        parameters: The values.
+        parameters: The plant.
         provenance: Data, method, date: plain YAML values.
-        intervals: 95 % interval by parameter name, in the parameter's unit.
-
-    Raises:
-        ParameterError: The file cannot be written.
-    """
-    return save_document(path, plant_document(parameters, intervals), provenance)
-
-
-def save_document(path: str | Path, document: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> Path:
-    """Write the content of a plant file, and where it is from; the file appears whole or not at all.
+        intervals: 95 % interval by name, as ``mass_1``, ``elbow.damping`` or ``damping``, in the parameter's unit.
 
     Raises:
         ParameterError: The file cannot be written.
     """
     path = Path(path)
-    whole = {**document, "provenance": dict(provenance)} if provenance else document
-    text = dump_yaml(whole, f"plant file {path}")
+    document = plant_document(parameters, intervals)
+    text = dump_yaml({**document, "provenance": dict(provenance)} if provenance else document, f"plant file {path}")
     with writing(f"plant file {path}", ParameterError):
         write_whole(path, text)
     return path
@@ -317,15 +658,27 @@ def save_document(path: str | Path, document: Mapping[str, Any], provenance: Map
 def plant_document(
     parameters: PlantParameters, intervals: Mapping[str, Sequence[float]] | None = None
 ) -> dict[str, Any]:
-    """Return the content of a plant file with some parameters, each with its unit and, where given, its interval."""
-    document: dict[str, Any] = {
-        "format": FORMAT,
-        "name": parameters.name,
-        "parameters": write_quantities(vars(parameters), PLANT_SPECS, intervals or {}),
-    }
-    if parameters.drivetrain is not None:
-        document["drivetrain"] = write_quantities(vars(parameters.drivetrain), DRIVETRAIN_SPECS, {})
-    return document
+    """Return the content of a plant file, each value with its unit and, where given, its interval."""
+    known = intervals or {}
+    mechanism, drive = parameters.mechanism, parameters.drivetrain
+    document: dict[str, Any] = {"format": FORMAT, "name": parameters.name}
+    if parameters.is_pendulum:
+        document["parameters"] = write_quantities(parameters.numbers, PLANT_SPECS, known)
+        if drive is not None:
+            document["drivetrain"] = write_quantities(vars(drive), DRIVETRAIN_SPECS, {})
+        return document
+    joints: dict[str, Any] = {}
+    for joint, own in zip(mechanism.joints, parameters.joints, strict=True):
+        specs, drives = _format_2(joint), actuator_specs(joint)
+        names = {spec.name: _name(mechanism, joint, spec.name) for spec in (*specs, *drives)}
+        of_joint = {key: known[name] for key, name in names.items() if name in known}
+        joints[joint.name] = write_quantities(vars(own), specs, of_joint)
+        if own.actuator is not None:
+            joints[joint.name]["actuator"] = write_quantities(vars(own.actuator), drives, of_joint)
+    own_values = write_quantities(parameters.numbers, mechanism.parameters, known)
+    return {
+        **document, "format": MECHANISM_FORMAT, "model": mechanism.name, "parameters": own_values, "joints": joints
+    }  # fmt: skip
 
 
 def resolve_plant(preset_or_path: str | Path) -> Path:
@@ -343,12 +696,14 @@ def resolve_plant(preset_or_path: str | Path) -> Path:
 
 
 def is_mechanism(preset_or_path: str | Path) -> bool:
-    """Return whether a preset or plant file is one of several joints.
+    """Return whether a preset or plant file is no pendulum; a sealed one is.
 
     Raises:
         ParameterError: No such preset or file.
     """
-    return load_yaml(resolve_plant(preset_or_path), "plant file").get("format") == MECHANISM_FORMAT
+    path = resolve_plant(preset_or_path)
+    document = load_yaml(path, "plant file")
+    return document.get("format") == MECHANISM_FORMAT and not read_plant_document(document, path)[0].is_pendulum
 
 
 def require_one_joint(preset_or_path: str | Path, instead: str) -> None:
@@ -365,3 +720,65 @@ def require_one_joint(preset_or_path: str | Path, instead: str) -> None:
         raise ParameterError(
             f"plant is {preset_or_path}, which has several joints; expected one of one joint, or {instead}"
         )
+
+
+def _positive_definite(rows: Sequence[Sequence[float]]) -> bool:
+    """Return whether a small symmetric matrix is positive definite, by the pivots of Gauss's elimination."""
+    matrix = [list(row) for row in rows]
+    for k, pivot_row in enumerate(matrix):
+        pivot = pivot_row[k]
+        if not pivot > 1e-12 * abs(rows[k][k]):
+            return False
+        for row in matrix[k + 1 :]:
+            factor = row[k] / pivot
+            for j in range(k, len(row)):
+                row[j] -= factor * pivot_row[j]
+    return True
+
+
+def pack_joints(parameters: PlantParameters) -> JointTable:
+    """Return friction, stops and lags of the joints, as the dynamics take them: in the order of ``JOINT_ROWS``.
+
+    Raises:
+        ParameterError: The plant has what these dynamics have not: a drivetrain, an offset, a further friction term.
+    """
+    _require_rigid(parameters)
+    joints = parameters.joints
+    return (
+        tuple(joint.coulomb_friction for joint in joints),
+        tuple(joint.breakaway for joint in joints),
+        tuple(joint.stribeck_velocity for joint in joints),
+        tuple(-FAR if joint.lower_stop is None else joint.lower_stop for joint in joints),
+        tuple(FAR if joint.upper_stop is None else joint.upper_stop for joint in joints),
+        tuple(0.0 if joint.actuator is None else joint.actuator.time_constant for joint in joints),
+    )
+
+
+def common_delay(parameters: PlantParameters) -> float:
+    """Return the transport delay of all actuators [s].
+
+    Raises:
+        ParameterError: They differ.
+    """
+    delays = {actuator.transport_delay for actuator in parameters.actuators}
+    if len(delays) > 1:
+        raise ParameterError(
+            f"transport_delay is {' and '.join(f'{delay} s' for delay in sorted(delays))} on plant "
+            f"{parameters.name!r}; expected the same for all actuators"
+        )
+    return delays.pop() if delays else 0.0
+
+
+def _require_rigid(parameters: PlantParameters) -> None:
+    name = parameters.name
+    if any(own.drivetrain is not None for own in parameters.joints):
+        raise ParameterError(f"plant {name!r} is series elastic; expected a rigid one for the equations of any joints")
+    for joint, own in zip(parameters.mechanism.joints, parameters.joints, strict=True):
+        for spec in joint_specs(joint):
+            value = getattr(own, spec.name)
+            if spec.name in OF_A_PENDULUM and value != spec.default:
+                given = f"{value} {spec.unit}".removesuffix(" -")
+                raise ParameterError(
+                    f"{spec.name} of plant {name!r} is {given}; expected {spec.default:g} for the equations of any "
+                    "joints"
+                )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
@@ -116,27 +116,25 @@ def write_quantities(
     values: Mapping[str, Any],
     specs: Sequence[ParameterSpec],
     intervals: Mapping[str, Sequence[float]],
-    prefix: str = "",
 ) -> dict[str, dict[str, Any]]:
     """Return what :func:`read_quantities` reads.
 
     Args:
         values: By name; None is left out.
         specs: The quantities to write.
-        intervals: By name, with the prefix.
-        prefix: Prefix of the names there, as ``elbow.``.
+        intervals: By name.
     """
     quantities: dict[str, dict[str, Any]] = {}
     for spec in specs:
         if values[spec.name] is None:
             continue
         quantities[spec.name] = {"value": float(values[spec.name]), "unit": spec.unit}
-        if prefix + spec.name in intervals:
-            quantities[spec.name]["interval"] = [float(bound) for bound in intervals[prefix + spec.name]]
+        if spec.name in intervals:
+            quantities[spec.name]["interval"] = [float(bound) for bound in intervals[spec.name]]
     return quantities
 
 
-def build_plant(kind: type[Any], parts: Mapping[str, Any], where: str) -> Any:
+def build_plant(kind: Callable[..., Any], parts: Mapping[str, Any], where: str) -> Any:
     """Return what a file describes; an error names the file."""
     try:
         return kind(**parts)

@@ -7,13 +7,8 @@ from rclpy.serialization import deserialize_message
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_differences import (
-    PLANT_PARAMETERS,
-    AnyPlant,
-    describe_plants,
-    plant_mismatch,
-    read_plants,
-)
+from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants, plant_mismatch, read_plants
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import plant_value
 from pendulum_msgs_py.ros.polled import PollingNode
@@ -36,7 +31,7 @@ class RunningPlant:
         mismatch: How the plant that runs is another one, in words; empty where it is not, or does not say.
     """
 
-    def __init__(self, node: PollingNode, designed: AnyPlant) -> None:
+    def __init__(self, node: PollingNode, designed: PlantParameters) -> None:
         self.mismatch = ""
         self._node = node
         self._designed = designed

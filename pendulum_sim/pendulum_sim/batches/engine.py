@@ -169,12 +169,15 @@ def seed_column(seeds: ArrayLike) -> NDArray[np.uint64]:
 
 
 def finite_columns(name: str, values: ArrayLike, width: int) -> Array:
-    """Return values as rows of a given width, (1, width) or (B, width).
+    """Return values as rows of a given width, (1, width) or (B, width); a scalar holds for all.
 
     Raises:
         ParameterError: They have another shape, or one is not finite.
     """
-    table = np.atleast_2d(np.asarray(values, dtype=np.float64))
+    given = np.asarray(values, dtype=np.float64)
+    if given.ndim == 0:
+        given = np.full(width, given)
+    table = given[:, None] if width == 1 and given.ndim == 1 else np.atleast_2d(given)
     if table.ndim != 2 or table.shape[1] != width:
         raise ParameterError(f"{name} has shape {np.shape(values)}; expected ({width},) or (B, {width})")
     if not np.isfinite(table).all():

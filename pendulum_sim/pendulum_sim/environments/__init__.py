@@ -1,5 +1,5 @@
-"""Gymnasium environments of plants of one joint and of several; importing this registers them all."""
+"""Gymnasium environments of plants of any number of joints; importing this registers them all."""
 
-from pendulum_sim.environments import environment, mechanism_environment
+from pendulum_sim.environments import environment
 
-__all__ = ["environment", "mechanism_environment"]
+__all__ = ["environment"]

@@ -1,75 +1,60 @@
-"""Gymnasium environment ``PendulumX59-v0``: the pendulum of the thesis for learning libraries.
+"""Gymnasium environments of a plant, single and vector: ``PendulumX59-v0``, ``PendulumAcrobot-v0`` and its sisters.
 
-Observation: x = [wrap(theta - pi), theta_dot] [rad, rad/s], as controllers see it: 0 is upright.
-Action: torque u [N m], Box of shape (1,), clamped to the effort limit.
-Reward: -(q_1 x_1^2 + q_2 x_2^2 + r u^2) at the state in which the action was chosen.
-Episodes never terminate; they are truncated after 5 s by default, whatever the step.
+Observation: x = [deviation of each joint from upright, velocity of each], what turns wrapped: 0 is upright.
+Action: one effort per driven joint [N m or N], clamped to its limit.
+Reward: -(x' Q x + u' R u) at the state in which the action was chosen, with the mechanism's weights by default.
+Episodes never terminate; they are truncated after 5 s, or 10 s where a mechanism has to swing up, whatever the step.
 
-Importing ``pendulum_sim.environments.environment`` registers it, and so does
-``gymnasium.make("pendulum_sim.environments.environment:PendulumX59-v0")``.
+Importing this module registers them, and so does ``gymnasium.make("pendulum_sim.environments.environment:ID")``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from pendulum_msgs_py.contract import noise
-from pendulum_msgs_py.contract.angles import UPRIGHT, from_upright
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_sim.environments.environment_arguments import (
-    Array,
-    check_disturbance,
-    check_reset_options,
-    check_start_name,
-    check_weights,
-    episode_steps,
-)
-from pendulum_sim.environments.environment_kernel import is_smooth, lane_table, step_kernel
-from pendulum_sim.stepping.integrators import get_integrator
-from pendulum_sim.stepping.plant import check_start, check_step
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_sim.environments.environment_motion import Lanes, make_motion
+from pendulum_sim.environments.environment_task import EPISODE_TIME, Array, EnvironmentTask, check_reset_options
 
-__all__ = [
-    "ENVIRONMENT_ID",
-    "EPISODE_TIME",
-    "PendulumEnv",
-    "action_space",
-    "check_arguments",
-    "draw_start",
-    "observation_space",
-    "register",
-]
+__all__ = ["IDS", "PlantEnv", "PlantVectorEnv", "register"]
 
-ENVIRONMENT_ID = "PendulumX59-v0"
-EPISODE_TIME = 5.0
-"""Time after which an episode is truncated: the length of the thesis's runs [s]."""
+_SWING_UP = {"start": "bottom", "episode_time": 10.0}
+IDS: dict[str, dict[str, Any]] = {
+    "PendulumX59-v0": {"plant": "thesis"},
+    "PendulumCartPole-v0": {"plant": "cart_pole", **_SWING_UP},
+    "PendulumAcrobot-v0": {"plant": "acrobot", **_SWING_UP},
+    "PendulumPendubot-v0": {"plant": "pendubot", **_SWING_UP},
+    "PendulumDouble-v0": {"plant": "double_pendulum", **_SWING_UP},
+    "PendulumFuruta-v0": {"plant": "furuta", **_SWING_UP},
+}
+"""Environments, and the arguments that they have where none are given."""
 _WINDOW_FPS = 50.0
 """Pictures a second in a window, which follows real time; a picture of each step would be ten times too many."""
-THESIS_Q = (100.0, 0.01)
-THESIS_R = 0.1
 
 
-class PendulumEnv(gymnasium.Env[Array, Array]):
-    """One pendulum.
+class PlantEnv(gymnasium.Env[Array, Array]):
+    """One plant.
 
     Args:
         plant: Preset, path of a plant file, or parameters; any plant, series elastic too.
         dt: Step over which an action is held [s].
         method: Integrator; ``auto`` chooses by the plant.
         substeps: Integration steps in a step.
-        start: ``bottom``, ``top`` or ``random``; ``reset(options={"state": [x_1, x_2]})`` overrides it.
-        disturbance: Half width of uniform noise on the torque [N m].
+        start: ``bottom``, ``top`` or ``random``; ``reset(options={"state": x})`` overrides it.
+        disturbance: Half width of uniform noise on each driven joint [N m or N].
         hold: Steps for which a noise sample is held.
-        q: Weights of angle and velocity in the reward.
-        r: Weight of the torque.
+        q: Weights of each deviation and velocity in the reward; None for the mechanism's.
+        r: Weight of the efforts; None for the mechanism's.
         render_mode: None, ``human`` or ``rgb_array``.
         screen_size: Width and height of the picture [px].
         episode_time: Time after which an episode is truncated, inf for never [s]; ``max_episode_steps`` of
@@ -92,147 +77,88 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         start: str = "top",
         disturbance: float = 0.0,
         hold: int = 1,
-        q: tuple[float, float] = THESIS_Q,
-        r: float = THESIS_R,
+        q: Sequence[float] | None = None,
+        r: float | None = None,
         render_mode: str | None = None,
         screen_size: tuple[int, int] = (600, 600),
         episode_time: float = EPISODE_TIME,
     ) -> None:
-        parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
-        check_arguments(dt, substeps, start, disturbance, hold, method, q, r)
+        self._task = task = EnvironmentTask(
+            plant, dt=dt, method=method, substeps=substeps, start=start, disturbance=disturbance, hold=hold, q=q, r=r,
+            episode_time=episode_time,
+        )  # fmt: skip
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ParameterError(f"render_mode is {render_mode!r}; expected None, human or rgb_array")
-        self.parameters = parameters
+        self.parameters = task.parameters
         self.dt = dt
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / dt))}
         self.render_mode = render_mode
+        self.observation_space, self.action_space = task.observation_space, task.action_space
+        self._motion = make_motion(task, 1)
+        self._limit, self._size = task.last, len(task.limits)
         self._steps = 0
-        self._limit = episode_steps(episode_time, dt)
         self._steps_a_picture = max(1, round(1.0 / (_WINDOW_FPS * dt)))
-        self.observation_space = observation_space(parameters, disturbance)
-        self.action_space = action_space(parameters)
-        self._start = start
-        self._amplitude = float(disturbance)
-        self._hold = hold
-        self._q, self._r = q, r
-        self._keys = np.zeros(1, dtype=np.uint64)
-        self._counts = np.zeros(1, dtype=np.int64)
-        self._rewards = np.zeros(1)
-        self._kernel: Any = None
-        self._plant: Any = None
         self._screen_size = screen_size
         self._picture: Any = None
         self._window: Any = None
-        self.effort = 0.0
-        if is_smooth(parameters) and method != "adaptive":
-            method = "etd4" if method == "auto" else method
-            self._h, self._substeps = dt / substeps, substeps
-            self._w = lane_table(parameters, method, self._h, 1, self._amplitude, q, r).reshape(-1)
-            self._kernel = step_kernel(method, 1)
-        else:
-            self._plant = make_plant(parameters, dt, method=method, substeps=substeps if substeps > 1 else None)
-
-    @property
-    def theta(self) -> float:
-        """Angle, 0 hanging, not wrapped [rad]."""
-        return float(self._w[0] if self._plant is None else self._plant.state.theta)
-
-    @property
-    def theta_dot(self) -> float:
-        """Velocity [rad/s]."""
-        return float(self._w[1] if self._plant is None else self._plant.state.theta_dot)
+        self._kernel: Any = None
+        if isinstance(self._motion, Lanes):
+            motion = self._motion
+            self._kernel, self._rewards = motion.kernel, np.zeros(1)
+            self._w, self._keys, self._counts = motion.w[0], motion.keys[0], motion.counts[0]
+            self._hold, self._h, self._substeps = task.hold, motion.h, task.substeps
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Start an episode.
 
         Args:
             seed: Seed of starts and noise.
-            options: ``state``: the start [x_1, x_2] in the observation's convention; ``start``: one of ``STARTS``.
+            options: ``state``: the start x in the observation's convention; ``start``: one of ``STARTS``.
 
         Returns:
-            Observation, shape (2,), and an empty dict.
+            Observation, shape (2n,), and an empty dict.
         """
         super().reset(seed=seed)
-        options = options or {}
-        check_reset_options(options)
+        known = options or {}
+        check_reset_options(known, ("state", "start"))
+        self._motion.place(
+            np.zeros(1, np.intp), *self._task.begin(known, self.np_random, 1, self._task.given(known, 1))
+        )
         self._steps = 0
-        state = options.get("state")
-        if state is None:
-            x = draw_start(options.get("start", self._start), self.np_random, 1)[0]
-        else:
-            x = np.asarray(state, dtype=np.float64)
-            if x.shape != (2,):
-                raise ParameterError(f"start state has shape {x.shape}; expected (2,)")
-        theta, theta_dot = float(x[0]) + UPRIGHT, float(x[1])
-        check_start(theta, theta_dot)
-        self._keys[0] = noise.stream_key(int(self.np_random.integers(2**63)))
-        self._counts[0] = 0
-        self.effort = 0.0
-        if self._plant is None:
-            self._w[0], self._w[1] = theta, theta_dot
-        else:
-            self._plant.reset(theta, theta_dot)
         if self.render_mode == "human":
             self.render()
-        return np.array([from_upright(theta), theta_dot]), {}
+        return self._motion.observe()[0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold a torque for one step.
+        """Hold efforts for one step.
 
         Args:
-            action: u, shape (1,) [N m].
+            action: u, shape (m,) [N m or N].
 
         Returns:
-            Observation (2,), reward, terminated (never), truncated (when its time is over), and an empty dict.
+            Observation (2n,), reward, terminated (never), truncated (when its time is over), and an empty dict.
         """
         if type(action) is not np.ndarray:
             action = np.asarray(action, dtype=np.float32)
-        if action.size != 1:
-            raise ParameterError(f"action has shape {action.shape}; expected (1,)")
+        if action.size != self._size:
+            raise ParameterError(f"action has shape {action.shape}; expected ({self._size},)")
         self._steps += 1
-        if self._plant is None:
+        if self._kernel is not None:
             observation = np.empty(2)
+            torque = action if action.ndim == 1 else action.reshape(1)
             self._kernel(
-                self._w,
-                self._keys,
-                self._counts,
-                self._hold,
-                self._h,
-                self._substeps,
-                action if action.ndim == 1 else action.reshape(1),
-                observation,
+                self._w, self._keys, self._counts, self._hold, self._h, self._substeps, torque, observation,
                 self._rewards,
-            )
+            )  # fmt: skip
             reward = float(self._rewards[0])
             if math.isnan(reward):
-                raise ParameterError(f"action is {action} N m; expected a finite number")
-            if self.render_mode == "human":
-                self._show()
-            return observation, reward, False, self._steps >= self._limit, {}
-        return self._step_any(float(action.reshape(-1)[0]))
-
-    def _step_any(self, action: float) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        if not math.isfinite(action):
-            raise ParameterError(f"action is {action} N m; expected a finite number")
-        limit = self.parameters.effort_limit
-        self.effort = min(limit, max(-limit, action))
-        disturbance = self._amplitude * noise.unit_interval(
-            noise.scramble(int(self._keys[0]), int(self._counts[0]) // self._hold)
-        )
-        self._counts[0] += 1
-        before = self._plant.state
-        deviation = from_upright(before.theta)
-        reward = -(self._q[0] * deviation**2 + self._q[1] * before.theta_dot**2 + self._r * self.effort**2)
-        state = self._plant.step(self.effort + disturbance)
-        if self.render_mode == "human":
-            self._show()
-        observation = np.array([from_upright(state.theta), state.theta_dot])
-        return observation, reward, False, self._steps >= self._limit, {}
-
-    def _show(self) -> None:
-        """Show a step in the window, where a picture is due."""
-        if self._steps % self._steps_a_picture == 0:
+                raise ParameterError(f"action is {action.tolist()}; expected finite numbers")
+        else:
+            observations, rewards = self._motion.step(action.reshape(1, -1))
+            observation, reward = observations[0], float(rewards[0])
+        if self.render_mode == "human" and self._steps % self._steps_a_picture == 0:
             self.render()
+        return observation, reward, False, self._steps >= self._limit, {}
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the present state: into a window, or as an array of shape (height, width, 3)."""
@@ -240,14 +166,15 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
             gymnasium.logger.warn("render() was called, but render_mode is None; expected human or rgb_array")
             return None
         # Imported late: training runs without pictures.
-        from pendulum_sim.pictures.drawing import PendulumPicture, Window
+        from pendulum_sim.pictures.drawing import Window
+        from pendulum_sim.pictures.plant_picture import PlantPicture
 
         if self._picture is None:
-            self._picture = PendulumPicture(self._screen_size, self.parameters.effort_limit)
+            self._picture = PlantPicture(self.parameters, self._screen_size)
             self._window = Window(self._picture.size) if self.render_mode == "human" else None
-        torque = self.effort if self._plant is not None else float(self._w[2])
-        time = int(self._counts[0]) * self.dt
-        self._picture.draw(self.theta, self.theta_dot, torque, time=time)
+        position, velocity = (tuple(rows[0].tolist()) for rows in self._motion.state)
+        effort = dict(zip(self.parameters.coordinates.driven_names, self._motion.effort.tolist(), strict=True))
+        self._picture.draw(position, velocity=velocity, effort=effort, time=self._steps * self.dt)
         if self._window is not None:
             self._window.show(self._picture, fps=round(1.0 / (self._steps_a_picture * self.dt)))
             return None
@@ -261,63 +188,145 @@ class PendulumEnv(gymnasium.Env[Array, Array]):
         self._window = self._picture = None
 
 
-def observation_space(parameters: PlantParameters, disturbance: float) -> spaces.Box:
-    """Return the space of x; the speed is bounded where friction bounds it."""
-    speed = math.inf
-    if parameters.drivetrain is None and parameters.damping > 0.0:
-        # b |theta'| cannot exceed the sum of all other torques for long: beyond that speed it only slows down.
-        torques = parameters.effort_limit + parameters.gravity + abs(parameters.torque_offset) + disturbance
-        speed = max(20.0, 1.1 * torques / parameters.damping)
-    high = np.array([math.pi, speed])
-    return spaces.Box(-high, high, dtype=np.float64)
+class PlantVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
+    """Many equal plants: smooth pendulums in one compiled step, smooth mechanisms in one of arrays, others in turn.
 
+    Smooth are those without dry friction, stops, lag, delay and drivetrain. Plant i, reset with a list of seeds, starts
+    and is disturbed as a single environment reset with seed i.
 
-def action_space(parameters: PlantParameters) -> spaces.Box:
-    """Return the space of u."""
-    limit = parameters.effort_limit
-    return spaces.Box(-limit, limit, shape=(1,), dtype=np.float32)
+    There are ``num_envs`` of them, >= 1. An episode is truncated after ``max_episode_steps``, or ``episode_time`` where
+    that is None, and restarts with the step after that. All other arguments are those of :class:`PlantEnv`.
 
+    Raises:
+        ParameterError: An argument is outside its domain.
+    """
 
-def draw_start(start: str, generator: np.random.Generator, count: int) -> Array:
-    """Return starts x of shape (count, 2): at the bottom or top, or at a random angle and up to 1 rad/s."""
-    check_start_name(start)
-    x = np.zeros((count, 2))
-    if start == "bottom":
-        x[:, 0] = -math.pi
-    elif start == "random":
-        x[:] = generator.uniform([-math.pi, -1.0], [math.pi, 1.0], (count, 2))
-    return x
+    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        plant: str | PlantParameters = "thesis",
+        dt: float = 2e-3,
+        method: str = "auto",
+        substeps: int = 1,
+        start: str = "top",
+        disturbance: float = 0.0,
+        hold: int = 1,
+        q: Sequence[float] | None = None,
+        r: float | None = None,
+        render_mode: str | None = None,
+        episode_time: float = EPISODE_TIME,
+    ) -> None:
+        self._task = task = EnvironmentTask(
+            plant, dt=dt, method=method, substeps=substeps, start=start, disturbance=disturbance, hold=hold, q=q, r=r,
+            episode_time=episode_time,
+        )  # fmt: skip
+        self._last = task.last if max_episode_steps is None else max_episode_steps
+        if num_envs < 1 or self._last < 1:
+            raise ParameterError(
+                f"num_envs is {num_envs} and max_episode_steps {max_episode_steps}; expected both >= 1"
+            )
+        if render_mode is not None:
+            raise ParameterError(f"render_mode is {render_mode!r}; expected None: draw one PlantEnv instead")
+        self.parameters, self.num_envs = task.parameters, num_envs
+        self.single_observation_space, self.single_action_space = task.observation_space, task.action_space
+        self.observation_space = batch_space(task.observation_space, num_envs)
+        self.action_space = batch_space(task.action_space, num_envs)
+        self._actions = (num_envs, len(task.limits))
+        self._done = np.zeros(num_envs, dtype=np.bool_)
+        self._generators: list[np.random.Generator] | None = None
+        self._motion = make_motion(task, num_envs)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start all episodes, or some.
+
+        Args:
+            seed: One seed for all, whose plants then share a generator, or one for each; where one is None, its
+                generator stays.
+            options: ``start``: one of ``STARTS``; ``state``: starts x, shape (2n,) or (N, 2n), in the observation's
+                convention; ``reset_mask``: which to start, shape (N,).
+
+        Returns:
+            Observations, shape (N, 2n), and an empty dict.
+
+        Raises:
+            ParameterError: An option is unknown, or has another shape.
+        """
+        known, n = options or {}, self.num_envs
+        check_reset_options(known, ("state", "start", "reset_mask"))
+        self._take_seeds(seed)
+        mask = np.asarray(known.get("reset_mask", np.ones(n, dtype=np.bool_)))
+        if mask.shape != (n,) or mask.dtype != np.bool_:
+            raise ParameterError(f"reset_mask has shape {mask.shape} of {mask.dtype}; expected ({n},) of bool")
+        self._restart(np.flatnonzero(mask), known, self._task.given(known, n))
+        self._done[mask] = False
+        return self._motion.observe(), {}
+
+    def step(self, actions: Array) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Hold efforts for one step.
+
+        Args:
+            actions: Shape (N, m) [N m or N].
+
+        Returns:
+            Observations (N, 2n), rewards (N,), terminated (N,), truncated (N,), and an empty dict.
+        """
+        if np.size(actions) != self._actions[0] * self._actions[1]:
+            raise ParameterError(f"actions have shape {np.shape(actions)}; expected {self._actions}")
+        observations, rewards = self._motion.step(np.reshape(actions, self._actions))
+        restart = np.flatnonzero(self._done)
+        if restart.size:
+            # By gymnasium's rule for NEXT_STEP this step starts their next episodes; its action is ignored.
+            self._restart(restart, {})
+            observations[restart] = self._motion.observe()[restart]
+            rewards[restart] = 0.0
+        self._done = truncated = self._motion.steps >= self._last
+        return observations, rewards, np.zeros(self.num_envs, dtype=np.bool_), truncated, {}
+
+    def _restart(self, which: NDArray[np.intp], options: dict[str, Any], state: Array | None = None) -> None:
+        begin = self._task.begin
+        if self._generators is None:
+            self._motion.place(
+                which, *begin(options, self.np_random, which.size, None if state is None else state[which])
+            )
+            return
+        for index in which.tolist():
+            # In the order of the single environment: the start, then the noise.
+            own = None if state is None else state[[index]]
+            self._motion.place(np.array([index]), *begin(options, self._generators[index], 1, own))
+
+    def _take_seeds(self, seed: int | list[int | None] | None) -> None:
+        """Set the generators: one for all plants, or one for each; None in a list leaves that generator as it is."""
+        if isinstance(seed, (list, tuple, np.ndarray)):
+            if len(seed) != self.num_envs:
+                raise ParameterError(f"seed has {len(seed)} entries; expected one for each of {self.num_envs} plants")
+            before = self._generators
+            self._generators = [
+                before[index]
+                if given is None and before is not None
+                else seeding.np_random(None if given is None else int(given))[0]
+                for index, given in enumerate(seed)
+            ]
+        elif seed is not None:
+            super().reset(seed=seed)
+            self._generators = None
 
 
 def register() -> None:
-    """Register ``PendulumX59-v0`` with gymnasium; done on import, and harmless twice."""
-    if ENVIRONMENT_ID not in gymnasium.registry:
-        gymnasium.register(
-            ENVIRONMENT_ID,
-            entry_point="pendulum_sim.environments.environment:PendulumEnv",
-            vector_entry_point="pendulum_sim.environments.vector_environment:PendulumVectorEnv",
-        )
-
-
-def check_arguments(
-    dt: float,
-    substeps: int,
-    start: str,
-    disturbance: float,
-    hold: int,
-    method: str,
-    q: Sequence[float],
-    r: float,
-) -> None:
-    """Refuse arguments that make no environment."""
-    check_weights(q, r, 2, "two finite numbers >= 0, the weights of angle and velocity")
-    check_step(dt, substeps)
-    if method != "auto":
-        get_integrator(method)
-    check_start_name(start)
-    check_disturbance(disturbance, "N m")
-    if hold < 1:
-        raise ParameterError(f"hold is {hold} steps; expected >= 1")
+    """Register the environments with gymnasium; done on import, and harmless twice."""
+    for name, arguments in IDS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                name,
+                entry_point="pendulum_sim.environments.environment:PlantEnv",
+                vector_entry_point="pendulum_sim.environments.environment:PlantVectorEnv",
+                kwargs=arguments,
+            )
 
 
 register()

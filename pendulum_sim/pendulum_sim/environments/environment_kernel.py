@@ -19,25 +19,15 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 from pendulum_sim.batches import vector_math
 from pendulum_sim.batches.compiling import compile_tree, tuple_loader
-from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_friction, is_dry
+from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_friction
 from pendulum_sim.stepping.integrators import get_integrator
 from pendulum_sim.stepping.plant import pack
 from pendulum_sim.stepping.stability import check_stability
 
-__all__ = ["ROWS", "is_smooth", "lane_table", "step_kernel"]
+__all__ = ["ROWS", "lane_table", "step_kernel"]
 
 ROWS = ("x", "v", "torque", "disturbance", "amplitude", "limit", "q_1", "q_2", "r", *PACKED)
 """Rows of the array; the integrator's coefficients follow."""
-
-
-def is_smooth(parameters: PlantParameters) -> bool:
-    """Return whether a plant is free of dry friction, lag, delay and drivetrain, which the compiled step leaves out."""
-    return (
-        parameters.drivetrain is None
-        and not is_dry(pack(parameters))
-        and parameters.actuator_time_constant == 0.0
-        and parameters.transport_delay == 0.0
-    )
 
 
 def lane_table(
@@ -46,7 +36,7 @@ def lane_table(
     h: float,
     lanes: int,
     amplitude: float,
-    q: tuple[float, float],
+    q: tuple[float, ...],
     r: float,
 ) -> NDArray[np.float64]:
     """Return the rows for a number of equal pendulums, at rest hanging down, shape (rows, lanes).

@@ -1,239 +1,256 @@
-"""``export_model``: write a plant as URDF or MJCF.
+"""``export_model``: write a plant as URDF or MJCF, from the same bodies as it is drawn with.
 
-The parameters are M_c and G_c, not mass and length: any link with m l^2 <= M_c and m g l = G_c moves the same. The
-one drawn has nine tenths of its inertia in the bob. Angle 0 hangs down along -z; positive turns the bob towards +x,
-counter-clockwise seen along +y.
+x points to the right, y away from the viewer, z up; hanging down is position 0 of every hinge. The parameters of a
+pendulum are M_c and G_c, not mass and length: any link with m l^2 <= M_c and m g l = G_c moves the same. The one drawn
+has nine tenths of its inertia in the bob, which positive angles turn towards +x.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 from xml.etree import ElementTree
 
 import typer
 
-from pendulum_msgs_py.contract.names import JOINT, LINK
+from pendulum_msgs_py.contract.joints import Joint
+from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.mechanisms import Body
+from pendulum_msgs_py.mechanisms.mechanism import STANDARD_GRAVITY
 from pendulum_msgs_py.plants.equilibrium import torque_gain, total_damping
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism, load_plant
+from pendulum_msgs_py.plants.joint_parameters import JointParameters, SeriesElasticParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.whole_file import write_whole, writing
-from pendulum_sim.exports.mechanism_files import mechanism_mjcf, mechanism_urdf
 from pendulum_sim.exports.ros2_control_tags import add_ros2_control
 from pendulum_sim.exports.xml_files import add, document_text, lateness, number, safe_name
 
-__all__ = ["LinkShape", "any_urdf", "link_shape", "main", "mjcf", "urdf"]
+__all__ = ["main", "mjcf", "urdf"]
 
-STANDARD_GRAVITY = 9.80665
-"""Acceleration of gravity in the files [m/s^2]."""
 _TIMESTEP, _STIFF_TIMESTEP = 0.002, 0.00025
-"""Timestep of a rigid link, and of one behind a spring [s]."""
-_BOB_SHARE = 0.9
-_FLAT_LENGTH = 0.3
+"""Timestep of rigid links, and of one behind a spring [s]."""
 _ROD_RADIUS = 0.008
 _STEEL = 7850.0
 _CASING, _ROD, _BOB = "0.25 0.25 0.28 1", "0.6 0.62 0.66 1", "0.85 0.3 0.2 1"
+_FAST = 100.0
+"""Velocity limit where no drivetrain sets one [rad/s or m/s]."""
+_ORIGIN = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class LinkShape:
-    """A link with the dynamics of the parameters.
+class _AtJoint(NamedTuple):
+    """What acts at a joint, motor and gears in slow motion included: limits, friction, and the inertia of a rotor."""
 
-    Attributes:
-        mass: m [kg].
-        length: Distance of the centre of mass from the joint, l [m].
-        inertia: Inertia about the centre of mass, parallel to the joint [kg m^2].
-        bob_radius: Radius of a steel ball of that mass, for drawing [m].
-    """
-
-    mass: float
-    length: float
-    inertia: float
-    bob_radius: float
-
-
-def link_shape(parameters: PlantParameters) -> LinkShape:
-    """Return mass, length and inertia of the link that is drawn."""
-    at_bob = _BOB_SHARE * parameters.inertia
-    if parameters.gravity > 0.0:
-        # m l^2 = at_bob and m g l = G
-        length = at_bob * STANDARD_GRAVITY / parameters.gravity
-        mass = at_bob / length**2
-    else:
-        length = _FLAT_LENGTH
-        mass = at_bob / length**2
-    radius = (3.0 * mass / (4.0 * math.pi * _STEEL)) ** (1.0 / 3.0)
-    return LinkShape(mass, length, parameters.inertia - at_bob, min(radius, 0.4 * length))
+    effort: float
+    velocity: float
+    damping: float
+    friction: float
+    rotor: float
 
 
 def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: str = "/sim") -> str:
-    """Return the URDF of the link, for RViz, robot_state_publisher and Gazebo; the joint bears the contract's name.
+    """Return the URDF of a plant, for RViz, robot_state_publisher and Gazebo; joints bear the contract's names.
 
-    URDF has no motor behind a spring. Of a series-elastic plant the joint has the damping and dry friction of link
-    and motor together, as in slow motion; the rotor's inertia joins that of the link.
-    An effort is then that of the motor: ``torque_gain`` times the command of this project's plants.
+    It has no word for rotors, which are left out, and no motor behind a spring. Of a series-elastic plant the joint has
+    the damping and dry friction of link and motor together, as in slow motion; the rotor's inertia joins that of the
+    link. An effort is then that of the motor: ``torque_gain`` times the command of this project's plants.
 
     Args:
         parameters: The plant.
-        ros2_control: Hardware for ros2_control: ``none``, ``gz`` or ``topic_based``.
+        ros2_control: Hardware for ros2_control: ``none``, or of a pendulum ``gz`` or ``topic_based``.
         namespace: Namespace of the plant behind ``topic_based``.
+
+    Raises:
+        ParameterError: A body has no positive inertia about its own centre of mass; or ros2_control is for one joint.
     """
-    shape = link_shape(parameters)
-    drive = parameters.drivetrain
-    speed = 100.0 if drive is None else drive.supply_voltage / (drive.back_emf_constant * drive.gear_ratio)
+    if ros2_control != "none" and not parameters.is_pendulum:
+        raise ParameterError(
+            f"ros2_control is {ros2_control!r} for {parameters.name!r}; expected a plant of one joint with it"
+        )
     robot = ElementTree.Element("robot", name=safe_name(parameters.name))
-    base = add(robot, "link", name="base_link")
-    _urdf_visual(base, ("box", {"size": "0.06 0.1 0.06"}), f"0 {number(0.06)} 0", _CASING)
-    link = add(robot, "link", name=LINK)
-    inertial = add(link, "inertial")
-    add(inertial, "origin", xyz=f"0 0 {number(-shape.length)}", rpy="0 0 0")
-    add(inertial, "mass", value=number(shape.mass))
-    rotor = drive.reflected_inertia if drive is not None else 0.0
-    i = number(shape.inertia + rotor)
-    add(inertial, "inertia", ixx=i, iyy=i, izz=number(0.02 * shape.inertia), ixy="0", ixz="0", iyz="0")
-    rod = {"radius": number(_ROD_RADIUS), "length": number(shape.length)}
-    _urdf_visual(link, ("cylinder", rod), f"0 0 {number(-0.5 * shape.length)}", _ROD)
-    _urdf_visual(link, ("sphere", {"radius": number(shape.bob_radius)}), f"0 0 {number(-shape.length)}", _BOB)
-    joint = add(robot, "joint", name=JOINT, type="continuous")
-    add(joint, "parent", link="base_link")
-    add(joint, "child", link=LINK)
-    # The measured angle is angle_offset when the link hangs: the frame is turned back by as much.
-    add(joint, "origin", xyz="0 0 0", rpy=f"0 {number(parameters.angle_offset)} 0")
-    add(joint, "axis", xyz="0 -1 0")
-    # topic_based drives this project's plants, which take commands; anything else moves the joint itself.
-    gain = 1.0 if ros2_control == "topic_based" else torque_gain(parameters)
-    limit = gain * parameters.effort_limit
-    friction = parameters.coulomb_friction + (drive.motor_coulomb_friction if drive is not None else 0.0)
-    add(joint, "limit", effort=number(limit), velocity=number(speed))
-    add(joint, "dynamics", damping=number(total_damping(parameters)), friction=number(friction))
+    parent = "base_link"
+    base = add(robot, "link", name=parent)
+    if len(parameters.joints) == 1:
+        _urdf_visual(base, "box", (0.0, 0.06, 0.0), _CASING, size="0.06 0.1 0.06")
+    limit = 0.0
+    for body, joint, own in _parts(parameters):
+        at = _at_joint(own, parameters)
+        link = add(robot, "link", name=body.name)
+        inertial = add(link, "inertial")
+        add(inertial, "origin", xyz=_vector(body.centre), rpy="0 0 0")
+        add(inertial, "mass", value=number(body.mass))
+        ixx, iyy, izz = body.inertia
+        moments = {"ixx": number(ixx + at.rotor), "iyy": number(iyy + at.rotor), "izz": number(izz)}
+        add(inertial, "inertia", {**moments, "ixy": "0", "ixz": "0", "iyz": "0"})
+        _urdf_link(link, body, _tip_radius(parameters, body))
+        kind = _urdf_type(joint, own)
+        joint_of = add(robot, "joint", name=joint.name, type=kind)
+        add(joint_of, "parent", link=parent)
+        add(joint_of, "child", link=body.name)
+        # The measured angle is angle_offset when the link hangs: the frame is turned back by as much.
+        add(joint_of, "origin", xyz=_vector(body.origin), rpy=f"0 {number(own.angle_offset)} 0")
+        add(joint_of, "axis", xyz=_vector(body.axis))
+        # topic_based drives this project's plants, which take commands; anything else moves the joint itself.
+        limit = at.effort
+        if ros2_control == "topic_based":
+            limit = parameters.effort_limit
+        limits = {"effort": number(limit), "velocity": number(at.velocity)}
+        if kind != "continuous":
+            limits["lower"], limits["upper"] = number(_stop(own.lower_stop, -1e6)), number(_stop(own.upper_stop, 1e6))
+        add(joint_of, "limit", limits)
+        add(joint_of, "dynamics", damping=number(at.damping), friction=number(at.friction))
+        parent = body.name
     add_ros2_control(robot, ros2_control, namespace, limit)
     return document_text(robot)
 
 
 def mjcf(parameters: PlantParameters) -> str:
-    """Return the MJCF of the plant for MuJoCo.
+    """Return the MJCF of a plant for MuJoCo, with its rotors as armature of tendons.
 
     What MuJoCo has no word for is left out: Stribeck's curve, further friction terms, and the spring's hysteresis and
-    hardening. Its dry friction is regularised: it creeps where this one sticks.
+    hardening. Its dry friction is regularised: it creeps where this one sticks; its end stops are springs. With a
+    drivetrain there is a second joint, the motor's, coupled by a spring.
 
-    Args:
-        parameters: The plant; with a drivetrain there is a second joint, the motor's, coupled by a spring.
+    Raises:
+        ParameterError: A body has no positive inertia about its own centre of mass, which MuJoCo refuses.
     """
-    shape = link_shape(parameters)
-    drive = parameters.drivetrain
+    drive, parts = parameters.drivetrain, _parts(parameters)
+    one = len(parts) == 1
+    gravity = parameters.value("gravity")
+    if one:
+        gravity = STANDARD_GRAVITY if gravity > 0.0 else 0.0
+    timestep = _TIMESTEP if drive is None else _STIFF_TIMESTEP
     model = ElementTree.Element("mujoco", model=safe_name(parameters.name))
     add(model, "compiler", angle="radian", autolimits="true")
-    flat = parameters.gravity == 0.0
-    add(
-        model,
-        "option",
-        gravity="0 0 0" if flat else f"0 0 {number(-STANDARD_GRAVITY)}",
-        timestep=number(_TIMESTEP if drive is None else _STIFF_TIMESTEP),
-        integrator="implicitfast",
-    )
+    integrator = "implicitfast" if one else "RK4"
+    add(model, "option", gravity=f"0 0 {number(-gravity)}", timestep=number(timestep), integrator=integrator)
     world = add(model, "worldbody")
     add(world, "light", pos="0 -1 1.5", dir="0 0.5 -1")
-    add(world, "camera", name="side", pos=f"0 {number(-4.0 * shape.length)} 0", xyaxes="1 0 0 0 0 1")
-    link = add(world, "body", name=LINK)
-    add(
-        link,
-        "joint",
-        name=JOINT,
-        type="hinge",
-        axis="0 -1 0",
-        ref=number(parameters.angle_offset),
-        damping=number(parameters.damping),
-        frictionloss=number(parameters.coulomb_friction),
-    )
-    add(
-        link,
-        "inertial",
-        pos=f"0 0 {number(-shape.length)}",
-        mass=number(shape.mass),
-        diaginertia=f"{number(shape.inertia)} {number(shape.inertia)} {number(0.02 * shape.inertia)}",
-    )
-    appearance = {"contype": "0", "conaffinity": "0"}
-    add(
-        link,
-        "geom",
-        type="capsule",
-        fromto=f"0 0 0 0 0 {number(-shape.length)}",
-        size=number(_ROD_RADIUS),
-        rgba=_ROD,
-        attributes=appearance,
-    )
-    add(
-        link,
-        "geom",
-        type="sphere",
-        pos=f"0 0 {number(-shape.length)}",
-        size=number(shape.bob_radius),
-        rgba=_BOB,
-        attributes=appearance,
-    )
-    driven, gain = JOINT, 1.0
+    size = sum(math.dist(body.tip, _ORIGIN) for body, _, _ in parts)
+    add(world, "camera", name="side", pos=f"0 {number(-4.0 * size)} 0", xyaxes="1 0 0 0 0 1")
+    parent = world
+    for body, joint, own in parts:
+        parent = add(parent, "body", name=body.name, pos=_vector(body.origin))
+        attributes = {"type": "hinge" if joint.unit == "rad" else "slide", "axis": _vector(body.axis)}
+        if own.lower_stop is not None or own.upper_stop is not None:
+            attributes["range"] = f"{number(_stop(own.lower_stop, -1e6))} {number(_stop(own.upper_stop, 1e6))}"
+        friction = {"damping": number(own.damping), "frictionloss": number(own.coulomb_friction)}
+        add(parent, "joint", attributes, name=joint.name, ref=number(own.angle_offset), **friction)
+        add(parent, "inertial", pos=_vector(body.centre), mass=number(body.mass), diaginertia=_vector(body.inertia))
+        unseen = {"contype": "0", "conaffinity": "0"}
+        if body.tip == _ORIGIN:
+            add(parent, "geom", unseen, type="box", size="0.08 0.05 0.03", rgba=_CASING)
+        else:
+            ends, radius = f"0 0 0 {_vector(body.tip)}", number(_tip_radius(parameters, body))
+            add(parent, "geom", unseen, type="capsule", fromto=ends, size=number(_ROD_RADIUS), rgba=_ROD)
+            add(parent, "geom", unseen, type="sphere", pos=_vector(body.tip), size=radius, rgba=_BOB)
+    gain = {}
     if drive is not None:
-        driven, gain = "motor_joint", torque_gain(parameters)
-        motor = add(world, "body", name="motor")
-        add(
-            motor,
-            "joint",
-            name=driven,
-            type="hinge",
-            axis="0 -1 0",
-            armature=number(drive.reflected_inertia),
-            damping=number(total_damping(parameters) - parameters.damping),
-            frictionloss=number(drive.motor_coulomb_friction),
-        )
-        add(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
-        tendons = add(model, "tendon")
-        spring = add(
-            tendons,
-            "fixed",
-            name="spring",
-            stiffness=number(drive.stiffness),
-            springlength=number(-parameters.angle_offset),
-        )
-        add(spring, "joint", joint=driven, coef="1")
-        add(spring, "joint", joint=JOINT, coef="-1")
+        _add_motor(model, world, drive, parameters)
+        gain = {"gainprm": number(torque_gain(parameters))}
+    _add_rotors(model, parameters)
     actuators = add(model, "actuator")
-    limit = f"{number(-parameters.effort_limit)} {number(parameters.effort_limit)}"
-    timestep = _TIMESTEP if drive is None else _STIFF_TIMESTEP
-    late = lateness(parameters.actuator_time_constant, parameters.transport_delay, timestep)
-    add(
-        actuators,
-        "general",
-        name="effort",
-        joint=driven,
-        ctrlrange=limit,
-        gainprm=number(gain),
-        biastype="none",
-        attributes=late,
-    )
+    for index, actuator in zip(parameters.coordinates.driven, parameters.actuators, strict=True):
+        late = lateness(actuator.time_constant, actuator.transport_delay, timestep)
+        limit, joint_name = number(actuator.effort_limit), parameters.coordinates.names[index]
+        names = {"name": "effort" if one else joint_name, "joint": "motor_joint" if drive is not None else joint_name}
+        add(actuators, "general", {**late, **names, **gain}, ctrlrange=f"-{limit} {limit}", biastype="none")
     return document_text(model)
 
 
-def _urdf_visual(link: ElementTree.Element, geometry: tuple[str, dict[str, str]], xyz: str, rgba: str) -> None:
-    shape, sizes = geometry
+def _parts(parameters: PlantParameters) -> list[tuple[Body, Joint, JointParameters]]:
+    bodies = parameters.mechanism.bodies(parameters.packed)
+    for body in bodies:
+        if not min(body.inertia) > 0.0:
+            raise ParameterError(
+                f"{body.name} of plant {parameters.name!r} has {min(body.inertia):.3g} kg m^2 about its centre of mass;"
+                " expected > 0: its inertia about the joint is less than mass * centre^2, and no file can say that"
+            )
+    return list(zip(bodies, parameters.mechanism.joints, parameters.joints, strict=True))
+
+
+def _at_joint(own: JointParameters, parameters: PlantParameters) -> _AtJoint:
+    effort, drive = 0.0 if own.actuator is None else own.actuator.effort_limit, own.drivetrain
+    if drive is None:
+        return _AtJoint(effort, _FAST, own.damping, own.coulomb_friction, 0.0)
+    return _AtJoint(
+        torque_gain(parameters) * effort,
+        drive.supply_voltage / (drive.back_emf_constant * drive.gear_ratio),
+        total_damping(parameters),
+        own.coulomb_friction + drive.motor_coulomb_friction,
+        drive.reflected_inertia,
+    )
+
+
+def _tip_radius(parameters: PlantParameters, body: Body) -> float:
+    """Return the radius of the ball at the end of a link: of a pendulum's bob, if it were of steel [m]."""
+    if len(parameters.joints) > 1:
+        return 2.0 * _ROD_RADIUS
+    return min((3.0 * body.mass / (4.0 * math.pi * _STEEL)) ** (1.0 / 3.0), 0.4 * math.dist(body.tip, _ORIGIN))
+
+
+def _add_motor(
+    model: ElementTree.Element, world: ElementTree.Element, drive: SeriesElasticParameters, parameters: PlantParameters
+) -> None:
+    motor = add(world, "body", name="motor")
+    damping, friction = number(total_damping(parameters) - parameters.damping), number(drive.motor_coulomb_friction)
+    hinge = {"type": "hinge", "axis": "0 -1 0", "armature": number(drive.reflected_inertia)}
+    add(motor, "joint", hinge, name="motor_joint", damping=damping, frictionloss=friction)
+    add(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
+    rest = number(-parameters.angle_offset)
+    spring = add(add(model, "tendon"), "fixed", name="spring", stiffness=number(drive.stiffness), springlength=rest)
+    add(spring, "joint", joint="motor_joint", coef="1")
+    add(spring, "joint", joint=JOINT, coef="-1")
+
+
+def _add_rotors(model: ElementTree.Element, parameters: PlantParameters) -> None:
+    rotors = [rotor for rotor in parameters.mechanism.rotors(parameters.packed) if rotor.inertia > 0.0]
+    if not rotors:
+        return
+    tendons = add(model, "tendon")
+    for count, rotor in enumerate(rotors, 1):
+        tendon = add(tendons, "fixed", name=f"rotor_{count}", armature=number(rotor.inertia))
+        for joint, rate in zip(parameters.mechanism.joints, rotor.rates, strict=True):
+            if rate != 0.0:
+                add(tendon, "joint", joint=joint.name, coef=number(rate))
+
+
+def _urdf_type(joint: Joint, own: JointParameters) -> str:
+    if joint.unit == "m":
+        return "prismatic"
+    return "continuous" if own.lower_stop is None and own.upper_stop is None else "revolute"
+
+
+def _urdf_link(link: ElementTree.Element, body: Body, radius: float) -> None:
+    length = math.dist(body.tip, _ORIGIN)
+    if length == 0.0:
+        _urdf_visual(link, "box", _ORIGIN, _CASING, size="0.16 0.1 0.06")
+        return
+    # A cylinder lies along z: along x it is turned about y.
+    turned = "0 1.5707963267948966 0" if body.tip[0] else "0 0 0"
+    middle = [0.5 * value for value in body.tip]
+    _urdf_visual(link, "cylinder", middle, _ROD, turned, radius=number(_ROD_RADIUS), length=number(length))
+    _urdf_visual(link, "sphere", body.tip, _BOB, radius=number(radius))
+
+
+def _urdf_visual(
+    link: ElementTree.Element, shape: str, xyz: Sequence[float], rgba: str, rpy: str = "0 0 0", **sizes: str
+) -> None:
     visual = add(link, "visual")
-    add(visual, "origin", xyz=xyz, rpy="0 0 0")
+    add(visual, "origin", xyz=_vector(xyz), rpy=rpy)
     add(add(visual, "geometry"), shape, sizes)
-    material = add(visual, "material", name=f"{shape}_colour")
-    add(material, "color", rgba=rgba)
+    add(add(visual, "material", name=f"{shape}_colour"), "color", rgba=rgba)
 
 
-def any_urdf(plant: str) -> str:
-    """Return the URDF of a preset or plant file, of one joint or more.
+def _stop(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value
 
-    Raises:
-        ParameterError: No such preset or file, or the file is refused.
-    """
-    return mechanism_urdf(load_mechanism(plant)) if is_mechanism(plant) else urdf(load_plant(plant))
+
+def _vector(values: Sequence[float]) -> str:
+    return " ".join(number(value) for value in values)
 
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -257,16 +274,8 @@ def export(
         raise ParameterError(f"format is {kind!r}; expected urdf or mjcf")
     if kind == "mjcf" and ros2_control != "none":
         raise ParameterError(f"ros2_control is {ros2_control!r} for mjcf; expected --format urdf, MuJoCo knows none")
-    if is_mechanism(plant):
-        if ros2_control != "none":
-            raise ParameterError(
-                f"ros2_control is {ros2_control!r} for {plant!r}; expected a plant of one joint with it"
-            )
-        mechanism = load_mechanism(plant)
-        text = mechanism_mjcf(mechanism) if kind == "mjcf" else mechanism_urdf(mechanism)
-    else:
-        parameters = load_plant(plant)
-        text = mjcf(parameters) if kind == "mjcf" else urdf(parameters, ros2_control=ros2_control, namespace=namespace)
+    parameters = load_mechanism(plant)
+    text = mjcf(parameters) if kind == "mjcf" else urdf(parameters, ros2_control=ros2_control, namespace=namespace)
     if output is None:
         typer.echo(text, nl=False)
         return

@@ -200,7 +200,7 @@ def check_equation(
     if per_joint[joint] > TOLERANCE:
         causes, left = _causes(_Case(plant, equation, runs, traces, errors, joint, count), switches, reseeded)
     where = _describe(runs.probes[int(np.argmax(errors))], plant)
-    names = plant.coordinates.names
+    names = plant.parameters.coordinates.names
     return EquationCheck(names, tuple(map(float, per_joint)), len(traces), where, causes, left)
 
 
@@ -246,7 +246,7 @@ def check_recording(position: Array, velocity: Array, effort: Array, equation: J
 def _plan(equation: JointPlant, coarse: JointPlant | None, count: int) -> _Runs:
     """Return the runs and the equation's results: from rest first, then at the speeds that these reached."""
     runs = _Runs()
-    limits, joints = equation.effort_limits, len(equation.coordinates.joints)
+    limits, joints = equation.parameters.effort_limits, len(equation.parameters.coordinates.joints)
     still, none = (0.0,) * joints, (0.0,) * len(limits)
     starts = _starts(equation)
     some = starts if joints > 1 else starts[::4]
@@ -271,13 +271,13 @@ def _plan(equation: JointPlant, coarse: JointPlant | None, count: int) -> _Runs:
 
 
 def _starts(plant: JointPlant) -> list[Vector]:
-    joints = plant.coordinates.joints
+    joints = plant.parameters.coordinates.joints
     if len(joints) == 1 and joints[0].turns:
         return [(float(q),) for q in np.linspace(-math.pi, math.pi, _ANGLES)]
     generator = np.random.default_rng(0)
     reach = np.array([math.pi if joint.turns else _SLIDE for joint in joints])
-    low, high = (np.array([stop[side] for stop in plant.stops]) for side in (0, 1))
-    drawn = [plant.coordinates.goal, (0.0,) * len(joints)]
+    low, high = (np.array([stop[side] for stop in plant.parameters.stops]) for side in (0, 1))
+    drawn = [plant.parameters.coordinates.goal, (0.0,) * len(joints)]
     drawn += [tuple(float(q) for q in generator.uniform(-reach, reach)) for _ in range(_RANDOM_STARTS)]
     return [tuple(float(x) for x in np.clip(q, low, high)) for q in drawn]
 
@@ -334,7 +334,7 @@ def _scales(runs: _Runs, i: int) -> tuple[Array, Array]:
 
 
 def _describe(probe: _Probe, plant: JointPlant) -> str:
-    joints, driven = plant.coordinates.joints, plant.coordinates.driven
+    joints, driven = plant.parameters.coordinates.joints, plant.parameters.coordinates.driven
     at = ", ".join(f"{q:.2f} {joint.unit}" for q, joint in zip(probe.position, joints, strict=True))
     speeds = ", ".join(f"{v:.2g} {joint.velocity_unit}" for v, joint in zip(probe.velocity, joints, strict=True))
     efforts = ", ".join(f"{u:.2g} {joints[j].effort_unit}" for u, j in zip(probe.effort, driven, strict=True))
@@ -452,7 +452,7 @@ def _reset(case: _Case) -> str:
     asked = np.array([probe.position[j] for probe, _, _ in swings])
     came = np.array([theirs.position[1, j] for _, theirs, _ in swings])
     there = np.array([mine.position[1, j] for _, _, mine in swings])
-    unit = case.plant.coordinates.joints[j].unit
+    unit = case.plant.parameters.coordinates.joints[j].unit
     far = np.abs(came - there)
     if len(swings) > _FEW and np.median(far) > 0.2 * np.std(asked):
         for sign, what in ((1.0, "another zero"), (-1.0, "another sign, or swapped sine and cosine,")):
@@ -468,7 +468,7 @@ def _reset(case: _Case) -> str:
                 f"as {came[0]:.2f} {unit})"
             )
         i = int(np.argmax(far))
-        at = wrap(float(came[i])) if case.plant.coordinates.joints[j].turns else float(came[i])
+        at = wrap(float(came[i])) if case.plant.parameters.coordinates.joints[j].turns else float(came[i])
         return f"a reset that is ignored (put at {asked[i]:.2f} {unit}, it is at {at:.2f} {unit} a period later)"
     moving = case.whole(_MOVING)
     asked = np.array([probe.velocity[j] for probe, _, _ in moving])
@@ -494,7 +494,7 @@ def _wrap(case: _Case) -> str:
     sizes = np.abs([change for change, _ in found])
     if not found or np.std(sizes) > 0.1 * np.mean(sizes):
         return ""
-    unit = case.plant.coordinates.joints[j].unit
+    unit = case.plant.parameters.coordinates.joints[j].unit
     return f"an angle that jumps by {found[0][0]:.3g} {unit} at {found[0][1]:.3g} {unit} (a wrap)"
 
 
@@ -521,7 +521,7 @@ def _period(case: _Case) -> str:
 
 def _response(case: _Case, plant: JointPlant, driven: int, effort: float, speed: float = 0.0) -> Array | None:
     """Return what a step of effort adds to the velocity of its joint, from 0 at rest or at a velocity of that joint."""
-    coordinates = plant.coordinates
+    coordinates = plant.parameters.coordinates
     still, none = (0.0,) * len(coordinates.joints), (0.0,) * len(coordinates.driven)
     moving = tuple(speed if i == coordinates.driven[driven] else 0.0 for i in range(len(still)))
     with_it = tuple(effort if i == driven else 0.0 for i in range(len(none)))
@@ -535,9 +535,9 @@ def _response(case: _Case, plant: JointPlant, driven: int, effort: float, speed:
 
 def _dead(case: _Case) -> str:
     """Name an effort below which a joint that moves anyhow, so that no friction holds it, does not answer."""
-    for i, limit in enumerate(case.plant.effort_limits):
-        speed = float(case.runs.scales[_FREE][1][case.plant.coordinates.driven[i]])
-        speed = speed or float(case.runs.scales[_SMALL_STEP][1][case.plant.coordinates.driven[i]])
+    for i, limit in enumerate(case.plant.parameters.effort_limits):
+        speed = float(case.runs.scales[_FREE][1][case.plant.parameters.coordinates.driven[i]])
+        speed = speed or float(case.runs.scales[_SMALL_STEP][1][case.plant.parameters.coordinates.driven[i]])
 
         def answers(effort: float, i: int = i, speed: float = speed) -> bool:
             theirs, mine = (_response(case, plant, i, effort, speed) for plant in (case.plant, case.equation))
@@ -549,7 +549,7 @@ def _dead(case: _Case) -> str:
         while high - low > 0.02 * high:
             middle = math.sqrt(low * high)
             low, high = (low, middle) if answers(middle) else (middle, high)
-        unit = case.plant.coordinates.joints[case.plant.coordinates.driven[i]].effort_unit
+        unit = case.plant.parameters.coordinates.joints[case.plant.parameters.coordinates.driven[i]].effort_unit
         return (
             f"a dead zone of the action (below about {high:.2g} {unit} it does nothing; the limit is {limit:.3g} "
             f"{unit})"
@@ -559,19 +559,19 @@ def _dead(case: _Case) -> str:
 
 def _clipped(case: _Case) -> str:
     """Name an effort beyond which more does nothing, or a speed beyond which nothing gets."""
-    j, joints = case.joint, case.plant.coordinates.joints
+    j, joints = case.joint, case.plant.parameters.coordinates.joints
     speeds = [float(np.max(np.abs(theirs.velocity[1:, j]))) for _, theirs, _ in case.whole()]
     fastest = max(speeds, default=0.0)
     # A start and its mirror image come equally fast, under efforts both ways.
     if sum(speed > (1.0 - 1e-6) * fastest for speed in speeds) > 2 * _FEW:
         return f"a limit of its speed (nothing is faster than {fastest:.3g} {joints[j].velocity_unit})"
-    for i, limit in enumerate(case.plant.effort_limits):
+    for i, limit in enumerate(case.plant.parameters.effort_limits):
         for sign in (1.0, -1.0):
             answers = [_response(case, case.plant, i, sign * share * limit) for share in (1.0, 0.8, _SMALL)]
             full, less, little = (np.zeros(1) if answer is None else answer for answer in answers)
             k = int(np.argmax(np.abs(full) > 0.02 * abs(full[-1])))
             if full[k] != 0.0 and abs(full[k] - less[k]) < 0.02 * abs(full[k]) and little[k] != 0.0:
-                unit = joints[case.plant.coordinates.driven[i]].effort_unit
+                unit = joints[case.plant.parameters.coordinates.driven[i]].effort_unit
                 return (
                     f"an action that is clipped (beyond about {abs(full[k] / little[k]) * _SMALL * limit:.2g} {unit} "
                     f"more does nothing; the limit is {limit:.3g} {unit})"
@@ -582,7 +582,7 @@ def _clipped(case: _Case) -> str:
 def _late(case: _Case) -> str:
     """Name a delayed effort, if the equation with that delay responds as the plant does."""
     dt = case.plant.dt
-    for i, limit in enumerate(case.plant.effort_limits):
+    for i, limit in enumerate(case.plant.parameters.effort_limits):
         theirs, mine = (_response(case, plant, i, _SMALL * limit) for plant in (case.plant, case.equation))
         if theirs is None or mine is None or not np.any(mine):
             continue
@@ -618,7 +618,7 @@ def _stop(case: _Case) -> str:
     swings.sort()
     bad = [e > TOLERANCE for _, e in swings]
     inside = [q for (q, _), wrong in zip(swings, bad, strict=True) if not wrong]
-    if len(case.plant.coordinates.joints) > 1 or len(inside) == len(bad) or len(inside) < _ANGLES // 4:
+    if len(case.plant.parameters.coordinates.joints) > 1 or len(inside) == len(bad) or len(inside) < _ANGLES // 4:
         return ""
     low, high = inside[0], inside[-1]
     if not any(e > _ABRUPT for q, e in swings if min(abs(q - low), abs(q - high)) < 2.1 * math.pi / (_ANGLES - 1)):
@@ -631,7 +631,7 @@ def _stop(case: _Case) -> str:
 def _shape(case: _Case) -> str:
     """Name the one term that explains what the equation leaves over of the accelerations."""
     j, dt, w = case.joint, case.plant.dt, max(2, case.count // 6)
-    driven = case.plant.coordinates.driven
+    driven = case.plant.parameters.coordinates.driven
     rows, left = [], []
     for i, (probe, theirs, mine) in enumerate(zip(case.runs.probes, case.traces, case.runs.traces, strict=True)):
         if theirs.fault or probe.kind == _FINE_STEP:

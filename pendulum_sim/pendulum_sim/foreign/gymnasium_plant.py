@@ -29,9 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.dynamics.runge_kutta import along_1, rk4_joints
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.parameters import load_yaml, reject_unknown, require_mapping
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, pendulum_plant
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_sim.foreign.mujoco_mapping import FORMAT
 from pendulum_sim.stepping.plant import PlantState, check_start, command_within
@@ -129,7 +130,7 @@ def load_gymnasium_plant(
     except ImportError as error:
         raise ParameterError(how_to_install(error) or f"Gymnasium cannot be imported: {error}") from error
     if env_id == "PendulumX59-v0":
-        import pendulum_sim.environments.environment  # noqa: F401  # registers it
+        import pendulum_sim.environments  # noqa: F401  # registers it
     entries = {**KNOWN.get(env_id.rpartition(":")[2], {}), **(adapter or {})}
     try:
         env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **entries.get("make", {}))
@@ -407,7 +408,7 @@ class GymnasiumPlant:
             kept = left <= max(_AS_WELL * _third(left), least)
         if rates[1] > 0.0 and _third(left) < _BETTER * best:
             inertia, damping, d = 1.0 / float(rates[1]), max(0.0, float(rates[0] / rates[1])), rates[2] / rates[1] * c
-        return PlantParameters(
+        return pendulum_plant(
             inertia=inertia, damping=damping, gravity=max(0.0, float(d / c)), effort_limit=self._limit, name=self._id
         )
 
@@ -419,24 +420,15 @@ def _third(left: Array) -> float:
 
 def _moved(rates: Array, rows: Array, angles: Array, dt: float) -> Array:
     """Return velocities after a period of v' = (v, u, -sin theta) . (-b/J, 1/J, G/J), by Runge-Kutta [rad/s]."""
-    theta, speed, effort = angles, rows[:, 0], rows[:, 1]
 
-    def slope(q: Array, v: Array) -> Array:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray(rates[1] * effort - rates[0] * v - rates[2] * np.sin(q))
+    def forward(q: tuple[Array], v: tuple[Array], torque: tuple[Array], p: Array) -> tuple[Array]:
+        return (p[1] * torque[0] - p[0] * v[0] - p[2] * np.sin(q[0]),)
 
-    h = dt / _SUBSTEPS
-    for _ in range(_SUBSTEPS):
-        v1, a1 = speed, slope(theta, speed)
-        v2 = speed + 0.5 * h * a1
-        a2 = slope(theta + 0.5 * h * v1, v2)
-        v3 = speed + 0.5 * h * a2
-        a3 = slope(theta + 0.5 * h * v2, v3)
-        v4 = speed + h * a3
-        a4 = slope(theta + h * v3, v4)
-        theta = theta + h * (v1 + 2.0 * v2 + 2.0 * v3 + v4) / 6.0
-        speed = speed + h * (a1 + 2.0 * a2 + 2.0 * a3 + a4) / 6.0
-    return np.asarray(speed)
+    q, v, effort = (angles,), (rows[:, 0],), (rows[:, 1],)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_SUBSTEPS):
+            q, v = rk4_joints(forward, along_1, q, v, effort, effort, effort, dt / _SUBSTEPS, rates)
+    return v[0]
 
 
 def _fit_rates(rates: Array, rows: Array, angles: Array, after: Array, dt: float) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import FaultError, ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
 from pendulum_msgs_py.programs.extras import how_to_install
 from pendulum_sim.foreign.mujoco_mapping import NO_ACTUATOR, MujocoMapping
 from pendulum_sim.foreign.mujoco_model import read_model
@@ -405,7 +405,7 @@ class MujocoPlant:
             # The motor's own, which MuJoCo stores apart from the joint's.
             damping += float(model.actuator_damping[self._actuator]) * self._gear**2
         gain = abs(gain)
-        return PlantParameters(
+        return pendulum_plant(
             inertia=inertia / gain,
             damping=damping / gain,
             gravity=weight / gain,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.mechanisms import Body
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["JointFrame", "across", "full_effort", "joint_frames"]
 
@@ -34,7 +34,7 @@ class JointFrame(NamedTuple):
     tip: Array
 
 
-def joint_frames(parameters: MechanismParameters, position: Vector) -> tuple[JointFrame, ...]:
+def joint_frames(parameters: PlantParameters, position: Vector) -> tuple[JointFrame, ...]:
     """Return where each joint is.
 
     Args:
@@ -67,7 +67,7 @@ def across(body: Body) -> tuple[Array, Array]:
     return right, np.cross(axis, right)
 
 
-def full_effort(parameters: MechanismParameters, index: int) -> float:
+def full_effort(parameters: PlantParameters, index: int) -> float:
     """Return the effort that is drawn in full: the joint's limit, or the strongest motor's of a passive one."""
     own = parameters.joints[index].actuator
     return own.effort_limit if own is not None else max(parameters.effort_limits, default=1.0)

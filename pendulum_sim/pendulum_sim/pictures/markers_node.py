@@ -19,15 +19,15 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import command_from_bytes, plant_mode, plant_value, stamp_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.ros.timers import create_wall_timer
 from pendulum_sim.pictures.joint_frames import across, full_effort
-from pendulum_sim.pictures.shown_plant import told_mechanism
+from pendulum_sim.pictures.shown_plant import shown_pendulum, told_mechanism
 from pendulum_sim.pictures.shown_torques import SHOWN_TOPICS, ShownTorques
 
 __all__ = ["SPECS", "MarkersNode", "arc_points", "arrow_points", "joint_marker", "main"]
@@ -112,7 +112,7 @@ class MarkersNode(Node):
         self._settings = NodeParameters(self, SPECS)
         self._torques = ShownTorques()
         self._told = ""
-        self._mechanism: MechanismParameters | None = None
+        self._mechanism: PlantParameters | None = None
         self._publisher = self.create_publisher(MarkerArray, "markers", qos.TRAJECTORY)
         self.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)
         for topic in SHOWN_TOPICS:
@@ -136,28 +136,20 @@ class MarkersNode(Node):
 
     def _publish(self) -> None:
         newest = self._torques.newest_ns
-        if self._mechanism is None:
-            markers = [self._of_the_pendulum(topic, newest) for topic in _ARCS]
-        else:
-            markers = [
-                self._of_a_joint(self._mechanism, index, topic, newest)
-                for topic in _ARCS
-                for index in range(len(self._mechanism.joints))
-            ]
+        plant = self._mechanism or shown_pendulum(self._settings["effort_scale"])
+        markers = [
+            self._of_a_joint(plant, index, topic, newest) for topic in _ARCS for index in range(len(plant.joints))
+        ]
         self._publisher.publish(MarkerArray(markers=markers))
 
-    def _of_the_pendulum(self, topic: str, newest_ns: int) -> Marker:
-        effort = self._torques.acting(topic, newest_ns)
-        points = arc_points(effort, self._settings["effort_scale"], _ARCS[topic][1] * self._settings["radius"])
-        return self._marker(topic, topic, self._settings["frame"], points, newest_ns)
-
-    def _of_a_joint(self, plant: MechanismParameters, index: int, topic: str, newest_ns: int) -> Marker:
+    def _of_a_joint(self, plant: PlantParameters, index: int, topic: str, newest_ns: int) -> Marker:
         joint = plant.mechanism.joints[index]
         effort = self._torques.acting(topic, newest_ns, joint.name)
         frame, points = joint_marker(
             plant, index, effort, self._settings["radius"], _ARCS[topic][1], self._settings["frame"]
         )
-        return self._marker(topic, f"{topic}/{joint.name}", frame, points, newest_ns)
+        space = topic if len(plant.joints) == 1 else f"{topic}/{joint.name}"
+        return self._marker(topic, space, frame, points, newest_ns)
 
     def _marker(self, topic: str, space: str, frame: str, points: Sequence[Sequence[float]], newest_ns: int) -> Marker:
         number, _, (red, green, blue) = _ARCS[topic]
@@ -173,7 +165,7 @@ class MarkersNode(Node):
 
 
 def joint_marker(
-    plant: MechanismParameters, index: int, effort: float, radius: float, factor: float, base: str
+    plant: PlantParameters, index: int, effort: float, radius: float, factor: float, base: str
 ) -> tuple[str, list[Sequence[float]]]:
     """Return in which frame of the plant's URDF an effort is drawn, and its polyline.
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import MECHANISMS
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_differences import read_plants
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
 
-__all__ = ["ShownPlant", "told_mechanism"]
+__all__ = ["ShownPlant", "shown_pendulum", "told_mechanism"]
 
 
 class ShownPlant:
@@ -16,15 +16,17 @@ class ShownPlant:
 
     Args:
         topic: Name of the topic, for messages.
+        pendulum: What is drawn where the plant has one joint.
 
     Attributes:
         joints: The joints of which states are drawn, in their order: one where the plant is a pendulum.
-        parameters: The plant of several joints; None for a pendulum, and until the plant's description arrives.
+        parameters: The plant that is drawn; None until the description of one of several joints arrives.
     """
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self, topic: str, pendulum: PlantParameters) -> None:
         self.joints: tuple[str, ...] = (JOINT,)
-        self.parameters: MechanismParameters | None = None
+        self.parameters: PlantParameters | None = pendulum
+        self._pendulum = pendulum
         self._topic = topic
         self._named: tuple[str, ...] | None = None
         self._told = ""
@@ -32,9 +34,7 @@ class ShownPlant:
     @property
     def missing(self) -> str:
         """What is not known yet of the plant whose states come, as text; empty where it can be drawn."""
-        if len(self.joints) == 1 or self.parameters is not None:
-            return ""
-        return f"waiting for the parameters of {', '.join(self.joints)}"
+        return "" if self.parameters is not None else f"waiting for the parameters of {', '.join(self.joints)}"
 
     def take_names(self, names: tuple[str, ...]) -> None:
         """Take the names of a state's joints.
@@ -65,16 +65,22 @@ class ShownPlant:
             self._find()
 
     def _find(self) -> None:
-        found = told_mechanism(self._told)
+        told = told_mechanism(self._told)
+        found = self._pendulum if len(self.joints) == 1 else told
         # A description of other joints is that of the plant before, or after.
         self.parameters = found if found is not None and found.coordinates.names == self.joints else None
 
 
-def told_mechanism(text: str) -> MechanismParameters | None:
+def shown_pendulum(effort_scale: float) -> PlantParameters:
+    """Return what is drawn of any pendulum: all look alike but for the torque that is drawn in full [N m]."""
+    return pendulum_plant(1.0, 0.0, 1.0, effort_limit=effort_scale)
+
+
+def told_mechanism(text: str) -> PlantParameters | None:
     """Return the plant of several joints of a description that a plant gave, or None where it has one joint.
 
     Raises:
         ParameterError: The text is no description of plants.
     """
     plants = read_plants(text) if text else ()
-    return next((plant for plant in plants if isinstance(plant, MechanismParameters)), None)
+    return next((plant for plant in plants if not plant.is_pendulum), None)

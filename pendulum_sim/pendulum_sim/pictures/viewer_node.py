@@ -17,8 +17,8 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import (
     command_from_bytes,
@@ -30,10 +30,9 @@ from pendulum_msgs_py.ros.convert import (
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.ros.timers import create_wall_timer
-from pendulum_sim.pictures.canvas import Picture
-from pendulum_sim.pictures.drawing import PendulumPicture, Window, save_gif, save_png
-from pendulum_sim.pictures.mechanism_drawing import MechanismPicture
-from pendulum_sim.pictures.shown_plant import ShownPlant
+from pendulum_sim.pictures.drawing import Window, save_gif, save_png
+from pendulum_sim.pictures.plant_picture import PlantPicture
+from pendulum_sim.pictures.shown_plant import ShownPlant, shown_pendulum
 from pendulum_sim.pictures.shown_torques import SHOWN_TOPICS, ShownTorques
 
 __all__ = ["SPECS", "ViewerNode", "main"]
@@ -93,11 +92,10 @@ class ViewerNode(Node):
         self._values = values
         self._topic = self.resolve_topic_name(names.JOINT_STATES)
         self._namespace = self._topic.rpartition("/")[0]
-        self._plant = ShownPlant(self._topic)
+        pendulum = shown_pendulum(values["effort_scale"])
+        self._plant = ShownPlant(self._topic, pendulum)
         self._size: tuple[int, int] = (values["width"], values["height"])
-        self._pendulum = PendulumPicture(self._size, values["effort_scale"], trail=values["trail"])
-        self._mechanism: MechanismPicture | None = None
-        self._picture: Picture = self._pendulum
+        self._picture = PlantPicture(pendulum, self._size, trail=values["trail"])
         self._window = Window(self._size, self._topic) if values["window"] else None
         self._sample: JointSample | None = None
         self._start_ns: int | None = None
@@ -182,46 +180,30 @@ class ViewerNode(Node):
     # --- picture -------------------------------------------------------------------------------------------
 
     def _draw(self) -> None:
-        if self._plant.missing:
+        if (plant := self._plant.parameters) is None:
             self._picture.show_text(self._plant.missing)
-        elif self._plant.parameters is not None and self._sample is not None:
-            self._draw_mechanism(self._plant.parameters, self._sample)
         else:
-            self._draw_pendulum()
+            self._draw_plant(plant, self._sample)
         if self._window is not None:
             self._window.show(self._picture)
 
-    def _draw_pendulum(self) -> None:
-        self._picture = self._pendulum
-        sample = self._sample
+    def _draw_plant(self, plant: PlantParameters, sample: JointSample | None) -> None:
+        if self._picture.parameters != plant:
+            self._picture = PlantPicture(plant, self._size, trail=self._values["trail"])
         if sample is None:
-            sample, note, time = JointSample.of_one(0, 0.0, 0.0), f"waiting for {self._topic}", None
-        else:
-            time, note = self._time_of(sample), self._topic
-        applied = self._torques.acting(names.APPLIED_EFFORT, sample.stamp_ns)
-        disturbance = sum(self._torques.acting(topic, sample.stamp_ns) for topic in _DISTURBING)
-        where = sample.position[0], sample.velocity[0]
-        self._pendulum.draw(*where, applied, disturbance=disturbance, time=time, note=note)
-
-    def _draw_mechanism(self, parameters: MechanismParameters, sample: JointSample) -> None:
-        if self._mechanism is None or self._mechanism.parameters != parameters:
-            self._mechanism = MechanismPicture(parameters, self._size, trail=self._values["trail"])
-        self._picture = self._mechanism
+            self._picture.draw((0.0,) * len(plant.joints), note=f"waiting for {self._topic}")
+            return
         disturbance: Counter[str] = Counter()
         for topic in _DISTURBING:
             disturbance.update(self._torques.acting_on(topic, sample.stamp_ns, self._plant.joints))
-        driven = parameters.coordinates.driven_names
-        self._mechanism.draw(
+        self._picture.draw(
             sample.position,
             velocity=sample.velocity,
-            effort=self._torques.acting_on(names.APPLIED_EFFORT, sample.stamp_ns, driven),
+            effort=self._torques.acting_on(names.APPLIED_EFFORT, sample.stamp_ns, plant.coordinates.driven_names),
             disturbance=disturbance,
-            time=self._time_of(sample),
+            time=(sample.stamp_ns - (self._start_ns or 0)) / NANOSECONDS,
             note=self._topic,
         )
-
-    def _time_of(self, sample: JointSample) -> float:
-        return (sample.stamp_ns - (self._start_ns or 0)) / NANOSECONDS
 
 
 def main(argv: Sequence[str] | None = None) -> int:

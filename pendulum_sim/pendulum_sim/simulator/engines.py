@@ -11,8 +11,11 @@ from typing import Any, NamedTuple
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PLANT_SPECS, PRESET_NAMES, is_mechanism
+from pendulum_msgs_py.plants.plant_parameters import (
+    MECHANISM_PRESETS,
+    PLANT_SPECS,
+    PRESET_NAMES,
+)
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_sim.foreign.equation_check import EquationCheck, Switches, check_equation
 from pendulum_sim.foreign.guarded_plant import GuardedPlant, in_one_sentence
@@ -20,8 +23,7 @@ from pendulum_sim.foreign.gymnasium_plant import GymnasiumPlant, load_adapter, l
 from pendulum_sim.foreign.mujoco_mapping import MujocoMapping, load_mujoco_mapping
 from pendulum_sim.foreign.mujoco_plant import MujocoPlant, load_mujoco_plant
 from pendulum_sim.stepping.integrators import METHODS
-from pendulum_sim.stepping.joint_plant import joint_plant
-from pendulum_sim.stepping.mechanism_plant import MechanismPlant
+from pendulum_sim.stepping.joint_plant import JointPlant, OneJoint, joint_plant, make_joint_plant
 from pendulum_sim.stepping.plant import Plant
 from pendulum_sim.stepping.plants import make_plant
 
@@ -40,7 +42,7 @@ class Simulation(NamedTuple):
         check: Runs a third-party simulation against its equation; to be reset afterwards.
     """
 
-    plant: Plant | MechanismPlant
+    plant: JointPlant
     name: str
     method: str
     remarks: tuple[str, ...] = ()
@@ -54,9 +56,9 @@ class Simulation(NamedTuple):
         Raises:
             ParameterError: It has several.
         """
-        if isinstance(self.plant, MechanismPlant):
+        if not isinstance(self.plant, OneJoint):
             raise ParameterError(f"simulation {self.name} has several joints; expected one")
-        return self.plant
+        return self.plant.plant
 
 
 @dataclass(frozen=True)
@@ -104,24 +106,15 @@ _FOREIGN_SPECS = (
 
 def _make_own(values: Mapping[str, Any]) -> Simulation:
     dt = round(NANOSECONDS / values["rate_hz"]) / NANOSECONDS
-    if is_mechanism(values["plant"]):
-        return _make_mechanism(values, dt)
     parameters, sealed = load_plant_to_run(values["plant"])
-    plant = make_plant(parameters, dt, method=values["method"], substeps=values["substeps"] or None)
-    return Simulation(plant, values["plant"], values["method"], sealed=sealed)
-
-
-def _make_mechanism(values: Mapping[str, Any], dt: float) -> Simulation:
-    if values["method"] != "auto":
-        raise ParameterError(
-            f"method is {values['method']!r}; expected auto: plant {values['plant']!r} has several joints, which are "
-            "integrated by Runge-Kutta of order four"
-        )
-    parameters = load_mechanism(values["plant"])
-    plant = MechanismPlant(parameters, dt, substeps=values["substeps"] or 1)
-    joints = ", ".join(parameters.coordinates.names)
-    driven = ", ".join(parameters.coordinates.driven_names) or "none"
-    return Simulation(plant, values["plant"], "rk4", (f"joints {joints}; driven: {driven}",))
+    method: str = values["method"]
+    remarks: tuple[str, ...] = ()
+    plant = make_joint_plant(parameters, dt, method=method, substeps=values["substeps"] or None)
+    if not parameters.is_pendulum:
+        coordinates = parameters.coordinates
+        driven = ", ".join(coordinates.driven_names) or "none"
+        method, remarks = "rk4", (f"joints {', '.join(coordinates.names)}; driven: {driven}",)
+    return Simulation(plant, values["plant"], method, remarks, sealed=sealed)
 
 
 def _make_mujoco(values: Mapping[str, Any]) -> Simulation:
@@ -165,7 +158,7 @@ def _foreign(plant: MujocoPlant | GymnasiumPlant, name: str, label: str) -> Simu
     found = [(spec, getattr(plant.parameters, spec.name)) for spec in PLANT_SPECS if spec.name in _OF_EQUATION]
     values = ", ".join(f"{spec.name} {value:.6g} {spec.unit}" for spec, value in found)
     remarks = (*plant.remarks, f"closest equation: {values}")
-    return Simulation(guarded, name, plant.description, remarks, check=check)
+    return Simulation(joint_plant(guarded), name, plant.description, remarks, check=check)
 
 
 OWN = Engine(

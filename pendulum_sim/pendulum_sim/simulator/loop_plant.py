@@ -8,6 +8,7 @@ import numpy as np
 
 from pendulum_msgs_py.loops.machine_code import NoMachineCodeError
 from pendulum_sim.stepping.dry_friction import PACKED
+from pendulum_sim.stepping.joint_plant import JointPlant, OneJoint
 from pendulum_sim.stepping.plant import RigidPlant
 
 __all__ = ["BUILDER", "LAYOUT", "MOST_COEFFICIENTS", "LoopPlant", "loop_plant"]
@@ -77,12 +78,13 @@ class LoopPlant:
         plant.delay.line.extend(record.line[: len(plant.delay.line)])
 
 
-def loop_plant(plant: object) -> LoopPlant:
+def loop_plant(joint_plant: JointPlant) -> LoopPlant:
     """Return a plant for a compiled loop.
 
     Raises:
         NoMachineCodeError: It is stepped by Python.
     """
+    plant = joint_plant.plant if isinstance(joint_plant, OneJoint) else None
     if not isinstance(plant, RigidPlant):
         raise NoMachineCodeError("the plant is not a rigid pendulum of ours")
     if plant.method in _INTERPRETED:

@@ -28,9 +28,8 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSam
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.loops.machine_code import NoMachineCodeError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, describe_plants
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism
+from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_msgs_py.programs.executables import report_error
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.compiled_periods import CompiledPeriods
@@ -43,7 +42,7 @@ from pendulum_msgs_py.ros.runner import run_node
 from pendulum_sim.foreign.guarded_plant import PaceWatch, StallWatch
 from pendulum_sim.simulator.engines import OWN, Engine
 from pendulum_sim.simulator.loop_plant import loop_plant
-from pendulum_sim.stepping.joint_plant import joint_plant, random_start
+from pendulum_sim.stepping.joint_plant import random_start
 from pendulum_sim.stepping.sensors import SENSOR_SPECS, Sensors
 from pendulum_sim.stepping.servo import PositionServo
 
@@ -99,13 +98,13 @@ class SimulatorNode(PollingNode):
         self._simulation = engine.make(values)
         # Before the first reset, which undoes the steps of the check.
         self._checked = None if self._simulation.check is None else self._simulation.check()
-        self._plant = joint_plant(self._simulation.plant)
-        self._coordinates = self._plant.coordinates
-        parameters = self._simulation.plant.parameters
+        self._plant = self._simulation.plant
+        self._coordinates = self._plant.parameters.coordinates
+        parameters = self._plant.parameters
         self._dt = self._plant.dt
         period_ns = round(self._dt * NANOSECONDS)
         self._told_plant = describe_plants([] if self._simulation.sealed else [parameters])
-        self._servo = PositionServo(parameters, self._dt) if isinstance(parameters, PlantParameters) else None
+        self._servo = PositionServo(parameters, self._dt) if parameters.is_pendulum else None
         self._failure = ""
         starts, sensor_noise = np.random.default_rng(values["seed"]).spawn(2)
         self._starts = starts
@@ -117,7 +116,7 @@ class SimulatorNode(PollingNode):
         least = _LEAST_PERIODS * self._dt
         limits = limits_from_parameters(
             values,
-            self._plant.effort_limits,
+            self._plant.parameters.effort_limits,
             coordinates=self._coordinates,
             lockstep=values["clock"] == "lockstep",
             least_command_timeout=least,
@@ -290,7 +289,7 @@ class SimulatorNode(PollingNode):
         """Return the parameters; the units of limits are those of the joints of the plant that was given."""
         specs, given = (*engine.specs, *_SHARED_SPECS), self._parameter_overrides.get("plant")
         plant = "" if given is None or engine is not OWN else str(given.value)
-        return in_units_of(specs, load_mechanism(plant).coordinates) if plant and is_mechanism(plant) else specs
+        return in_units_of(specs, load_plant_to_run(plant)[0].coordinates) if plant else specs
 
     def _start_state(self, values: Mapping[str, Any]) -> tuple[Vector, Vector]:
         start, coordinates = values["start"], self._coordinates

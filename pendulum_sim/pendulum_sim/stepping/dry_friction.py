@@ -20,7 +20,8 @@ from __future__ import annotations
 
 from pendulum_msgs_py.dynamics import friction_magnitude, gravity_torque, rigid_acceleration
 from pendulum_msgs_py.dynamics.steps import actuator_torque, narrowed
-from pendulum_msgs_py.plants.friction_terms import STRENGTHS, TERM_PARAMETERS, added_friction
+from pendulum_msgs_py.plants.friction_terms import STRENGTHS, added_friction
+from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 from pendulum_sim.stepping.integrators import Acceleration, Coefficients, PlantTuple, Step
 
 __all__ = [
@@ -33,19 +34,8 @@ __all__ = [
     "static_friction_balance",
 ]
 
-PACKED = (
-    "inertia",
-    "damping",
-    "gravity",
-    "coulomb_friction",
-    "static_friction",
-    "stribeck_velocity",
-    "torque_offset",
-    "angle_offset",
-    "actuator_time_constant",
-    *TERM_PARAMETERS,
-)
-"""Order of the values in a ``PlantTuple``."""
+PACKED = tuple(spec.name for spec in PLANT_SPECS if spec.name not in {"effort_limit", "transport_delay"})
+"""Order of the values in a ``PlantTuple``: that of plant files."""
 _INERTIA, _DAMPING, _GRAVITY, _COULOMB, _STATIC, _STRIBECK, _OFFSET, _ANGLE, LAG, _TERMS = range(10)
 """Where they stand in it; ``LAG`` is the actuator's time constant, the values of the friction terms are the last."""
 _added_friction = added_friction(PACKED)

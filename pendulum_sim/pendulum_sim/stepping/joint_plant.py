@@ -6,11 +6,14 @@ import math
 
 import numpy as np
 
-from pendulum_msgs_py.contract.joints import ONE_JOINT, Vector
+from pendulum_msgs_py.contract.joints import Vector
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant, MechanismState
 from pendulum_sim.stepping.plant import Plant, PlantState
+from pendulum_sim.stepping.plants import make_plant
 
-__all__ = ["JointPlant", "OneJoint", "joint_plant", "random_start"]
+__all__ = ["JointPlant", "OneJoint", "joint_plant", "make_joint_plant", "random_start"]
 
 _SLIDE = 0.1
 """Largest distance from the middle at which a joint that slides starts at random [m]."""
@@ -21,11 +24,7 @@ class OneJoint:
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
-        self.dt = plant.dt
-        self.name = plant.parameters.name
-        self.coordinates = ONE_JOINT
-        self.stops = ((-math.inf, math.inf),)
-        self.effort_limits = (plant.parameters.effort_limit,)
+        self.parameters, self.dt = plant.parameters, plant.dt
         self._step = plant.step
 
     @property
@@ -52,11 +51,35 @@ def joint_plant(plant: Plant | MechanismPlant) -> JointPlant:
     return plant if isinstance(plant, MechanismPlant) else OneJoint(plant)
 
 
+def make_joint_plant(
+    parameters: PlantParameters, dt: float, *, method: str = "auto", substeps: int | None = None
+) -> JointPlant:
+    """Return the plant that the parameters describe.
+
+    Args:
+        parameters: The plant.
+        dt: Period over which commands are held [s].
+        method: As of :func:`~pendulum_sim.stepping.plants.make_plant`; for other plants than a pendulum ``auto``.
+        substeps: Integration steps in a period; None chooses by the plant.
+
+    Raises:
+        ParameterError: The method does not go with the plant, or an argument is outside its domain.
+    """
+    if parameters.is_pendulum:
+        return OneJoint(make_plant(parameters, dt, method=method, substeps=substeps))
+    if method != "auto":
+        raise ParameterError(
+            f"method is {method!r}; expected auto: plant {parameters.name!r} has several joints, which are integrated "
+            "by Runge-Kutta of order four"
+        )
+    return MechanismPlant(parameters, dt, substeps=substeps or 1)
+
+
 def random_start(plant: JointPlant, generator: np.random.Generator) -> tuple[Vector, Vector]:
     """Return positions and velocities of a start: in a turn, or near the middle, between stops; at most 1 rad/s."""
-    joints = plant.coordinates.joints
+    joints = plant.parameters.coordinates.joints
     position = []
-    for joint, (low, high) in zip(joints, plant.stops, strict=True):
+    for joint, (low, high) in zip(joints, plant.parameters.stops, strict=True):
         reach = math.pi if joint.turns else _SLIDE
         position.append(generator.uniform(min(max(-reach, low), high), max(min(reach, high), low)))
     return tuple(position), tuple(generator.uniform(-1.0, 1.0) for _ in joints)

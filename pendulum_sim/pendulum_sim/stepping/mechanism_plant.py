@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pendulum_msgs_py.contract.joints import Coordinates, Vector
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.joint_steps import LAG, advance_joints, joint_functions
 from pendulum_msgs_py.dynamics.runge_kutta import rk4_joints
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_delay, pack_joints
 from pendulum_sim.stepping.plant import DelayLine, check_step, period_segments
 
 __all__ = [
@@ -25,7 +25,7 @@ __all__ = [
     "MechanismState",
     "check_decay",
     "check_stable_step",
-    "is_smooth_mechanism",
+    "is_smooth",
 ]
 
 _RK4_STABLE = 2.78
@@ -61,7 +61,7 @@ class MechanismPlant:
             transport delays.
     """
 
-    def __init__(self, parameters: MechanismParameters, dt: float, *, substeps: int = 1) -> None:
+    def __init__(self, parameters: PlantParameters, dt: float, *, substeps: int = 1) -> None:
         check_step(dt, substeps)
         check_stable_step(parameters, dt / substeps)
         self.parameters = parameters
@@ -80,26 +80,6 @@ class MechanismPlant:
         self._still = (0.0,) * len(parameters.joints)
         self._position = self._velocity = self._effort = self._still
         self._steps = 0
-
-    @property
-    def name(self) -> str:
-        """Name of the plant."""
-        return self.parameters.name
-
-    @property
-    def coordinates(self) -> Coordinates:
-        """Its joints, and which of them are driven."""
-        return self.parameters.coordinates
-
-    @property
-    def stops(self) -> tuple[tuple[float, float], ...]:
-        """Lowest and highest position of each joint, infinite where nothing stops it [rad or m]."""
-        return self.parameters.stops
-
-    @property
-    def effort_limits(self) -> Vector:
-        """Largest effort of each driven joint [N m or N]."""
-        return self._limits
 
     @property
     def state(self) -> MechanismState:
@@ -174,12 +154,13 @@ class MechanismPlant:
         return self.parameters.energy(self._position, self._velocity)
 
 
-def is_smooth_mechanism(parameters: MechanismParameters) -> bool:
-    """Return whether a plant is free of dry friction, end stops, lag and delay."""
-    return not _has_events(parameters) and not any(actuator.transport_delay for actuator in parameters.actuators)
+def is_smooth(parameters: PlantParameters) -> bool:
+    """Return whether a plant is free of dry friction, end stops, lag, delay and drivetrain."""
+    late = any(actuator.transport_delay for actuator in parameters.actuators)
+    return parameters.drivetrain is None and not _has_events(parameters) and not late
 
 
-def check_stable_step(parameters: MechanismParameters, h: float) -> None:
+def check_stable_step(parameters: PlantParameters, h: float) -> None:
     """Refuse a step at which damping alone would make the integrator unstable.
 
     Raises:
@@ -207,6 +188,6 @@ def check_decay(rate: float, h: float, whose: str) -> None:
         )
 
 
-def _has_events(parameters: MechanismParameters) -> bool:
+def _has_events(parameters: PlantParameters) -> bool:
     lagging = any(actuator.time_constant > 0.0 for actuator in parameters.actuators)
     return parameters.has_dry_friction or lagging or any(map(math.isfinite, chain(*parameters.stops)))

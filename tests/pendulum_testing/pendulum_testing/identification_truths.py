@@ -12,14 +12,14 @@ from scipy.signal import lfilter
 from pendulum_bags.identification.model import from_plant
 from pendulum_bags.identification.result import IdentificationResult
 from pendulum_bags.runs.datasets import Recording
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
 from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
 __all__ = ["OUTSIDE", "PLANT", "TRUTHS", "Truth", "covered", "outside"]
 
 Array = NDArray[np.float64]
 
-PLANT = PlantParameters(
+PLANT = pendulum_plant(
     inertia=0.05, damping=0.03, gravity=1.5, coulomb_friction=0.05, angle_offset=0.01, transport_delay=0.006
 )
 

@@ -11,7 +11,7 @@ import numpy as np
 from pendulum_bags.identification.identify_mechanism import identify_mechanism
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 
 __all__ = ["MECHANISMS", "NOISE", "OFF", "PERIOD", "joint_verdict", "motion", "truth"]
 
@@ -26,7 +26,7 @@ OFF = {
 }
 
 
-def truth(name: str) -> MechanismParameters:
+def truth(name: str) -> PlantParameters:
     """Return a preset, with frictions where it has none."""
     plant = load_mechanism(name)
     if name == "cart_pole":
@@ -36,7 +36,7 @@ def truth(name: str) -> MechanismParameters:
 
 @cache
 def motion(
-    plant: MechanismParameters, seed: int, seconds: float = 6.0, period: float = PERIOD, swing: float = 0.3
+    plant: PlantParameters, seed: int, seconds: float = 6.0, period: float = PERIOD, swing: float = 0.3
 ) -> JointRecording:
     """Return a noisy recording of a plant under slow multisines, by an integrator of its own with small steps."""
     rng = np.random.default_rng(seed)

@@ -17,15 +17,13 @@ from pendulum_lqr.policies.policy import (
     default_signals,
     sample_layout,
 )
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["linear_policy", "lqr_policy", "random_policy"]
 
 
 def random_policy(
-    plant: AnyPlant, *, hidden: tuple[int, ...] = (8, 8), history: int = 3, seed: int = 0, **changes: Any
+    plant: PlantParameters, *, hidden: tuple[int, ...] = (8, 8), history: int = 3, seed: int = 0, **changes: Any
 ) -> Policy:
     """Return a policy of random weights for a plant."""
     coordinates = plant.coordinates
@@ -47,7 +45,7 @@ def linear_policy(plant: PlantParameters, angle_gain: float, velocity_gain: floa
     return _policy(plant, Network((weight,), (np.zeros(1, dtype=np.float32),)), **changes)
 
 
-def lqr_policy(plant: MechanismParameters, **changes: Any) -> Policy:
+def lqr_policy(plant: PlantParameters, **changes: Any) -> Policy:
     """Return the policy that answers as the LQR of a plant of several joints does near upright, u = -K [x, q']."""
     gain = output_lqr(linearise(plant), *plant.mechanism.weights).rows
     coordinates = plant.coordinates
@@ -72,10 +70,9 @@ def _network(sizes: tuple[int, ...], seed: int, activation: str, output: str) ->
     return Network(weights, biases, activation, output)
 
 
-def _policy(plant: AnyPlant, network: Network, **changes: Any) -> Policy:
+def _policy(plant: PlantParameters, network: Network, **changes: Any) -> Policy:
     coordinates = plant.coordinates
     n, m = len(coordinates.joints), len(coordinates.driven)
-    limits = plant.effort_limits if isinstance(plant, MechanismParameters) else (plant.effort_limit,)
     values: dict[str, Any] = {
         "name": "test",
         "task": "swing_up",
@@ -83,7 +80,7 @@ def _policy(plant: AnyPlant, network: Network, **changes: Any) -> Policy:
         "period": 0.01,
         "plant": plant,
         "ranges": {},
-        "effort_limit": limits,
+        "effort_limit": plant.effort_limits,
         "effort_rate": (math.inf,) * m,
         "velocity_scale": (1.0,) * n,
         "angle_box": tuple(math.pi if joint.turns else 0.5 for joint in coordinates.joints),

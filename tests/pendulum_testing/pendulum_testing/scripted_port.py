@@ -7,7 +7,7 @@ from typing import Any
 from pendulum_hw_bridge.port.actuator import Applied, Command, Feedback, HardwareLimits, Strategy
 from pendulum_hw_bridge.port.command_check import check_command
 from pendulum_hw_bridge.port.gains import GainSet
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 
 __all__ = ["DRIVETRAIN", "MILLISECOND", "PERIOD", "SECOND", "STEP", "TIMEOUT", "Port"]
 

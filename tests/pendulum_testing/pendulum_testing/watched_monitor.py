@@ -8,7 +8,7 @@ from typing import Any
 from pendulum_hw_bridge.drive.fault_table import FAULTS
 from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.port.actuator import Command, Strategy
-from pendulum_msgs_py.plants.plant_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 from pendulum_testing.feedback_records import feedback_record
 
 __all__ = ["DRIVETRAIN", "LIMITS", "MILLISECOND", "PERIOD", "STEP", "TIMEOUT", "Watched"]

@@ -30,7 +30,7 @@ from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import FaultError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant, write_plant
 from pendulum_msgs_py.programs import graph
 from pendulum_rosbag.reader import read_bag
 from tests.tools.faults.network import (
@@ -55,7 +55,7 @@ __all__ = [
     "survive_loss",
 ]
 
-LIGHT = PlantParameters(inertia=0.1495, damping=0.1, gravity=2.996955, effort_limit=100.0, name="light")
+LIGHT = pendulum_plant(inertia=0.1495, damping=0.1, gravity=2.996955, effort_limit=100.0, name="light")
 """A pendulum that feels delay: the preset ``dfki`` without dry friction, with a motor that does not saturate."""
 Q, R = (1000.0, 1.0), 0.1
 PERIOD = 0.002

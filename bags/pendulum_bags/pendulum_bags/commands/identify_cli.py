@@ -111,7 +111,7 @@ def identify(
         _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS)
         from pendulum_bags.identification.identify_mechanism import identify_mechanism
         from pendulum_bags.identification.joint_recordings import read_joints
-        from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+        from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
         start = load_mechanism(plant)
         if len(start.joints) == 1:

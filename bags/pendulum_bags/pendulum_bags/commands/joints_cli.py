@@ -98,7 +98,7 @@ def joints(
     from pendulum_bags.runs.next_test import MACHINE_FILE
     from pendulum_bags.whole.carry_out import Order
     from pendulum_lqr.linear.model import linearise
-    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism, write_mechanism
+    from pendulum_msgs_py.plants.plant_parameters import load_mechanism, write_plant
 
     if amplitude is None:
         amplitude = default_amplitude(plant, joint)
@@ -124,7 +124,7 @@ def joints(
     margins, steps = Margins.of(margins_file, margin), steps_of(only, budget)
 
     def order_in(folder: Path) -> Order:
-        file = write_mechanism(folder / MACHINE_FILE, machine, provenance={"stands_in_for": f"the machine of {plant}"})
+        file = write_plant(folder / MACHINE_FILE, machine, provenance={"stands_in_for": f"the machine of {plant}"})
         of = JointSettings(plant, str(file), design_file(folder, plant), joint, settings.noise, storage, controller)
         multisine = Multisine(signal_period=signal_period, periods=periods)
         return Order(of, margins, budget, steps, contenders, seeds, multisine=multisine, designs=design or ())

@@ -132,23 +132,21 @@ def _settings(
 ) -> Training:
     from pendulum_bags.learning.ppo import PpoSettings
     from pendulum_bags.learning.training import Training
-    from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism_file
-    from pendulum_msgs_py.plants.plant_parameters import is_mechanism, load_plant_file
+    from pendulum_msgs_py.plants.plant_parameters import load_plant_file
 
     if task == "pendulum_v1":
         # Few and long steps: an episode has 200, and is all but over after the swing-up.
         ppo = PpoSettings(hidden=hidden, discount=0.95, epochs=8, batches=8)
         settings = Training(task=task, swing_up=swing_up, ppo=ppo, environments=256, updates=80, seed=seed)
     else:
-        several = is_mechanism(plant)
-        parameters, provenance = load_mechanism_file(plant) if several else load_plant_file(plant)
+        parameters, provenance = load_plant_file(plant)
         settings = Training(
             task=task, plant=parameters, intervals=provenance["intervals"], swing_up=swing_up,
             ppo=PpoSettings(hidden=hidden), seed=seed, teacher=teacher,
         )  # fmt: skip
         if teacher != "none":
             settings = replace(settings, updates=300)
-        elif several:
+        elif not parameters.is_pendulum:
             # There is more to learn: more steps, a lasting spread, and a swing-up is longer than the 2 s that
             # the discount of one joint looks ahead.
             settings = replace(settings, ppo=replace(settings.ppo, least_spread=0.1, discount=0.998), updates=1500)

@@ -19,8 +19,7 @@ from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
-from pendulum_msgs_py.plants.plant_differences import load_any_plant
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism, load_plant
 from pendulum_sim.stepping.joint_plant import JointPlant, OneJoint
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_sim.stepping.plants import make_plant
@@ -89,13 +88,13 @@ def _whole(period: float) -> float:
 
 def _simulate(spec: RunSpec, plant: JointPlant, sensors: Sensors) -> RunArrays:
     period_ns = round(NANOSECONDS * spec.period)
-    coordinates, is_one = plant.coordinates, isinstance(plant, OneJoint)
+    coordinates, is_one = plant.parameters.coordinates, isinstance(plant, OneJoint)
     limits: dict[str, Any] = validate(LIMIT_SPECS, BEGINS_ANYWHERE if is_one else {})
     supervisor = PlantSupervisor(
-        limits_from_parameters(limits, plant.effort_limits, coordinates=coordinates, lockstep=True),
+        limits_from_parameters(limits, plant.parameters.effort_limits, coordinates=coordinates, lockstep=True),
         coordinates=coordinates,
     )
-    design = load_any_plant(spec.design_plant)
+    design = load_mechanism(spec.design_plant)
     controller = ControlLoop(
         make_controller(spec.controller, design, spec.period, spec.law(design)), float("inf"), simulated_time=True
     )

@@ -14,8 +14,7 @@ from pendulum_bags.experiments.settings import NoiseSettings
 from pendulum_msgs_py.contract.names import JOINT_STATES
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import FaultError, ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism, write_mechanism
-from pendulum_msgs_py.plants.plant_parameters import is_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism, load_mechanism, write_plant
 from pendulum_rosbag.reader.bag import read_bag
 
 __all__ = [
@@ -151,12 +150,12 @@ def default_amplitude(plant: str, joint: str = "") -> float:
     return loaded.effort_limits[index] / LIMIT_PER_NOISE
 
 
-def identified_names(plant: MechanismParameters) -> list[str]:
+def identified_names(plant: PlantParameters) -> list[str]:
     """Return the names of the values that an identification finds: masses, lengths, inertias and friction."""
     return [name for name in plant.numbers if name.rpartition(".")[2] not in {*_UNCHANGED, _DELAY}]
 
 
-def stand_in_for(plant: MechanismParameters, *, share: float, delay: float, seed: int) -> MechanismParameters:
+def stand_in_for(plant: PlantParameters, *, share: float, delay: float, seed: int) -> PlantParameters:
     """Return another plant in place of a machine: values as far off as an identification may leave them.
 
     Args:
@@ -178,7 +177,7 @@ def stand_in_for(plant: MechanismParameters, *, share: float, delay: float, seed
     return replace(plant.with_values(changes), name=f"{plant.name}_stand_in")
 
 
-def design_for(plant: MechanismParameters) -> MechanismParameters:
+def design_for(plant: PlantParameters) -> PlantParameters:
     """Return the plant on which the LQR is designed: dry friction of passive joints as viscous friction.
 
     A linear model has no dry friction, and no motor can compensate that of a passive joint: an LQR without a model
@@ -200,10 +199,10 @@ def design_file(folder: Path, plant: str) -> str:
     if designed is loaded:
         return plant
     meaning = f"{loaded.name}, dry friction of its passive joints as viscous friction at {_SLIDING:g} rad/s or m/s"
-    return str(write_mechanism(folder / "design.yaml", designed, provenance={"design_of": meaning}))
+    return str(write_plant(folder / "design.yaml", designed, provenance={"design_of": meaning}))
 
 
-def load_stand_in(path: str | Path, plant: MechanismParameters) -> MechanismParameters:
+def load_stand_in(path: str | Path, plant: PlantParameters) -> PlantParameters:
     """Return the plant of a file that is to stand in for a machine.
 
     Args:
@@ -226,7 +225,7 @@ def load_stand_in(path: str | Path, plant: MechanismParameters) -> MechanismPara
     return found
 
 
-def fall_time(plant: MechanismParameters, stamps_ns: Array, position: Array) -> float | None:
+def fall_time(plant: PlantParameters, stamps_ns: Array, position: Array) -> float | None:
     """Return when a plant fell, from the first state on [s], or None: half of its height of potential energy is lost.
 
     Args:

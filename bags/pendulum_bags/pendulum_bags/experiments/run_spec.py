@@ -19,9 +19,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import reject_unknown, validate
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_msgs_py.plants.plant_differences import AnyPlant, load_any_plant
-from pendulum_msgs_py.plants.plant_parameters import is_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism, load_mechanism
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
@@ -132,7 +130,7 @@ class RunSpec:
                 # The node judges what it has, but what a run is made of is written down before it starts.
                 if isinstance(value, float) and not math.isfinite(value):
                     raise ParameterError(f"parameter {name} of the plant is {value}; expected a finite number")
-        design = load_any_plant(self.design_plant)
+        design = load_mechanism(self.design_plant)
         known = controller_parameters(self.controller, design)
         validate(known, self.law(design), where=f"controller {self.controller}")
         own = {spec.name for spec in DISTURBANCE_SPECS} | _OF_THE_NODE
@@ -146,13 +144,13 @@ class RunSpec:
         return f"/{self.side}"
 
     @property
-    def mechanism(self) -> MechanismParameters | None:
+    def mechanism(self) -> PlantParameters | None:
         """The plant that runs, where it has several joints; else None."""
         return load_mechanism(self.plant) if is_mechanism(self.plant) else None
 
-    def law(self, design: AnyPlant) -> dict[str, Any]:
+    def law(self, design: PlantParameters) -> dict[str, Any]:
         """Return the parameters of the controller, with the set-point that those of one joint have."""
-        own = {} if isinstance(design, MechanismParameters) else {"set_point": float(self.set_point)}
+        own = {"set_point": float(self.set_point)} if design.is_pendulum else {}
         return {**self.controller_parameters, **own}
 
     @property
@@ -236,7 +234,7 @@ class RunSpec:
             **{
                 **{
                     name: str(Path(value).resolve()) if name == "policy" and value else value
-                    for name, value in self.law(load_any_plant(self.design_plant)).items()
+                    for name, value in self.law(load_mechanism(self.design_plant)).items()
                 },
                 "controller": self.controller,
                 "plant": absolute_plant(self.design_plant),

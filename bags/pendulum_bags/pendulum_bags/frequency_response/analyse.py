@@ -24,9 +24,7 @@ from pendulum_lqr.responses.gap_metric import DEFAULT_SCALING, JointScaling, Sca
 from pendulum_lqr.responses.machine_response import Machine
 from pendulum_lqr.responses.measured_response import MeasuredResponse, read_response
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism, load_plant
 
 __all__ = [
     "analyse_machine",
@@ -129,7 +127,7 @@ def analyse_responses(
         DataError: A policy file cannot be read.
     """
     by_label = {response.label: response for response in responses}
-    own: AnyPlant
+    own: PlantParameters
     if responses[0].joints:
         own = mechanism = load_mechanism(plant)
         _refuse_other_joints(mechanism, responses[0])
@@ -163,7 +161,7 @@ def analyse_responses(
     return replace(found, layers=name_in(layers, emulated=found.is_emulated))
 
 
-def _refuse_other_joints(parameters: MechanismParameters, measured: MeasuredResponse) -> None:
+def _refuse_other_joints(parameters: PlantParameters, measured: MeasuredResponse) -> None:
     coordinates, joints = parameters.coordinates, measured.joints
     driven = joints[measured.driven]
     if coordinates.names != joints or coordinates.driven_names != (driven,):

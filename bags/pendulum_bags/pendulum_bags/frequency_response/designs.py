@@ -18,8 +18,6 @@ from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy
 from pendulum_lqr.responses.certificate import Certificate, Certifier
 from pendulum_lqr.responses.controller_response import controller_response
 from pendulum_msgs_py.errors import ParameterError, PendulumError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.terminal import WholeTable
 
@@ -111,7 +109,7 @@ class DesignResult:
         }
 
 
-def read_designs(texts: Sequence[str], plant: MechanismParameters, model: LinearModel) -> list[Design]:
+def read_designs(texts: Sequence[str], plant: PlantParameters, model: LinearModel) -> list[Design]:
     """Return the designs that texts stand for, made on a plant of several joints, one of them driven.
 
     Args:
@@ -127,7 +125,7 @@ def read_designs(texts: Sequence[str], plant: MechanismParameters, model: Linear
 
 
 def certify_designs(
-    texts: Sequence[str], plant: AnyPlant, certifier: Certifier, *, recorded: bool = False
+    texts: Sequence[str], plant: PlantParameters, certifier: Certifier, *, recorded: bool = False
 ) -> list[DesignResult]:
     """Return the certificates of designs that were made on a plant.
 
@@ -143,10 +141,10 @@ def certify_designs(
         ParameterError: A text is no design, or a policy is not for the plant.
         DataError: A policy file cannot be read.
     """
-    cost = plant.mechanism.weights[1] if isinstance(plant, MechanismParameters) else THESIS_WEIGHTS[0][1]
+    cost = plant.mechanism.weights[1]
     found = []
     for text in _asked(texts, plant):
-        if isinstance(plant, MechanismParameters) or text.startswith(("q=", "k=")):
+        if not plant.is_pendulum or text.startswith(("q=", "k=")):
             one = _static(text, cost, certifier.plant)
             found.append(DesignResult(one.name, tuple(map(float, one.K)), certifier.gain(one.K), text=text))
         elif text.endswith(POLICY_SUFFIX):
@@ -158,9 +156,9 @@ def certify_designs(
     return found
 
 
-def _asked(texts: Sequence[str], plant: AnyPlant) -> list[str]:
+def _asked(texts: Sequence[str], plant: PlantParameters) -> list[str]:
     usual: Sequence[tuple[tuple[float, ...], float]] = THESIS_WEIGHTS
-    if isinstance(plant, MechanismParameters):
+    if not plant.is_pendulum:
         q, r = plant.mechanism.weights
         usual = [(q, r * share) for share in _OTHER_COSTS]
     written = (f"q={','.join(f'{weight:g}' for weight in q)} r={r:g}" for q, r in usual)

@@ -37,7 +37,7 @@ from pendulum_bags.identification.uncertainty import Uncertainty
 from pendulum_bags.runs.datasets import distinct_names
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.determined import SPAN, undetermined
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["identify_mechanism"]
 
@@ -67,7 +67,7 @@ _FEWEST = 5
 # BLAS on one core, as for one joint: a recording has the same result on every worker.
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def identify_mechanism(
-    plant: MechanismParameters,
+    plant: PlantParameters,
     recordings: Sequence[JointRecording],
     *,
     held_out: Sequence[JointRecording] = (),
@@ -188,7 +188,7 @@ class _Attempt:
 class _Search:
     """A fit from the start, or by way of shorter windows where that ends in a poor minimum."""
 
-    plant: MechanismParameters
+    plant: PlantParameters
     recordings: Sequence[JointRecording]
     extras: str | None
     stride: int

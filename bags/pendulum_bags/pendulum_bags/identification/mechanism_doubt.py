@@ -14,7 +14,7 @@ from pendulum_bags.identification.mechanism_fit import MechanismFit, Score, Wind
 from pendulum_bags.identification.mechanism_model import MechanismModel, tellable
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["better_reading", "refusal"]
 
@@ -58,7 +58,7 @@ class _Reading:
         )
 
 
-def _readings(plant: MechanismParameters, data: Sequence[Windows]) -> Iterator[_Reading]:
+def _readings(plant: PlantParameters, data: Sequence[Windows]) -> Iterator[_Reading]:
     """Yield what a mapping file gets wrong without a trace: order, signs, units, zeros, an angle against the world."""
     names, driven, count = plant.coordinates.names, plant.coordinates.driven, len(plant.joints)
     joints = plant.coordinates.joints
@@ -146,9 +146,7 @@ def _far_off(found: MechanismFit) -> str | None:
     return None
 
 
-def better_reading(
-    plant: MechanismParameters, data: Sequence[Windows], found: MechanismFit | None = None
-) -> str | None:
+def better_reading(plant: PlantParameters, data: Sequence[Windows], found: MechanismFit | None = None) -> str | None:
     """Return how the columns are to be read, with what mends it, where that alone explains the motion; else None.
 
     Each reading is fitted to a few short windows, and so is the given one: a fit that ended in a poor minimum is no
@@ -183,7 +181,7 @@ def better_reading(
     )
 
 
-def _fits(plant: MechanismParameters, reading: _Reading, data: Sequence[Windows]) -> float:
+def _fits(plant: PlantParameters, reading: _Reading, data: Sequence[Windows]) -> float:
     """Return the share that a quick fit under a reading misses, inf where it ends far from the start."""
     others = [reading.of(part) for part in data]
     model = MechanismModel.of(plant)

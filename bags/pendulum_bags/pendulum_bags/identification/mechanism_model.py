@@ -18,7 +18,7 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, pack_joints
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pack_joints
 
 __all__ = ["DELAY", "LAG", "MechanismModel", "tellable"]
 
@@ -47,7 +47,7 @@ class MechanismModel:
         values: Fit parameters, in the order of ``names``.
     """
 
-    plant: MechanismParameters
+    plant: PlantParameters
     values: Array
 
     @property
@@ -58,7 +58,7 @@ class MechanismModel:
         return (*self.plant.mechanism.parameter_names, *extra, DELAY, LAG)
 
     @classmethod
-    def of(cls, plant: MechanismParameters) -> MechanismModel:
+    def of(cls, plant: PlantParameters) -> MechanismModel:
         """Return the model that a plant file makes."""
         joints = plant.joints
         zeros = [0.0] * (2 * len(joints) + 2)
@@ -121,7 +121,7 @@ class MechanismModel:
             names += [name for name, wanted in ((DELAY, delay), (LAG, lag)) if wanted]
         return tuple(names)
 
-    def identified(self, free: Sequence[str], name: str) -> MechanismParameters:
+    def identified(self, free: Sequence[str], name: str) -> PlantParameters:
         """Return the plant that has the values of what was fitted; a delay below 0 and offsets are left out.
 
         Raises:
@@ -154,7 +154,7 @@ class MechanismModel:
 
 
 @lru_cache(maxsize=16)
-def tellable(plant: MechanismParameters) -> tuple[str, ...]:
+def tellable(plant: PlantParameters) -> tuple[str, ...]:
     """Return the mechanism's own parameters that any motion under known efforts tells apart; the others are held.
 
     The acceleration's derivatives at random states show which parameters do the same. Of those, an inertia is fitted

@@ -12,7 +12,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
 
 __all__ = [
     "BOUNDS",
@@ -204,7 +204,7 @@ def to_plant(model: FitModel, *, name: str = "identified", effort_limit: float =
     stamps, not of the plant, and is left out.
     """
     further: dict[str, Any] = {name: model[name] for name in _FURTHER}
-    return PlantParameters(
+    return pendulum_plant(
         inertia=model["inertia"],
         damping=model["damping"] + (model["drive_damping"] if model.input_kind == "position_goal" else 0.0),
         gravity=model["gravity"],

@@ -39,8 +39,6 @@ from pendulum_bags.runs.next_test import next_test_of, question_of
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, write_mechanism
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, write_plant
 
 __all__ = [
@@ -136,7 +134,7 @@ class IdentificationResult:
     def _remarks(self) -> list[str]:
         return []
 
-    def plant(self, name: str = "identified") -> AnyPlant:
+    def plant(self, name: str = "identified") -> PlantParameters:
         """Return the plant that simulator, bridge and controller load.
 
         Raises:
@@ -268,7 +266,7 @@ class IdentificationResult:
         """
         return self._write(path, self.plant(name) if not self.refused else None)
 
-    def _write(self, path: str | Path, plant: AnyPlant | None) -> Path:
+    def _write(self, path: str | Path, plant: PlantParameters | None) -> Path:
         if plant is None:
             raise DataError(f"{self.refusal} No plant file is written.")
         target = Path(path)
@@ -283,16 +281,13 @@ class IdentificationResult:
             **facts,
             "remarks": [*remarks, *self.sentences()],
         }
-        if isinstance(plant, MechanismParameters):
-            write_mechanism(target, plant, provenance=provenance, intervals=intervals)
-        else:
-            write_plant(target, plant, provenance=provenance, intervals=intervals)
+        write_plant(target, plant, provenance=provenance, intervals=intervals)
         write_json(target.with_suffix(".json"), self.to_dict())
         return target
 
-    def _of_the_file(self, plant: AnyPlant) -> tuple[dict[str, tuple[float, float]], dict[str, Any], list[str]]:
+    def _of_the_file(self, plant: PlantParameters) -> tuple[dict[str, tuple[float, float]], dict[str, Any], list[str]]:
         """Return the intervals of what the plant file holds, facts on the fit, and remarks on what is left out."""
-        model, known = self.model, plant.specs if isinstance(plant, MechanismParameters) else {}
+        model, known = self.model, plant.specs
         intervals = {n: (one.low, one.high) for n, one in self.intervals.items() if n in known and one.low < one.high}
         left_out = {f"{n} [{model.unit(n)}]": model[n] for n in self.fit.free if n not in known}
         return intervals, {"not_in_the_plant": left_out}, []
@@ -432,7 +427,7 @@ class PendulumResult(IdentificationResult):
         """
         return self._write(path, None if self.refused else self.plant(name, effort_limit))
 
-    def _of_the_file(self, plant: AnyPlant) -> tuple[dict[str, tuple[float, float]], dict[str, Any], list[str]]:
+    def _of_the_file(self, plant: PlantParameters) -> tuple[dict[str, tuple[float, float]], dict[str, Any], list[str]]:
         candidate = self.plant_candidate
         facts = {
             "friction": candidate.friction,
@@ -448,12 +443,12 @@ class PendulumResult(IdentificationResult):
             remarks.insert(0, "torques are per unit of inertia: the recording does not fix their scale")
         return intervals, facts, remarks
 
-    def _file_intervals(self, plant: AnyPlant) -> tuple[dict[str, tuple[float, float]], list[str]]:
+    def _file_intervals(self, plant: PlantParameters) -> tuple[dict[str, tuple[float, float]], list[str]]:
         """Return the intervals of what the plant file holds, and remarks on those that are of something else."""
         intervals: dict[str, tuple[float, float]] = {}
         remarks = []
         for name, interval in self.uncertainty.intervals.items():
-            if name not in PlantParameters.__dataclass_fields__:
+            if name not in plant.numbers:
                 continue
             value = float(getattr(plant, name))
             # A delay that may be 0 keeps the part of its interval that a plant can have.

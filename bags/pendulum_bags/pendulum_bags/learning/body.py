@@ -33,9 +33,7 @@ from pendulum_msgs_py.dynamics.joint_steps import (
 from pendulum_msgs_py.dynamics.steps import actuator_torque
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import Mechanism
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, pack_joints
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_delay, pack_joints
 from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 from pendulum_sim.batches.compiling import WITHIN, compile_by_type, compile_tree, tuple_loader
 from pendulum_sim.stepping.dry_friction import LAG as LAG_OF_ONE
@@ -93,7 +91,7 @@ class Body:
     held: Callable[[Array, Array, NDArray[np.bool_]], Array] | None
 
 
-def body_of(plant: AnyPlant, ranges: Mapping[str, tuple[float, float]], travel: float) -> Body:
+def body_of(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]], travel: float) -> Body:
     """Return what a training needs of a plant.
 
     Args:
@@ -104,7 +102,7 @@ def body_of(plant: AnyPlant, ranges: Mapping[str, tuple[float, float]], travel: 
     Raises:
         ParameterError: The plant is series elastic, has no motor, or a delay of its own.
     """
-    if isinstance(plant, MechanismParameters):
+    if not plant.is_pendulum:
         return _mechanism(plant, ranges, travel)
     if plant.drivetrain is not None:
         raise ParameterError(
@@ -113,17 +111,16 @@ def body_of(plant: AnyPlant, ranges: Mapping[str, tuple[float, float]], travel: 
     return _pendulum(plant, ranges)
 
 
-def travel_of(plant: AnyPlant, travel: float) -> tuple[float, ...]:
+def travel_of(plant: PlantParameters, travel: float) -> tuple[float, ...]:
     """Return the largest deviation of each joint that a training lets it visit; pi where it turns [rad or m].
 
     Args:
         plant: The plant.
         travel: Largest deviation of joints that slide [m].
     """
-    stops = plant.stops if isinstance(plant, MechanismParameters) else ((-math.inf, math.inf),)
     return tuple(
         math.pi if joint.turns else min(BEYOND * travel, joint.goal - low, high - joint.goal)
-        for joint, (low, high) in zip(plant.coordinates.joints, stops, strict=True)
+        for joint, (low, high) in zip(plant.coordinates.joints, plant.stops, strict=True)
     )
 
 
@@ -133,7 +130,7 @@ _START_TRAVEL = 0.6
 """Largest deviation at a start of what slides, as a share of the way to its stop [-]."""
 
 
-def start_spread(plant: AnyPlant, travel: float, scales: Sequence[float]) -> tuple[Array, Array]:
+def start_spread(plant: PlantParameters, travel: float, scales: Sequence[float]) -> tuple[Array, Array]:
     """Return how far from upright joints may start, and how fast [rad or m, rad/s or m/s].
 
     Args:
@@ -163,19 +160,19 @@ def can_exist(mechanism: Mechanism, parameters: Array) -> NDArray[np.bool_]:
     return good
 
 
-def kicks_of(plant: AnyPlant) -> Array:
+def kicks_of(plant: PlantParameters) -> Array:
     """Return the largest kick of each joint where the share is 1: its effort limit, or the largest torque of gravity.
 
     Args:
         plant: The plant.
     """
-    if isinstance(plant, PlantParameters):
+    if plant.is_pendulum:
         return np.array([plant.effort_limit])
     limits = dict(zip(plant.coordinates.driven, plant.effort_limits, strict=True))
     return np.array([limits.get(i, torque) for i, torque in enumerate(_gravity(plant))])
 
 
-def velocity_scales(plant: AnyPlant, travel: float) -> tuple[float, ...]:
+def velocity_scales(plant: PlantParameters, travel: float) -> tuple[float, ...]:
     """Return the velocity of each joint that is seen as 1 [rad/s or m/s].
 
     Of a joint on which gravity acts, half of its speed after a fall from upright without friction, 1 at least; of one
@@ -185,7 +182,7 @@ def velocity_scales(plant: AnyPlant, travel: float) -> tuple[float, ...]:
         plant: The plant.
         travel: Largest deviation of joints that slide [m].
     """
-    if isinstance(plant, PlantParameters):
+    if plant.is_pendulum:
         return (max(1.0, math.sqrt(plant.gravity / plant.inertia)),)
     n, driven = len(plant.joints), plant.coordinates.driven
     masses = plant.mechanism.mass((0.0,) * n, plant.packed)
@@ -199,7 +196,7 @@ def velocity_scales(plant: AnyPlant, travel: float) -> tuple[float, ...]:
     return tuple(found)
 
 
-def _gravity(plant: MechanismParameters) -> tuple[float, ...]:
+def _gravity(plant: PlantParameters) -> tuple[float, ...]:
     """Return the largest torque of gravity on each joint, hanging at the others [N m or N]."""
     n, step = len(plant.joints), 1e-6
     found = []
@@ -250,7 +247,7 @@ def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]])
     )
 
 
-def _mechanism(plant: MechanismParameters, ranges: Mapping[str, tuple[float, float]], travel: float) -> Body:
+def _mechanism(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]], travel: float) -> Body:
     coordinates, mechanism = plant.coordinates, plant.mechanism
     n, driven = len(plant.joints), coordinates.driven
     if not driven:
@@ -319,7 +316,7 @@ def _ratio(static: int, coulomb: int, value: float, of: float) -> tuple[tuple[in
     return ((static, coulomb, value / of),) if of > 0.0 else ()
 
 
-def _decay(plant: MechanismParameters) -> float:
+def _decay(plant: PlantParameters) -> float:
     """Return the largest rate at which damping slows a joint, with half of its inertia as a margin [1/s]."""
     n = len(plant.joints)
     damping = np.diag([joint.damping for joint in plant.joints])

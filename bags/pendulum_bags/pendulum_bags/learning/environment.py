@@ -16,7 +16,7 @@ from pendulum_bags.learning.body import body_of, start_spread, travel_of, veloci
 from pendulum_bags.learning.task import SwingUpTask
 from pendulum_lqr.policies.policy import default_signals, sample_layout
 from pendulum_msgs_py.contract.angles import wrap
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["SwingUp"]
 
@@ -64,7 +64,7 @@ class SwingUp:
     def __init__(
         self,
         count: int,
-        plant: AnyPlant,
+        plant: PlantParameters,
         ranges: Mapping[str, tuple[float, float]],
         task: SwingUpTask,
         generator: np.random.Generator,

@@ -18,11 +18,8 @@ from pendulum_lqr.controllers.policy import LearnedPolicy
 from pendulum_lqr.policies.policy import Policy
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
-from pendulum_sim.stepping.joint_plant import JointPlant, joint_plant
-from pendulum_sim.stepping.mechanism_plant import MechanismPlant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_sim.stepping.joint_plant import JointPlant, make_joint_plant
 
 __all__ = ["HOLD", "UP", "Trial", "gymnasium_return", "is_up", "measured_success", "run_trial", "trials_of"]
 
@@ -45,7 +42,7 @@ class Trial:
         travel: Largest deviation of joints that slide, which is never to be left [m].
     """
 
-    plant: AnyPlant
+    plant: PlantParameters
     position: Vector
     velocity: Vector
     kicks: NDArray[np.float64]
@@ -93,7 +90,7 @@ def trials_of(
     return found
 
 
-def _drawn(policy: Policy, task: SwingUpTask, rng: np.random.Generator) -> AnyPlant:
+def _drawn(policy: Policy, task: SwingUpTask, rng: np.random.Generator) -> PlantParameters:
     """Return a plant from the ranges, drawn again where its masses and inertias make none."""
     plant = policy.plant
     for _ in range(_MOST_DRAWS):
@@ -103,7 +100,7 @@ def _drawn(policy: Policy, task: SwingUpTask, rng: np.random.Generator) -> AnyPl
             if coulomb in drawn:
                 drawn[name] = value_of(plant, name) / value_of(plant, coulomb) * drawn[coulomb]
         delay = float(rng.uniform(0.0, task.delay))
-        if not isinstance(plant, MechanismParameters):
+        if plant.is_pendulum:
             return plant.with_values(**drawn, transport_delay=delay)
         drawn |= {f"{joint}.transport_delay": delay for joint in plant.coordinates.driven_names}
         with suppress(ParameterError):
@@ -113,12 +110,11 @@ def _drawn(policy: Policy, task: SwingUpTask, rng: np.random.Generator) -> AnyPl
     return plant
 
 
-def plant_of(parameters: AnyPlant, period: float) -> JointPlant:
+def plant_of(parameters: PlantParameters, period: float) -> JointPlant:
     """Return the simulated plant, whose states are tuples [s]."""
-    if isinstance(parameters, MechanismParameters):
-        # As fine as the simulator's own period.
-        return MechanismPlant(parameters, period, substeps=max(1, round(period / 0.002)))
-    return joint_plant(make_plant(parameters, period))
+    # A mechanism as fine as with the simulator's own period.
+    substeps = None if parameters.is_pendulum else max(1, round(period / 0.002))
+    return make_joint_plant(parameters, period, substeps=substeps)
 
 
 def run_trial(policy: Policy, trial: Trial, start_time: float = START_TIME) -> tuple[NDArray[np.float64], str]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Floats
 from pendulum_msgs_py.contract.angles import wrap
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import pendulum_plant
 
 __all__ = ["EPISODE", "PLANT", "STEP", "PendulumV1"]
 
@@ -24,7 +24,7 @@ EPISODE = 200
 _G, _M, _L, _MOST_SPEED, _MOST_TORQUE = 10.0, 1.0, 1.0, 8.0, 2.0
 _REWARD = 0.1
 """Factor on the reward, so that returns are of the order of one to ten."""
-PLANT = PlantParameters(
+PLANT = pendulum_plant(
     inertia=_M * _L * _L / 3.0, damping=0.0, gravity=0.5 * _M * _G * _L, effort_limit=_MOST_TORQUE, name="Pendulum-v1"
 )
 """The same plant in our terms."""

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["VARIED", "SwingUpTask", "ranges_of", "value_of"]
 
@@ -72,7 +71,7 @@ class SwingUpTask:
 
 
 def ranges_of(
-    plant: AnyPlant, share: float, intervals: Mapping[str, Sequence[float]]
+    plant: PlantParameters, share: float, intervals: Mapping[str, Sequence[float]]
 ) -> dict[str, tuple[float, float]]:
     """Return lowest and highest value of each parameter that differs in training, static friction among them.
 
@@ -83,7 +82,7 @@ def ranges_of(
         share: Half width as a share of the value [-].
         intervals: Those of the plant file, by name.
     """
-    if isinstance(plant, MechanismParameters):
+    if not plant.is_pendulum:
         numbers = plant.numbers
         varied = [name for name in numbers if name not in _FIXED and _varies(name)]
     else:
@@ -103,9 +102,9 @@ def ranges_of(
     return {name: pair for name, pair in found.items() if pair[0] < pair[1]}
 
 
-def value_of(plant: AnyPlant, name: str) -> float:
+def value_of(plant: PlantParameters, name: str) -> float:
     """Return a parameter of a plant by its name."""
-    return plant.value(name) if isinstance(plant, MechanismParameters) else float(getattr(plant, name))
+    return plant.value(name)
 
 
 def _varies(name: str) -> bool:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pendulum_bags.arrays import Array
 from pendulum_lqr.swing_up.stored_swing_up import tracked_swing_up
 from pendulum_msgs_py.contract.angles import wrap
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Teacher", "TeacherAnswers"]
 
@@ -49,7 +49,7 @@ class Teacher:
         ParameterError: No swing-up is stored for the plant.
     """
 
-    def __init__(self, plant: MechanismParameters, period: float) -> None:
+    def __init__(self, plant: PlantParameters, period: float) -> None:
         tracked = tracked_swing_up(plant, period)
         n, m = len(plant.joints), len(plant.effort_limits)
         self._limits = np.array(plant.effort_limits)

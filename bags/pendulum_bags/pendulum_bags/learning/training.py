@@ -27,8 +27,8 @@ from pendulum_bags.runs.run_folder import provenance
 from pendulum_lqr.policies.policy import Network, Policy, default_signals
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
-from pendulum_msgs_py.plants.plant_differences import AnyPlant, describe_plants
+from pendulum_msgs_py.plants.plant_differences import describe_plants
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["EPISODES", "TASKS", "TEACHERS", "TRIALS", "Training", "checkpoint_path", "train"]
@@ -62,7 +62,7 @@ class Training:
     """
 
     task: str = "swing_up"
-    plant: AnyPlant = PLANT
+    plant: PlantParameters = PLANT
     intervals: Mapping[str, Any] = field(default_factory=dict)
     swing_up: SwingUpTask = field(default_factory=SwingUpTask)
     ppo: PpoSettings = field(default_factory=PpoSettings)
@@ -77,7 +77,7 @@ class Training:
             raise ParameterError(f"task is {self.task!r}; expected one of {', '.join(TASKS)}")
         if self.teacher not in TEACHERS:
             raise ParameterError(f"teacher is {self.teacher!r}; expected one of {', '.join(TEACHERS)}")
-        if self.teacher != "none" and not isinstance(self.plant, MechanismParameters):
+        if self.teacher != "none" and self.plant.is_pendulum:
             raise ParameterError(
                 f"teacher is {self.teacher!r}, and plant {self.plant.name!r} has one joint; expected one of several "
                 "joints with a stored swing-up, or none"
@@ -184,7 +184,7 @@ def _environment(settings: Training, generator: np.random.Generator) -> SwingUp 
 
 def _learner(settings: Training, environment: SwingUp | PendulumV1, generator: np.random.Generator) -> Ppo | Imitation:
     plant = settings.plant
-    if settings.teacher == "none" or not (isinstance(environment, SwingUp) and isinstance(plant, MechanismParameters)):
+    if settings.teacher == "none" or not (isinstance(environment, SwingUp) and not plant.is_pendulum):
         return Ppo(environment, settings.ppo, generator)
     return Imitation(environment, settings.ppo, generator, Teacher(plant, settings.swing_up.period))
 
@@ -210,11 +210,10 @@ def _policy(
         **provenance(),
     }  # fmt: skip
     plant, task = settings.plant, settings.swing_up
-    limits = plant.effort_limits if isinstance(plant, MechanismParameters) else (plant.effort_limit,)
     coordinates = plant.coordinates
     common: dict[str, Any] = {
         "network": network, "task": settings.task, "joints": coordinates.names, "plant": plant,
-        "ranges": settings.ranges, "effort_limit": limits, "provenance": origin,
+        "ranges": settings.ranges, "effort_limit": plant.effort_limits, "provenance": origin,
         "angle_box": travel_of(plant, task.travel), "name": f"{plant.name} {settings.task} seed {settings.seed}",
     }  # fmt: skip
     if settings.task == "pendulum_v1":
@@ -223,7 +222,7 @@ def _policy(
             signals=("cos", "sin", "velocity"),
         )  # fmt: skip
     return Policy(
-        **common, period=task.period, effort_rate=tuple(2.0 * limit / task.rate_time for limit in limits),
+        **common, period=task.period, effort_rate=tuple(2.0 * limit / task.rate_time for limit in plant.effort_limits),
         velocity_scale=velocity_scales(plant, task.travel), history=task.history, signals=default_signals(coordinates),
         velocity_box=tuple(float(_SPEED_MARGIN * speed) for speed in fastest),
     )  # fmt: skip

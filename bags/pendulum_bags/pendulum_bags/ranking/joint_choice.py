@@ -10,7 +10,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.joint_run import fall_time
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_msgs_py.contract.names import EFFORT_COMMAND, JOINT_STATES
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_rosbag.reader import read_bag
 
 __all__ = ["COST", "joint_cost_parts"]

@@ -17,7 +17,7 @@ from pendulum_bags.identification.mechanism_fit import Score, fit, line_errors, 
 from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel
 from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, common_delay, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_delay, load_mechanism
 
 __all__ = ["JointReplay", "replay_joints"]
 
@@ -95,7 +95,7 @@ class JointReplay:
 
 def replay_joints(
     path: str | os.PathLike[str],
-    plant: str | MechanismParameters,
+    plant: str | PlantParameters,
     *,
     window: float = 1.0,
     mapping: str | None = None,

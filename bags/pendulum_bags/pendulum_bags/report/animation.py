@@ -12,8 +12,8 @@ from pendulum_bags.comparison import Comparison
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.runs.series import uniform_times
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.pictures.mechanism_drawing import seen_from_the_side
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
+from pendulum_sim.pictures.plant_picture import seen_from_the_side
 
 __all__ = ["animation_of", "joint_animation"]
 
@@ -81,7 +81,7 @@ def joint_animation(comparisons: Mapping[str, Comparison], plant: str) -> dict[s
     return {"period": 1.0 / FRAMES_PER_SECOND, "factor": factor, **frames}
 
 
-def _chains(parameters: MechanismParameters, positions: Array) -> Array:
+def _chains(parameters: PlantParameters, positions: Array) -> Array:
     """Return where the ends of all links are, to the right and up, shape (frames, points, 2) [m]."""
     mechanism, packed = parameters.mechanism, parameters.packed
     return np.array(

@@ -18,8 +18,9 @@ from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import record_named, run_record
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
+from pendulum_msgs_py.plants.joint_parameters import DRIVETRAIN_SPECS
 from pendulum_msgs_py.plants.plant_differences import PLANT_PARAMETERS, read_plants
-from pendulum_msgs_py.plants.plant_parameters import DRIVETRAIN_SPECS, PLANT_SPECS, PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, PlantParameters
 
 __all__ = ["citation", "emulator_table", "provenance_table", "seed_of", "settings_table"]
 
@@ -164,7 +165,7 @@ def _emulated_plant(run: RunData, open_bag: OpenBag) -> PlantParameters | None:
     # The page is made without this table, too.
     except (BagError, DataError, ParameterError):
         return None
-    return next((plant for plant in plants if isinstance(plant, PlantParameters) and plant.drivetrain), None)
+    return next((plant for plant in plants if plant.drivetrain), None)
 
 
 def settings_table(data: ReportData) -> Table | None:

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.plant_differences import AnyPlant, describe_plants
+from pendulum_msgs_py.plants.plant_differences import describe_plants
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["IDENTITY", "UNKNOWN", "Case", "identity_of", "plant_identity"]
 
@@ -28,7 +29,7 @@ def identity_of(name: str, *content: Any) -> str:
     return f"{name} ({hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:8]})"
 
 
-def plant_identity(plant: AnyPlant) -> str:
+def plant_identity(plant: PlantParameters) -> str:
     """Return the identity of a plant of ours: two that move alike have one, whatever their files are called."""
     values = json.loads(describe_plants([plant]))[0]
     return identity_of(str(values.pop("name")), values)

@@ -20,8 +20,8 @@ from pendulum_bags.studies.random_runs import Columns, RandomRuns, figures_of_ru
 from pendulum_bags.studies.uncertain import share_of_interval
 from pendulum_lqr.controller_interface.loop_check import settling_lqr
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism, load_mechanism_file
-from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism, load_plant_file
+from pendulum_sim.batches.batch import simulate_batch
 
 __all__ = ["JointMonteCarlo", "joint_shares", "scatter"]
 
@@ -37,7 +37,7 @@ class JointMonteCarlo(RandomRuns):
 
     shares: Mapping[str, float] = field(default_factory=dict)
 
-    def load(self) -> MechanismParameters:
+    def load(self) -> PlantParameters:
         """Return the nominal plant."""
         return load_mechanism(self.plant)
 
@@ -45,7 +45,7 @@ class JointMonteCarlo(RandomRuns):
         """Return all numbers of the plant."""
         return self.load().numbers
 
-    def draw(self, plant: MechanismParameters, count: int, generator: np.random.Generator) -> Columns:
+    def draw(self, plant: PlantParameters, count: int, generator: np.random.Generator) -> Columns:
         """Return parameters and starts of a number of runs."""
         drawn: Columns = {**scatter(plant, self.shares, count, generator)}
         for name, goal in zip(plant.coordinates.names, plant.coordinates.goal, strict=True):
@@ -53,11 +53,11 @@ class JointMonteCarlo(RandomRuns):
         return drawn
 
     def simulate(
-        self, plant: MechanismParameters, drawn: Columns, threads: int | None = None, *, record: bool = False
+        self, plant: PlantParameters, drawn: Columns, threads: int | None = None, *, record: bool = False
     ) -> tuple[Columns, Array | None]:
         """Run what was drawn; see :class:`RandomRuns`."""
         limits = np.array(plant.effort_limits)
-        result = simulate_mechanisms(
+        result = simulate_batch(
             plant,
             variations={name: drawn[name] for name in self.shares},
             steps=self.steps,
@@ -111,7 +111,7 @@ def joint_shares(text: str, plant: str) -> dict[str, float]:
     parameters = load_mechanism(plant)
     names = identified_names(parameters)
     if text.strip() == "identified":
-        intervals = load_mechanism_file(plant)[1].get("intervals", {}) if Path(plant).suffix else {}
+        intervals = load_plant_file(plant)[1].get("intervals", {}) if Path(plant).suffix else {}
         found = {name: share_of_interval(interval, parameters.value(name)) for name, interval in intervals.items()}
         found = {name: share for name, share in found.items() if share > 0.0}
         if not found:
@@ -138,7 +138,7 @@ def joint_shares(text: str, plant: str) -> dict[str, float]:
 
 
 def scatter(
-    plant: MechanismParameters, shares: Mapping[str, float], count: int, generator: np.random.Generator
+    plant: PlantParameters, shares: Mapping[str, float], count: int, generator: np.random.Generator
 ) -> dict[str, Array]:
     """Return values of uncertain parameters, shape (count,) each: log-normal and independent, for no mass is negative.
 

@@ -26,8 +26,8 @@ from pendulum_lqr.linear.design import DesignError, Gain
 from pendulum_lqr.linear.roa import sublevel_ellipse
 from pendulum_lqr.swing_up.mechanism_catch import CaughtRegion, sample_caught_region
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
-from pendulum_sim.batches.mechanism_batch import simulate_mechanisms
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
+from pendulum_sim.batches.batch import simulate_batch
 
 __all__ = ["Axis", "JointRegion", "JointRegionResult"]
 
@@ -111,15 +111,15 @@ class JointRegion(StartGrid):
         """Return all numbers of the plant, for a fingerprint."""
         return load_mechanism(self.plant).numbers
 
-    def job(self) -> MechanismParameters:
+    def job(self) -> PlantParameters:
         """Return the nominal plant."""
         return load_mechanism(self.plant)
 
-    def gain(self, plant: MechanismParameters) -> Gain:
+    def gain(self, plant: PlantParameters) -> Gain:
         """Return the plant's own LQR."""
         return settling_lqr(design_for(plant), *plant.mechanism.weights, self.dt)
 
-    def run_chunk(self, plant: MechanismParameters, index: int, threads: int | None) -> Columns:
+    def run_chunk(self, plant: PlantParameters, index: int, threads: int | None) -> Columns:
         """Run a chunk and return its columns."""
         numbers, generator = self.chunk(index)
         count = len(numbers)
@@ -132,7 +132,7 @@ class JointRegion(StartGrid):
         states = np.tile(np.array([*plant.coordinates.goal, *(0.0,) * n]), (size, 1))
         for axis, deviation in zip(self.both, (x, y), strict=True):
             states[:, axis.index] += deviation.ravel()
-        result = simulate_mechanisms(
+        result = simulate_batch(
             plant,
             variations={name: np.repeat(values[:count], size) for name, values in drawn.items()},
             steps=self.steps,

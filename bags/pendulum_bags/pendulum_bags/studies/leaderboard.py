@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -153,8 +153,8 @@ def model_errors(plant: PlantParameters) -> list[PlantParameters]:
     """Return plants by which a model may be wrong: inertia with gravity, or damping, by 10 and 25 %."""
     changed = []
     for share in (0.75, 0.9, 1.1, 1.25):
-        changed.append(replace(plant, inertia=share * plant.inertia, gravity=share * plant.gravity))
-        changed.append(replace(plant, damping=share * plant.damping))
+        changed.append(plant.with_values(inertia=share * plant.inertia, gravity=share * plant.gravity))
+        changed.append(plant.with_values(damping=share * plant.damping))
     return changed
 
 
@@ -183,10 +183,10 @@ PERTURBATIONS: Mapping[str, Callable[[PlantParameters, float], Sequence[Variatio
         (plant, {}, {"position_noise": a, "velocity_noise": 10.0 * a}) for a in (0.001, 0.003, 0.01, 0.03)
     ],
     "delay": lambda plant, _: [
-        (replace(plant, transport_delay=delay), {}, {}) for delay in (0.002, 0.005, 0.01, 0.02, 0.04)
+        (plant.with_values(transport_delay=delay), {}, {}) for delay in (0.002, 0.005, 0.01, 0.02, 0.04)
     ],
     "torque_response": lambda plant, _: [
-        (replace(plant, actuator_time_constant=lag), {}, {}) for lag in (0.005, 0.01, 0.02, 0.05)
+        (plant.with_values(actuator_time_constant=lag), {}, {}) for lag in (0.005, 0.01, 0.02, 0.05)
     ],
     "pushes": lambda plant, duration: [(plant, push, {}) for push in push_trains(plant, duration)],
 }

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from pendulum_bags.arrays import Array
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters, load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 
 __all__ = [
     "BENCHMARK_PLANTS",
@@ -114,7 +114,7 @@ PUBLISHED = (
 """Rows of the public boards (simulation v2, robustness v2, simulation v3), as read in 2025."""
 
 
-def benchmark_plant(name: str) -> MechanismParameters:
+def benchmark_plant(name: str) -> PlantParameters:
     """Return the plant that the benchmark's boards simulate: design C.1 without friction and rotors, 6 N m.
 
     Args:
@@ -128,7 +128,7 @@ def benchmark_plant(name: str) -> MechanismParameters:
     return load_mechanism(f"{name}_frictionless")
 
 
-def is_above_line(plant: MechanismParameters, states: Array) -> NDArray[np.bool_]:
+def is_above_line(plant: PlantParameters, states: Array) -> NDArray[np.bool_]:
     """Return where the tip is above the line.
 
     Args:
@@ -140,12 +140,12 @@ def is_above_line(plant: MechanismParameters, states: Array) -> NDArray[np.bool_
     return np.asarray(height > line_height(plant), dtype=np.bool_)
 
 
-def line_height(plant: MechanismParameters) -> float:
+def line_height(plant: PlantParameters) -> float:
     """Return the height above the base from which a double pendulum's tip is up [m]."""
     return _LINE * (plant.value("length_1") + plant.value("length_2"))
 
 
-def criteria_of(plant: MechanismParameters, times: Array, states: Array, efforts: Array) -> dict[str, float]:
+def criteria_of(plant: PlantParameters, times: Array, states: Array, efforts: Array) -> dict[str, float]:
     """Return the criteria of a recorded swing-up.
 
     ``swingup_time`` is when the tip rises above the line for good, the last sample's time where it never does; like the
@@ -188,6 +188,6 @@ def score_v2(criteria: Mapping[str, float], duration: float) -> float:
     return 1.0 - share / len(CRITERIA)
 
 
-def time_above_line(plant: MechanismParameters, times: Array, states: Array) -> float:
+def time_above_line(plant: PlantParameters, times: Array, states: Array) -> float:
     """Return how long the tip was above the line, each sample counting for the interval before it [s]."""
     return float(np.sum(np.diff(times, prepend=0.0)[is_above_line(plant, states)]))

@@ -11,7 +11,7 @@ from pendulum_bags.studies.mechanism_benchmark import is_above_line, line_height
 from pendulum_bags.studies.mechanism_benchmark_runs import DURATION
 from pendulum_bags.studies.mechanism_benchmark_table import Row
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["write_swing_up_figure"]
 
@@ -20,7 +20,7 @@ _APART = 1.4
 """Distance of two poses, in lengths of the arms."""
 
 
-def write_swing_up_figure(path: Path, plant: MechanismParameters, rows: Sequence[Row]) -> Path:
+def write_swing_up_figure(path: Path, plant: PlantParameters, rows: Sequence[Row]) -> Path:
     """Draw the best swing-up as a row of poses, and height and torque of all over time; return the path.
 
     Args:

@@ -23,7 +23,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 from pendulum_sim.batches.compiling import compile_tree
 
@@ -151,7 +151,7 @@ def _smooth_friction(v: Any, torque: Any, p: Any) -> Any:
     return torque[0] - c[0] * math.atan(100.0 * v[0]), torque[1] - c[1] * math.atan(100.0 * v[1])
 
 
-def make_stepper(plant: MechanismParameters, *, compiled: bool = True) -> Stepper:
+def make_stepper(plant: PlantParameters, *, compiled: bool = True) -> Stepper:
     """Return ``(q, v, torque, p, coulomb) -> (q, v)`` after one step of the benchmark's simulation.
 
     Args:
@@ -184,7 +184,7 @@ def make_stepper(plant: MechanismParameters, *, compiled: bool = True) -> Steppe
 
 
 def simulate(
-    plant: MechanismParameters,
+    plant: PlantParameters,
     stepper: Stepper,
     answer: Callable[[float, Vector], Sequence[float]],
     steps: int,
@@ -241,7 +241,7 @@ def simulate(
 
 
 def swing_up(
-    plant: MechanismParameters, stepper: Stepper, controller: Controller
+    plant: PlantParameters, stepper: Stepper, controller: Controller
 ) -> tuple[Trajectory, dict[str, float], float]:
     """Return the undisturbed run of 10 s, its criteria and its score v2."""
     controller.reset()
@@ -251,7 +251,7 @@ def swing_up(
     return run, criteria, score_v2(criteria, float(times[-1]))
 
 
-def robustness_trials(plant: MechanismParameters, seed: int = 1) -> list[Trial]:
+def robustness_trials(plant: PlantParameters, seed: int = 1) -> list[Trial]:
     """Return the 722 runs of the six tests of robustness, each with a seed of its own.
 
     Args:
@@ -292,7 +292,7 @@ def robustness_trials(plant: MechanismParameters, seed: int = 1) -> list[Trial]:
     return trials
 
 
-def try_once(plant: MechanismParameters, stepper: Stepper, controller: Controller, trial: Trial) -> bool:
+def try_once(plant: PlantParameters, stepper: Stepper, controller: Controller, trial: Trial) -> bool:
     """Return whether a run ends upright: within 0.35 rad and 1 rad/s of each joint."""
     controller.reset()
     # Added up, 5000 times 2 ms stay a little below 10 s, and the public loop takes one step more.
@@ -317,7 +317,7 @@ def robustness_of(trials: Sequence[Trial], successes: Sequence[bool]) -> Robustn
 
 
 def knock_downs(
-    plant: MechanismParameters, stepper: Stepper, controller: Controller, seed: int
+    plant: PlantParameters, stepper: Stepper, controller: Controller, seed: int
 ) -> tuple[Trajectory, float]:
     """Return a run of 60 s with 15 knock-downs and its score v3, the share of time above the line.
 
@@ -337,7 +337,7 @@ def knock_downs(
 class _KnockDowns:
     """The controller, interrupted: what the public tester of global policies does, its oddities included."""
 
-    def __init__(self, plant: MechanismParameters, controller: Controller, rng: np.random.Generator) -> None:
+    def __init__(self, plant: PlantParameters, controller: Controller, rng: np.random.Generator) -> None:
         self._answer = _answering(plant, controller)
         self._plant = plant
         self._goals = rng.uniform(-math.pi, math.pi, (KNOCKS, 2))
@@ -380,13 +380,13 @@ class _KnockDowns:
         return torques[0], torques[1]
 
 
-def _gravity(plant: MechanismParameters, x: Vector) -> Vector:
+def _gravity(plant: PlantParameters, x: Vector) -> Vector:
     """Return the torques of both joints that hold the arms against gravity [N m]."""
     potential, p = in_arithmetic(plant.mechanism.potential, cmath), plant.packed
     return tuple(complex_step(lambda *q: (potential(q, p),), x[:2])[0])
 
 
-def _answering(plant: MechanismParameters, controller: Controller) -> Callable[[float, Vector], Vector]:
+def _answering(plant: PlantParameters, controller: Controller) -> Callable[[float, Vector], Vector]:
     spread = plant.coordinates.spread
     n = len(plant.joints)
     return lambda t, x: spread(controller.efforts(t, x[:n], x[n:]))

@@ -24,7 +24,7 @@ from pendulum_bags.studies.mechanism_benchmark_runs import (
 )
 from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.mechanism_controllers import make_mechanism_controller
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Bench", "Job", "Row", "document", "prepare", "run_job", "score_rows"]
 Job = tuple[str, str, int]
@@ -81,7 +81,7 @@ class Bench:
 
 @dataclass(frozen=True)
 class _Prepared:
-    plant: MechanismParameters
+    plant: PlantParameters
     stepper: Stepper
     controllers: dict[str, Controller]
     trials: list[Trial]

@@ -82,7 +82,7 @@ class MonteCarlo(RandomRuns):
             steps=self.steps,
             dt=self.dt,
             method=self.method,
-            theta=drawn["theta_0"],
+            position=drawn["theta_0"],
             gain=settling_lqr(plant, self.q, self.r, self.dt).K,
             seeds=drawn["noise_seed"],
             amplitude=self.amplitude,
@@ -93,11 +93,11 @@ class MonteCarlo(RandomRuns):
         )
         columns = {
             **drawn,
-            "max_theta": result.max_theta,
-            "max_effort": result.max_effort,
-            "std_theta": result.std_theta,
-            "theta_end": result.theta,
-            "theta_dot_end": result.theta_dot,
+            "max_theta": result.max_deviation[:, 0],
+            "max_effort": result.max_effort[:, 0],
+            "std_theta": result.std_deviation[:, 0],
+            "theta_end": result.position[:, 0],
+            "theta_dot_end": result.velocity[:, 0],
         }
         return {name: columns[name] for name in COLUMNS}, result.trajectories
 

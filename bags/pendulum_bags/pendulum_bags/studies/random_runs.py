@@ -107,7 +107,8 @@ class RandomRuns(ABC):
 
     def numbers_of_plant(self) -> Any:
         """Return all numbers of the plant, for a fingerprint."""
-        return self.load()
+        plant = self.load()
+        return {**plant.numbers, "drivetrain": None, "name": plant.name}
 
     @abstractmethod
     def draw(self, plant: Any, count: int, generator: np.random.Generator) -> Columns:
@@ -136,7 +137,7 @@ class RandomRuns(ABC):
     def fingerprint(self) -> str:
         """Return a hash of all that a run depends on; how many runs there are is not among that."""
         settings = {name: value for name, value in on_device(self).items() if name != "runs"}
-        content = json.dumps([settings, self.numbers_of_plant()], sort_keys=True, default=asdict)
+        content = json.dumps([settings, self.numbers_of_plant()], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 

@@ -8,7 +8,7 @@ ellipse of the linear analysis, proven for that plant, belongs inside.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -87,7 +87,7 @@ class RegionMap(StartGrid):
         plant = load_plant(self.plant)
         if plant.drivetrain is not None:
             raise ParameterError(f"plant {self.plant!r} is series elastic; expected a rigid one")
-        return replace(plant, effort_limit=self.effort_limit or plant.effort_limit)
+        return plant.with_values(effort_limit=self.effort_limit or plant.effort_limit)
 
     def gain(self) -> Gain:
         """Return the LQR gain."""
@@ -95,7 +95,8 @@ class RegionMap(StartGrid):
 
     def numbers_of_plant(self) -> Any:
         """Return all numbers of the plant, for a fingerprint."""
-        return asdict(self.believed())
+        plant = self.believed()
+        return {**plant.numbers, "drivetrain": None, "name": plant.name}
 
     def job(self) -> tuple[PlantParameters, tuple[float, ...]]:
         """Return the nominal plant, and the gain."""
@@ -120,22 +121,21 @@ class RegionMap(StartGrid):
             steps=self.steps,
             dt=self.dt,
             method=self.method,
-            theta=starts,
-            theta_dot=speeds,
+            position=starts,
+            velocity=speeds,
             gain=gain,
             threads=threads,
             device=self.device,
         )
-        near = (np.abs(wrap(result.theta - UPRIGHT)) < self.tolerance[0]) & (
-            np.abs(result.theta_dot) < self.tolerance[1]
-        )
+        theta_end, theta_dot_end = result.position[:, 0], result.velocity[:, 0]
+        near = (np.abs(wrap(theta_end - UPRIGHT)) < self.tolerance[0]) & (np.abs(theta_dot_end) < self.tolerance[1])
         columns: Columns = {
             "plant": np.repeat(numbers, theta.size),
             **every,
             "theta_0": starts,
             "theta_dot_0": speeds,
-            "theta_end": result.theta,
-            "theta_dot_end": result.theta_dot,
+            "theta_end": theta_end,
+            "theta_dot_end": theta_dot_end,
             "attracted": near,
         }
         return {name: columns[name] for name in COLUMNS}

@@ -58,8 +58,7 @@ from pendulum_bags.whole.contenders import (
     simulate_contenders,
 )
 from pendulum_msgs_py.errors import DataError, FaultError, PendulumError, PlantStoppedError
-from pendulum_msgs_py.plants.mechanism_parameters import load_mechanism
-from pendulum_msgs_py.plants.plant_parameters import load_plant
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant
 
 __all__ = ["IDENTIFIED", "STEPS", "Findings", "Order", "Settings", "Simulated", "carry_out"]
 

@@ -1,4 +1,4 @@
-"""Pictures of plants of several joints, from the points of their chain: for environments, viewer and pages."""
+"""Pictures of plants, from the points of their chain: for environments, viewer and pages."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.contract.joints import Joint, Vector
 from pendulum_msgs_py.mechanisms.mechanism import Mechanism, Point
-from pendulum_msgs_py.plants.mechanism_parameters import MechanismParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.pictures.canvas import BACKGROUND, BOB, DISTURBANCE, GREY, INK, LINK, TORQUE, Colour, Picture
 from pendulum_sim.pictures.joint_frames import JointFrame, full_effort, joint_frames
 
-__all__ = ["MechanismPicture", "seen_from_the_side"]
+__all__ = ["PlantPicture", "seen_from_the_side"]
 
 _LINKS = (LINK, BOB)
 _TILT = math.radians(25.0)
 """Elevation of the view of a spatial plant [rad]."""
-_LINES = 26
-"""Lines of text that fill the height of a picture: several joints need more text than one."""
+_LINES = 20, 26
+"""Lines of text that fill the height of a picture, of one joint and of several, which need more text."""
 _RAIL = 10.0
 """How far the rail is drawn to either side of a cart that nothing stops [m]."""
 
 
-class MechanismPicture(Picture):
+class PlantPicture(Picture):
     """Draws a plant from the side, or in space from a little above, with a driven joint filled and a passive one open.
 
     Args:
@@ -39,8 +40,8 @@ class MechanismPicture(Picture):
         ParameterError: The size is too small or too large to draw.
     """
 
-    def __init__(self, parameters: MechanismParameters, size: tuple[int, int] = (600, 600), *, trail: int = 60) -> None:
-        super().__init__(size, trail=trail, lines=_LINES)
+    def __init__(self, parameters: PlantParameters, size: tuple[int, int] = (600, 600), *, trail: int = 60) -> None:
+        super().__init__(size, trail=trail, lines=_LINES[len(parameters.joints) > 1])
         self.parameters = parameters
         self._joints = parameters.mechanism.joints
         self._slides = self._joints[0].unit == "m"
@@ -137,7 +138,7 @@ class MechanismPicture(Picture):
         for index, point in enumerate(points[: len(self._joints) - first], first):
             draw.circle(self.canvas, INK, point, 0.055 * length)
             draw.circle(self.canvas, BACKGROUND, point, (0.022 if index in driven else 0.042) * length)
-        draw.circle(self.canvas, BOB, points[-1], 0.08 * length)
+        draw.circle(self.canvas, BOB, points[-1], (0.08 if len(self._joints) > 1 else 0.1) * length)
 
     def _draw_link(self, start: Any, end: Any, colour: Colour, half: float) -> None:
         along = end - start
@@ -182,6 +183,11 @@ class MechanismPicture(Picture):
         self, position: Vector, velocity: Vector, effort: Mapping[str, float], disturbance: Mapping[str, float]
     ) -> list[tuple[str, Colour]]:
         rows: list[tuple[str, Colour]] = []
+        if len(self._joints) == 1:
+            rows = [(f"theta {position[0]:+.4f} rad", INK), (f"from upright {from_upright(position[0]):+.4f} rad", INK)]
+            rows += [(f"theta' {value:+.3f} rad/s", INK) for value in velocity]
+            rows += [(f"torque {value:+.3f} N m", TORQUE) for value in effort.values()]
+            return rows + [(f"disturbance {value:+.3f} N m", DISTURBANCE) for value in disturbance.values() if value]
         for index, (joint, value) in enumerate(zip(self._joints, position, strict=True)):
             speed = f", {velocity[index]:+.3f} {joint.velocity_unit}" if velocity else ""
             rows.append((f"{joint.name} {value:+.4f} {joint.unit}{speed}", INK))
