@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_bags.comparison import Margins
 from pendulum_bags.experiments.joint_run import (
     JointSettings,
     default_amplitude,
@@ -256,6 +257,15 @@ def test_a_design_that_is_none_is_refused_before_anything_runs(
     said = capsys.readouterr().err
     assert "with 4 numbers for q or k, for shoulder, elbow, shoulder_dot, elbow_dot" in said
     assert not (tmp_path / "run").exists()
+
+
+def test_frequencies_are_measured_where_one_joint_is_driven() -> None:
+    for plant, measured in (("cart_pole", True), ("double_pendulum", False)):
+        order = Order(JointSettings(plant), Margins.parse(), 60.0, carry_out.STEPS)
+        assert order.in_frequency is measured
+        assert [one.layer.key for one in carry_out._undefined(order.settings)] == (
+            [] if measured else ["same_plant", "which_controllers"]
+        )
 
 
 def test_a_run_of_several_joints_that_records_nothing_leaves_no_folder(

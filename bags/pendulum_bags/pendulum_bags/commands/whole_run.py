@@ -114,7 +114,14 @@ def run_whole(
             else:
                 _print_whole(console, found, answer, answers)
             progress.phase("writing the report", 6.0)
-            write_whole_report(folder, summary, found, answer, answers)
+            try:
+                write_whole_report(folder, summary, found, answer, answers)
+            except KeyboardInterrupt:
+                if found.interrupted:
+                    raise
+                # The first leaves out the files of figures alone.
+                found.interrupted = True
+                write_whole_report(folder, summary, found, answer, answers)
         console.print(f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}", soft_wrap=True)
         if text := remark(folder):
             console.print(text, soft_wrap=True)

@@ -132,9 +132,7 @@ class Order:
     @property
     def in_frequency(self) -> bool:
         """Whether both plants are measured in frequency, which is defined where one joint is driven."""
-        settings = self.settings
-        one = not isinstance(settings, JointSettings) or len(load_mechanism(settings.plant).effort_limits) == 1
-        return one and self.wants(Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS)
+        return self.wants(Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS) and not _undefined(self.settings)
 
 
 @dataclass
@@ -172,7 +170,7 @@ class Simulated:
         """Return the sum of what was measured; there is a comparison."""
         more = self.more() if self.budget else ""
         how = dict.fromkeys(Layer, more) if more else {}
-        return answer_of(self.comparisons, anew=self.layers, more=more, how=how)
+        return answer_of(self.comparisons, anew=[*self.layers, *_undefined(self.settings)], more=more, how=how)
 
     def add(self, *layers: LayerResult) -> None:
         """Add layers of this plant and store them.
@@ -490,6 +488,16 @@ class _Run:
         if isinstance(plant.settings, JointSettings):
             words = replace(words, cost=COST)
         plant.add(same_choice(plant.ranking, words, case=case))
+
+
+def _undefined(settings: Settings) -> list[LayerResult]:
+    """Return the layers that are not defined for a plant: those in frequency where several joints are driven."""
+    if not isinstance(settings, JointSettings):
+        return []
+    driven = len(load_mechanism(settings.plant).effort_limits)
+    why = f"Not defined: {driven} joints are driven, and frequencies are measured where one is."
+    layers = (Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS) if driven > 1 else ()
+    return [LayerResult(layer, Mark.NOT_MEASURED, why) for layer in layers]
 
 
 def _under_other_noise(settings: _Settings) -> _Settings:
