@@ -67,8 +67,7 @@ _BEFORE = 0.02
 """Longest delay after which an effort from before the recording may still act [s]."""
 
 _DIFFERENCE = 1e-4
-"""Step of the differences, in the size of a parameter, and in rad, m, rad/s or m/s of a start. Where a joint sticks or
-breaks away in another step of the simulation, the motion jumps: over a short difference that counts as sensitivity."""
+"""Step of the differences, in the size of a parameter, and in rad, m, rad/s or m/s of a start."""
 
 _AWAY = "the starting plant's motion leaves all bounds within a window; expected a plant that is near"
 

@@ -21,7 +21,7 @@ from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 __all__ = ["lagged", "motion_kernel"]
 
 
-_BREAKAWAY = 6e-5
+_BREAKAWAY = 2e-5
 """Resolution of the instant at which a resting joint breaks away [s]."""
 
 
@@ -79,6 +79,32 @@ def motion_kernel(name: str) -> Any:
                 rest -= held[i] > 0.0 and table[COULOMB][i] > 0.0
         return rest > 0.0
 
+    @numba.njit(error_model="numpy", fastmath={"contract"}, **WITHIN)
+    def hides(q: Any, v: Any, q_1: Any, v_1: Any, part: float, effort: Any, effort_1: Any, p: Any, table: Any) -> bool:
+        """Return whether a joint broke away within a step, or rested, so that the step does not resolve when."""
+        before, reversals, started = v_1, 0.0, 0.0
+        for i in range(n):
+            if v[i] == 0.0:
+                started += v_1[i] != 0.0 and table[COULOMB][i] > 0.0
+            elif table[COULOMB][i] > 0.0:
+                way, mean = 1.0 if v[i] > 0.0 else -1.0, (q_1[i] - q[i]) / part
+                if v_1[i] == 0.0:
+                    before = put(before, i, v[i])
+                elif v_1[i] * way < 0.0:
+                    reversals += 1.0
+                else:
+                    # Sliding one way at both ends, it may have rested between: its velocity as a parabola.
+                    slope = way * (6.0 * mean - 4.0 * v[i] - 2.0 * v_1[i])
+                    bend = way * (3.0 * (v[i] + v_1[i]) - 6.0 * mean)
+                    reversals += -2.0 * bend < slope < 0.0 and slope * slope > 4.0 * bend * way * v[i]
+        if reversals > 0.0 or breaks(q_1, v_1, effort_1, p, table):
+            return True
+        if before == v_1 and started == 0.0:
+            return False
+        loose = breaks(q, v, effort, p, table)
+        # The friction of one that comes to rest drops another that it dragged along, or holds one that broke away.
+        return (started > 0.0 and not loose) or (before != v_1 and (loose or breaks(q_1, before, effort_1, p, table)))
+
     @numba.njit(error_model="numpy", fastmath={"contract"})
     def run(p: Any, table: Any, push: Any, shift: Any, drive: Any, which: Any, h: Any, states: Any, path: Any) -> None:
         for c in range(p.shape[0]):
@@ -100,20 +126,22 @@ def motion_kernel(name: str) -> Any:
                     if h[w, k] > 0.0:
                         effort = drive[which[c], w, k]
                         rise = load(effort, n)
-                        # A joint at rest breaks away at the start of a step only. Where one would do so at the end
-                        # of a step, bisection finds when, and a new step starts there.
-                        done, part = 0.0, h[w, k]
+                        # A joint at rest breaks away at the start of a step only. Where one would do so within it,
+                        # bisection finds when, and a new step starts there.
+                        done, part, ahead = 0.0, h[w, k], False
                         while part > 0.0:
                             begun = along(load(effort, 0), done, rise)
                             q_1, v_1 = advance(forward, along, put, ramp, q, v, begun, rise, pushed, part, own, rows)
-                            if part > _BREAKAWAY and breaks(
-                                q_1, v_1, along(along(begun, part, rise), 1.0, pushed), own, rows
-                            ):
+                            u, u_1 = along(begun, 1.0, pushed), along(along(begun, part, rise), 1.0, pushed)
+                            if part > _BREAKAWAY and hides(q, v, q_1, v_1, part, u, u_1, own, rows):
                                 part *= 0.5
+                                ahead = True
                             else:
                                 q, v = q_1, v_1
                                 done += part
-                                part = h[w, k] - done
+                                # What twice that step hid lies within as long a step again.
+                                ahead = ahead and part > _BREAKAWAY
+                                part = 0.5 * part if ahead else h[w, k] - done
                     for i in range(n):
                         path[c, w, k + 1, i] = q[i] + zero[i]
                         path[c, w, k + 1, n + i] = v[i]

@@ -28,8 +28,10 @@ DELAY = "delay"
 LAG = "time_constant"
 """First-order lag of the actuators [s]."""
 
-_RULER = 0.03
-"""Standard deviation of a length in the plant file, as a share of it: the fit weighs it against the motion."""
+_SPREADS = {"length": 0.03, "rotor": 0.05}
+"""Standard deviations of lengths and rotor inertias in the plant file, as shares of them: a ruler's, and that of a
+catalogue's 10 %. The fit weighs them against the motion: a rotor that is held biases inertias, outside their intervals.
+"""
 
 _ORDER = ("kg m^2", "m", "kg")
 """Which of two parameters that the motion cannot tell apart is fitted: that of the unit that comes first here."""
@@ -97,7 +99,7 @@ class MechanismModel:
 
     def spread(self, name: str) -> float:
         """Return the standard deviation with which the plant file knows a parameter; inf where it does not count."""
-        return _RULER * self.plant.value(name) if _is_length(name) else np.inf
+        return next((s * self.plant.value(name) for part, s in _SPREADS.items() if part in name), np.inf)
 
     def size(self, name: str) -> float:
         """Return a scale of a parameter, in its unit, so that steps and ranks do not depend on units."""
@@ -158,15 +160,16 @@ def tellable(plant: PlantParameters) -> tuple[str, ...]:
     """Return the mechanism's own parameters that any motion under known efforts tells apart; the others are held.
 
     The acceleration's derivatives at random states show which parameters do the same. Of those, an inertia is fitted
-    rather than a centre of mass, that rather than a mass, and that rather than a length. Gravity and gears are held.
+    rather than a centre of mass, that rather than a mass, and that rather than a length or a rotor. Gravity, gears and
+    rotors of no inertia are held.
 
     Source:
         Gautier and Khalil, Direct calculation of minimum set of inertial parameters of serial robots, IEEE Trans.
         Robotics and Automation 6(3), 1990 (base parameters; by random states: Gautier 1991).
     """
     model = MechanismModel.of(plant)
-    own = [spec for spec in plant.mechanism.parameters if spec.unit in _ORDER and not spec.name.startswith("rotor")]
-    names = [spec.name for spec in sorted(own, key=lambda spec: (_is_length(spec.name), _ORDER.index(spec.unit)))]
+    own = [spec for spec in plant.mechanism.parameters if spec.unit in _ORDER and model.spread(spec.name) > 0.0]
+    own.sort(key=lambda spec: (model.spread(spec.name) < np.inf, _ORDER.index(spec.unit)))
     damping = list(plant.mechanism.parameter_names[len(plant.mechanism.parameters) :])
     count = len(plant.joints)
     forward = in_arithmetic(plant.mechanism.forward, cmath)
@@ -182,7 +185,7 @@ def tellable(plant: PlantParameters) -> tuple[str, ...]:
     table = np.concatenate(samples)
     kept: list[str] = []
     basis = np.linalg.qr(table[:, model.index(damping)])[0] if damping else np.zeros((len(table), 0))
-    for name in names:
+    for name in (spec.name for spec in own):
         column = table[:, model.names.index(name)] * model.size(name)
         rest = column - basis @ (basis.T @ column)
         rest -= basis @ (basis.T @ rest)
@@ -190,7 +193,3 @@ def tellable(plant: PlantParameters) -> tuple[str, ...]:
             kept.append(name)
             basis = np.column_stack((basis, rest / np.linalg.norm(rest)))
     return tuple(spec.name for spec in plant.mechanism.parameters if spec.name in kept)
-
-
-def _is_length(name: str) -> bool:
-    return "length" in name
