@@ -24,15 +24,10 @@ class Band:
     Prediction intervals by Student's t of the runs, at each time by itself.
 
     Attributes:
-        t: Times, shape (n,) [s].
-        low, high: Its ends, shape (n,) [rad or m].
         coverage: Share of the time in which the simulation is inside.
         own: Mean of that share for each run of the machine, in the band of the others; NaN for fewer than three runs.
     """
 
-    t: Array
-    low: Array
-    high: Array
     coverage: float
     own: float
 
@@ -51,7 +46,7 @@ class Band:
             a, b = _predicted(np.delete(rows, index, axis=0))
             own.append(np.mean((rows[index] >= a) & (rows[index] <= b)))
         coverage = float(np.mean((simulated >= low) & (simulated <= high)))
-        return cls(t, low, high, coverage, float(np.mean(own)) if own else math.nan)
+        return cls(coverage, float(np.mean(own)) if own else math.nan)
 
     @property
     def sentence(self) -> str:

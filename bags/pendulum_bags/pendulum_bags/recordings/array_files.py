@@ -10,7 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -170,13 +170,11 @@ def _columns(
 ) -> Columns:
     notes = []
     parts = grouped_parts(lists)
-    chosen = 0
     if parts:
         if not 0 <= part <= len(parts):
             raise DataError(f"{path}#{part}: part is {part}; expected 1 to {len(parts)} ({parts[0][0]}, ...)")
-        chosen = part or 1
-        what, chosen_columns = parts[chosen - 1]
-        found = [*chosen_columns, *found]
+        what, chosen = parts[max(part - 1, 0)]
+        found = [*chosen, *found]
         if not part:
             notes.append(f"part 1 of {len(parts)} is read, {what}; {path.name}#2 is the next")
     elif part > 1:
@@ -195,7 +193,7 @@ def _columns(
         own = next((clocks[name] for name in _places(column.name) if name in clocks), None)
         belongs = own is not None and own is not column and own.size == column.size
         columns[column.name] = replace(column, clock=own.name) if own is not None and belongs else column
-    return Columns(path, kind, columns, notes, chosen, [what for what, _ in parts], period, named=named)
+    return Columns(path, kind, columns, notes, period, named=named)
 
 
 def _is_clock(name: str) -> bool:
@@ -226,18 +224,11 @@ def _variables(path: Path, opaque: list[str]) -> Iterator[tuple[str, _Node]]:
     except (OSError, ValueError, NotImplementedError, KeyError, IndexError, MemoryError) as error:
         raise DataError(f"{path} is no MATLAB file: {str(error).splitlines()[0]}") from error
 
-    @cache
-    def load(name: str) -> Any:
-        try:
-            return scipy.io.loadmat(str(path), variable_names=[name], mat_dtype=True)[name]
-        except Exception as error:  # scipy raises what a damaged file makes it stumble over
-            raise DataError(f"{path}: variable {name!r} cannot be read: {type(error).__name__}: {error}") from error
-
     for name, shape, kind in listed:
         if kind in {"unknown", "opaque", "object", "function"}:
             opaque.append(name)
         elif kind in {"struct", "cell"}:
-            yield name, _node(load(name))
+            yield name, _node(_loaded(path, name))
         elif kind not in {"char", "sparse"}:
             yield name, _Node(shape=shape, read=partial(_loaded, path, name))
 
@@ -248,7 +239,7 @@ def _loaded(path: Path, name: str) -> Any:
 
     try:
         return scipy.io.loadmat(str(path), variable_names=[name], mat_dtype=True)[name]
-    except Exception as error:
+    except Exception as error:  # scipy raises what a damaged file makes it stumble over
         raise DataError(f"{path}: variable {name!r} cannot be read: {type(error).__name__}: {error}") from error
 
 
@@ -257,21 +248,13 @@ def _node(value: Any) -> _Node:
     if not isinstance(value, np.ndarray) or type(value).__name__ in {"MatlabOpaque", "MatlabFunction"}:
         return _Node(opaque=type(value).__name__ == "MatlabOpaque")
     if value.dtype.names:
-        rows = [_Node(fields={field: partial(_node, row[field]) for field in value.dtype.names}) for row in value.flat]
-        return rows[0] if len(rows) == 1 else _Node(entries=[partial(_same, row) for row in rows])
+        rows = [{field: partial(_node, row[field]) for field in value.dtype.names} for row in value.flat]
+        return _Node(fields=rows[0]) if len(rows) == 1 else _Node(entries=[partial(_Node, fields=row) for row in rows])
     if value.dtype == object:
         return _Node(entries=[partial(_node, entry) for entry in value.flat])
     if value.dtype.kind in "biuf":
-        return _Node(shape=value.shape, read=partial(_same_array, value))
+        return _Node(shape=value.shape, read=partial(np.asarray, value))
     return _Node()
-
-
-def _same(node: _Node) -> _Node:
-    return node
-
-
-def _same_array(array: Any) -> Any:
-    return array
 
 
 # -- version 7.3 -------------------------------------------------------------------------------------------------

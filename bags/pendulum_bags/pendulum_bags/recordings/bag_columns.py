@@ -31,12 +31,11 @@ _ONE_CLOCK = 60.0
 Messages = Sequence[tuple[int, Any]]
 
 
-def read_bag_columns(path: Path, topics: Sequence[str] = ()) -> Columns:
+def read_bag_columns(path: Path) -> Columns:
     """Return the numbers of a bag as columns.
 
     Args:
         path: A rosbag2 folder or file, or a ``.bag`` file of ROS 1.
-        topics: Topics to offer; by default all.
 
     Raises:
         BagError: It cannot be read.
@@ -45,7 +44,7 @@ def read_bag_columns(path: Path, topics: Sequence[str] = ()) -> Columns:
     source: _Source = _Ros1(path) if is_ros1(path) else _Rosbag2(path)
     columns: dict[str, Column] = {}
     stamped = ""
-    for topic in topics or source.topics:
+    for topic in source.topics:
         try:
             first = source.first(topic)
         except DataError as error:

@@ -51,20 +51,15 @@ class Columns:
         kind: Its format, for messages.
         columns: By name, in the order of the file.
         notes: What reading has found out, one sentence each.
-        part: Number of the part that was read, from 1; 0 where the file holds one recording.
-        parts: What each part is, as text.
         period: Sampling period that the file states [s].
         is_table: Whether the values in one row were measured together.
         named: Whether the columns have names that an author gave.
-        header: How many lines are above the first row, for messages.
     """
 
     path: Path
     kind: str
     columns: Mapping[str, Column]
     notes: list[str] = field(default_factory=list)
-    part: int = 0
-    parts: Sequence[str] = ()
     period: float | None = None
     is_table: bool = False
     named: bool = True

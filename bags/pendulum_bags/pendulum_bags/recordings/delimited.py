@@ -168,7 +168,7 @@ def _layout(path: Path, lines: Sequence[str], delimiter: str, skip: int) -> _Lay
             raise DataError(_other_count(path, count, len(names), halves=halves))
         count = len(names)  # each row ends with a delimiter
     elif not names and mark == "," and count % 2 == 0 and first > skip:
-        # A titleer of half as many names, above decimal commas between commas.
+        # A title of half as many names, above decimal commas between commas.
         title = _cells(lines[first - 1].strip().lstrip("#"), mark)
         if 2 * len(title) == count and not any(_is_number(cell, mark) for cell in title):
             raise DataError(_other_count(path, count, len(title), halves=True))

@@ -85,9 +85,8 @@ def read_lerobot(folder: Path, part: int = 0) -> Columns:
             name = f"{entry.name}.{labels[index]}" if index < len(labels) else column.name
             columns[name] = Column(name, column.size, column.read)
     notes = [f"episode 1 of {episodes} is read; {folder.name}#2 is the next"] if episodes > 1 and not part else []
-    names = [f"episode {index + 1}" for index in range(episodes)]
     # Stamps are stored in 32 bits; the frames of an episode are equally spaced.
-    return Columns(folder, "LeRobot dataset", columns, notes, max(part, 1), names, 1.0 / rate, is_table=True)
+    return Columns(folder, "LeRobot dataset", columns, notes, 1.0 / rate, is_table=True)
 
 
 def _labels(names: Any) -> Iterator[str]:
