@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.io
+import yaml
 
 from pendulum_bags.commands.analyse_cli import main as analyse_main
 from pendulum_bags.commands.compare_cli import main as compare_main
@@ -248,6 +250,63 @@ def test_a_velocity_that_is_not_the_derivative_is_left_out_and_named(tmp_path: P
 
 
 @pytest.mark.parametrize(
+    ("names", "scale", "units"),
+    [
+        (("time_s", "theta_deg", "theta_dot_deg_s", "torque_nm"), 180.0 / np.pi, ("s", "deg", "deg/s", "N m")),
+        (("t_ms", "angle_rad", "omega_rad_s", "u_nm"), 1.0, ("ms", "rad", "rad/s", "N m")),
+    ],
+)
+def test_units_in_names_are_read(tmp_path: Path, names: Any, scale: float, units: Any) -> None:
+    columns = (
+        RUN["t"] * (1e3 if units[0] == "ms" else 1.0),
+        scale * RUN["position"],
+        scale * RUN["velocity"],
+        RUN["torque"],
+    )
+    np.savez(tmp_path / "run.npz", **dict(zip(names, columns, strict=True)))
+    reading = Reading(tmp_path / "run.npz")
+    assert tuple(guess.unit for guess in reading.guesses) == units
+    np.testing.assert_allclose(reading.motion.joints[0].position, RUN["position"])
+    np.testing.assert_allclose(reading.motion.time, RUN["t"])
+
+
+@pytest.mark.parametrize("zero", [0.0, np.pi])
+@pytest.mark.parametrize("seed", [6, 15, 16])
+def test_an_angle_of_noise_alone_shows_nowhere_that_it_hangs(tmp_path: Path, seed: int, zero: float) -> None:
+    generator = np.random.default_rng(seed)
+    counts = np.round(0.6 * generator.normal(size=500))
+    torque = np.repeat(generator.normal(size=100), 5)
+    np.savez(tmp_path / "run.npz", t=0.02 * np.arange(500), theta=zero + 2.0 * np.pi / 4096 * counts, torque=torque)
+    position = next(guess for guess in Reading(tmp_path / "run.npz").guesses if guess.quantity == "position")
+    assert "that 0 hangs down is assumed" in position.how
+
+
+def test_a_motion_that_something_unseen_may_drive_is_marked(tmp_path: Path) -> None:
+    t = 0.01 * np.arange(2000)
+    held = 0.6 * np.sin(3.0 * t) + 1e-3 * np.random.default_rng(0).normal(size=t.size)
+    for name, ref, words in (("a.npz", {}, "if nothing drives it"), ("b.npz", {"ref": np.sin(3.0 * t)}, "is assumed")):
+        np.savez(tmp_path / name, t=t, theta=held, **ref)
+        position = next(guess for guess in Reading(tmp_path / name).guesses if guess.quantity == "position")
+        assert position.assumed
+        assert words in position.how
+
+
+def test_a_cart_is_a_place_and_the_column_that_another_hides_is_listed(tmp_path: Path) -> None:
+    states = {"x": 0.1 * RUN["position"], "theta": RUN["position"], "theta_filtered": RUN["position"]}
+    np.savez(tmp_path / "run.npz", t=RUN["t"], **states, u=RUN["torque"])
+    reading = Reading(tmp_path / "run.npz")
+    assert [joint.slides for joint in reading.motion.joints] == [True, False]
+    assert ("left out", "theta_filtered") in {(guess.quantity, guess.column) for guess in reading.guesses}
+
+
+def test_a_position_that_stands_still_is_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "run.npz", t=RUN["t"], theta=np.full(RUN["t"].size, 3.0), u=RUN["torque"])
+    for topics in ((), ("position=theta",)):
+        with pytest.raises(DataError, match=r"the position theta is 3 throughout; expected a plant that moves"):
+            Reading(tmp_path / "run.npz", topics=topics).rules  # noqa: B018
+
+
+@pytest.mark.parametrize(
     ("arrays", "words"),
     [
         ({"theta": RUN["position"]}, r"has no column of time; it has theta: --dt SECONDS"),
@@ -327,7 +386,60 @@ def test_degrees_that_were_taken_for_radians_make_no_verdict(tmp_path: Path, cap
     sim, hardware = save(tmp_path / "sim.npz", small, scale=180.0 / np.pi), save(tmp_path / "hw.npz", small)
     said = compared(capsys, sim, hardware, code=2)["error"]
     assert "moves 0.0175 times as much" in said
-    assert "correct the unit of sim.npz to deg" in said
+    assert "correct the units of sim.npz to deg and deg/s" in said
+
+
+@pytest.mark.parametrize(
+    ("sign", "zero", "words"),
+    [(-1.0, 0.0, "moves against the simulation's"), (1.0, np.pi, "as an angle that is 0 upright on one side would be")],
+    ids=["sign", "zero"],
+)
+def test_a_guessed_sign_or_zero_makes_no_verdict(
+    tmp_path: Path, capsys: Any, sign: float, zero: float, words: str
+) -> None:
+    for name, run, s, z in (("sim.npz", RUN, 1.0, 0.0), ("hw.npz", swing(noise=0.5, seed=1), sign, zero)):
+        # A motion that follows a reference, without the input, does not show where the angle hangs.
+        states = {"theta": s * run["position"] + z, "omega": s * run["velocity"]}
+        np.savez(tmp_path / name, t=run["t"], ref=run["torque"], **states)
+    pair, written = [str(tmp_path / "sim.npz"), str(tmp_path / "hw.npz")], tmp_path / "columns.yaml"
+    assert compare_main([*pair, "--write-mapping", str(written)]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+    # The hint works when it is followed.
+    rules = yaml.safe_load(written.read_text())
+    corrected = copy.deepcopy(rules)
+    for key in ("position", "velocity"):
+        corrected[key] |= {"sign": int(sign)} | ({"offset": -zero} if key == "position" else {})
+    rules = {"format": rules["format"], "recordings": {"sim.npz": rules, "hw.npz": corrected}}
+    for one in rules["recordings"].values():
+        del one["format"]
+    written.write_text(yaml.safe_dump(rules))
+    assert compare_main([*pair, "--mapping", str(written), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["answer"]["mark"] != "no"
+
+
+@pytest.mark.parametrize("voltage", [False, True])
+def test_an_input_that_one_side_lacks_or_has_in_another_unit_is_no_test(
+    tmp_path: Path, capsys: Any, voltage: bool
+) -> None:
+    for name, run in (("sim.npz", RUN), ("hw.npz", swing(noise=0.5, seed=1))):
+        motor = {"torque": run["torque"]} if name == "sim.npz" else {"u_volt": 5.0 * run["torque"]} if voltage else {}
+        np.savez(tmp_path / name, t=run["t"], theta=run["position"], noise=run["torque"], **motor)
+    found = compared(capsys, tmp_path / "sim.npz", tmp_path / "hw.npz")
+    assert not any("torque" in test["quantity"] for test in found["verdict"]["tests"])
+    assert any("The inputs are not compared" in note for note in found["notes"])
+    assert compare_main([str(tmp_path / "sim.npz"), str(tmp_path / "hw.npz")]) == 0
+    assert "max |u|" not in capsys.readouterr().out
+
+
+def test_a_mapping_whose_velocity_is_no_derivative_makes_no_verdict(tmp_path: Path, capsys: Any) -> None:
+    names = "time,position,velocity,torque"
+    for name, turn in (("sim.csv", 1.0), ("hw.csv", 180.0 / np.pi)):
+        run = swing(noise=0.5, seed=int(turn))
+        rows = np.stack([run["t"], run["position"], turn * run["velocity"], run["torque"]], axis=1)
+        np.savetxt(tmp_path / name, rows, delimiter=",", header=names, comments="")
+    said = compared(capsys, tmp_path / "sim.csv", tmp_path / "hw.csv", code=2)["error"]
+    assert "the velocity is 57.3 times the derivative" in said
+    assert "by its name, as pendulum has it" in said  # what the names chose is shown
 
 
 def step(seed: int, *, damping: float = 0.5) -> dict[str, np.ndarray]:

@@ -230,8 +230,9 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
         *noise,
         (f"std of {what} \\[{unit}]", "std_theta", ".5f"),
         (f"std of {what}' \\[{unit}/s]", "std_theta_dot", ".5f"),
-        (f"max |u| \\[{motion.effort_unit}]", "max_abs_u", ".4f"),
     ]
+    if not result.of_files or all(plant["max_abs_u"] for plant in plants.values()):
+        rows.append((f"max |u| \\[{motion.effort_unit}]", "max_abs_u", ".4f"))
     if any("rms_tracking_error" in plant for plant in plants.values()):
         rows.append(("rms of tracking error \\[rad]", "rms_tracking_error", ".5f"))
     when = "in the part that both have" if result.of_files else "during the noise"

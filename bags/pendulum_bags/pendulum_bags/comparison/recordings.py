@@ -48,6 +48,10 @@ _MOST_SAMPLES = 200_000
 _PARTS = 5
 _NEAR_DEGREES = 0.3
 """Largest logarithm of the ratio of spreads to 180 / pi that is taken for degrees."""
+_NEAR_HALF_TURN = 0.3
+"""Largest distance of two mean angles from half a turn that is taken for another zero [rad]."""
+_OPPOSITE = 0.7
+"""Least correlation of one motion with the negative of another that is taken for another sign."""
 _DISTURBANCE, _REFERENCE, _INPUT, _MOTION = "disturbance", "reference", "input", "motion"
 _SIGNALS: dict[str, Callable[[RunData], Signal | None]] = {
     _DISTURBANCE: lambda run: run.disturbance,
@@ -160,6 +164,11 @@ def compare_recordings(
         result = replace(compare(pairs, margin=margins, on_one_clock=True), shared=kind)
     else:
         result = _described(pairs, kind, shared[0], margins)
+    if not all(_has_one_input(simulation, run) for run in hardware):
+        units = ", ".join(
+            f"{run.label}: {run.window.effort_unit if run.applied else 'none'}" for run in (simulation, *hardware)
+        )
+        notes.append(f"The inputs are not compared, for they are not in one unit ({units}).")
     return replace(result, left_out=(*result.left_out, *dict.fromkeys(notes)))
 
 
@@ -329,8 +338,18 @@ def _on_one_clock(simulation: RunData, hardware: RunData, shared: Shared) -> tup
         signal = _SIGNALS[shared.kind](run) if shared.kind in _SIGNALS else None
         found.append(replace(run.between(start, stop + 1e-9), disturbance=signal))
     ours, theirs = (run.moved(-start) for run in found)
-    _check_units(ours, theirs)
+    _check_guesses(ours, theirs, shared)
+    if not _has_one_input(ours, theirs):
+        ours, theirs = (
+            replace(run, window=replace(run.window, effort=0.0 * run.window.effort)) for run in (ours, theirs)
+        )
     return replace(ours, label="simulation"), replace(theirs, label="hardware")
+
+
+def _has_one_input(*runs: RunData) -> bool:
+    """Return whether all runs have an input, in one unit: else their torques are no test."""
+    has = all(run.applied is not None or np.any(run.window.effort) for run in runs)
+    return has and len({run.window.effort_unit for run in runs}) == 1
 
 
 def _refuse_copies(runs: Sequence[RunData]) -> None:
@@ -353,17 +372,36 @@ def _refuse_copies(runs: Sequence[RunData]) -> None:
                 )
 
 
-def _check_units(simulation: RunData, hardware: RunData) -> None:
-    """Refuse a guess that takes degrees for radians on one side: it alone would make the verdict."""
-    if not (simulation.unit_assumed or hardware.unit_assumed) or hardware.window.slides:
+def _check_guesses(simulation: RunData, hardware: RunData, shared: Shared) -> None:
+    """Refuse a guess that takes one side's unit, zero or sign for another: it alone would make the verdict."""
+    a, b = simulation.window, hardware.window
+    if not (simulation.guessed or hardware.guessed) or a.slides or b.slides:
         return
-    ratio = float(hardware.window.position.std()) / max(float(simulation.window.position.std()), 1e-300)
+    how = "write the guess with --write-mapping, correct"
+    ends = f"and give it as --mapping; unchanged, where {Path(hardware.source).name} is really so"
+    ratio = float(b.position.std()) / max(float(a.position.std()), 1e-300)
     for factor, degrees in ((180.0 / math.pi, hardware), (math.pi / 180.0, simulation)):
         if abs(math.log(max(ratio, 1e-300) / factor)) < _NEAR_DEGREES:
             raise DataError(
                 f"the hardware's angle of {hardware.source} moves {ratio:.3g} times as much as the simulation's of "
-                f"{simulation.source}, as degrees taken for radians would; expected one unit: write the guess with "
-                f"--write-mapping, correct the unit of {Path(degrees.source).name} to deg, and give it as --mapping"
+                f"{simulation.source}, as degrees taken for radians would; expected one unit: {how} the units of "
+                f"{Path(degrees.source).name} to deg and deg/s, {ends}"
+            )
+    apart = float(b.position.mean() - a.position.mean())
+    if shared.kind and math.cos(apart) < -math.cos(_NEAR_HALF_TURN):
+        raise DataError(
+            f"the hardware's mean angle of {hardware.source} is {apart:.4g} rad from the simulation's of "
+            f"{simulation.source}, as an angle that is 0 upright on one side would be; expected one zero: {how} the "
+            f"offset of one position to 3.14159 (180 in deg), {ends}"
+        )
+    if shared.kind in _SIGNALS:
+        motions = interpolated_difference(a, b)
+        like = float(np.corrcoef(motions.simulation.velocity, motions.hardware.velocity)[0, 1])
+        if like < -_OPPOSITE:
+            raise DataError(
+                f"the hardware's angle of {hardware.source} moves against the simulation's of {simulation.source} "
+                f"(correlation {like:.2f}), as one of the opposite sign would; expected one sign: {how} the sign of "
+                f"one position and its velocity to -1, {ends}"
             )
 
 

@@ -28,7 +28,7 @@ from pendulum_bags.recordings.physics import (
     turn_of,
     units_by_slope,
 )
-from pendulum_bags.recordings.units import INPUTS, UNITS, quantity_of
+from pendulum_bags.recordings.units import INPUTS, UNITS, known_unit, quantity_of
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["Guess", "guess_rules"]
@@ -71,6 +71,7 @@ _UNIT_WORDS = {
 _TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_]+")
 _MOST_PAIRS = 24
 _ASSUMED = "assumed, for the file does not say, and small angles in degrees move alike"
+_ASSUMED_PLACE = "m: assumed, for the file does not say"
 
 
 @dataclass(frozen=True)
@@ -200,6 +201,8 @@ class _Guesser:
         measured, filtered = bool(present & _MEASURED), bool(present & _FILTERED)
         rank = 0 if measured else 2 if filtered else 3 if role == "input" and present & {"con", "commanded"} else 1
         unit = stated or next((_UNIT_WORDS[word.casefold()] for word in words if word.casefold() in _UNIT_WORDS), "")
+        if role == "velocity" and not stated and unit in UNITS["angle"]:
+            unit += "/s"  # as of omega_rad_s
         return _Candidate(
             name, role, stem.casefold(), rank, weak and not wanted, unit, _label(name, stem), bool(wanted)
         )
@@ -272,8 +275,9 @@ class _Guesser:
 
     def _time_section(self, name: str, how: str) -> dict[str, Any]:
         column = self.columns.columns[name]
-        word = next((_UNIT_WORDS[token] for token in _tokens(name) if token in UNITS["time"]), "")
-        stated = column.unit or word
+        # Not the name of a struct: `s.t` says nothing of seconds.
+        words = map(known_unit, _tokens(re.split(r"[/.]", name)[-1]))
+        stated = column.unit or next((word for word in words if word in UNITS["time"]), "")
         values = self.columns.values(name)
         step = float(np.median(np.diff(values[np.isfinite(values)])))
         unit = stated if stated in UNITS["time"] else _time_unit(step)
@@ -295,22 +299,23 @@ class _Guesser:
         if any(not one.weak for one in found):
             places = _WORDS["place"]
             found = [one for one in found if not one.weak or set(one.label.casefold().split("_")) & places]
+        still = ""
         chosen: dict[str, _Candidate] = {}
         for one in sorted(found, key=lambda one: one.rank):
             values = self.columns.values(one.name)
             if one.stem in chosen:
-                if one.rank == chosen[one.stem].rank:
-                    self.guesses.append(Guess("left out", one.name, "", f"{chosen[one.stem].name} has that name too"))
+                self.guesses.append(Guess("left out", one.name, "", f"{chosen[one.stem].name} has that name too"))
                 continue
             if not moves(values):
                 self.guesses.append(Guess("left out", one.name, "", "it has one value throughout"))
+                still = one.name
                 continue
             chosen[one.stem] = one
         if chosen:
             order = list(self.columns.columns)
             ordered = sorted(chosen.values(), key=lambda one: order.index(one.name))
             return [self._joint(one.label, one.stem, one.name, one.unit, one.how) for one in ordered]
-        return self._joints_by_data()
+        return self._joints_by_data(still)
 
     def _joint(self, label: str, stem: str, column: str, unit: str, how: str) -> _Found:
         joint = _Found(label, stem, column)
@@ -318,8 +323,12 @@ class _Guesser:
         joint.rows.append(Guess("position", column, unit, how))
         return joint
 
-    def _joints_by_data(self) -> list[_Found]:
-        """Return the joints of columns without names: those of which another column is the derivative."""
+    def _joints_by_data(self, still: str) -> list[_Found]:
+        """Return the joints of columns without names: those of which another column is the derivative.
+
+        Args:
+            still: A column with the name of a position, which has one value throughout; empty for none.
+        """
         taken = {guess.column for guess in self.guesses}
         names = [
             name
@@ -348,6 +357,11 @@ class _Guesser:
         if joints:
             order = list(self.columns.columns)
             return sorted(joints, key=lambda joint: order.index(joint.position))
+        if still:
+            raise DataError(
+                f"{self.columns.path}: the position {still} is {float(np.nanmean(self.columns.values(still))):.6g} "
+                "throughout; expected a plant that moves, or --topic position=COLUMN with another column"
+            )
         if len(names) == 1:
             return [self._joint("", "", names[0], "", "the only column that moves")]
         raise self._ambiguous("position", names)
@@ -395,6 +409,9 @@ class _Guesser:
     def _velocity(self, joint: _Found, *, alone: bool) -> None:
         """Take the velocity that the data confirm, and the units and sign that they give."""
         section = joint.sections["position"]
+        how = joint.rows[0].how
+        if not section["unit"] and _slides(joint.position, alone=alone):
+            section["unit"], how = "m", f"{how}; {_ASSUMED_PLACE}"
         tried: list[str] = []
         best: tuple[bool, float, _Candidate, float, Array, Array] | None = None
         for one in (one for one in self.candidates if one.role == "velocity"):
@@ -402,8 +419,7 @@ class _Guesser:
             if shared is None:
                 continue
             stamps, position, velocity = shared
-            turn = turn_of(position)
-            if turn:
+            if turn := self._turn(joint.position):
                 position = np.unwrap(position, period=turn)
             slope = derivative(stamps, position, velocity)
             own = alone or one.stem == joint.stem
@@ -413,7 +429,6 @@ class _Guesser:
                     best = (*score, one, slope.slope, position, velocity)
             elif own:
                 tried.append(f"{one.name} is not its derivative (correlation {slope.alike:.2f})")
-        how = joint.rows[0].how
         stated = bool(section["unit"]) or (best is not None and bool(best[2].unit))
         wanted, why = ("", "") if stated else self._angle_unit(joint.position, alone=alone)
         if best is not None:
@@ -444,12 +459,14 @@ class _Guesser:
         if turn:
             how += f"; it is wrapped (jumps of {turn:.4g}), and is unwrapped"
         how += "".join(f"; {text}, left out" for text in tried)
-        joint.rows[0] = Guess("position", joint.position, str(section["unit"]), how, _ASSUMED in how)
+        joint.rows[0] = Guess(
+            "position", joint.position, str(section["unit"]), how, _ASSUMED in how or _ASSUMED_PLACE in how
+        )
 
     def _turn(self, column: str) -> float:
         values = self.columns.values(column)
         turn = turn_of(values[np.isfinite(values)])
-        return turn if any(abs(turn / one - 1.0) < 0.1 for one in (2.0 * math.pi, 360.0, 1.0)) else 0.0
+        return next((one for one in (2.0 * math.pi, 360.0, 1.0) if abs(turn / one - 1.0) < 0.1), 0.0)
 
     def _angle_unit(self, column: str, *, alone: bool) -> tuple[str, str]:
         """Return the unit of an angle, and what shows it: jumps where it is wrapped, its speed, or its equation.
@@ -583,17 +600,18 @@ class _Guesser:
         balance = self._balance(joint, joints)
         row = joint.rows[0]
         assumed = row.assumed
+        alone = "" if any("input" in one.sections for one in joints) else ", if nothing drives it"
         if balance is None or not balance.hangs_at:
             words, assumed = "that 0 hangs down is assumed", True
         elif balance.hangs_at == "0":
-            words = f"tested: 0 hangs down (t = {balance.t:.0f})"
+            words = f"tested: 0 hangs down (t = {balance.t:.0f}){alone}"
         else:
             section["offset"] = round(math.pi / UNITS["angle"][unit], 9)
             followed = joint.sections.get("reference", {})
             if quantity_of(str(followed.get("unit"))) == "angle":
                 followed["offset"] = round(math.pi / UNITS["angle"][str(followed["unit"])], 9)
-            words = f"tested: 0 is upright (t = {balance.t:.0f}), so that {section['offset']:.6g} is added"
-        joint.rows[0] = Guess(row.quantity, row.column, row.unit, f"{row.how}; {words}", assumed)
+            words = f"tested: 0 is upright (t = {balance.t:.0f}){alone}, so that {section['offset']:.6g} is added"
+        joint.rows[0] = Guess(row.quantity, row.column, row.unit, f"{row.how}; {words}", assumed or bool(alone))
 
     def _balance(self, joint: _Found, joints: Sequence[_Found]) -> Balance | None:
         alone = self._angle(joint, None)
@@ -610,7 +628,7 @@ class _Guesser:
                 return None
             has = np.isfinite(values) & np.isfinite(stamps)
             drives.append((stamps[has], values[has]))
-        if not drives and np.ptp(angle) < 1.0:
+        if not drives and (np.ptp(angle) < 1.0 or any("reference" in one.sections for one in joints)):
             return None  # a controller whose commands are not here may hold it anywhere
         others = [found[1] for one in joints if one is not joint and (found := self._angle(one, time)) is not None]
         return balance_of(time, angle, drives, others)
@@ -671,6 +689,13 @@ def _is_derivative(words: Sequence[str]) -> bool:
         (folded[index - 1 : index], folded[index + 1 : index + 2]) for index, one in enumerate(folded) if one == "d"
     ]
     return any(angles & {*before, *behind} for before, behind in beside)
+
+
+def _slides(name: str, *, alone: bool) -> bool:
+    """Return whether a name is that of a place; an x alone may be an angle."""
+    words = {word.casefold() for word in _tokens(name)}
+    angles = _WORDS["angle"] - _WEAK - {"pos", "position", "qpos"}
+    return bool(words & (_WORDS["place"] - ({"x"} if alone else set()))) and not words & angles
 
 
 def _is_command(name: str) -> bool:

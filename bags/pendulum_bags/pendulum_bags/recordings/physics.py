@@ -98,21 +98,19 @@ class Balance(NamedTuple):
     Attributes:
         pull: Negative where the angle is 0 hanging down, positive where it is 0 upright [1/s^2].
         t: Of it, Student's.
-        gain: Of the input [unit of q'' per unit of u]; 0 without one.
-        gain_t: Of it.
         explained: Share of the variance of q'' that is explained.
+        longer: The pull by test functions twice as long: that of gravity is the same, that of noise a quarter [1/s^2].
     """
 
     pull: float
     t: float
-    gain: float
-    gain_t: float
     explained: float
+    longer: float = 0.0
 
     @property
     def hangs_at(self) -> str:
         """``0`` or ``pi``, by where the pull is restoring; empty where the motion does not say."""
-        if abs(self.t) < 5.0 or self.explained < _LEAST_EXPLAINED:
+        if abs(self.t) < 5.0 or self.explained < _LEAST_EXPLAINED or not 0.5 < self.longer / self.pull < 2.0:
             return ""
         return "0" if self.pull < 0.0 else "pi"
 
@@ -131,8 +129,16 @@ def balance_of(
         drives: Stamps [s] and values of each input.
         others: Positions of the other joints, whose accelerations pull at this one, each of shape (n,).
     """
+    found = _balance_of(time, angle, drives, others, _WINDOW)
+    longer = found and _balance_of(time, angle, drives, others, 2.0 * _WINDOW)
+    return found and found._replace(longer=longer.pull if longer else 0.0)
+
+
+def _balance_of(
+    time: Array, angle: Array, drives: Sequence[tuple[Array, Array]], others: Sequence[Array], window: float
+) -> Balance | None:
     period = float(np.median(np.diff(time)))
-    length = max(round(_WINDOW / period), 10)
+    length = max(round(window / period), round(10 * window / _WINDOW))
     count = int((time[-1] - time[0]) / period) + 1
     if count < 8 * length or count > 5_000_000:
         return None
@@ -168,7 +174,4 @@ def balance_of(
     freedom = max(0.5 * starts.size - a.shape[1], 1.0)  # half of each window is in the next one
     errors = np.sqrt(np.diag(np.linalg.inv((a / scale).T @ (a / scale))) * float(left @ left) / freedom)
     explained = 1.0 - float(left @ left) / max(float((y - y.mean()) @ (y - y.mean())), 1e-300)
-    t = solution / np.maximum(errors, 1e-300)
-    last = len(columns) - 1
-    gain, gain_t = (float(solution[last] / scale[last]), float(t[last])) if drives else (0.0, 0.0)
-    return Balance(float(solution[0] / scale[0]), float(t[0]), gain, gain_t, explained)
+    return Balance(float(solution[0] / scale[0]), float(solution[0] / max(errors[0], 1e-300)), explained)

@@ -128,7 +128,8 @@ class Reading:
         if "rules" not in self._cache:
             known = self._known()
             if known is not None:
-                self._cache["rules"] = (load_rules(known, self.path), ())
+                rules = load_rules(known, self.path)
+                self._cache["rules"] = (rules, _taken_by_name(self.columns, known, rules) if self.is_guessed else ())
             else:
                 self._cache["rules"] = guess_rules(self.columns, period=self.dt, only=_roles(self.topics))
         return self._cache["rules"]
@@ -146,6 +147,11 @@ class Reading:
             if all(self.columns.find([one] if isinstance(one, str) else one) for one in wanted):
                 return "pendulum"
         return None if self.mapping == GUESS else self.mapping
+
+    @property
+    def is_guessed(self) -> bool:
+        """Whether nobody stated what its columns are; a HEBI log has its own."""
+        return self.mapping in (None, GUESS) and self.path.suffix.lower() != ".hebilog"
 
     @property
     def motion(self) -> Motion:
@@ -187,6 +193,14 @@ class Reading:
         raise DataError(
             f"{source} has the suffix {suffix!r}; expected {', '.join(SUFFIXES)}, .mcap, .db3, .bag or a bag folder"
         )
+
+
+def _taken_by_name(columns: Columns, mapping: str | Path | Mapping[str, Any], rules: Rules) -> Sequence[Guess]:
+    """Return the rows of a built-in mapping that the names of the columns chose."""
+    how = f"by its name, as {mapping} has it, 0 hanging down; --mapping {GUESS} tests it"
+    sections = {"time": rules.time, **rules.joints[""]}
+    names = {key: columns.find(np.atleast_1d(section["column"])) for key, section in sections.items()}
+    return [Guess(key, name, str(sections[key]["unit"]), how, True) for key, name in names.items() if name]
 
 
 def holds_states(bag: Bag) -> bool:

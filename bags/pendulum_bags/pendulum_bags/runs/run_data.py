@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pendulum_bags.recordings.mapping import Drive
 from pendulum_bags.recordings.reading import Reading, holds_states
 from pendulum_bags.runs.correlation import effective_size
-from pendulum_bags.runs.datasets import data_notes, recording_of, unwrap
+from pendulum_bags.runs.datasets import check_consistency, data_notes, recording_of, unwrap
 from pendulum_bags.runs.moving_reference import follows_reference, recorded_reference
 from pendulum_bags.runs.run_record import STAND_IN, run_record, stands_in
 from pendulum_bags.runs.series import Series, Signal, unwrap_near_upright
@@ -83,7 +83,7 @@ class RunData:
         followed: Reference of a file, over the whole recording, None of a bag [rad or m].
         recorded: Disturbance of a file; ``disturbance`` may be another signal that two files share.
         of_file: Whether it is a recording that says nothing of an experiment.
-        unit_assumed: Whether nothing shows the unit of its angle.
+        guessed: Whether units, zero and sign of its columns are a guess.
     """
 
     label: str
@@ -105,7 +105,7 @@ class RunData:
     followed: Signal | None = None
     recorded: Signal | None = None
     of_file: bool = False
-    unit_assumed: bool = False
+    guessed: bool = False
 
     @property
     def is_disturbed(self) -> bool:
@@ -357,7 +357,7 @@ def _run_of(reading: Reading, name: str, joint: str | None) -> RunData:
             f"{', '.join(one.name for one in motion.joints)}"
         )
     recording = recording_of(motion, found)
-    recording = recording if found.slides else unwrap(recording)
+    recording = check_consistency(recording if found.slides else unwrap(recording))
     times = recording.time - recording.time[0]
     position = recording.position if found.slides else unwrap_near_upright(recording.position)
     velocity = _slope(times, position) if recording.velocity is None else recording.velocity
@@ -397,7 +397,7 @@ def _run_of(reading: Reading, name: str, joint: str | None) -> RunData:
         followed=followed,
         recorded=disturbance,
         of_file=True,
-        unit_assumed=reading.rules.guessed,
+        guessed=reading.is_guessed,
     )
 
 
