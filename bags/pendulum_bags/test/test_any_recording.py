@@ -291,6 +291,11 @@ def test_a_motion_that_something_unseen_may_drive_is_marked(tmp_path: Path) -> N
         assert words in position.how
 
 
+def test_an_x_alone_may_be_an_angle(tmp_path: Path) -> None:
+    np.savez(tmp_path / "run.npz", t=RUN["t"], x=RUN["position"], u=RUN["torque"])
+    assert not Reading(tmp_path / "run.npz").motion.joints[0].slides
+
+
 def test_a_cart_is_a_place_and_the_column_that_another_hides_is_listed(tmp_path: Path) -> None:
     states = {"x": 0.1 * RUN["position"], "theta": RUN["position"], "theta_filtered": RUN["position"]}
     np.savez(tmp_path / "run.npz", t=RUN["t"], **states, u=RUN["torque"])
@@ -378,6 +383,10 @@ def test_one_input_that_acts_throughout_has_the_tests_of_an_experiment(tmp_path:
     assert "hw.npz has no disturbance" in same[1]["sentence"]
     wrong = compared(capsys, tmp_path / "sim.mat", save(tmp_path / "no.npz", swing(damping=4.0, noise=0.5, seed=1)))
     assert wrong["answer"]["mark"] == "no"
+    late = {"t": RUN["t"][2:], "position": RUN["position"][:-2], "torque": RUN["torque"][2:]}
+    steps = compared(capsys, tmp_path / "sim.mat", save(tmp_path / "late.npz", late))["answer"]["next_steps"]
+    assert steps[0].startswith("Give the simulation of sim.mat")  # it has no plant file
+    assert steps[0].endswith("ms more delay than now; measure again.")
 
 
 def test_degrees_that_were_taken_for_radians_make_no_verdict(tmp_path: Path, capsys: Any) -> None:

@@ -293,7 +293,10 @@ def _late(test: EquivalenceTest) -> str:
 
 def _foreign_simulation(comparison: Comparison) -> str:
     """Return the name of a third-party simulation, else nothing."""
-    simulation = run_record(comparison.pairs[0].simulation.metadata).get("simulation")
+    run = comparison.pairs[0].simulation
+    if run.of_file:
+        return f"the simulation of {Path(run.source).name}"
+    simulation = run_record(run.metadata).get("simulation")
     return str(simulation.get("name", "")) if isinstance(simulation, Mapping) else ""
 
 
