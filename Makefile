@@ -31,11 +31,11 @@ extras: $(VENV)/.linked $(VENV)/.extras # Install what every program needs: cons
 # goes before another of its version: ROS runs on it, and it is built with profile-guided optimisation, which pyenv's are
 # not unless somebody asks: programs then take 1.3 times as long.
 $(VENV)/.made:
-	@for python in $(PYTHON) $(foreach version,3.12 3.11 3.10,/usr/bin/python$(version) python$(version)) python3 none; do \
-	  if $$python -c 'import ensurepip, sys; sys.exit(sys.implementation.name != "cpython" or not (3, 10) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null; \
+	@for python in $(PYTHON) $(foreach version,3.12 3.11 3.10 3.13 3.14,/usr/bin/python$(version) python$(version)) python3 none; do \
+	  if $$python -c 'import ensurepip, sys; sys.exit(sys.implementation.name != "cpython" or not (3, 10) <= sys.version_info[:2] <= (3, 14))' 2>/dev/null; \
 	  then break; fi; \
 	done; \
-	if [ $$python = none ]; then echo "error: found no CPython 3.10, 3.11 or 3.12 that can make a virtual environment; install one (Debian and Ubuntu: with python3-venv), or name it with make PYTHON=/path/to/python3" >&2; exit 1; fi; \
+	if [ $$python = none ]; then echo "error: found no CPython 3.10 to 3.14 that can make a virtual environment; install one (Debian and Ubuntu: with python3-venv), or name it with make PYTHON=/path/to/python3" >&2; exit 1; fi; \
 	echo "making $(VENV) with $$($$python --version) ($$(command -v $$python))" && $$python -m venv $(VENV)
 	@touch $@
 
@@ -108,12 +108,14 @@ faults: venv # Attack the running system, count what it stood, print a table (te
 mutants: venv # Break the safety rules in every small way; fail if no test notices one (build/mutants.md)
 	@$(PY) -m tests.mutants.run $(ARGS)
 
-# The lock covers CPython 3.10 to 3.12 at once. All layers are compiled together first, for one version of each package;
-# then each by itself on those versions, less what `run` has. The peers of the benchmarks come last, less what all have,
-# and before them a reader of others, without what it names.
-LOCK := $(VENV)/.uv/bin/uv pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-header --no-annotate --no-emit-index-url
-# What a lock has everywhere: without a marker, or with several that share the versions of Python among them.
-without = $$(awk -F== '/^[A-Za-z0-9]/ {n[$$1] += $$2 ~ /;/ ? 1 : 2} END {for (p in n) if (n[p] > 1) print "--no-emit-package " p}' $(1))
+# The lock covers CPython 3.10 to 3.14 on every system at once; ROS and colcon in it are for Linux on x86_64, where rclpy has
+# wheels. All layers are compiled together first, for one version of each package; then each by itself on those versions,
+# less what `run` has. The peers of the benchmarks come last, less what all have, and before them a reader of others,
+# without what it names.
+LOCK := $(VENV)/.uv/bin/uv --config-file requirements/uv.toml pip compile --quiet --universal --python-version 3.10 --generate-hashes --no-header --no-annotate --no-emit-index-url
+# What a lock has wherever another may need it: without a marker, with ROS's, or with several that share the versions of
+# Python among them.
+without = $$(awk -F== '/^[A-Za-z0-9]/ {n[$$1] += /;/ && !/x86_64/ ? 1 : 2} END {for (p in n) if (n[p] > 1) print "--no-emit-package " p}' $(1))
 
 lock: $(VENV)/.made # Compile requirements/*.in into requirements/*.txt with hashes (ARGS=--upgrade renews the versions)
 	@test -x $(VENV)/.uv/bin/uv || { $(PY) -m venv $(VENV)/.uv && $(VENV)/.uv/bin/pip --quiet --quiet --disable-pip-version-check install uv; }
