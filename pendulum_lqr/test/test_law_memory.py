@@ -33,7 +33,7 @@ def test_discrete_lqr_feeds_back_the_state_of_its_model_limits_included(delay: f
     for step in range(60):
         x = np.array([generator.gauss(0.0, 0.5), generator.gauss(0.0, 0.3)])
         z = np.concatenate([x, hidden])
-        effort = float(np.clip(hold - controller.gain.K @ z, -limit, limit))
+        effort = np.clip(hold - controller.gain.K @ z, -limit, limit).item()
         saturated += abs(effort) == limit
         assert controller.command(step * PERIOD, tuple(x)) == pytest.approx(effort, abs=1e-9)
         hidden = (model.A @ z + model.B[:, 0] * (effort - hold))[2:]

@@ -33,7 +33,7 @@ def extra_of(module: str) -> str:
     from importlib.metadata import PackageNotFoundError, requires
 
     top = module.partition(".")[0]
-    wanted = {_plain(_DISTRIBUTIONS.get(top, top)), _plain(f"ros-{top}")}
+    wanted = {_plain(name) for name in (_DISTRIBUTIONS.get(top, top), f"ros-{top}", f"ros-jazzy-{top}")}
     for package in _PACKAGES:
         try:
             entries = requires(package) or []
@@ -65,10 +65,10 @@ def how_to_install(error: ImportError) -> str:
     extra = extra_of(module) if module else ""
     if not module or not extra:
         return ""
-    return (
-        f"{module.partition('.')[0]} is not installed, which this needs; "
-        f"install it with make extras, or python -m pip install '{extra}'"
-    )
+    missing = f"{module.partition('.')[0]} is not installed, which this needs"
+    if extra.endswith("[ros]"):
+        return f"{missing}; install ROS 2 Jazzy, or its wheels for Linux on x86_64: python -m pip install '{extra}'"
+    return f"{missing}; install it with make extras, or python -m pip install '{extra}'"
 
 
 def _place_of(package: str) -> Path | None:

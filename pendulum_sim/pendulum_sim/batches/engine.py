@@ -164,7 +164,7 @@ def seed_column(seeds: ArrayLike) -> NDArray[np.uint64]:
         wrong = []
     wrong = wrong or list(given[(given < 0) | (given > MAX_SEED)][:1])
     if wrong:
-        raise ParameterError(f"seeds has {wrong[0]!r}; expected whole numbers from 0 to 2^64 - 1")
+        raise ParameterError(f"seeds has {wrong[0]}; expected whole numbers from 0 to 2^64 - 1")
     return given.astype(np.uint64)
 
 
