@@ -1,4 +1,4 @@
-"""``export``: write a bag as Parquet or CSV files, or several as one dataset for learning (LeRobot)."""
+"""``export``: write a bag as Parquet, CSV or MATLAB files, or several as one dataset for learning (LeRobot)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def export(
     ],
     output: Annotated[Path, out_option("Folder to create.")],
     topics: Annotated[list[str] | None, typer.Option("-t", "--topic", help="Topic to export; by default all.")] = None,
-    format: Annotated[str, typer.Option(help="parquet, csv, or lerobot (dataset v3.0).")] = "parquet",
+    format: Annotated[str, typer.Option(help="parquet, csv, mat, or lerobot (dataset v3.0).")] = "parquet",
     fps: Annotated[
         int | None,
         typer.Option(help="lerobot: frames per second [Hz]; by default those of the slowest plant's states."),

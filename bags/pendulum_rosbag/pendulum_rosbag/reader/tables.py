@@ -1,4 +1,4 @@
-"""Bags as tables: pandas, Parquet and CSV."""
+"""Bags as tables: pandas, Parquet, CSV and MATLAB."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 import os
+import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -24,6 +25,7 @@ from pendulum_rosbag.reader.topic_info import TopicInfo
 
 if TYPE_CHECKING:
     import pandas as pd
+    from numpy.typing import NDArray
     from rosbags.typesys.store import Typestore
 
     from pendulum_rosbag.reader.topic_info import StoredMessage
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FORMATS", "LEROBOT", "export_bag", "require_pyarrow", "to_pandas"]
 
-FORMATS = ("parquet", "csv")
+FORMATS = ("parquet", "csv", "mat")
 LEROBOT = "lerobot"
 """Format of :mod:`pendulum_rosbag.reader.lerobot`."""
 _JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -84,7 +86,7 @@ def export_bag(
     Args:
         bag: The bag.
         folder: Folder to create.
-        format: ``parquet`` or ``csv``.
+        format: ``parquet``, ``csv`` or ``mat`` (MATLAB's version 5).
         on_left_out: Called with a sentence for each topic that cannot be read.
 
     Returns:
@@ -117,7 +119,7 @@ def export_bag(
                     on_left_out(str(error))
                     continue
                 files.append(_free_path(place, topic, format, files))
-                _write_table(files[-1], table, bag.topics[topic], format)
+                _write_table(files[-1], table, bag.topics[topic], format, bag.start_ns)
             if failed and not files:
                 raise failed
             files.append(place / "metadata.json")
@@ -134,9 +136,12 @@ def _free_path(folder: Path, topic: str, format: str, taken: Sequence[Path]) -> 
     return next(path for name in names if (path := folder / f"{name}.{format}") not in taken)
 
 
-def _write_table(path: Path, table: pd.DataFrame, info: TopicInfo, format: str) -> None:
+def _write_table(path: Path, table: pd.DataFrame, info: TopicInfo, format: str, start_ns: int) -> None:
     if format == "parquet":
         _write_parquet(path, table, info)
+        return
+    if format == "mat":
+        _write_mat(path, table, start_ns)
         return
     for name in table.columns:
         if table[name].map(lambda value: isinstance(value, list)).any():
@@ -162,6 +167,44 @@ def _write_parquet(path: Path, table: pd.DataFrame, info: TopicInfo) -> None:
                 values = pa.array(table[column.name].tolist(), types[column.name])
                 arrow = arrow.set_column(index, column.name, values)
     pyarrow.parquet.write_table(arrow, path)
+
+
+def _write_mat(path: Path, table: pd.DataFrame, start_ns: int) -> None:
+    """Write each column as a MATLAB variable with a row for each message, and ``time``: seconds from the bag's start.
+
+    Lists of one length become a matrix, text and other lists a cell array.
+    """
+    from scipy.io import savemat
+
+    clock = table["stamp_ns" if "stamp_ns" in table else "log_time_ns"].to_numpy()
+    variables: dict[str, NDArray[Any]] = {"time": (clock - start_ns) * 1e-9}
+    for column in table.columns:
+        # MATLAB's names are letters, digits and underscores, begin with a letter, and have at most 63 characters.
+        stem = re.sub(r"\W", "_", str(column), flags=re.ASCII)[:58]
+        stem = stem if stem[:1].isalpha() else f"x{stem}"
+        names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+        variables[next(name for name in names if name not in variables)] = _matlab(table[column])
+    savemat(path, variables, oned_as="column", do_compression=True)
+
+
+def _matlab(column: pd.Series[Any]) -> NDArray[Any]:
+    values = column.to_numpy()
+    if values.dtype.kind in "biuf":
+        return values
+    if all(isinstance(value, list) for value in values) and len({len(value) for value in values}) == 1:
+        matrix = np.array(values.tolist())
+        if matrix.ndim == 2 and matrix.dtype.kind in "biuf":
+            return matrix
+    cells = np.empty(len(values), object)
+    for index, value in enumerate(values):
+        cells[index] = (
+            np.array(value, float) if _all_numbers(value) else value if isinstance(value, str) else _json(value)
+        )
+    return cells
+
+
+def _all_numbers(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, (bool, int, float)) for item in value)
 
 
 def _is_untyped(kind: Any) -> bool:
