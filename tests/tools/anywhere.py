@@ -1,11 +1,11 @@
 """Where the lock and the wheels of this project can be installed, found out by installing them.
 
-It asks the package index whether all packages of a layer have wheels, for each system and version of Python; then it installs
-``pendulum_bags`` into an empty environment of every CPython that is given, and compares the two example recordings there::
+It asks the package index whether all packages of a layer have wheels, for each system and version of Python; then it
+installs ``pendulum_bags`` into an empty environment of every given CPython, and compares the example recordings there::
 
     python -m tests.tools.anywhere [PYTHON ...]
 
-It exits with code 1 where a wheel is not pure, or an installed program fails. ``make lock`` brings ``uv``, which it uses.
+It exits with code 1 where a wheel of this project is not pure, or a program fails. ``make lock`` brings ``uv``.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def without_wheel(layer: str, system: str, version: str) -> list[str]:
         with tempfile.TemporaryDirectory() as folder:
             lock = Path(folder, "lock.txt")
             lock.write_text("".join(entry for entry in entries if entry.partition("==")[0] not in missing), "utf-8")
-            asked = f"--python-platform {SYSTEMS[system]} --python-version {version} --target {folder}/target"
+            what = f"--python-platform {SYSTEMS[system]} --python-version {version} --target {folder}/target -r {lock}"
+            how = f"--dry-run --quiet --only-binary :all: --no-deps --require-hashes --python {sys.executable}"
             done = subprocess.run(
-                [UV, *"pip install --dry-run --quiet --only-binary :all: --no-deps --require-hashes".split()]
-                + ["--python", sys.executable, *asked.split(), "-r", lock],
+                [UV, "pip", "install", *how.split(), *what.split()],
                 capture_output=True,
                 text=True,
                 check=False,

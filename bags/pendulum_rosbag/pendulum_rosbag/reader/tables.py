@@ -197,14 +197,9 @@ def _matlab(column: pd.Series[Any]) -> NDArray[Any]:
             return matrix
     cells = np.empty(len(values), object)
     for index, value in enumerate(values):
-        cells[index] = (
-            np.array(value, float) if _all_numbers(value) else value if isinstance(value, str) else _json(value)
-        )
+        numbers = isinstance(value, list) and all(isinstance(item, (bool, int, float)) for item in value)
+        cells[index] = np.array(value, float) if numbers else value if isinstance(value, str) else _json(value)
     return cells
-
-
-def _all_numbers(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(item, (bool, int, float)) for item in value)
 
 
 def _is_untyped(kind: Any) -> bool:
