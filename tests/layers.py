@@ -54,14 +54,16 @@ def requirements(layer: str) -> tuple[Requirement, ...]:
     return tuple(Requirement(line) for line in lines if line)
 
 
-def environment_of(folder: Path, *layers: str) -> dict[str, str]:
+def environment_of(folder: Path, *layers: str, ros: bool = True) -> dict[str, str]:
     """Return variables under which Python finds, of the libraries of others, only those of the given layers.
 
     Args:
         folder: Empty; what hides the rest goes here.
         layers: Names of layers.
+        ros: Whether the layers' wheels of ROS are found too.
     """
     there = {canonicalize_name(pin.name) for layer in layers for pin in pins(layer)}
+    there = {name for name in there if ros or not name.startswith("ros-")}
     hidden = [
         module
         for module, names in distributions_of_modules().items()
