@@ -97,7 +97,7 @@ def recordings(setting: Setting, seeds: range) -> list[Recording]:
         noises = []
         for own in (seed, OTHER + seed if setting.apart else seed):
             values = pair.noise(own, setting.duration)
-            signal = Signal(HOLD * np.arange(values.size), values)
+            signal = Signal(HOLD * np.arange(values.size, dtype=np.float64), values)
             noises.append(Disturbance.of(signal, HOLD) if setting.known else None)
         found.append(Recording((series[0], series[1]), (noises[0], noises[1])))
     return found
@@ -185,7 +185,7 @@ def certificate_rows(pool: Executor) -> Iterator[Row]:
 def identified(seed: int, preset: str) -> tuple[int, int]:
     """Return how many intervals of a machine held upright miss its values, and their number; (0, 0) if refused."""
     run = run_balanced(preset, seed)
-    time = 0.002 * np.arange(len(run.position))
+    time = 0.002 * np.arange(len(run.position), dtype=np.float64)
     recording = JointRecording("run", time, run.position, run.effort, ("zero", "zero"), velocity=run.velocity)
     result = identify_mechanism(load_mechanism(preset), [recording])
     held = [] if result.refused else [i.low <= run.truth.get(n, 0.0) <= i.high for n, i in result.intervals.items()]

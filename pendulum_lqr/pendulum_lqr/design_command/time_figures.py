@@ -167,4 +167,4 @@ def _simulate(
         if not abs(x[0]) < 1e9:
             angle[k:] = np.inf
             break
-    return dt * np.arange(count), angle, torque
+    return dt * np.arange(count, dtype=np.float64), angle, torque

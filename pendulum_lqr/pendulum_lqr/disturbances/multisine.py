@@ -90,7 +90,7 @@ def multisine_wave(parameters: Mapping[str, Any]) -> tuple[NDArray[np.float64], 
     peak = float(np.abs(_wave(harmonics, phases, size)).max())
     # Between the points of the raster a sum of lines can rise above them by 1/cos(pi k/size) at most.
     peak /= math.cos(math.pi * float(harmonics[-1]) / size) if 4 * harmonics[-1] < size else 0.7
-    omega = 2.0 * math.pi * harmonics / float(parameters["signal_period"])
+    omega = 2.0 * math.pi * harmonics.astype(np.float64) / float(parameters["signal_period"])
     return omega, phases, float(parameters["amplitude"]) / peak
 
 

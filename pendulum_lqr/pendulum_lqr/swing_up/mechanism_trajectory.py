@@ -149,7 +149,9 @@ def trajectory_of(
     """Return a plan whose nodes lie a step apart [s] as a trajectory, with what made it."""
     names = plant.coordinates.names
     q_v, u = np.hsplit(plan.states, [2 * len(names)])
-    return MechanismTrajectory(plant.name, names, np.arange(len(plan.states)) * step, q_v.copy(), u.copy(), how or {})
+    return MechanismTrajectory(
+        plant.name, names, np.arange(len(plan.states), dtype=np.float64) * step, q_v.copy(), u.copy(), how or {}
+    )
 
 
 def cheapest_swing_up(
@@ -248,4 +250,4 @@ def load_trajectory(path: Path) -> MechanismTrajectory:
         )
     if not (np.isfinite(states).all() and np.isfinite(efforts).all() and math.isfinite(step) and step > 0.0):
         raise ParameterError(f"{path} has numbers that are not finite, or the step {step} s; expected one > 0")
-    return MechanismTrajectory(plant, joints, np.arange(len(states)) * step, states, efforts, how)
+    return MechanismTrajectory(plant, joints, np.arange(len(states), dtype=np.float64) * step, states, efforts, how)

@@ -113,7 +113,7 @@ class MechanismTvlqr(Controller):
         super().__init__(plant.effort_limits)
         self.plant, self.period, self.catch, self.recover = plant, period, catch, recover
         count = round(trajectory.duration / period)
-        times = period * np.arange(count + 1)
+        times = period * np.arange(count + 1, dtype=np.float64)
         self.states, _ = trajectory.at(times)
         # A held sample does best with the effort of the middle of its interval.
         _, self.planned = trajectory.at(times[:-1] + 0.5 * period)

@@ -374,8 +374,8 @@ class GymnasiumPlant:
         fits = []
         for _ in range(_DRAWN):
             few = generator.choice(_PROBES, _FEW, replace=False)
-            found, *_ = np.linalg.lstsq(rows[few], after[few], rcond=None)
-            left = np.abs(after - rows @ found)
+            fitted, *_ = np.linalg.lstsq(rows[few], after[few], rcond=None)
+            left = np.abs(after - rows @ fitted)
             fits.append((_third(left), left))
         best, left = min(fits, key=lambda fit: fit[0])
         least = _AS_GOOD * float(np.median(np.abs(after - rows[:, 0])))

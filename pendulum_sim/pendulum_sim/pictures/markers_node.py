@@ -7,11 +7,12 @@ messages whose ``frame_id`` is no frame (here it is the commander).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point
+from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA
@@ -151,7 +152,7 @@ class MarkersNode(Node):
         space = topic if len(plant.joints) == 1 else f"{topic}/{joint.name}"
         return self._marker(topic, space, frame, points, newest_ns)
 
-    def _marker(self, topic: str, space: str, frame: str, points: Sequence[Sequence[float]], newest_ns: int) -> Marker:
+    def _marker(self, topic: str, space: str, frame: str, points: Sequence[Iterable[float]], newest_ns: int) -> Marker:
         number, _, (red, green, blue) = _ARCS[topic]
         marker = Marker(ns=space, id=number, type=Marker.LINE_STRIP)
         marker.header.frame_id = frame
@@ -166,7 +167,7 @@ class MarkersNode(Node):
 
 def joint_marker(
     plant: PlantParameters, index: int, effort: float, radius: float, factor: float, base: str
-) -> tuple[str, list[Sequence[float]]]:
+) -> tuple[str, list[NDArray[np.float64]]]:
     """Return in which frame of the plant's URDF an effort is drawn, and its polyline.
 
     A torque is an arc about the joint's axis, in the frame of the link before; a force is an arrow that goes along.

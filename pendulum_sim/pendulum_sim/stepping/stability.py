@@ -149,4 +149,4 @@ def _is_stable(integrator: Integrator, parameters: PlantParameters, h: float) ->
     rate = parameters.damping / parameters.inertia
     coefficients = [np.float64(value) for value in integrator.coefficients(rate, h)]
     stiffness = parameters.gravity / parameters.inertia
-    return bool(growth_rate(integrator, rate, stiffness, h, coefficients) <= MOST_GROWTH)  # type: ignore[arg-type]
+    return bool(growth_rate(integrator, rate, stiffness, h, coefficients) <= MOST_GROWTH)

@@ -57,7 +57,7 @@ class Truth:
     def recording(self, seed: int, *, seconds: float = 6.0, period: float = 0.005) -> Recording:
         """Return one recording of it."""
         rng = np.random.default_rng(seed)
-        time = period * np.arange(round(seconds / period))
+        time = period * np.arange(round(seconds / period), dtype=np.float64)
         effort = multisine(time, self.amplitude, rng)
         hidden = _memory(rng, time.size, self.torque, 0.05 / period)
         found = synthetic_recording(
@@ -99,7 +99,7 @@ OUTSIDE: Mapping[str, Callable[[float, float, float], float]] = {
 def outside(name: str, seed: int, *, seconds: float = 6.0, period: float = 0.005) -> Recording:
     """Return a recording of the plant with one of the torques of ``OUTSIDE``, which no candidate has."""
     rng = np.random.default_rng(seed)
-    time = period * np.arange(round(seconds / period))
+    time = period * np.arange(round(seconds / period), dtype=np.float64)
     effort = multisine(time, 1.2, rng)
     extra = OUTSIDE[name]
     theta, omega, angles = 0.0, 0.0, []

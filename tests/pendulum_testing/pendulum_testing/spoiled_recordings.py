@@ -65,7 +65,7 @@ def pendulum(seed: int) -> dict[str, float]:
 def good(seed: int, seconds: float = 6.0) -> Array:
     """Return the table of a pendulum that swings through large angles."""
     rng, arm = np.random.default_rng(seed), pendulum(seed)
-    time = PERIOD * np.arange(round(seconds / PERIOD))
+    time = PERIOD * np.arange(round(seconds / PERIOD), dtype=np.float64)
     drive = tones(rng, rng.uniform(0.8, 1.3) * arm["gravity"])
     dry = rng.uniform(0.0, 0.06) * arm["gravity"]
     angle = coulomb_pendulum(drive, time, coulomb=dry, start=(rng.uniform(0.5, 1.5), 0.0), **arm)
@@ -77,7 +77,7 @@ def good(seed: int, seconds: float = 6.0) -> Array:
 def whirling(seed: int) -> Array:
     """Return the table of a pendulum that is driven over the top again and again."""
     rng, arm = np.random.default_rng(seed), pendulum(seed)
-    time = PERIOD * np.arange(800)
+    time = PERIOD * np.arange(800, dtype=np.float64)
     drive = tones(rng, 2.7 * arm["gravity"], lowest=0.5)
     angle = coulomb_pendulum(drive, time, coulomb=0.03 * arm["gravity"], start=(2.5, 0.0), **arm)
     return np.column_stack(

@@ -105,7 +105,7 @@ def synthetic_recording(
     if resolution > 0.0:
         position = resolution * np.round(position / resolution)
     return Recording(
-        period * np.arange(len(clean)),
+        period * np.arange(len(clean), dtype=np.float64),
         position,
         None,
         effort,

@@ -54,7 +54,7 @@ def _record(
     push: Callable[[float], float] | None = None,
 ) -> Recording:
     period, noise = float(rng.choice([0.005, 0.01])), float(np.exp(rng.uniform(np.log(2e-4), np.log(1.5e-3))))
-    time = period * np.arange(round(seconds / period))
+    time = period * np.arange(round(seconds / period), dtype=np.float64)
     angle, torque = sampled_pendulum(
         command,
         time,

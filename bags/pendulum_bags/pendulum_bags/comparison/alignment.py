@@ -77,7 +77,7 @@ def _peak(first: Array, second: Array, period: float, of: str) -> Alignment:
         bend = left - 2.0 * middle + right
         # The top of the parabola through the three highest points: a fraction of a sample.
         offset = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-    lags = period * np.arange(-reach, reach + 1)
+    lags = period * np.arange(-reach, reach + 1, dtype=np.float64)
     return Alignment(period * (top - reach + offset), float(curve[top]), float(curve[reach]), lags, curve, of)
 
 

@@ -133,7 +133,9 @@ def design_excitation(
         raise DataError(f"duration is {duration} s at a period of {period} s; expected at least 50 periods")
     if not noise > 0.0:
         raise DataError(f"noise is {noise} rad; expected > 0")
-    problem = _Problem(plant, np.arange(round(duration / period)) * period, limits, tuple(parameters), noise)
+    problem = _Problem(
+        plant, np.arange(round(duration / period), dtype=np.float64) * period, limits, tuple(parameters), noise
+    )
     rng = np.random.default_rng(seed)
     best: tuple[Excitation, Array] | None = None
     for trial in range(max(trials, len(kinds))):

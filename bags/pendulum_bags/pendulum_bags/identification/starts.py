@@ -50,7 +50,7 @@ def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
         # An offset, or a dry friction in one direction, would explain such an input without inertia and weight.
         inertia, damping, gravity = np.linalg.lstsq(columns[:, (0, 1, 3)], drive, rcond=None)[0]
         return np.array([inertia, damping, 0.0, gravity, 0.0])
-    return np.linalg.lstsq(columns, drive, rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(columns, drive, rcond=None)[0], np.float64)
 
 
 def equation_residual(recording: Recording, *, window: float = 0.2) -> tuple[float, float]:

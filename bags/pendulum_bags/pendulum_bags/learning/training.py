@@ -236,7 +236,7 @@ def _keep(
     curves: list[list[float]],
     fastest: NDArray[np.float64],
 ) -> None:
-    arrays: dict[str, NDArray[Any]] = {f"learner/{name}": each for name, each in learner.state().items()}
+    arrays: dict[str, Any] = {f"learner/{name}": each for name, each in learner.state().items()}
     arrays |= {f"environment/{name}": each for name, each in learner.environment.state().items()}
     words = {"settings": _settings_text(settings), "generator": json.dumps(generator.bit_generator.state)}
     arrays |= {name: np.frombuffer(text.encode(), dtype=np.uint8) for name, text in words.items()}

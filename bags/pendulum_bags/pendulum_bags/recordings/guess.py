@@ -384,7 +384,8 @@ class _Guesser:
         clock = self.columns.columns[column].clock
         guess = next(guess for guess in self.guesses if guess.quantity == "time")
         if self.period or (self.columns.period and guess.column not in self.columns.columns and not clock):
-            return np.arange(self.columns.columns[column].size) * float(self.period or self.columns.period or 0.0)
+            period = float(self.period or self.columns.period or 0.0)
+            return period * np.arange(self.columns.columns[column].size, dtype=np.float64)
         name = clock or guess.column
         size = UNITS["time"].get(self.columns.columns[name].unit or guess.unit, 1.0)
         stamps = self.columns.values(name) * size

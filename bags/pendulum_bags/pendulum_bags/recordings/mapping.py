@@ -408,7 +408,7 @@ class _Reader:
             period = _number("period", section, "time", self.origin) * factor(section.get("unit"), "time", where)
             if not (math.isfinite(period) and period > 0.0):
                 raise DataError(f"{self.origin}: period of time is {section['period']!r}; expected > 0")
-            return "", np.arange(column.size) * period
+            return "", np.arange(column.size, dtype=np.float64) * period
         if section.get("own") is True:
             if not column.clock:
                 raise DataError(f"{self.source}: column {column.name!r} has no stamps of its own; name a time column")

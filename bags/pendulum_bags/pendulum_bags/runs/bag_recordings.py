@@ -95,7 +95,7 @@ def cut_at_steps(bag: Bag, stamps: NDArray[np.int64], origin: int) -> NDArray[np
 
     Those behind each step of a clock are moved so far away that no window reaches across.
     """
-    times = (stamps - origin) * _NS
+    times = (stamps - origin).astype(np.float64) * _NS
     gap = gap_length(times)
     for cut in bag.cuts_ns:
         times = np.where(stamps >= cut, times + gap, times)
