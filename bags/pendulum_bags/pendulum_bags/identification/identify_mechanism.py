@@ -364,5 +364,5 @@ def _uncertainty(found: MechanismFit, held: Sequence[str] = ()) -> Uncertainty:
         float(np.max(largest / np.maximum(white, 1e-300))),
         "windows and recordings as clusters",
         {},
-        (*said, *held_sentences(found, intervals, held)),
+        (*said, *held_sentences(found, held)),
     )

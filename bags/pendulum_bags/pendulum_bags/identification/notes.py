@@ -150,12 +150,11 @@ def edge_sentences(intervals: Mapping[str, Interval], fit: OutputErrorFit, unres
     return said
 
 
-def held_sentences(found: MechanismFit, intervals: Mapping[str, Interval], undetermined: Sequence[str]) -> list[str]:
+def held_sentences(found: MechanismFit, undetermined: Sequence[str]) -> list[str]:
     """Return what was held in the fit of a mechanism, and what its plant file leaves out, in words.
 
     Args:
         found: The fit.
-        intervals: By parameter.
         undetermined: Sizes that were held since the recordings do not determine them.
     """
     said, model = [], found.model
@@ -163,11 +162,6 @@ def held_sentences(found: MechanismFit, intervals: Mapping[str, Interval], undet
         said.append(
             f"The recordings do not determine {', '.join(undetermined)}: held at the starting plant's value, without "
             "interval."
-        )
-    if any(n.endswith("coulomb_friction") and intervals[n].low > 0.0 for n in found.free):
-        said.append(
-            "The plant has dry friction: in trials with such plants, held upright, 72 to 92 % of the values lay in "
-            "their 95 % intervals, fewest of lengths, inertias, delay and lag."
         )
     held = [spec.name for spec in model.plant.mechanism.parameters if spec.name not in found.free]
     said.append(
