@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -86,7 +87,11 @@ def main() -> int:
         places = [PROJECT / folder for folder in FOLDERS.values()]
         build = f"-m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir {dist}".split()
         for place in places:
-            subprocess.run([sys.executable, *build, place], check=True)
+            # A copy: pip builds in place, and leaves there what the next build would take for its own.
+            source = shutil.copytree(
+                place, Path(scratch, place.name), ignore=shutil.ignore_patterns("build", "*.egg-info")
+            )
+            subprocess.run([sys.executable, *build, source], check=True)
         if impure := [path.name for path in dist.iterdir() if not path.name.endswith("-py3-none-any.whl")]:
             print("not pure:", *impure)
             return 1
