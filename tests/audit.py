@@ -45,9 +45,12 @@ class Finding:
     fixed_in: str = ""
 
 
-def pinned(text: str) -> dict[str, str]:
-    """Return the pins of a lock: normalised name -> version."""
-    return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in _PIN.findall(text)}
+def pinned(*locks: str) -> dict[str, set[str]]:
+    """Return the pins of locks: normalised name -> versions, which differ between interpreters."""
+    pins: dict[str, set[str]] = {}
+    for name, version in _PIN.findall("\n".join(locks)):
+        pins.setdefault(re.sub(r"[-_.]+", "-", name).lower(), set()).add(version)
+    return pins
 
 
 def from_pip_audit(report: Mapping[str, Any]) -> tuple[set[str], list[Finding]]:
@@ -65,12 +68,12 @@ def from_pip_audit(report: Mapping[str, Any]) -> tuple[set[str], list[Finding]]:
     return looked_up, sorted(findings)
 
 
-def from_advisories(path: Path, pins: Mapping[str, str]) -> list[Finding]:
+def from_advisories(path: Path, pins: Mapping[str, set[str]]) -> list[Finding]:
     """Look pins up in an export of the open database of vulnerabilities.
 
     Args:
         path: ZIP file of advisories in the OSV format.
-        pins: Normalised name -> version.
+        pins: Normalised name -> versions.
 
     Raises:
         DataError: It is no such file, or holds no advisory.
@@ -90,18 +93,18 @@ def from_advisories(path: Path, pins: Mapping[str, str]) -> list[Finding]:
     return sorted(findings)
 
 
-def _matches(advisory: Mapping[str, Any], pins: Mapping[str, str]) -> Iterator[Finding]:
+def _matches(advisory: Mapping[str, Any], pins: Mapping[str, set[str]]) -> Iterator[Finding]:
     if advisory.get("withdrawn"):
         return
     for affected in advisory.get("affected", []):
         name = re.sub(r"[-_.]+", "-", affected["package"]["name"]).lower()
-        version = pins.get(name)
-        if version is None or affected["package"]["ecosystem"] != "PyPI":
+        if affected["package"]["ecosystem"] != "PyPI":
             continue
         ranges = [span["events"] for span in affected.get("ranges", []) if span["type"] == "ECOSYSTEM"]
-        if version in affected.get("versions", []) or any(_within(Version(version), events) for events in ranges):
-            fixed = [event["fixed"] for events in ranges for event in events if "fixed" in event]
-            yield Finding(name, version, advisory["id"], ", ".join(fixed))
+        fixed = ", ".join(event["fixed"] for events in ranges for event in events if "fixed" in event)
+        for version in pins.get(name, ()):
+            if version in affected.get("versions", []) or any(_within(Version(version), events) for events in ranges):
+                yield Finding(name, version, advisory["id"], fixed)
 
 
 def _within(version: Version, events: Sequence[Mapping[str, str]]) -> bool:
@@ -157,15 +160,15 @@ def audit(
 ) -> int:
     """Look the pinned versions up; code 1 for known vulnerabilities, 2 where they could not be looked up."""
     locks = locks or sorted((PROJECT / "requirements").glob("*.txt"))
-    pins: dict[str, str] = {}
+    texts = []
     for lock in locks:
         try:
-            found = pinned(lock.read_text(encoding="utf-8"))
+            texts.append(lock.read_text(encoding="utf-8"))
         except OSError as error:
             raise DataError(f"lock {lock} cannot be read: {error.strerror}") from error
-        if not found:
-            raise DataError(f"lock {lock} pins nothing; expected lines such as numpy==1.26.4")
-        pins.update(found)
+        if not pinned(texts[-1]):
+            raise DataError(f"lock {lock} pins nothing; expected lines such as numpy==2.4.6")
+    pins = pinned(*texts)
     if advisories is not None:
         looked_up, findings = set(pins), from_advisories(advisories, pins)
     else:
