@@ -5,13 +5,17 @@ from __future__ import annotations
 import io
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 
+from pendulum_bags.experiments import processes as processes_module
 from pendulum_bags.experiments import progress
+from pendulum_bags.experiments.bound_process import start_bound_process
 from pendulum_bags.experiments.processes import ProcessSet
 from pendulum_msgs_py.errors import FaultError
 from pendulum_testing.fixtures import wait_for
@@ -100,3 +104,18 @@ def test_a_long_phase_is_reported_repeatedly_where_the_output_is_no_terminal(mon
     with progress.PhaseProgress(10.0, Console(file=output)) as shown:
         shown.phase("noise", 5.0)
         wait_for(lambda: output.getvalue().count("  noise: ") >= 2, 20.0, "two lines of one phase")
+
+
+def test_a_program_is_waited_for_though_its_start_is_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+        os.kill(os.getpid(), signal.SIGINT)
+        return start_bound_process(*arguments, **options)
+
+    monkeypatch.setattr(processes_module, "start_bound_process", interrupted)
+    with ProcessSet(tmp_path, {}) as processes:
+        with pytest.raises(KeyboardInterrupt):
+            processes.start("sleeper", ["sleep", "60"])
+        (child,) = processes.children
+    assert child.process.poll() is not None

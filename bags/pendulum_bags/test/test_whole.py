@@ -23,6 +23,7 @@ from pendulum_bags.verdict import Answer, Layer, LayerResult, Mark
 from pendulum_bags.whole import carry_out, words
 from pendulum_bags.whole.carry_out import Findings, Simulated
 from pendulum_bags.whole.contenders import contender_specs, place_of, simulate_contenders
+from pendulum_bags.whole.page import leave_files_out
 from pendulum_msgs_py.errors import BagError, DataError, FaultError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_msgs_py.programs.terminal import make_console
@@ -209,3 +210,16 @@ def test_one_sentence_names_both_plants_and_the_choice(
     assert answer.mark is marks[0]
     assert [one.mark for one in own] == list(marks)
     assert ("design on it" in answer.next_steps[0]) is (marks[1] is Mark.YES)
+
+
+def test_files_that_the_budget_has_no_time_for_are_named(tmp_path: Path) -> None:
+    settings = RegulationSettings()
+    early, late = (
+        Findings(Simulated("thesis", settings, tmp_path, 0.0), deadline=Deadline(budget)) for budget in (1.0, 3600.0)
+    )
+    for found in (early, late):
+        leave_files_out(found)
+    assert early.spent
+    assert any("report.html alone" in note for note in early.notes)
+    assert not late.spent
+    assert late.notes == []

@@ -6,12 +6,14 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
 from pendulum_msgs_py.programs.starter import end_with_starter, stops
 
-__all__ = ["keep_interrupts"]
+__all__ = ["defer_interrupts", "keep_interrupts"]
 
 _MOMENT = 0.01
 """Time after which it is raised again [s]: by then the destructor has most probably returned; if not, once more."""
@@ -50,6 +52,29 @@ def keep_interrupts() -> None:
 
     hook.keeps_interrupts = True  # type: ignore[attr-defined]
     sys.unraisablehook = hook
+
+
+@contextmanager
+def defer_interrupts() -> Iterator[None]:
+    """Handle requests to end after the block: what it starts is on record before anything is raised.
+
+    Masks of signals do not do this, since another thread takes the signal then.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    handled = {number: handler for number, handler in handlers.items() if callable(handler)}
+    came: list[tuple[int, FrameType | None]] = []
+    for number in handled:
+        signal.signal(number, lambda number, frame: came.append((number, frame)))
+    try:
+        yield
+    finally:
+        for number, handler in handled.items():
+            signal.signal(number, handler)
+    for arrived, frame in came:
+        handled[signal.Signals(arrived)](arrived, frame)
 
 
 _interrupted: set[int] = set()

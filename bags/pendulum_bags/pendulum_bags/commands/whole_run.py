@@ -96,7 +96,7 @@ def run_whole(
         typer.Exit: The user interrupted it.
     """
     from pendulum_bags.whole.carry_out import carry_out
-    from pendulum_bags.whole.page import write_whole_report
+    from pendulum_bags.whole.page import leave_files_out, write_whole_report
     from pendulum_bags.whole.words import whole_answer
 
     console = make_console(stderr=json_output, highlight=False)
@@ -105,6 +105,7 @@ def run_whole(
         started = time.monotonic()
         with PhaseProgress(order.expected_wall_time, console) as progress:
             found = carry_out(folder, order, progress, leaving, partial(_print_first, console, json_output=json_output))
+            leave_files_out(found)
             answer, answers = whole_answer(found)
             summary = _summary(experiment, found, answer, answers)
             write_json(folder / "summary.json", summary)

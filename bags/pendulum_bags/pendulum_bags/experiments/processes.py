@@ -19,6 +19,7 @@ from pendulum_bags.experiments.host_pool import HostedProgram, HostPool
 from pendulum_msgs_py.contract.plant_specs import REALTIME_PRIORITY
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs.graph import NodeProgram
+from pendulum_msgs_py.programs.interrupts import defer_interrupts
 
 __all__ = ["Child", "ProcessSet", "ros_environment", "start_recorder"]
 
@@ -137,13 +138,14 @@ class ProcessSet:
         log = self.log_folder / f"{name}.log"
         everything = {**os.environ, **self.environment, **(environment or {})}
         process: subprocess.Popen[bytes] | HostedProgram | None = None
-        with log.open("wb") as sink:
+        # Interrupted before it is on record, a program would not be waited for.
+        with log.open("wb") as sink, defer_interrupts():
             if self.hosts is not None and not alone:
                 process = self.hosts.start(command, environment=everything, log=log, niceness=niceness)
             if process is None:
                 process = start_bound_process(command, environment=everything, output=sink, niceness=niceness)
-        child = Child(name, process, log, ends_last, ends_by_itself)
-        self.children.append(child)
+            child = Child(name, process, log, ends_last, ends_by_itself)
+            self.children.append(child)
         return child
 
     def check(self) -> None:

@@ -25,7 +25,7 @@ from pendulum_bags.report.write import write_joint_report, write_report
 from pendulum_bags.verdict import Answer, Layer, Mark
 from pendulum_bags.whole.carry_out import Findings, Simulated
 
-__all__ = ["write_whole_report"]
+__all__ = ["leave_files_out", "write_whole_report"]
 
 _FILES = 20.0
 """Processor time to write the page and the files of its figures [s]."""
@@ -53,8 +53,7 @@ def write_whole_report(
         return replace(page, figures=figures, tables=tables, others=others, notes=[*page.notes, *found.notes])
 
     # Files for paper take three times as long as the page: what ends early has its plots alone.
-    ends_early = found.interrupted or found.spent or found.deadline.total_left < _FILES * slowness()
-    formats = () if ends_early else ("png", "pdf")
+    formats = () if found.interrupted or found.spent else ("png", "pdf")
     if "" not in given.comparisons:
         return write_joint_report(
             folder, given.comparisons, folders=[folder], formats=formats, answer=answer, extend=extend
@@ -68,6 +67,13 @@ def write_whole_report(
         extend=extend,
         formats=formats,
     )
+
+
+def leave_files_out(found: Findings) -> None:
+    """Mark a budget as spent, with a note, where it has no time left for the files of the figures."""
+    if not (found.interrupted or found.spent) and found.deadline.total_left < _FILES * slowness():
+        found.spent = True
+        found.notes.append("The budget has no time left for files of the figures: report.html alone shows them.")
 
 
 def _add(figures: list[Figure], tables: list[Table], plant: Simulated, answer: Answer, *, given: bool) -> None:
