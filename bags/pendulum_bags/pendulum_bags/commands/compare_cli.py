@@ -195,7 +195,7 @@ def _judge(
         joints = {joint: result.to_json() for joint, result in results.items()}
         return answer, {"joints": joints, "answer": answer.to_json()}, ()
     certified = carry_over(results[""], kept, machine, designs)
-    answer = answer_of(results[""], kept, anew=layers_of(certified))
+    answer = answer_of(results[""], kept, updated=layers_of(certified))
     content = {**results[""].to_json(), "answer": answer.to_json()}
     if certified is None:
         return answer, content, ()

@@ -110,7 +110,7 @@ def report(
                 margins = Margins.parse(margin_of(summary))
             result = run(margin=margins, open_bag=bags)
             certified = carry_over(result, kept, machine, design or ())
-            answer = answer_of(result, kept, anew=layers_of(certified))
+            answer = answer_of(result, kept, updated=layers_of(certified))
             page = write_report(
                 target,
                 {key: value for key, value in (summary or {}).items() if key != "verdict"},

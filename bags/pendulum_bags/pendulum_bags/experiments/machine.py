@@ -65,7 +65,7 @@ class Machine:
     ) -> None:
         self.interrupt()
         if kind is KeyboardInterrupt and self._child is not None:
-            # Nothing real moves, and whoever interrupts twice wants no more waiting: its own end with it.
+            # Nothing real moves: a second interrupt ends it without further waiting.
             with suppress(ProcessLookupError):
                 os.killpg(self._child.process.pid, signal.SIGKILL)
         if self._child is not None:

@@ -84,7 +84,7 @@ def identify_mechanism(
         window: Length of the windows [s]; by default a sixth of the data, between 0.5 and 5 s, or what
             neighbouring motions stay together for.
         extras: One of ``EXTRAS``; None lets held-out windows choose.
-        stride: Take every so manieth position.
+        stride: Take every n-th position, n being this.
 
     Raises:
         DataError: A recording is too short, of other joints, or one joint of it does not move.

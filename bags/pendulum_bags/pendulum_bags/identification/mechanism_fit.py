@@ -136,7 +136,7 @@ def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1
     Args:
         recording: The data.
         window: Length [s].
-        stride: Take every so manieth sample; the effort between them is not lost, its mean drives the step.
+        stride: Take every n-th sample, n being this; the effort between them is not lost, its mean drives the step.
     """
     # What was commanded before the recording acts on in its first moments.
     begin = int(np.searchsorted(recording.time, recording.time[0] + _BEFORE))

@@ -99,7 +99,7 @@ class Rules:
         joints: Sections of each joint, by its name; one without a name for a plant of one.
         origin: Where the mapping is from, for messages.
         further: ``delimiter``, ``skip``, ``rows``, ``drop_nan`` and ``meta``.
-        guessed: Whether nobody wrote it.
+        guessed: Whether it was guessed, not read from a file.
     """
 
     time: Mapping[str, Any]
@@ -131,7 +131,7 @@ class Drive:
         quantity: ``effort``, ``force``, ``voltage``, ``command``, ``angle`` or ``place``.
         hold: ``zero`` or ``linear``.
         own_clock: Whether it has stamps of its own.
-        hold_assumed: Whether nobody said so of this file.
+        hold_assumed: Whether that is assumed, not stated for this file.
     """
 
     time: Array

@@ -150,7 +150,7 @@ class Reading:
 
     @property
     def is_guessed(self) -> bool:
-        """Whether nobody stated what its columns are; a HEBI log has its own."""
+        """Whether its columns were guessed, not stated; a HEBI log has its own."""
         return self.mapping in (None, GUESS) and self.path.suffix.lower() != ".hebilog"
 
     @property

@@ -79,7 +79,7 @@ def write_report(
     names = [Path(folder).name for folder in folders] or [out.resolve().name]
     kept = [Path(folder) for folder in folders] if len(folders) == 1 else [] if folders else [out]
     certified = certified or carry_over(comparison, kept)
-    answer = answer or answer_of(comparison, kept, anew=layers_of(certified))
+    answer = answer or answer_of(comparison, kept, updated=layers_of(certified))
     known = [read_trials(path) for path in trials]
     data = ReportData(comparison, content, replays, names, known, answer, certified, open_bag)
     figures, missing = make_figures(data)

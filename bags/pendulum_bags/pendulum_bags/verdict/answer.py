@@ -21,7 +21,7 @@ def answer_of(
     folders: Sequence[Path] = (),
     *,
     more: str = "",
-    anew: Sequence[LayerResult] = (),
+    updated: Sequence[LayerResult] = (),
     how: Mapping[Layer, str] = MappingProxyType({}),
 ) -> Answer:
     """Return the answer of a comparison, or of those of the joints of a plant.
@@ -30,7 +30,7 @@ def answer_of(
         compared: The first layer, or that of each joint by its name, at least one.
         folders: Folders that may have further layers: of the run, or of experiments that measured them.
         more: How to record more, where that is what is missing.
-        anew: Layers that were judged again, and replace those of the folders.
+        updated: Layers that were judged again, and replace those of the folders.
         how: The command that measures a layer, where it is another than that of the recordings' plants.
 
     Raises:
@@ -40,14 +40,14 @@ def answer_of(
     comparison = next(iter(results.values()))
     layers = {joint: same_run_layer(one, more=more) for joint, one in results.items()}
     first = layers[""] if "" in layers else join_joints(layers)
-    known = {Layer.SAME_RUN, *(one.layer for one in anew)}
+    known = {Layer.SAME_RUN, *(one.layer for one in updated)}
     others = [one for folder in folders for one in read_layers(folder, first.case) if one.layer not in known]
     commands = {**how_to_measure(comparison), **how}
     if comparison.of_files:
-        found = {one.layer for one in (*anew, *others)}
+        found = {one.layer for one in (*updated, *others)}
         others += [one for one in layers_of_files(comparison) if one.layer not in found]
     emulated = all(one.is_emulated for one in results.values())
-    return sum_up([first, *anew, *others], emulated=emulated, how=commands)
+    return sum_up([first, *updated, *others], emulated=emulated, how=commands)
 
 
 def join_joints(results: Mapping[str, LayerResult]) -> LayerResult:

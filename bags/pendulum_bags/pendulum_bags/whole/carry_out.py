@@ -170,7 +170,7 @@ class Simulated:
         """Return the sum of what was measured; there is a comparison."""
         more = self.more() if self.budget else ""
         how = dict.fromkeys(Layer, more) if more else {}
-        return answer_of(self.comparisons, anew=[*self.layers, *_undefined(self.settings)], more=more, how=how)
+        return answer_of(self.comparisons, updated=[*self.layers, *_undefined(self.settings)], more=more, how=how)
 
     def add(self, *layers: LayerResult) -> None:
         """Add layers of this plant and store them.
@@ -416,7 +416,6 @@ class _Run:
         else:
             limit = load_plant(given.settings.design_plant).effort_limit
             words += ["--no-page", "--effort-limit", str(limit)]
-        self.programs.__enter__()
         self.identification = self.programs.start(
             "identify", [sys.executable, "-m", "pendulum_bags", *words], ends_by_itself=True
         )
@@ -427,7 +426,7 @@ class _Run:
         deadline, file, place = self.found.deadline, self.folder / PLANT_FILE, self.folder / IDENTIFIED
         self._phase("identifying the plant", 12.0)
         # While it waits: what writes the page takes a second or two to load.
-        import_module("pendulum_bags.whole.page")
+        import_module("pendulum_bags.report.write")
         import_module("matplotlib.backends.backend_pdf")
         while (code := self.identification.process.poll()) is None:
             deadline.require()
