@@ -27,7 +27,7 @@ from pendulum_rosbag.storage.qos import profiles_of
 __all__ = ["Choice", "RewriteReport", "rewrite"]
 
 _WINDOW_BYTES = 64 << 20
-"""Bytes of storage files that are sorted at once; what they hold may be five times as much."""
+"""Bytes of storage files that are sorted at once (decompressed perhaps five times as much)."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Choice:
     """Which messages to copy.
 
     Args:
-        topics: Full names; with ``regex`` empty, too, all topics.
+        topics: Full names; if this and ``regex`` are empty, all topics.
         regex: Pattern that a topic may match instead of being listed.
         exclude: Pattern of topics to leave out.
         start_ns: First log time [ns]; ``None`` for the beginning.
-        stop_ns: Log time before which the last message lies [ns]; ``None`` for the end.
+        stop_ns: End of the log times, exclusive [ns]; ``None`` for the end.
 
     Raises:
-        ParameterError: A pattern is none, or the span is empty.
+        ParameterError: A pattern is invalid, or the span is empty.
     """
 
     topics: tuple[str, ...] = ()
@@ -62,11 +62,11 @@ class Choice:
             raise ParameterError(f"the span from start to stop is {length:g} s long; expected more than 0 s")
 
     def holds(self, time_ns: int) -> bool:
-        """Tell whether a log time is in the span [ns]."""
+        """Return whether a log time [ns] is in the span."""
         return (self.start_ns is None or time_ns >= self.start_ns) and (self.stop_ns is None or time_ns < self.stop_ns)
 
     def wants(self, topic: str) -> bool:
-        """Tell whether a topic is to be copied."""
+        """Return whether a topic is to be copied."""
         full = ros_topic(topic)
         if self.exclude and (re.search(self.exclude, topic) or re.search(self.exclude, full)):
             return False
@@ -78,14 +78,7 @@ class Choice:
 
 @dataclass(slots=True)
 class RewriteReport:
-    """What was copied.
-
-    Args:
-        path: The new bag.
-        messages: Topic -> number of messages.
-        damage: What was wrong with the bags that were read, one sentence each.
-        left_out: What was asked for and has no place in the new bag, one sentence each.
-    """
+    """What was copied to ``path``: messages per topic, damage found, and what was left out, in sentences."""
 
     path: Path
     messages: dict[str, int] = field(default_factory=dict)
@@ -100,8 +93,6 @@ class RewriteReport:
 
 @dataclass(frozen=True)
 class _Input:
-    """A bag that is open for reading."""
-
     path: Path
     folder: BagFolder
     sources: Sequence[Source]
@@ -118,23 +109,22 @@ def rewrite(
     max_duration: float = 0.0,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> RewriteReport:
-    """Write messages of bags to a new one, ordered by log time; topics, QoS, types, metadata and attachments with them.
+    """Copy messages with topics, QoS, types, metadata and attachments to a new bag, ordered by log time.
 
     Args:
         paths: Bags: rosbag2 folders, ``.mcap`` and ``.db3`` files, ROS 1 ``.bag`` files.
         output: Folder of the new bag; it must not exist.
         choice: Which messages; by default all.
         storage: ``mcap`` or ``sqlite3``; empty for that of the first bag.
-        compression: ``None``, ``zstd``, or empty for what the bags have.
-        max_size: Begin a new storage file before this one is larger [bytes]; 0 for never.
-        max_duration: Begin a new storage file before this one is longer [s]; 0 for never.
-        on_progress: Called with the share that is done, 0 to 1.
+        compression: ``None``, ``zstd``, or empty for that of the bags.
+        max_size: Largest storage file [bytes]; 0 for no limit.
+        max_duration: Longest time span of a storage file [s]; 0 for no limit.
+        on_progress: Called with the finished share, 0 to 1.
 
     Raises:
-        BagError: A bag cannot be read, two have a topic of one name with different types, or the new one cannot be
-            written.
-        DataError: A topic that was named is in none of them, or no message is left.
-        ParameterError: Unknown storage or compression, or one bag is named twice.
+        BagError: A bag cannot be read or written, or a topic has different types in two bags.
+        DataError: A named topic is in none of them, or no message is left.
+        ParameterError: Unknown storage or compression, or a bag is named twice.
     """
     choice = choice or Choice()
     places = [Path(path).resolve() for path in paths]
@@ -172,12 +162,12 @@ def _open(path: Path, stack: ExitStack) -> _Input:
     sources = open_sources(folder, verify=True)
     for source in sources:
         stack.callback(source.close)
-    # (`.` and `..` name no bag)
+    # `.` and `..` are no names for a bag.
     return _Input(path.resolve() if path.name in {"", ".."} else path, folder, sources)
 
 
 def _from_ros1(path: Path, scratch: Path) -> Path:
-    """Return a rosbag2 folder with what a ROS 1 bag holds, its messages serialised anew as ROS 2 does."""
+    """Convert a ROS 1 bag to a rosbag2 folder."""
     from rosbags.convert import ConverterError, convert
 
     target = scratch / path.stem
@@ -192,7 +182,7 @@ def _from_ros1(path: Path, scratch: Path) -> Path:
 
 
 def _no_index(path: Path) -> bool:
-    """Tell whether a ROS 1 bag has no index: the head of its first record says where, 0 until it is closed."""
+    """Return whether a ROS 1 bag has no index: its first record gives the place, 0 until the bag is closed."""
     head = path.read_bytes()[:4096]
     at = head.find(b"index_pos=")
     return (
@@ -212,7 +202,7 @@ def _require_topics(inputs: Sequence[_Input], choice: Choice) -> None:
 
 
 def _metadata(inputs: Sequence[_Input], choice: Choice) -> dict[str, Any]:
-    """Return the run metadata: what all bags agree on, and of several the whole of each by the name of its bag."""
+    """Return the run metadata: entries on which all bags agree, and for several bags each one's whole by its name."""
     span = {name: value for name, value in (("start_ns", choice.start_ns), ("stop_ns", choice.stop_ns)) if value}
     origin = {"pendulum.origin": [{"bag": str(one.path), **span} for one in inputs]}
     first, *others = (one.folder.custom_data for one in inputs)
@@ -257,7 +247,7 @@ def _copy(
             for batch in source.batches(set(topics), start, stop):
                 topic = topics[batch.channel]
                 rows += [(time, topic, data) for time, data in batch.payloads()]
-        rows.sort(key=lambda row: row[0])  # (stable: what was written first comes first)
+        rows.sort(key=lambda row: row[0])  # stable: equal times stay in the order of writing
         writer.write_many((topic, time, data) for time, topic, data in rows)
         on_progress(number / len(windows))
 
@@ -273,7 +263,7 @@ def _copy_passes(
     steps: Mapping[int, Sequence[ClockStep]],
     writer: BagWriter,
 ) -> None:
-    """Copy bags of which the clock stepped back: in order of log time as if it had gone on."""
+    """Copy bags whose clock stepped back, in order of log time as if it had continued."""
     rows: list[tuple[int, int, str, bytes]] = []
     for one in inputs:
         seen: dict[str, int] = {}
@@ -290,7 +280,7 @@ def _copy_passes(
 
 
 def _storable(kind: MessageType, writer: BagWriter) -> MessageType:
-    """Return a type as a storage can hold it: a database has no place for a definition that is no text."""
+    """Return a type without a definition that is not UTF-8, unless the storage is MCAP: a database cannot hold it."""
     is_text = kind.definition.encode(errors="ignore").decode() == kind.definition
     return kind if is_text or writer.storage == "mcap" else replace(kind, definition="")
 
@@ -304,7 +294,7 @@ def _keep_extras(source: Source, writer: BagWriter, report: RewriteReport) -> No
 
 
 def _windows(sources: Sequence[Source], choice: Choice) -> Iterator[tuple[int, int]]:
-    """Yield spans of log time [ns], first included and last not, that hold about as much as is sorted at once."""
+    """Yield half-open spans of log time [ns] that each hold about what is sorted at once."""
     filled = [source for source in sources if any(stream.count for stream in source.streams)]
     if not filled:
         return

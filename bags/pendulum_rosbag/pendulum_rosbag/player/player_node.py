@@ -42,7 +42,7 @@ SPECS = (
     ),
     ParameterSpec("clock_rate", 100.0, "Hz", "Messages on /clock a second of wall time; 0 for none.", minimum=0.0),
 )
-_LONGEST_WAIT = 0.05  # so that pause, stop and a new rate are noticed soon [s]
+_LONGEST_WAIT = 0.05  # latency of pause, stop and a new rate [s]
 _DEPTH = 1000
 
 
@@ -77,7 +77,7 @@ class PlayOptions:
 
 
 class _Timeline:
-    """Recorded time as a function of wall time, for a rate that may change and pauses between."""
+    """Recorded time as a function of wall time, with changing rate and pauses."""
 
     def __init__(self, start_ns: int, rate: float, paused: bool) -> None:
         self._rate = rate
@@ -85,31 +85,24 @@ class _Timeline:
         self._anchor = (time.monotonic_ns(), start_ns)
 
     def now(self) -> int:
-        """Return the recorded time now [ns]."""
         wall, recorded = self._anchor
         return recorded if self._paused else recorded + round((time.monotonic_ns() - wall) * self._rate)
 
     def wait_for(self, recorded_ns: int) -> float:
-        """Return how long to wait until some recorded time [s]."""
         return _LONGEST_WAIT if self._paused else (recorded_ns - self.now()) / self._rate * 1e-9
 
     def change(self, *, rate: float | None = None, paused: bool | None = None, jump_to: int | None = None) -> None:
-        """Continue at another rate, pause, or continue from another recorded time."""
         self._anchor = (time.monotonic_ns(), self.now() if jump_to is None else jump_to)
         self._rate = self._rate if rate is None else rate
         self._paused = self._paused if paused is None else paused
 
 
 class Player(Node):
-    """Publishes recorded bytes at recorded times; serialises nothing, so any type that is installed can be played.
-
-    Args:
-        options: What to play, and how.
-        stop: Requests the runner to end the process.
+    """Publishes recorded bytes at recorded times, of any installed type; ``stop`` requests the process to end.
 
     Raises:
         BagError: There is no readable bag.
-        DataError: A topic is missing, or nothing is there to play.
+        DataError: A topic is missing, or there is nothing to play.
     """
 
     def __init__(self, options: PlayOptions, stop: Callable[[], None]) -> None:
@@ -141,10 +134,7 @@ class Player(Node):
         """Stop publishing and log what was done."""
         self._leave.set()
         self._thread.join()
-        print(
-            f"played {self.published} messages, the latest {self.latest * 1e3:.1f} ms behind its time",
-            flush=True,
-        )
+        print(f"played {self.published} messages, the latest {self.latest * 1e3:.1f} ms behind its time", flush=True)
 
     def _publisher(self, bag: Bag, name: str) -> Publisher:
         info = bag.topics[name]
@@ -171,7 +161,7 @@ class Player(Node):
         self._stop()
 
     def _wait_for_subscribers(self) -> bool:
-        """Give subscribers time to match; False on a request to end."""
+        """Wait for subscribers to match; False on a request to end."""
         end = time.monotonic() + self._options.wait
         while time.monotonic() < end and not all(output.get_subscription_count() for output in self._outputs):
             if self._leave.wait(_LONGEST_WAIT):
@@ -198,7 +188,7 @@ class Player(Node):
         return 1.0 / rate if self._clock_output is not None and rate > 0 else _LONGEST_WAIT
 
     def _tell_time(self, due: int, recorded_ns: int) -> int:
-        """Publish ``/clock`` when it is due; return when it is due next [ns of the monotonic clock]."""
+        """Publish ``/clock`` if due; return when it is due next [ns of the monotonic clock]."""
         now = time.monotonic_ns()
         if self._clock_output is None or now < due:
             return due
@@ -222,7 +212,7 @@ class Player(Node):
 
 
 def _schedule(bag: Bag, options: PlayOptions) -> tuple[Any, Any, list[bytes], list[str]]:
-    """Return log times, topic numbers and bytes of all messages in order, and the topics' names."""
+    """Return log times, topic indices and bytes of all messages in order, and the topic names."""
     begin = bag.start_ns + round(options.start * 1e9)
     end = begin + round(options.duration * 1e9) if options.duration else 2**63 - 1
     names: list[str] = []
@@ -243,7 +233,6 @@ def _schedule(bag: Bag, options: PlayOptions) -> tuple[Any, Any, list[bytes], li
 
 
 def _recorded_qos(text: str) -> QoSProfile:
-    """Return the reliability and durability that the publishers had, where the bag has them."""
     recorded = profiles_of(text)
     best_effort = any(profile.reliability == "best_effort" for profile in recorded)
     latched = bool(recorded) and all(profile.durability == "transient_local" for profile in recorded)

@@ -1,4 +1,4 @@
-"""A bag as arrays: lazy by topic, limited to a time span if wanted, the same for every storage and every recorder."""
+"""A bag as arrays: read lazily by topic, the same for every storage and recorder."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ class _Topic:
 class Bag(Mapping[str, Any]):
     """A bag that is open for reading; made by :func:`read_bag`.
 
-    ``bag[topic]`` is a structured array with the columns ``log_time_ns``, ``stamp_ns`` [ns], ``position`` [rad],
-    ``velocity`` [rad/s], ``effort`` [N m] (NaN where the message has none) and, when any message has one,
-    ``frame_id``, ordered by log time, for topics of one-joint ``sensor_msgs/JointState``; for any other topic a list
-    of :class:`StoredMessage`. Topics are read when they are asked for, and kept.
+    ``bag[topic]`` is read on first use and cached, ordered by log time. A topic of one-joint ``sensor_msgs/JointState``
+    is a structured array with the columns ``log_time_ns``, ``stamp_ns`` [ns], ``position`` [rad], ``velocity`` [rad/s],
+    ``effort`` [N m] (NaN if absent) and, when any message has one, ``frame_id``; any other topic is a list of
+    :class:`StoredMessage`.
 
     Attributes:
         path: Where the bag is.
         topics: Topic name -> :class:`TopicInfo`.
-        metadata: Run metadata (``custom_data``), values parsed where they are JSON.
+        metadata: Run metadata (``custom_data``), JSON values parsed.
         damage: What is wrong with the bag, one sentence per file; empty for a healthy one.
-        clock_notes: What reading has found out about clocks so far: steps back, and stamps that were never set.
+        clock_notes: Clock faults that reading has found so far: steps back, and stamps that were never set.
         cuts_ns: Stamps at which a clock stepped back, in the times of :meth:`array` [ns].
-        notes: Files that were left out as copies, and what reading cannot find out, one sentence each.
+        notes: Files left out as copies, and what reading cannot find out, one sentence each.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Bag(Mapping[str, Any]):
 
     @property
     def topics(self) -> dict[str, TopicInfo]:
-        """Topic name -> type, number of messages and what else the bag tells."""
+        """Topic name -> type, number of messages and further descriptions."""
         return {name: topic.info for name, topic in self._topics.items()}
 
     @property
@@ -110,11 +110,11 @@ class Bag(Mapping[str, Any]):
         return self._arrays[topic]
 
     def __contains__(self, topic: object) -> bool:
-        # (the mapping's own would read the topic, and expects a KeyError)
+        # Mapping's own would read the topic, and expects a KeyError.
         return topic in self._topics or self._also.get(str(topic)) in self._topics
 
     def get(self, topic: str, default: Any = None) -> Any:
-        """Return a topic as ``bag[topic]`` does, or a default where the bag has none of that name."""
+        """Return a topic as ``bag[topic]`` does, or a default if the bag has none of that name."""
         return self[topic] if topic in self else default  # noqa: SIM401 (this is that method)
 
     def __iter__(self) -> Iterator[str]:
@@ -124,10 +124,10 @@ class Bag(Mapping[str, Any]):
         return len(self._topics)
 
     def array(self, topic: str) -> npt.NDArray[Any]:
-        """Return a topic of one-joint JointState as an array, with times that can be reckoned with.
+        """Return a topic of one-joint JointState as an array with consistent times.
 
-        Where a clock stepped back, later times are moved so that they go on; stamps that were never set are those of
-        the log (``clock_notes`` tells).
+        After a clock's step back, later times are shifted so that they continue; stamps that were never set are
+        replaced by log times (see ``clock_notes``).
 
         Raises:
             DataError: The topic is missing, or its messages are something else.
@@ -150,9 +150,7 @@ class Bag(Mapping[str, Any]):
         return values
 
     def joints(self, topic: str) -> JointTable:
-        """Return a topic of JointState, of one joint or several, as arrays with one column for each joint.
-
-        Times are as those of :meth:`array`.
+        """Return a topic of JointState as arrays with one column per joint and times as in :meth:`array`.
 
         Raises:
             DataError: The topic is missing, its messages are something else, or not all of the same joints.
@@ -165,13 +163,13 @@ class Bag(Mapping[str, Any]):
         return self._tables[topic]
 
     def joint_names(self, topic: str) -> tuple[str, ...]:
-        """Return the joints that the first message of a topic names; none where it has none or is no JointState."""
+        """Return the joints in the first message of a topic; none if it has none or is no JointState."""
         batches = self._batches(topic) if self._is_fixed(topic) else []
         first = next((decode_joint_state(data) for batch in batches for _, data in batch.payloads()), None)
         return () if first is None else first.joints
 
     def load(self) -> Bag:
-        """Read all topics now, in one pass over the files, and return the bag; one that cannot be read is left."""
+        """Read all topics in one pass over the files and return the bag; unreadable topics are skipped."""
         topics = [topic for topic in self._topics if topic not in self._arrays]
         self._load([topic for topic in topics if self._is_fixed(topic)])
         for topic in topics:
@@ -180,16 +178,13 @@ class Bag(Mapping[str, Any]):
         return self
 
     def raw(self, topic: str) -> list[tuple[int, bytes]]:
-        """Return all messages of a topic as (log time [ns], CDR bytes), ordered by log time.
-
-        Where the recorder's clock stepped back, what came after the step follows what came before.
-        """
+        """Return all messages of a topic as (log time [ns], CDR bytes), by log time but in file order across steps."""
         rows = [row for batch in self._batches(topic) for row in batch.payloads()]
         order = self._order(topic, np.array([time for time, _ in rows], np.int64))
         return rows if order is None else [rows[place] for place in order.tolist()]
 
     def log_times(self, topic: str) -> Int64:
-        """Return the log times of a topic in the order of :meth:`raw` [ns], shape (n,); no message is read."""
+        """Return the log times of a topic in the order of :meth:`raw` [ns], shape (n,), without reading messages."""
         batches = self._batches(topic)
         for batch in batches:
             batch.check_heads()
@@ -198,7 +193,7 @@ class Bag(Mapping[str, Any]):
         return times if order is None else times[order]
 
     def clock_steps(self) -> list[ClockStep]:
-        """Return where the recorder's clock stepped back."""
+        """Return the steps back of the recorder's clock."""
         if self._steps is None:
             self._steps = find_steps(self._wanted(set(self._topics)), self._span)
             self.clock_notes += [
@@ -209,7 +204,7 @@ class Bag(Mapping[str, Any]):
         return self._steps
 
     def messages(self, topic: str) -> list[StoredMessage]:
-        """Return all messages of a topic as objects, whatever their type.
+        """Return all messages of a topic as objects of any type.
 
         Raises:
             DataError: Neither the bag nor ROS 2 Jazzy knows the message type, or a message is damaged.
@@ -226,10 +221,10 @@ class Bag(Mapping[str, Any]):
         return [StoredMessage(time, decode(data)) for time, data in rows]
 
     def events(self) -> list[dict[str, Any]]:
-        """Return what was noted on the ``events`` topics, in order of time.
+        """Return the messages on ``events`` topics, in order of time.
 
-        Each event has ``stamp_ns``, ``name``, ``topic``, ``log_time_ns`` and whatever its author added. A text that
-        is no JSON object becomes an event with that text as its name.
+        Each event has ``stamp_ns``, ``name``, ``topic``, ``log_time_ns`` and its author's fields. Text that is no JSON
+        object becomes an event of that name.
         """
         events: list[dict[str, Any]] = []
         for name, topic in self._topics.items():
@@ -244,7 +239,7 @@ class Bag(Mapping[str, Any]):
                 event: dict[str, Any] = content if isinstance(content, dict) else {"name": text}
                 event = {"stamp_ns": time, "name": "", **event, "topic": name, "log_time_ns": time}
                 if not isinstance(event["stamp_ns"], int):
-                    event["stamp_ns"] = time  # anybody may write there
+                    event["stamp_ns"] = time  # the topic is open to any writer
                 event["stamp_ns"] += sum(size for known, size in self._stamp_steps if moved >= known)
                 events.append(event)
         events.sort(key=lambda event: (event["stamp_ns"], event["log_time_ns"]))
@@ -274,14 +269,13 @@ class Bag(Mapping[str, Any]):
         return found
 
     def _batches(self, topic: str) -> list[Batch]:
-        """Collect the batches of a topic over all files in order."""
         return [batch for source, wanted in self._wanted({topic}) for batch in source.batches(set(wanted), *self._span)]
 
     def _order(self, topic: str, times: Int64) -> Int64 | None:
-        """Return the order of messages that stand in the order of the files; ``None`` where it is that already."""
+        """Return the order of messages given in file order; ``None`` if they are in order already."""
         if len(times) < 2 or bool((times[1:] >= times[:-1]).all()):
             return None
-        # A topic with few messages does not show itself whether its clock stepped, or messages were late.
+        # A topic with few messages does not show whether its clock stepped or messages were late.
         if int(np.diff(times).min()) > -CLOCK_JUMP * 1e9 and not steps_back(times):
             return np.argsort(times, kind="stable")
         name = self._entry(topic).info.name
@@ -295,7 +289,7 @@ class Bag(Mapping[str, Any]):
             )
 
     def _timed(self, topic: str, log_times: Int64, stamps: Int64) -> tuple[Int64, Int64]:
-        """Return log times and stamps of a topic that go on where a clock stepped back, all stamps set."""
+        """Return log times and stamps that continue across clock steps, with all stamps set."""
         name = self._entry(topic).info.name
         if len(log_times) and int(np.diff(log_times).min(initial=0)) < 0:
             self.clock_steps()
@@ -324,7 +318,7 @@ class Bag(Mapping[str, Any]):
         return log_times, stamps
 
     def _moved(self, name: str, log_times: Int64) -> Int64:
-        """Return the log times of a topic, those after a step of the clock moved so that they go on."""
+        """Return a topic's log times, shifted after each clock step so that they continue."""
         for step in self._steps or []:
             if step.rows.get(name, len(log_times)) < len(log_times):
                 log_times = log_times.copy()
@@ -382,18 +376,18 @@ def read_bag(
     """Open a bag for reading.
 
     Args:
-        path: A rosbag2 folder, or a single ``.mcap`` or ``.db3`` file. Bags of any recorder are read; a bag whose
-            recorder died is read as far as it is whole (``bag.damage`` tells).
+        path: A rosbag2 folder, or a single ``.mcap`` or ``.db3`` file, of any recorder; a bag whose recorder died is
+            read as far as it is whole (see ``bag.damage``).
         topics: Topics to offer; by default all.
-        start: Log time of the first message wanted [ns]; by default from the beginning.
-        stop: Log time before which the last message lies [ns]; by default to the end.
-        verify: Checksums of an MCAP file. By default those of what is read are compared beside reading, and a damaged
-            chunk is refused then. ``True`` compares all of them now and leaves damaged chunks out (``bag.damage``
-            tells), as is always done where a recorder died; ``False`` compares none.
+        start: First log time [ns]; by default from the beginning.
+        stop: End of the log times, exclusive [ns]; by default to the end.
+        verify: Checksums of an MCAP file. By default those of chunks that are read; a damaged chunk is then an error.
+            ``True`` compares all now and leaves damaged chunks out (see ``bag.damage``), as always after a recorder
+            died; ``False`` compares none.
 
     Raises:
         BagError: There is no bag, or nothing of it can be read.
-        DataError: A topic was asked for that the bag does not have.
+        DataError: The bag lacks a requested topic.
 
     Example:
         >>> bag = read_bag("runs/today/sim")
@@ -412,14 +406,9 @@ def read_bags(
     *,
     workers: int | None = None,
 ) -> list[Bag]:
-    """Read many bags in parallel, all topics of each, and return them in the order of their paths.
+    """Read many bags in parallel, in the order of ``paths``; arguments as for :func:`read_bag`.
 
-    Args:
-        paths: Bags, as for :func:`read_bag`.
-        topics: Topics to read; by default all.
-        start: Log time of the first message wanted [ns].
-        stop: Log time before which the last message lies [ns].
-        workers: Threads; by default one per processor (copying and decompressing run outside the interpreter's lock).
+    ``workers`` threads, by default one per processor: copying and decompressing release the interpreter's lock.
     """
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
         return list(pool.map(lambda path: read_bag(path, topics, start, stop).load(), paths))
@@ -428,7 +417,7 @@ def read_bags(
 def _group(sources: Sequence[Source], hashes: Mapping[str, str]) -> tuple[dict[str, _Topic], list[str]]:
     """Return the topics by name, and a sentence for each that has several types.
 
-    The type of most messages has the name; others of it are offered as ``NAME (TYPE)``.
+    The type of most messages gets the name; the others are offered as ``NAME (TYPE)``.
     """
     grouped: dict[str, dict[str, list[tuple[Source, Stream]]]] = {}
     stored = {stream.topic for source in sources for stream in source.streams}
@@ -456,7 +445,7 @@ def _group(sources: Sequence[Source], hashes: Mapping[str, str]) -> tuple[dict[s
 
 
 def _type_of_messages(source: Source, stream: Stream) -> str:
-    """Return JointState for a topic without a type whose first message is one; else nothing."""
+    """Return JointState for an untyped topic whose first message is one, else nothing."""
     if stream.serialization != "cdr" or not stream.count:
         return ""
     batches = source.batches({stream.channel}, None, None)
@@ -473,7 +462,7 @@ def _topic(name: str, kind: str, streams: list[tuple[Source, Stream]], type_hash
 
 
 def _held(kind: str, stored: Sequence[StoredMessage]) -> str:
-    """Return what a topic holds, in words: of joint states, what makes them unfit."""
+    """Return what a topic holds, in words, and for joint states why they do not fit."""
     if kind != _JOINT_STATE:
         return kind
     turns = dict.fromkeys(str(name) for item in stored for name in item.message.name)

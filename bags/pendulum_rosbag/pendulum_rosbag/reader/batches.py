@@ -1,4 +1,4 @@
-"""What a storage file hands to the parsers: many messages of one topic in one buffer."""
+"""The interface between storage files and parsers: many messages of one topic in one buffer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Bytes = npt.NDArray[np.uint8]
 Int64 = npt.NDArray[np.int64]
 
 MCAP_HEAD = 31
-"""Bytes of an MCAP message record before the message itself: opcode, length, channel, sequence, two times."""
+"""Bytes of an MCAP record before the message: opcode, length, channel, sequence, two times."""
 _HEAD = np.dtype(
     {"names": ["opcode", "channel", "time"], "formats": ["u1", "<u2", "<i8"], "offsets": [0, 9, 15], "itemsize": 23}
 )
@@ -31,9 +31,9 @@ def _unknown_origin(*_: int) -> str:
 
 
 def items_at(buffer: Bytes, item: np.dtype[Any], at: Int64) -> npt.NDArray[Any]:
-    """Return copies of the items that begin at some bytes of a buffer.
+    """Return copies of the items at byte offsets of a buffer.
 
-    Every byte counts as the possible start of one: taking rows of that copies the items, and nothing else.
+    The strided view has one row per byte, so that indexing copies only the items.
     """
     places = max(len(buffer) - item.itemsize + 1, 0)
     anywhere: npt.NDArray[Any] = np.ndarray((places,), f"V{item.itemsize}", buffer.data, strides=(1,))
@@ -41,13 +41,13 @@ def items_at(buffer: Bytes, item: np.dtype[Any], at: Int64) -> npt.NDArray[Any]:
 
 
 def joined(datas: Sequence[bytes]) -> tuple[Bytes, Int64, Int64]:
-    """Return messages in one buffer, where each begins there, and the size of each."""
+    """Return messages in one buffer, their offsets there and their sizes."""
     sizes = np.fromiter(map(len, datas), np.int64, len(datas))
     return np.frombuffer(b"".join(datas), np.uint8), np.cumsum(sizes) - sizes, sizes
 
 
 def within(times: Int64, start: int | None, stop: int | None) -> npt.NDArray[np.bool_]:
-    """Return which log times lie in a span [ns]: first included, last not, ``None`` for no end."""
+    """Return which log times [ns] lie in the half-open span from start to stop; ``None`` is unlimited."""
     inside = np.ones(len(times), bool)
     if start is not None:
         inside &= times >= start
@@ -62,11 +62,11 @@ class Batch:
 
     Args:
         channel: Channel id (MCAP) or topic id (SQLite).
-        buffer: Bytes that hold all messages of the batch, shape (n,).
-        offsets: Where each message (SQLite) or each message record (MCAP) begins in ``buffer``, shape (k,).
+        buffer: Bytes of all messages of the batch, shape (n,).
+        offsets: Offset of each message (SQLite) or message record (MCAP) in ``buffer``, shape (k,).
         times: Log time of each message [ns], shape (k,).
         sizes: Bytes of each message, shape (k,); ``None`` for MCAP, whose records carry their length.
-        origin: Says of a message (by its log time [ns] and offset) which index names it, for errors.
+        origin: Names the index that lists a message (by log time [ns] and offset), for errors.
     """
 
     channel: int
@@ -82,7 +82,7 @@ class Batch:
         return MCAP_HEAD if self.sizes is None else 0
 
     def check_heads(self) -> None:
-        """Hold the message index of an MCAP file, which no checksum covers, against the messages themselves.
+        """Compare an MCAP message index, which no checksum covers, with the messages.
 
         Raises:
             BagError: A message has another channel or log time than the index says.
@@ -103,7 +103,7 @@ class Batch:
         """Yield (log time [ns], message bytes) one by one."""
         self.check_heads()
         view = self.buffer.data
-        # Messages do not overlap, so together they are no larger than the buffer; an index that says otherwise is
+        # Messages do not overlap, so together they are no larger than the buffer. An index that says otherwise is
         # damaged, or a bomb that names one large message a million times.
         left = len(view)
         if self.sizes is not None:
@@ -153,7 +153,7 @@ class Source(Protocol):
         ...
 
     def extras(self) -> list[Attachment | Metadata]:
-        """Return attachments and metadata that others than the recorder put into the file."""
+        """Return attachments and metadata that other programs put into the file."""
         ...
 
     def close(self) -> None:

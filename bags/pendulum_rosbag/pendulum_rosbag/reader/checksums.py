@@ -1,4 +1,4 @@
-"""Checksums of MCAP chunks, compared beside reading: a byte that a disk or a cable changed is told, not handed over."""
+"""Checksums of MCAP chunks, compared while reading, so that corrupted bytes are reported and not returned."""
 
 from __future__ import annotations
 
@@ -16,39 +16,29 @@ __all__ = ["Checksums", "Comparison"]
 
 
 class Checksums:
-    """Which chunks of one file are known to be sound: each is compared once, however many topics are read from it.
-
-    Args:
-        path: The file.
-        enabled: Whether to compare anything.
-    """
+    """Which chunks of a file are known to be sound; each is compared once. ``enabled`` False compares none."""
 
     def __init__(self, path: Path, *, enabled: bool) -> None:
         self.path = path
         self.enabled = enabled
         self.sound: set[int] = set()
-        """Bytes of the file at which sound chunks begin."""
+        """Offsets of sound chunks in the file."""
         self._running: set[Comparison] = set()
 
     def begin(self) -> Comparison:
-        """Return what compares the chunks of one pass over the file; several may go on at a time."""
+        """Return a comparison for one pass over the file; several may run at a time."""
         comparison = Comparison(self, self._running.discard)
         self._running.add(comparison)
         return comparison
 
     def close(self) -> None:
-        """End all passes that go on, and their threads."""
+        """End all running passes and their threads."""
         for comparison in list(self._running):
             comparison.end()
 
 
 class Comparison:
-    """Checksums of the chunks of one pass over a file, compared in a thread of their own while the reader goes on.
-
-    Args:
-        file: What is known of the file.
-        on_end: Called with this comparison when it ends.
-    """
+    """Compares the chunks of one pass over a file in a thread of its own; ``on_end`` is called when it ends."""
 
     def __init__(self, file: Checksums, on_end: Callable[[Comparison], None]) -> None:
         self._file = file
@@ -64,7 +54,7 @@ class Comparison:
         self.end()
 
     def end(self) -> None:
-        """End the thread; what was not compared by then never is."""
+        """End the thread; pending chunks are not compared."""
         self._ended = True
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
@@ -73,24 +63,16 @@ class Comparison:
         self._on_end(self)
 
     def compare(self, chunk: Chunk, raw: Bytes) -> None:
-        """Begin to compare the checksum of a chunk's content.
-
-        Raises:
-            BagError: The file was closed meanwhile.
-        """
+        """Queue the comparison of a chunk's content; a BagError if the file was closed meanwhile."""
         self._require_going()
         if not self._file.enabled or not chunk.crc or chunk.offset in self._file.sound:
             return
         if self._pool is None:
-            self._pool = ThreadPoolExecutor(1, "checksums")  # (zlib works outside the interpreter's lock)
+            self._pool = ThreadPoolExecutor(1, "checksums")  # zlib releases the interpreter's lock
         self._begun.append((chunk, self._pool.submit(zlib.crc32, raw.data)))
 
     def finish(self) -> None:
-        """Wait for what was begun.
-
-        Raises:
-            BagError: The content of a chunk is not what was written, or the file was closed meanwhile.
-        """
+        """Wait for the queued comparisons; a BagError if a chunk is damaged or the file was closed meanwhile."""
         self._require_going()
         for chunk, crc in self._begun:
             if crc.result() != chunk.crc:

@@ -1,7 +1,7 @@
-"""Clocks that step back inside a recording: where, and times that go on across the step.
+"""Steps back of the clock inside a recording, and times that continue across them.
 
-A recorder writes the messages of a topic in the order in which they arrive, so that log times which go back in the
-order of the file tell of its clock. Sorted by them, what came before the step and what came after would be mixed.
+A recorder writes a topic's messages in order of arrival, so log times that go back in file order reveal its clock.
+Sorting by them would mix the messages before and after the step.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from pendulum_rosbag.reader.batches import Int64, Source
 __all__ = ["CLOCK_JUMP", "ClockStep", "find_steps", "go_on", "pass_order", "set_stamps", "steps_back"]
 
 CLOCK_JUMP = 0.05
-"""A lasting step of a clock counts as a jump from this size [s]."""
+"""Smallest lasting step that counts as a jump of the clock [s]."""
 _MOST = 20
-"""Steps of a topic, and one of 50 messages, from which they count as stored in no order."""
+"""Number of steps on a topic, and one in 50 messages, from which the messages count as unordered."""
 _AROUND = 20
-"""Messages on either side of a small step that have to confirm it."""
+"""Messages on either side of a small step that must confirm it."""
 _NEXT_BUFFER = 1 << 40
 
 
@@ -30,9 +30,9 @@ class ClockStep:
     """A step back of the recorder's clock.
 
     Args:
-        size_ns: By how much the next messages are to be moved so that they go on [ns].
-        after_ns: How long after the first message it was, by the clock before it [ns].
-        rows: Topic -> number of its messages before the step, in the order of the files.
+        size_ns: Shift of later messages so that their times continue [ns].
+        after_ns: Time from the first message to the step, by the clock before it [ns].
+        rows: Topic -> number of its messages before the step, in file order.
     """
 
     size_ns: int
@@ -41,10 +41,9 @@ class ClockStep:
 
 
 def steps_back(times: Int64) -> list[int]:
-    """Return at which messages times step back for good, as indices; a single late message is no step.
+    """Return the indices at which times [ns] in order of arrival, shape (n,), step back for good.
 
-    Args:
-        times: In the order of arrival [ns], shape (n,).
+    A single late message is no step.
     """
     intervals = np.diff(times)
     if not len(intervals) or int(intervals.min()) >= 0:
@@ -52,7 +51,7 @@ def steps_back(times: Int64) -> list[int]:
     period = _period(times)
     sizes = period - intervals
     large = sizes > CLOCK_JUMP * 1e9
-    # Of steady messages a smaller step shows, too, as long as it is none of the usual irregularities.
+    # Steady messages also show smaller steps, unless these are among the usual irregularities.
     small = ~large & (sizes > max(1.5 * period, 10 * float(np.quantile(np.abs(sizes), 0.9))))
     limit = min(_MOST, 1 + len(times) // 50)
     back = np.zeros(len(sizes), bool)
@@ -63,7 +62,7 @@ def steps_back(times: Int64) -> list[int]:
     for place in np.flatnonzero(back).tolist():
         if small[place] and not _lasts(times, place + 1, period, int(sizes[place])):
             continue
-        # What follows a late message makes up for the step.
+        # The message after a late one makes up for the step.
         following = int(intervals[place + 1]) if place + 1 < len(intervals) else -1
         if 0 <= following < max(-int(intervals[place]) / 2, 1.5 * period):
             found.append(place + 1)
@@ -71,7 +70,7 @@ def steps_back(times: Int64) -> list[int]:
 
 
 def _lasts(times: Int64, step: int, period: int, size: int) -> bool:
-    """Return whether most messages around a step, and not one or a few alone, stand apart by its size."""
+    """Return whether most messages on both sides of a step, not just a few, differ by its size."""
     regular = times - period * np.arange(len(times))
     before, after = regular[max(step - _AROUND, 0) : step], regular[step : step + _AROUND]
     return bool(np.median(before) - np.median(after) > size / 2)
@@ -84,12 +83,12 @@ def _period(times: Int64) -> int:
 
 
 def go_on(times: Int64, step: int) -> int:
-    """Return by how much times from a step on are to be moved so that they follow one period later [ns]."""
+    """Return the shift after which times from a step on follow one period later [ns]."""
     return int(times[step - 1]) - int(times[step]) + _period(times)
 
 
 def pass_order(times: Int64, steps: Iterable[int]) -> Int64:
-    """Return the order of messages by time within each pass between two steps, shape (n,)."""
+    """Return the order of messages by time within each pass between steps, shape (n,)."""
     passes = np.zeros(len(times), np.int64)
     for step in steps:
         passes[step:] += 1
@@ -99,13 +98,10 @@ def pass_order(times: Int64, steps: Iterable[int]) -> Int64:
 def find_steps(
     wanted: Iterable[tuple[Source, Mapping[int, str]]], span: tuple[int | None, int | None]
 ) -> list[ClockStep]:
-    """Return where the clock of a recorder stepped back, in the order of the files.
+    """Return where the recorder's clock stepped back, in file order.
 
-    Topics whose messages are too rare to show a step are cut where the others are.
-
-    Args:
-        wanted: Storage files in order, each with its channels and their topics.
-        span: Log times to read [ns], as ``Source.batches`` takes them.
+    Topics whose messages are too rare to show a step are cut where the others are. ``wanted`` are storage files in
+    order with their channels and topics; ``span`` is as for ``Source.batches`` [ns].
     """
     places, times = _sequences(wanted, span)
     found: list[tuple[int, int, str, int]] = []
@@ -131,7 +127,7 @@ def find_steps(
 def _sequences(
     wanted: Iterable[tuple[Source, Mapping[int, str]]], span: tuple[int | None, int | None]
 ) -> tuple[dict[str, Int64], dict[str, Int64]]:
-    """Return where the messages of each topic stand among all others, and their log times, in order of the files."""
+    """Return each topic's places among all messages, and its log times, in file order."""
     places: dict[str, list[Int64]] = {}
     times: dict[str, list[Int64]] = {}
     number, buffer = 0, None
@@ -146,9 +142,9 @@ def _sequences(
 
 
 def set_stamps(log_times: Int64, stamps: Int64) -> npt.NDArray[np.bool_]:
-    """Return which messages have a stamp that was set, shape (n,): none where all are equal, else all but zeros."""
+    """Return which stamps were set, shape (n,): none if all are equal, else all but zeros."""
     if len(stamps) > 2 and bool((stamps == stamps[0]).all()) and bool((log_times != log_times[0]).any()):
         return np.zeros(len(stamps), bool)
-    # Stamps of a simulated time begin at 0 and go on from there.
+    # Simulated time begins at 0.
     unset = (stamps == 0) & (np.max(stamps, initial=0) > 3600 * 10**9)
     return ~unset

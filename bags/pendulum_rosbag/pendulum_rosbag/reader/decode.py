@@ -1,4 +1,4 @@
-"""Messages of any type as objects, by rosbags, with the definitions that the bag itself carries."""
+"""Messages of any type as objects, decoded by rosbags with the bag's own definitions."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _MAX_DEPTH = 40
 
 
 def store_for(info: TopicInfo) -> Typestore:
-    """Return a type store that knows a topic's type as its bag defines it.
+    """Return a type store with a topic's type as its bag defines it.
 
-    What a bag defines holds for its own topics only: a store that all bags share would let one bag say how the next
-    one is read. The types of ROS 2 Jazzy stand in for what the bag does not define.
+    Each definition has a store of its own: in a shared one a bag could change how the next is read. ROS 2 Jazzy's types
+    complete what the bag does not define.
 
     Raises:
         DataError: The definition cannot be read, or neither it nor ROS 2 has the type.
@@ -35,7 +35,7 @@ def store_for(info: TopicInfo) -> Typestore:
         store = _defined(info.type, info.definition) if info.definition else shared
     except Exception as error:  # rosbags raises its own and parser errors
         if info.type in shared.fielddefs:
-            return shared  # in a language that rosbags does not read, such as IDL in other clothes
+            return shared  # in a language that rosbags does not read, such as IDL under another name
         reason = f": {error}" if isinstance(error, DataError) else ""
         raise DataError(
             f"topic {info.name}: the definition of {info.type} in the bag is not one of ROS 2 messages{reason}"
@@ -48,7 +48,7 @@ def store_for(info: TopicInfo) -> Typestore:
 
 @lru_cache(maxsize=64)
 def _defined(name: str, definition: str) -> Typestore:
-    """Return the store of one definition: by its text, so that equal topics of many bags share the work."""
+    """Return the store of one definition, cached by its text for equal topics of many bags."""
     from rosbags.typesys import get_types_from_msg
     from rosbags.typesys.store import Typestore
 
@@ -70,9 +70,9 @@ def _defined(name: str, definition: str) -> Typestore:
 
 
 def _values(kind: str, known: dict[str, Any], counted: dict[str, int], depth: int = 0) -> int:
-    """Return how many values a message has at least, all arrays of fixed length written out.
+    """Return the least number of values in a message, with fixed-length arrays written out.
 
-    A line of text can define more of them than a machine has memory for, or a type that holds itself.
+    A line of text can define more than memory holds, or a recursive type.
     """
     from rosbags.interfaces import Nodetype
 
@@ -86,7 +86,7 @@ def _values(kind: str, known: dict[str, Any], counted: dict[str, int], depth: in
             is_list = node in {Nodetype.ARRAY, Nodetype.SEQUENCE}
             (inner, of), length = detail if is_list else ((node, detail), 1)
             values = _values(of, known, counted, depth + 1) if inner == Nodetype.NAME else 1
-            # Numbers of an array are read as one; everything else in it is written out.
+            # Numeric arrays are read as one value; everything else is written out.
             written_out = inner == Nodetype.NAME or of[0] in {"string", "wstring"}
             total += values * (length if node == Nodetype.ARRAY and written_out else 1)
         counted[kind] = total
@@ -97,7 +97,7 @@ def decoder_for(info: TopicInfo) -> Callable[[bytes], Any]:
     """Return a function from CDR bytes to an object of a topic's type.
 
     Raises:
-        DataError: Nobody knows the type; or, when the function is called, a message is damaged.
+        DataError: The type is unknown; or, in the function, a message is damaged.
     """
     store = store_for(info)
     kind = store.get_msgdef(info.type)
@@ -105,8 +105,8 @@ def decoder_for(info: TopicInfo) -> Callable[[bytes], Any]:
     def decode(data: bytes) -> Any:
         try:
             parse = kind.deserialize_cdr_le if data[1] & 1 else kind.deserialize_cdr_be
-            # rclpy's serialiser leaves up to twelve meaningless bytes behind a message, which rosbags' own
-            # entry point takes for an error: what counts is that all fields are there.
+            # rclpy's serialiser leaves up to twelve meaningless bytes behind a message, which rosbags' own entry point
+            # rejects: what counts is that all fields are there.
             message, end = parse(memoryview(data)[4:], 0, kind.cls, store)
             if end + 4 > len(data):
                 raise ValueError("it is cut off")

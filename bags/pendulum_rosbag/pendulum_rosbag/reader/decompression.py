@@ -1,4 +1,4 @@
-"""Decompression with a bound: no chunk and no file may cost more memory than it claims, or than any recorder needs."""
+"""Decompression with a bound: no chunk or file costs more memory than it claims, or than any recorder needs."""
 
 from __future__ import annotations
 
@@ -14,23 +14,21 @@ from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 
 __all__ = ["UnpackedSource", "decompress", "decompress_bounded", "holds_packed_messages"]
 
-_MAX_CHUNK = 1 << 28  # decompressed bytes of one chunk: recorders write chunks of about 1 MB, bombs larger ones
+_MAX_CHUNK = 1 << 28  # decompressed bytes of one chunk: recorders write about 1 MB, bombs more
 _GROUP_SIZE = 1 << 20  # decompressed bytes that are parsed at once
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-"""How a zstd frame begins; no CDR message does, whose second byte says its byte order and kind (0 to 11)."""
+"""Start of a zstd frame, but of no CDR message, whose second byte is its byte order and kind (0 to 11)."""
 
 
 def decompress(packed: Bytes, compression: str, size: int, name: str, *, torn: bool = False) -> bytes:
-    """Return the content of a chunk.
-
-    Never more is decompressed than the head of the chunk says, and that has a bound.
+    """Return the content of a chunk, at most as much as its head claims, which is bounded.
 
     Args:
         packed: The chunk, compressed.
         compression: ``zstd`` or ``lz4``.
-        size: What its head says that it holds [bytes].
+        size: Content size in the chunk's head [bytes].
         name: The file, for messages.
-        torn: Its end was cut off: return its beginning, as far as its compression gives it back.
+        torn: Its end was cut off: return the beginning that can be recovered.
 
     Raises:
         BagError: Unknown compression, a chunk larger than any recorder's, or the bytes are damaged.
@@ -43,7 +41,7 @@ def decompress(packed: Bytes, compression: str, size: int, name: str, *, torn: b
         try:
             if torn:
                 return _beginning(io.BytesIO(packed.tobytes()), size)
-            claimed = zstandard.frame_content_size(packed.data)  # -1 where the frame does not say
+            claimed = zstandard.frame_content_size(packed.data)  # -1 if the frame does not say
             if claimed not in (-1, size):
                 raise BagError(f"{name}: a chunk claims to hold {claimed} bytes; its head says {size}")
             raw = zstandard.ZstdDecompressor().decompress(packed.data, max_output_size=size)
@@ -66,11 +64,7 @@ def decompress(packed: Bytes, compression: str, size: int, name: str, *, torn: b
 
 
 def decompress_bounded(packed: BinaryIO, name: str, limit: int = _MAX_CHUNK) -> bytes:
-    """Return the content of a zstd stream that does not say how much it holds, or cannot be believed.
-
-    Raises:
-        BagError: It holds more than ``limit`` bytes, or is damaged.
-    """
+    """Return the content of a zstd stream whose size is unknown; a BagError above ``limit`` bytes or if damaged."""
     import zstandard
 
     try:
@@ -83,7 +77,7 @@ def decompress_bounded(packed: BinaryIO, name: str, limit: int = _MAX_CHUNK) -> 
 
 
 def _beginning(packed: BinaryIO, size: int) -> bytes:
-    """Return the first bytes of a zstd stream, which takes no more memory than they do."""
+    """Return the first bytes of a zstd stream, using no more memory than that."""
     import zstandard
 
     parts, left = [], size
@@ -95,13 +89,7 @@ def _beginning(packed: BinaryIO, size: int) -> bytes:
 
 
 class UnpackedSource:
-    """A storage file whose messages were compressed one by one (``ros2 bag record --compression-mode message``).
-
-    They are decompressed on their way to the parsers.
-
-    Args:
-        packed: The file as it is.
-    """
+    """A storage file with separately compressed messages (``ros2 bag record --compression-mode message``)."""
 
     compressed = True
 
@@ -116,7 +104,7 @@ class UnpackedSource:
         self.unchecked = packed.unchecked
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
-        """Yield all messages of some channels with start <= log time < stop, in the order of the file.
+        """Yield all messages of some channels with start <= log time < stop, in file order.
 
         Raises:
             BagError: A message cannot be decompressed, or claims to be larger than any message.
@@ -144,7 +132,7 @@ class UnpackedSource:
         self.packed.close()
 
     def _unpacked(self, data: bytes) -> bytes:
-        # (a recorder that could not compress a message in time may leave it as it was)
+        # A recorder that could not compress a message in time may leave it uncompressed.
         if not data.startswith(_ZSTD_MAGIC):
             return data
         return decompress_bounded(io.BytesIO(data), f"a message of {self.path}")
@@ -156,7 +144,7 @@ def _batch(channel: int, times: list[int], parts: list[bytes]) -> Batch:
 
 
 def holds_packed_messages(source: Source) -> bool:
-    """Tell by its first message whether the messages of a file are compressed, where no metadata says so."""
+    """Return whether a file's first message is compressed, if no metadata says so."""
     for stream in source.streams:
         if stream.serialization != "cdr" or not stream.count:
             continue

@@ -25,8 +25,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 @app.command(epilog="Example: python -m pendulum_rosbag info runs/today/sim --json")
 def info(
-    bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
-    as_json: Json = False,
+    bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")], as_json: Json = False
 ) -> int:
     """Print whether a bag is good: rates, gaps, jitter, latencies between topics, duplicates and clock jumps."""
     opened = read_bag(bag, verify=True)
@@ -53,7 +52,7 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any], notes: list[str]
         console.print(f"damaged: {sentence}", style="bold red", highlight=False, soft_wrap=True)
     for sentence in notes:
         console.print(f"note: {sentence}", highlight=False, soft_wrap=True, markup=False)
-    # One line a topic for the rate, one table for what can be wrong with it.
+    # Two tables: one line per topic for the rate, one for faults.
     title = "topics (intervals between stamps, or log times, in ms)"
     table = WholeTable("topic", "type", "by", title=title, title_justify="left")
     for heading in ("count", "rate [Hz]", "median", "jitter", "p99", "longest", "gaps", "missing"):
@@ -88,16 +87,13 @@ def _print(statistics: BagStatistics, metadata: dict[str, Any], notes: list[str]
         console.print(table)
     for event in statistics.events:
         offset = (event["log_time_ns"] - statistics.events[0]["log_time_ns"]) * 1e-9
-        told = [str(event[key]) for key in ("mode", "reason", "trial") if event.get(key) not in (None, "")]
-        text = f"event {offset:+9.3f} s  {' '.join([str(event['name']), ': '.join(told)]).rstrip()}"
+        parts = [str(event[key]) for key in ("mode", "reason", "trial") if event.get(key) not in (None, "")]
+        text = f"event {offset:+9.3f} s  {' '.join([str(event['name']), ': '.join(parts)]).rstrip()}"
         console.print(text, highlight=False, soft_wrap=True, markup=False)
     for key, value in metadata.items():
         text = value if isinstance(value, str) else json.dumps(value)
         console.print(
-            f"{key}: {text if len(text) < 400 else text[:400] + ' ...'}",
-            highlight=False,
-            soft_wrap=True,
-            markup=False,
+            f"{key}: {text if len(text) < 400 else text[:400] + ' ...'}", highlight=False, soft_wrap=True, markup=False
         )
 
 

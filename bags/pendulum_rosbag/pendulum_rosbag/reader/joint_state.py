@@ -1,14 +1,14 @@
 """One-joint ``sensor_msgs/JointState`` messages from CDR bytes to arrays, thousands at a time.
 
-CDR aligns every value to its own size, counted from the end of the four bytes of encapsulation. For one joint the
-layout is therefore fixed by two string lengths and by which of position, velocity and effort are present::
+CDR aligns each value to its size, counted from the end of the encapsulation. For one joint the layout depends on two
+string lengths and on which of position, velocity and effort are present::
 
     encapsulation[4]  sec i32  nanosec u32  frame_id: u32 n, n bytes   names: u32 1, u32 m, m bytes
     position: u32 0|1, (f64)   velocity: u32 0|1, (f64)   effort: u32 0|1, (f64)
 
-Messages of one topic nearly always share one layout. It is taken from the first of them; every message is then
-checked against every constant byte of it (padding excepted: rclpy leaves it uninitialised), those that fit are
-copied out column by column, and the rest is tried with the layout of the first that did not fit.
+The layout is taken from a topic's first message. Each message is checked against all its constant bytes (not padding,
+which rclpy leaves uninitialised); those that fit are copied column by column, the rest is tried with the layout of the
+first that did not fit.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FIELDS = np.dtype(
 """Columns of the arrays: times [ns], position [rad], velocity [rad/s], effort [N m]; absent values are NaN."""
 
 _BLOCK = 8192  # messages parsed at once: their bytes stay in the cache
-_MAX_EXPECTED = 1 << 22  # messages that memory is taken for before they are seen: a damaged file may claim any number
+_MAX_EXPECTED = 1 << 22  # messages for which memory is allocated in advance: a damaged file may claim any number
 _MAX_COPY = 1 << 26  # bytes of messages that are copied at once
 _MAX_FRAME = 255  # bytes of a frame id that are kept: no name in ROS is longer
 _LAYOUTS = 16  # layouts tried in one batch before a topic counts as not fixed
@@ -40,13 +40,13 @@ _LAYOUTS = 16  # layouts tried in one batch before a topic counts as not fixed
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where the fields stand in a message; offsets count from the first byte of encapsulation.
+    """Where the fields of a message are; offsets count from the first byte of encapsulation.
 
     Args:
-        size: Bytes up to the last field (a serialiser may append some that mean nothing).
+        size: Bytes up to the last field (a serialiser may append meaningless ones).
         joint: Its name, with the terminating zero.
         frame: Start and length of the frame id without its terminating zero.
-        values: Offset of position, velocity and effort; -1 when absent.
+        values: Offset of position, velocity and effort; -1 if absent.
         constants: (offset, bytes) that every message of this layout has.
     """
 
@@ -58,7 +58,7 @@ class Layout:
 
 
 def layout_of(data: bytes) -> Layout | None:
-    """Return the layout of a one-joint JointState, ``None`` when the bytes are something else."""
+    """Return the layout of a one-joint JointState, ``None`` for other bytes."""
     try:
         if data[:2] != b"\x00\x01":  # little-endian CDR
             return None
@@ -91,7 +91,7 @@ def layout_of(data: bytes) -> Layout | None:
         return None
     if at > len(data):
         return None
-    # The zero that ends the frame id is as constant as its length.
+    # The frame id's terminating zero is as constant as its length.
     constants.append((15 + frame_size, b"\x00"))
     position, velocity, effort = values
     return Layout(at, joint, (16, frame_size - 1), (position, velocity, effort), tuple(constants))
@@ -102,7 +102,7 @@ def _align(at: int, size: int) -> int:
 
 
 def canonical(data: bytes) -> bytes:
-    """Return a one-joint JointState with zeroed padding and nothing behind its last field; others unchanged.
+    """Return a one-joint JointState with zeroed padding and nothing after its last field; others unchanged.
 
     rclpy leaves padding uninitialised, so equal messages may differ in their bytes.
     """
@@ -119,16 +119,16 @@ def canonical(data: bytes) -> bytes:
 
 
 class Trimmer:
-    """Cuts off what rclpy's serialiser leaves behind one-joint JointStates of one topic.
+    """Cuts off the up to twelve meaningless bytes that rclpy appends to one-joint JointStates of one topic.
 
-    Up to twelve bytes that mean nothing; readers such as rosbags refuse such messages. Other bytes pass unchanged.
+    Readers such as rosbags refuse such messages. Other messages pass unchanged.
     """
 
     def __init__(self) -> None:
         self._layouts: list[Layout] = []
 
     def __call__(self, data: bytes) -> bytes:
-        """Return the message without what is behind it."""
+        """Return the message without trailing bytes."""
         for layout in self._layouts:
             if all(data[start : start + len(content)] == content for start, content in layout.constants):
                 return data if len(data) <= layout.size else data[: layout.size]
@@ -140,14 +140,13 @@ class Trimmer:
 
 
 _APART, _BACK, _SHARE = 0.05, 0.2, 0.12
-"""Two motions on one topic: jumps of at least this angle [rad], back but for that share, in that share of messages."""
+"""Two motions on one topic: least jump [rad], its remainder after the jump back, and share of such messages."""
 
 
 def two_motions(position: npt.NDArray[Any]) -> str:
-    """Return how an angle jumps to and fro, in words, where two senders share a topic; nothing where it does not.
+    """Return how an angle jumps to and fro, in words, if two senders share a topic; else nothing.
 
-    Args:
-        position: Of one joint, in the order of the messages, shape (n,) [rad].
+    ``position``: of one joint in message order, shape (n,) [rad].
     """
     known = position[np.isfinite(position)]
     steps = np.diff(np.unwrap(known))
@@ -163,7 +162,7 @@ def two_motions(position: npt.NDArray[Any]) -> str:
 
 
 def _words(offset: int, content: bytes) -> list[tuple[int, str, int]]:
-    """Cut constant bytes into integers, so that each check is one comparison of a column."""
+    """Split constant bytes into integers, so that each check is one column comparison."""
     pieces = []
     while content:
         size = next(size for size in (8, 4, 2, 1) if size <= len(content))
@@ -175,7 +174,7 @@ def _words(offset: int, content: bytes) -> list[tuple[int, str, int]]:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """A layout as a numpy record type over the bytes of one message (and, in MCAP, of its record head)."""
+    """A layout as a numpy record type over a message (and in MCAP its record head)."""
 
     item: np.dtype[Any]
     checks: tuple[tuple[str, Any], ...]
@@ -217,7 +216,7 @@ def _plan(layout: Layout, head: int, channel: int) -> _Plan:
 
 @dataclass(slots=True)
 class _Columns:
-    """The array under construction, and the frame ids beside it (kept short while they do not change)."""
+    """The array under construction, and its frame ids (short while they do not change)."""
 
     array: npt.NDArray[Any]
     at: int = 0
@@ -226,18 +225,14 @@ class _Columns:
 
 
 class JointStateParser:
-    """Collects the messages of one topic.
-
-    Args:
-        count: Number of messages to expect (the result has the number there is).
-    """
+    """Collects the messages of one topic, of which about ``count`` are expected."""
 
     def __init__(self, count: int) -> None:
         self._columns = _Columns(np.empty(min(count, _MAX_EXPECTED), FIELDS))
         self._fixed = True
 
     def add(self, batch: Batch) -> None:
-        """Parse more messages; once one is no JointState of one joint and the same, the rest is passed over."""
+        """Parse more messages; after one that is not a JointState of the same one joint, ignore the rest."""
         if not self._fixed:
             return
         columns = self._columns
@@ -248,11 +243,10 @@ class JointStateParser:
         self._fixed = _parse_batch(batch, columns)
 
     def result(self) -> npt.NDArray[Any] | None:
-        """Return the messages in the order in which they were added.
+        """Return the messages in the order of :meth:`add`, or ``None`` if one did not fit.
 
-        Returns:
-            Structured array with the columns :data:`FIELDS`, and ``frame_id`` when any message has one; ``None``
-            when a message is no one-joint JointState in little-endian CDR, or joints take turns.
+        Structured array with the columns :data:`FIELDS`, and ``frame_id`` when any message has one. One-joint
+        JointStates in little-endian CDR fit, of the same joint.
         """
         return _with_frames(self._columns) if self._fixed else None
 
@@ -268,12 +262,7 @@ def _parse_batch(batch: Batch, columns: _Columns) -> bool:
 
 
 def _parse_block(
-    batch: Batch,
-    offsets: Int64,
-    times: Int64,
-    sizes: Int64 | None,
-    columns: _Columns,
-    layouts: list[Layout],
+    batch: Batch, offsets: Int64, times: Int64, sizes: Int64 | None, columns: _Columns, layouts: list[Layout]
 ) -> bool:
     out = columns.array[columns.at : columns.at + len(offsets)]
     out["log_time_ns"] = times
@@ -309,7 +298,7 @@ def _fit(
     out: npt.NDArray[Any],
     columns: _Columns,
 ) -> Int64 | None:
-    """Copy out the rows that have a layout; return those that have not, ``None`` for none."""
+    """Copy the rows that have a layout; return the others, ``None`` for none."""
     plan = _plan(layout, batch.head, batch.channel)
     size = plan.item.itemsize
     if left is not None:
@@ -318,7 +307,7 @@ def _fit(
     places = len(batch.buffer) - size + 1
     inside = offsets < places
     if places <= 0 or not inside.all():
-        # Too near to the end of the buffer for this layout: not of this layout.
+        # A row too near to the end of the buffer has another layout.
         rows = np.arange(len(out)) if left is None else left
         if places <= 0 or not inside.any():
             return rows
@@ -341,7 +330,7 @@ def _fit_items(
 ) -> Int64 | None:
     size = plan.item.itemsize
     if len(offsets) > 1 and len(offsets) * size > _MAX_COPY:
-        # Long frame ids: halves, so that the copy stays small whatever the messages claim.
+        # Long frame ids: halve, so that the copy stays small whatever the messages claim.
         rows = np.arange(len(out)) if left is None else left
         rests = [
             _fit_items(

@@ -26,7 +26,7 @@ class JointTable:
         names: The joints, in the order of the columns.
         log_time_ns: Shape (k,) [ns].
         stamp_ns: Shape (k,) [ns].
-        position: Shape (k, n), NaN where messages have none [rad or m].
+        position: Shape (k, n), NaN if absent [rad or m].
         velocity: Shape (k, n) [rad/s or m/s].
         effort: Shape (k, n) [N m or N].
     """
@@ -39,11 +39,7 @@ class JointTable:
     effort: Array
 
     def of(self, joint: str) -> NDArray[Any]:
-        """Return one joint's messages, with the columns that :meth:`Bag.array` gives of a topic of one joint.
-
-        Raises:
-            DataError: The messages are of other joints.
-        """
+        """Return one joint's messages with the columns of :meth:`Bag.array`; a DataError for other joints."""
         if joint not in self.names:
             raise DataError(f"joint is {joint!r}; expected one of {', '.join(self.names)}")
         column = self.names.index(joint)
@@ -55,14 +51,10 @@ class JointTable:
 
 
 def joint_table(messages: Iterable[tuple[int, bytes]], where: str) -> JointTable:
-    """Return messages of JointState as a table; joints may stand in another order in each message.
-
-    Args:
-        messages: Log time [ns] and bytes of each.
-        where: Topic and bag, for messages.
+    """Return JointStates (log time [ns], bytes) as a table; each message may order the joints differently.
 
     Raises:
-        DataError: There is none, one is no JointState with a value for each of its names, or one names other joints.
+        DataError: There is none, one is no JointState with a value per name, or the joints differ (names ``where``).
     """
     times: list[int] = []
     stamps: list[int] = []

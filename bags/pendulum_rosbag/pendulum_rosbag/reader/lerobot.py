@@ -1,6 +1,6 @@
-"""Bags as a dataset for learning: LeRobot's format v3.0, in which a frame is a state and the torque that answered it.
+"""Bags as a learning dataset in LeRobot's format v3.0: a frame is a state with the effort commanded in reply.
 
-The format is described at https://huggingface.co/docs/lerobot/lerobot-dataset-v3; it was read back with lerobot 0.4.4.
+Format: https://huggingface.co/docs/lerobot/lerobot-dataset-v3; read back with lerobot 0.4.4.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["DEFAULT_TASK", "Episode", "episodes_of", "export_lerobot"]
 DEFAULT_TASK = "keep the pendulum upright"
 _STATE, _EFFORT, _ACTION = "observation.state", "observation.effort", "action"
 _LONGEST_HOLE = 5
-"""Frames for which a hole in the states is bridged by the nearest; a longer one ends the episode."""
+"""Frames for which a hole in the states is bridged by the nearest state; a longer one ends the episode."""
 _LEAST_FRAMES = 2
 _ROWS_PER_FILE = 1_000_000
 _CHUNK = 1000
@@ -43,13 +43,13 @@ class Episode:
     """Frames at a constant rate, without holes.
 
     Attributes:
-        source: Bag that they are from.
+        source: The bag.
         topic: Topic of the states.
         joints: Names of the joints, in the order of the columns.
-        driven: Names of the joints that are commanded.
+        driven: Names of the commanded joints.
         state: Positions, then velocities; shape (k, 2 n) [rad or m, rad/s or m/s].
-        effort: Measured, shape (k, n) [N m or N]; NaN where none is measured.
-        action: What was commanded in answer to each state, shape (k, m) [N m or N].
+        effort: Measured, shape (k, n) [N m or N]; NaN if not measured.
+        action: Commanded in reply to each state, shape (k, m) [N m or N].
     """
 
     source: str
@@ -62,17 +62,13 @@ class Episode:
 
 
 def episodes_of(bag: Bag, fps: int) -> list[Episode]:
-    """Return the stretches of a bag in which somebody answered the states of a plant.
+    """Return the parts of a bag in which the states of a plant were answered with commands, at ``fps`` [Hz].
 
-    Frame k of an episode is the state next to k / fps, with the command that bears its stamp; a state without one has
-    that of the state before, which the plant held.
-
-    Args:
-        bag: Bag with ``joint_states`` and ``effort_command`` of one plant or several.
-        fps: Frames per second [Hz].
+    Frame k is the state nearest to k / fps with the command of its stamp, or else the previous command, which the plant
+    held.
 
     Raises:
-        DataError: There is no plant with commands, or none was answered for as long as two frames.
+        DataError: There is no plant with commands, or none for as long as two frames.
     """
     found: list[Episode] = []
     for topic, commanded in _commanded(bag):
@@ -88,7 +84,7 @@ def episodes_of(bag: Bag, fps: int) -> list[Episode]:
 
 
 def _commanded(bag: Bag) -> Iterator[tuple[str, str]]:
-    """Yield the topics of states that have a topic of commands beside them, with that."""
+    """Yield the topics of states that have a topic of commands alongside, with it."""
     for topic in sorted(bag.topics):
         commanded = f"{topic.removesuffix(names.JOINT_STATES)}{names.EFFORT_COMMAND}"
         if topic.rpartition("/")[2] == names.JOINT_STATES and commanded in bag.topics:
@@ -100,7 +96,7 @@ def _stretches(bag: Bag, topic: str, states: JointTable, commands: JointTable, f
     stamps = states.stamp_ns[order]
     newest = np.argsort(commands.stamp_ns, kind="stable")
     answered = commands.stamp_ns[newest]
-    # From the first answered state to the last.
+    # From the first state with a command to the last.
     first, last = np.searchsorted(stamps, (answered[0], answered[-1]))
     last = min(int(last), len(stamps) - 1)
     if first > last:
@@ -137,7 +133,7 @@ def _nearest(sorted_times: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDAr
 
 
 def _rate(bags: Sequence[Bag]) -> int:
-    """Return the rate of the slowest plant that is commanded, as whole frames per second [Hz]."""
+    """Return the state rate of the slowest commanded plant, in whole frames per second [Hz]."""
     rates = []
     for bag in bags:
         for topic, _ in _commanded(bag):
@@ -151,21 +147,18 @@ def _rate(bags: Sequence[Bag]) -> int:
 def export_lerobot(
     bags: Sequence[Bag], folder: Path, *, fps: int | None = None, task: str = DEFAULT_TASK
 ) -> list[Path]:
-    """Write bags as one dataset in LeRobot's format v3.0.
+    """Write bags as one dataset in LeRobot's format v3.0; return the files.
 
     Args:
         bags: Recordings of plants with the same joints.
         folder: Folder to create.
-        fps: Frames per second [Hz]; by default the rate of the states of the slowest plant.
-        task: What was to be done, in words.
-
-    Returns:
-        The files that were written.
+        fps: Frames per second [Hz]; by default the state rate of the slowest plant.
+        task: The task, in words.
 
     Raises:
         BagError: The folder exists or cannot be written.
         DataError: A bag has no commands, or the joints differ.
-        ParameterError: The rate or the task is none.
+        ParameterError: The rate is below 1 Hz or the task is empty.
     """
     import pandas as pd
     import pyarrow as pa
@@ -258,7 +251,7 @@ def export_lerobot(
 
 
 def _features(episodes: Sequence[Episode]) -> dict[str, dict[str, Any]]:
-    """Return the columns of the frames, each with type, shape and what its entries are."""
+    """Return the columns of the frames with type, shape and names of their entries."""
     joints, driven = episodes[0].joints, episodes[0].driven
     for episode in episodes[1:]:
         if (episode.joints, episode.driven) != (joints, driven):
@@ -296,7 +289,7 @@ def _columns(episode: Episode, index: int, before: int, rate: int) -> dict[str, 
 
 
 def _table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Mapping[str, Any]]) -> pa.Table:
-    """Return frames as Arrow has them: a list of fixed size for a vector, a plain column for what has one entry."""
+    """Return frames in Arrow's form: a fixed-size list for a vector, a plain column for one entry."""
     import pyarrow as pa
 
     arrays = []
@@ -308,7 +301,7 @@ def _table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Mapping[s
 
 
 def _statistics(values: NDArray[Any]) -> dict[str, list[float] | list[int]]:
-    """Return what policies are normalised with, for each entry of a column."""
+    """Return the statistics that policies are normalised with, for each entry of a column."""
     table = values.reshape(len(values), -1).astype(np.float64)
     found: dict[str, Any] = {
         "min": table.min(axis=0),

@@ -1,4 +1,4 @@
-"""Chunks of an MCAP file as a reader knows them, and the texts in its records."""
+"""Chunks of an MCAP file as a reader sees them, and the texts in its records."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _HEAD = rec.RECORD_HEAD_SIZE
 _LARGEST_FILLER = 8192
 _MOST_STAGED = 64 << 20
 CHUNK_FIELDS = struct.Struct("<QQQII")
-"""Head of a chunk: first and last log time [ns], size and checksum of the content, length of the compression's name."""
+"""Head of a chunk: first and last log time [ns], content size and checksum, length of the compression's name."""
 
 
 class DamagedError(Exception):
@@ -38,7 +38,7 @@ class DamagedError(Exception):
 
 @dataclass(slots=True)
 class Chunk:
-    """One chunk: where its records stand in a buffer, and where its message indexes do (channel -> offset)."""
+    """One chunk: where its records and its message indexes (channel -> offset) are in a buffer."""
 
     buffer: Bytes
     start_ns: int
@@ -49,17 +49,13 @@ class Chunk:
     compression: str
     indexes: dict[int, int] = field(default_factory=dict)
     crc: int = 0
-    """Checksum of the content before compression; 0 where its writer made none."""
+    """Checksum of the uncompressed content; 0 if its writer made none."""
     offset: int = 0
-    """Byte of the file at which the chunk's record begins."""
+    """Offset of the chunk's record in the file."""
 
 
 def raw_content(chunk: Chunk, path: Path) -> Bytes:
-    """Return the records of a chunk, decompressed.
-
-    Raises:
-        BagError: They cannot be decompressed; names the file.
-    """
+    """Return the records of a chunk, decompressed; a BagError with the file's name if they cannot be."""
     packed = chunk.buffer[chunk.data_start : chunk.data_start + chunk.data_size]
     if not chunk.compression:
         return packed
@@ -67,9 +63,9 @@ def raw_content(chunk: Chunk, path: Path) -> Bytes:
 
 
 def keep_staged(buffer: Bytes, chunks: Sequence[Chunk]) -> None:
-    """Copy the chunks behind the unused room of a file that our recorder has not closed.
+    """Copy the staged chunks of a file that our recorder has not closed.
 
-    A recorder that still runs writes others over them some megabytes later, or cuts them off when it ends.
+    A running recorder overwrites them some megabytes later, or cuts them off when it ends.
     """
     in_order = sorted(chunks, key=lambda chunk: chunk.data_start)
     end = 0
@@ -83,7 +79,7 @@ def keep_staged(buffer: Bytes, chunks: Sequence[Chunk]) -> None:
     start = staged[0].data_start
     stop = max(_index_end(buffer, chunk) for chunk in staged)
     if stop - start > _MOST_STAGED:
-        return  # not written by our recorder, whatever it says
+        return  # not written by our recorder
     copy = np.array(buffer[start:stop])
     for chunk in staged:
         chunk.buffer = copy
@@ -97,7 +93,7 @@ def _index_end(buffer: Bytes, chunk: Chunk) -> int:
 
 
 def records_in(raw: Bytes) -> tuple[list[tuple[int, int, int]], int]:
-    """Return the whole records of a chunk's content, as (opcode, offset, length), and where the last of them ends."""
+    """Return the whole records of a chunk's content as (opcode, offset, length), and where the last one ends."""
     found = []
     at, size = 0, len(raw)
     view = raw.data
@@ -111,7 +107,7 @@ def records_in(raw: Bytes) -> tuple[list[tuple[int, int, int]], int]:
 
 
 def read_text(content: bytes, at: int, errors: str = "strict") -> tuple[str, int]:
-    """Return the text at some byte of a record, and where it ends."""
+    """Return the text at an offset of a record, and where it ends."""
     (size,) = struct.unpack_from("<I", content, at)
     end = at + 4 + size
     if end > len(content):
@@ -120,7 +116,7 @@ def read_text(content: bytes, at: int, errors: str = "strict") -> tuple[str, int
 
 
 def read_text_map(content: bytes, at: int) -> dict[str, str]:
-    """Return the map of texts at some byte of a record."""
+    """Return the map of texts at an offset of a record."""
     (size,) = struct.unpack_from("<I", content, at)
     end, at = at + 4 + size, at + 4
     items = {}
@@ -131,6 +127,6 @@ def read_text_map(content: bytes, at: int) -> dict[str, str]:
 
 
 def read_metadata(content: bytes) -> rec.Metadata:
-    """Return the named map of texts that a record holds."""
+    """Return the metadata in a record."""
     name, at = read_text(content, 0)
     return rec.Metadata(name, read_text_map(content, at))

@@ -1,4 +1,4 @@
-"""Message indexes of an MCAP file: log times and places of the messages of many chunks at once."""
+"""Message indexes of an MCAP file: log times and offsets of the messages of many chunks at once."""
 
 from __future__ import annotations
 
@@ -29,12 +29,9 @@ _INDEX_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
 
 
 def indexed_counts(chunks: Sequence[Chunk]) -> dict[int, int]:
-    """Return how many messages the message indexes of some chunks name: channel id -> number.
+    """Return how many messages the indexes of some chunks name, by channel id.
 
-    Only the heads of the indexes are read, so that it costs next to nothing to ask when a file is opened.
-
-    Raises:
-        struct.error: An index lies beyond the end of the file.
+    Only their heads are read, which costs next to nothing. Raises struct.error for an index beyond the end of the file.
     """
     counts: dict[int, int] = {}
     for chunk in chunks:
@@ -52,7 +49,7 @@ def indexed_messages(path: Path, channel: int, index: Bytes, places: Sequence[tu
         path: The file, for its errors.
         channel: Channel id.
         index: Bytes that hold the message indexes, shape (n,).
-        places: Where each index begins in them, and what to add to its offsets.
+        places: Offset of each index there, and what to add to its offsets.
 
     Raises:
         BagError: An index is damaged.
@@ -73,7 +70,7 @@ def indexed_messages(path: Path, channel: int, index: Bytes, places: Sequence[tu
     rows_at = np.repeat(at + 15 - 16 * first, counts) + 16 * np.arange(int(counts.sum()))
     table = _take(path, index, _INDEX_ENTRY, rows_at)
     offsets = table["offset"] + np.repeat(base, counts)
-    # In nearly every file they ascend.
+    # Nearly always they ascend.
     if not (offsets[1:] > offsets[:-1]).all() and len(np.unique(offsets)) != len(offsets):
         raise BagError(f"{path}: a message index names a message twice; try to repair the bag")
     return table["time"], offsets

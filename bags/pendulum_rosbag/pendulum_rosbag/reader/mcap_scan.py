@@ -1,6 +1,6 @@
-"""Walking through an MCAP file record by record: for one that is damaged, was not closed, or has no index.
+"""Sequential reading of an MCAP file that is damaged, was not closed, or has no index.
 
-Also for what no message index tells, attachments and metadata: they are found in a file that was cut off, too.
+Also finds attachments and metadata, which no message index lists, in a file that was cut off.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ _HEAD = rec.RECORD_HEAD_SIZE
 MessageTable = dict[int, list[tuple[int, int]]]
 """(Log time [ns], offset) of the messages of each channel."""
 _OURS = "rosbag2"
-"""Name of the metadata that every writer of rosbag2 files makes anew."""
+"""Name of the metadata that every writer of rosbag2 files writes itself."""
 
 
 class McapScan:
-    """All whole records from the start of the file; what is cut off at its end is left out.
+    """All whole records from the start of the file; a torn end is left out.
 
     Args:
         buffer: The file.
         path: Its name, for errors.
-        topics: Takes the descriptions that are met.
-        sound: Takes the offsets of chunks that have their checksum.
-        damage: What is known to be damaged already.
+        topics: Collects the descriptions.
+        sound: Collects the offsets of chunks with a correct checksum.
+        damage: Damage that is known already.
 
     Attributes:
-        chunks: In the order of the file.
+        chunks: In file order.
         scanned: Messages of each chunk.
         loose: Messages outside of chunks.
         counts: Messages of each channel.
         start_ns, stop_ns: First and last log time [ns].
-        damage: What was found first; empty where nothing was.
+        damage: The first damage found, or empty.
     """
 
     def __init__(self, buffer: Bytes, path: Path, topics: McapTopics, sound: set[int], damage: str) -> None:
@@ -122,7 +122,7 @@ class McapScan:
         self._take_chunk(chunk, raw, records)
 
     def _scan_torn_chunk(self, body: int) -> None:
-        """Take the whole records of a chunk whose end was cut off; nothing tells whether they are as they were."""
+        """Take the whole records of a chunk whose end was cut off; no checksum covers them."""
         try:
             chunk, _ = self._chunk_at(body)
             packed = self._buffer[chunk.data_start :]
@@ -133,12 +133,12 @@ class McapScan:
             records, end = records_in(raw)
         except (BagError, struct.error, UnicodeDecodeError):
             return
-        # Its bytes as they are now, decompressed: whoever reads messages later must not try to again.
+        # Stored decompressed, so that later reads need not decompress the torn chunk again.
         whole = Chunk(np.ascontiguousarray(raw[:end]), chunk.start_ns, chunk.stop_ns, 0, end, end, "")
         self._take_chunk(whole, raw, records)
 
     def _chunk_at(self, body: int) -> tuple[Chunk, int]:
-        """Return the chunk whose record's content begins at some byte, and its checksum."""
+        """Return the chunk whose record's content begins at an offset, and its checksum."""
         view = self._buffer.data
         start, stop, raw_size, crc, text_size = CHUNK_FIELDS.unpack_from(view, body)
         compression, at = read_text(bytes(view[body + 28 : body + 32 + text_size]), 0)
@@ -165,10 +165,9 @@ class McapScan:
 
 
 def find_extras(buffer: Bytes) -> Iterator[rec.Attachment | rec.Metadata]:
-    """Yield what a file holds besides messages, the copy of its ``metadata.yaml`` left out; broken records too.
+    """Yield a file's attachments and metadata, except the copy of ``metadata.yaml`` and broken records.
 
-    Args:
-        buffer: The whole file, shape (n,).
+    ``buffer``: the whole file, shape (n,).
     """
     view, size, at = buffer.data, len(buffer), len(rec.MAGIC)
     while at + _HEAD <= size:

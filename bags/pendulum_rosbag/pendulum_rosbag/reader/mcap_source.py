@@ -1,4 +1,4 @@
-"""Reading MCAP files by their message indexes, and without them when the file is damaged."""
+"""Reading MCAP files by their message indexes, or sequentially if the file is damaged."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["McapSource"]
 _HEAD = rec.RECORD_HEAD_SIZE
 _FOOTER_REGION = rec.FOOTER_SIZE + len(rec.MAGIC)
 _NOT_CLOSED = rec.record(rec.DATA_END, bytes(4))
-"""What stands right before the footer of a file that our recorder has not closed."""
+"""What precedes the footer in a file that our recorder has not closed."""
 _TRIES = 5
 _GROUP_SIZE = 1 << 20  # decompressed bytes that are parsed at once
 
@@ -37,24 +37,23 @@ _UNREADABLE = (DamagedError, struct.error, ValueError, KeyError, OverflowError, 
 
 
 class _NoIndexError(Exception):
-    """The file has no index, as the format allows: its records must be walked through."""
+    """The file has no index, as the format allows, and must be scanned."""
 
 
 class McapSource:
     """One MCAP file, read through a memory map.
 
-    A file with a footer is read by its index. A file without one (its writer died), or with an index that does not
-    fit the file, is scanned from the start; then ``damage`` says what was found. ``unclosed`` is true for a file of
-    our recorder that is complete but was not closed.
+    A file with a footer is read by its index. One without (its writer died), or with a wrong index, is scanned;
+    ``damage`` then says what was found. ``unclosed`` marks a complete file that our recorder has not closed.
 
     Args:
         path: The file.
-        data: Its content, when it is not a plain file (a decompressed copy).
-        verify: Checksums: ``None`` to compare those of the chunks that are read (of all at once where the file was not
-            closed), ``True`` for all at once; chunks that are damaged are then left out. ``False`` for none.
+        data: Its content, if it is not a plain file (a decompressed copy).
+        verify: Checksums: ``None`` compares those of chunks that are read (of all if the file was not closed), ``True``
+            all at once, leaving damaged chunks out, ``False`` none.
 
     Raises:
-        BagError: The file cannot be opened or is no MCAP file at all.
+        BagError: The file cannot be opened or is no MCAP file.
     """
 
     def __init__(self, path: Path, data: bytes | None = None, *, verify: bool | None = None) -> None:
@@ -71,7 +70,7 @@ class McapSource:
         self._topics = McapTopics()
         self.metadata = self._topics.metadata
         self.chunks: list[Chunk] = []
-        # Only after a scan: (time, offset) of messages outside of chunks by channel, and inside of each chunk.
+        # Only after a scan: (time, offset) of messages outside of chunks, and inside each chunk, by channel.
         self._loose: MessageTable = {}
         self._scanned: list[MessageTable] = []
         self._counts: dict[int, int] = {}
@@ -87,7 +86,7 @@ class McapSource:
             try:
                 self._leave_out_damaged()
             except (DamagedError, BagError) as error:
-                self._scan(str(error).removeprefix(f"{path}: "))  # (whoever tells the damage names the file)
+                self._scan(str(error).removeprefix(f"{path}: "))  # the report of the damage names the file
         self.compressed = any(chunk.compression for chunk in self.chunks)
         self.streams = [
             self._topics.stream(channel, self._counts.get(channel, 0)) for channel in sorted(self._topics.channels)
@@ -95,22 +94,22 @@ class McapSource:
         self.unchecked = self._without_checksums()
 
     def _without_checksums(self) -> str:
-        """Return what of the file no checksum covers, in words; empty where all of it has one."""
+        """Return which part of the file no checksum covers, in words."""
         bare = sum(not chunk.crc for chunk in self.chunks)
         if self._loose:
             return "messages outside of chunks have no checksum"
         return f"{bare} of {len(self.chunks)} chunks have no checksum" if bare else ""
 
     def extras(self) -> list[Attachment | Metadata]:
-        """Return attachments and metadata that others than the recorder put into the file."""
+        """Return attachments and metadata that other programs put into the file."""
         return list(find_extras(self.buffer))
 
     def close(self) -> None:
-        """Release the memory map once no array refers to it any more, and end what still reads."""
+        """Release the memory map once no array refers to it, and end running reads."""
         self._checksums.close()
         self.buffer = np.empty(0, np.uint8)
         if self._map is not None:
-            with contextlib.suppress(BufferError):  # an array still looks into it; it goes with that array
+            with contextlib.suppress(BufferError):  # an array still refers to it and releases it later
                 self._map.close()
             self._map = None
 
@@ -129,7 +128,7 @@ class McapSource:
         return np.frombuffer(self._map, np.uint8)
 
     def _read_summary(self) -> None:
-        """Read the summary; once more where a recorder that goes on has shown another one meanwhile."""
+        """Read the summary; repeat if a running recorder has published another one meanwhile."""
         for again in reversed(range(_TRIES)):
             shown = bytes(self.buffer[-_FOOTER_REGION:])
             try:
@@ -167,7 +166,7 @@ class McapSource:
             if at + length > footer:
                 raise DamagedError(f"a summary record of {length} bytes does not fit the file")
             if opcode == rec.PADDING:
-                self.unclosed = True  # complete, but its writer did not give back the room to grow
+                self.unclosed = True  # complete, but its writer did not release the room to grow
                 break
             if opcode == rec.SUMMARY_CHECKSUM and grows and self._verify is not False:
                 content = bytes(buffer[at : at + length])
@@ -183,7 +182,7 @@ class McapSource:
         if not statistics and not self.chunks:
             raise _NoIndexError
         if not self._describes_all():
-            raise _NoIndexError  # topics are told beside their messages only, as the format allows
+            raise _NoIndexError  # the format allows topic descriptions next to their messages only
         if self.chunks:
             if not self._counts or any(not chunk.indexes for chunk in self.chunks):
                 raise _NoIndexError
@@ -198,17 +197,13 @@ class McapSource:
             raise _NoIndexError  # messages outside of chunks
 
     def _describes_all(self) -> bool:
-        """Tell whether the summary describes every channel that it names, and every schema that those name."""
+        """Return whether the summary describes all its channels and their schemas."""
         named = {channel for channel, count in self._counts.items() if count}
         named.update(*(chunk.indexes for chunk in self.chunks))
         return self._topics.describe_all(named)
 
     def _compare_counts(self) -> None:
-        """Hold what the message indexes name, which no checksum covers, against the counts of the file.
-
-        Raises:
-            DamagedError: They name more or fewer messages.
-        """
+        """Compare the message indexes, which have no checksum, with the counts; a DamagedError if they differ."""
         named = indexed_counts(self.chunks)
         for channel in sorted(named.keys() | self._counts.keys()):
             found, count = named.get(channel, 0), self._counts.get(channel, 0)
@@ -247,7 +242,7 @@ class McapSource:
         return Chunk(self.buffer, start, stop, data_start, packed, raw, compression, indexes, crc, offset)
 
     def _scan(self, damage: str) -> None:
-        """Take what a walk through the file finds in the place of what the index says."""
+        """Replace what the index says by the result of a scan."""
         found = McapScan(self.buffer, self.path, self._topics, self._checksums.sound, damage)
         self.damage = found.damage
         self.chunks, self._scanned, self._loose = found.chunks, found.scanned, found.loose
@@ -256,10 +251,9 @@ class McapSource:
     # -- checksums ---------------------------------------------------------------------------------------------
 
     def _leave_out_damaged(self) -> None:
-        """Compare checksums and message indexes of all chunks, and leave out those whose content was not written so.
+        """Compare checksums and message indexes of all chunks, and leave damaged chunks out.
 
-        Raises:
-            DamagedError, BagError: A message index is damaged; the chunks themselves must be walked through.
+        Raises DamagedError or BagError if a message index is damaged, so that the chunks must be scanned.
         """
         kept: list[Chunk] = []
         lost: dict[int, int] = {}
@@ -292,7 +286,7 @@ class McapSource:
     # -- reading -----------------------------------------------------------------------------------------------
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
-        """Yield all messages of some channels with start <= log time < stop, in the order of the file."""
+        """Yield all messages of some channels with start <= log time < stop, in file order."""
         for channel, entries in self._loose.items():
             if channel in channels:
                 table = np.array(entries, np.int64)
@@ -308,7 +302,7 @@ class McapSource:
     def _groups(
         self, channels: set[int], start: int | None, stop: int | None, checksums: Comparison
     ) -> Iterator[tuple[Bytes, Bytes, list[tuple[int, int]]]]:
-        """Yield buffers that hold many chunks, and their index, with (number of the chunk, where it begins)."""
+        """Yield buffers of many chunks, and their index, with (chunk number, offset of the chunk)."""
         plain: dict[int, list[tuple[int, int]]] = {}
         packed: list[tuple[int, int]] = []
         parts: list[Bytes] = []
@@ -321,7 +315,7 @@ class McapSource:
                 continue
             if not chunk.compression:
                 checksums.compare(chunk, raw_content(chunk, self.path))
-                plain.setdefault(id(chunk.buffer), []).append((number, chunk.data_start))  # they lie in the same map
+                plain.setdefault(id(chunk.buffer), []).append((number, chunk.data_start))  # all in the same map
                 continue
             if packed and (size >= _GROUP_SIZE or index is not chunk.buffer):
                 yield np.concatenate(parts), index, packed
@@ -353,7 +347,7 @@ class McapSource:
         return indexed_messages(self.path, channel, index, places)
 
     def _origin(self, channel: int, index: Bytes, members: Sequence[tuple[int, int]], time_ns: int, offset: int) -> str:
-        """Say which message index names a message of a group of chunks, by its log time [ns] and offset."""
+        """Return which message index lists a message of a group, by its log time [ns] and offset."""
         place = ""
         for number, base in members:
             times, offsets = self._entries(channel, index, [(number, base)])
@@ -363,7 +357,7 @@ class McapSource:
         return f"{self.path}: the message index{place}, topic {self._topics.channels[channel][1]},"
 
     def _cut(self, batch: Batch, start: int | None, stop: int | None) -> Iterator[Batch]:
-        """Limit a batch to a time span and check that its records lie inside the buffer."""
+        """Limit a batch to a time span and check that its records are inside the buffer."""
         if start is not None or stop is not None:
             keep = within(batch.times, start, stop)
             batch = replace(batch, offsets=batch.offsets[keep], times=batch.times[keep])

@@ -1,4 +1,4 @@
-"""What an MCAP file says of its topics: schemas, channels, metadata."""
+"""Topic descriptions of an MCAP file: schemas, channels, metadata."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["McapTopics"]
 
 
 class McapTopics:
-    """Descriptions as they are met in a summary, or between the messages.
+    """Descriptions found in a summary, or between the messages.
 
     Attributes:
         schemas: Name, encoding and definition of each schema, by its number.
@@ -26,21 +26,17 @@ class McapTopics:
         self.metadata: dict[str, dict[str, str]] = {}
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove all descriptions."""
         for known in (self.schemas, self.channels, self.metadata):
             known.clear()
 
     def take(self, opcode: int, content: bytes) -> None:
-        """Take the content of a record: schema, channel or metadata; what is none of them describes nothing.
-
-        Raises:
-            struct.error, UnicodeDecodeError: It is not whole.
-        """
+        """Store a schema, channel or metadata record; raises struct.error or UnicodeDecodeError if it is not whole."""
         if opcode == rec.SCHEMA:
             (key,) = struct.unpack_from("<H", content)
             name, at = read_text(content, 2)
             encoding, at = read_text(content, at)
-            definition, at = read_text(content, at, "surrogateescape")  # not text in every encoding
+            definition, at = read_text(content, at, "surrogateescape")  # some encodings are not text
             self.schemas[key] = (name, encoding, definition)
         elif opcode == rec.CHANNEL:
             key, schema = struct.unpack_from("<HH", content)
@@ -52,14 +48,14 @@ class McapTopics:
             self.metadata[found.name] = dict(found.items)
 
     def describe_all(self, named: set[int]) -> bool:
-        """Tell whether every channel of a set is described, and every schema that the channels name."""
+        """Return whether every channel of a set is described, and every schema of the channels."""
         return (
             named <= self.channels.keys()
             and {schema for schema, *_ in self.channels.values()} - {0} <= self.schemas.keys()
         )
 
     def stream(self, channel: int, count: int) -> Stream:
-        """Return what a channel is known by, with the number of its messages."""
+        """Return the description of a channel, with the number of its messages."""
         schema, topic, encoding, metadata = self.channels[channel]
         name, schema_encoding, definition = self.schemas.get(schema, ("", "", ""))
         return Stream(

@@ -1,4 +1,4 @@
-"""Finding the storage files of a bag, with its ``metadata.yaml`` or without."""
+"""Finding the storage files of a bag, with or without its ``metadata.yaml``."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ __all__ = [
 _ENDINGS = {".mcap": "mcap", ".db3": "sqlite3"}
 _LEAST_ROOM = 1 << 28
 _MAX_RATIO = 100
-"""A file compressed as a whole may hold this many times its size: states shrink to a fifth, bombs to nothing."""
+"""Largest ratio of content to size in a file compressed as a whole: states reach 5, bombs far more."""
 _MAX_METADATA = 16 << 20
 _MAX_DEPTH = 40
 _NO_METADATA = (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, RecursionError, OverflowError)
-"""What reading leads to where YAML is not that of a bag."""
+"""Errors of reading YAML that is not a bag's."""
 
 
 @dataclass(slots=True)
@@ -51,35 +51,35 @@ class BagFolder:
     custom_data: dict[str, str] = field(default_factory=dict)
     topic_hashes: dict[str, str] = field(default_factory=dict)
     message_compression: bool | None = None
-    """Whether messages are compressed one by one; ``None`` where nothing says so."""
+    """Whether messages are compressed one by one; ``None`` if unknown."""
     topic_counts: dict[str, int] = field(default_factory=dict)
-    """Messages by topic, as its metadata has it; empty where nothing says so."""
+    """Messages by topic in the metadata; empty if unknown."""
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    """What was left out because it is there twice, or read without being listed."""
+    """Files left out as duplicates, or read without being listed."""
     unlisted: list[Path] = field(default_factory=list)
-    """Those of the files that no metadata lists."""
+    """Files that no metadata lists."""
     twins: dict[Path, Path] = field(default_factory=dict)
-    """File -> the same file in its other form, compressed or not, which is not read besides."""
+    """File -> the same file in its other form (compressed or not), which is not read."""
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """Run metadata (``custom_data``), values parsed where they are JSON."""
+        """Run metadata (``custom_data``), JSON values parsed."""
         return {key: parsed(value) for key, value in self.custom_data.items()}
 
 
 def is_storage_file(path: Path) -> bool:
-    """Tell whether a file is a storage file by its name, compressed as a whole or not."""
+    """Return whether a file's name is that of a storage file, compressed as a whole or not."""
     return _ending(path) in _ENDINGS and not path.name.startswith(".") and path.is_file()
 
 
 def is_ros1(path: Path) -> bool:
-    """Tell whether a file is a bag of ROS 1 by its name; ``.active`` is one whose recorder was killed."""
+    """Return whether a file's name is that of a ROS 1 bag; ``.active`` is one whose recorder was killed."""
     return path.name.removesuffix(".active").endswith(".bag") and path.is_file()
 
 
 def is_bag_folder(path: Path) -> bool:
-    """Tell whether a folder is a bag: it has storage files, or the metadata of some that were lost."""
+    """Return whether a folder is a bag: it has storage files, or metadata of lost ones."""
     if any(is_storage_file(file) for file in path.iterdir()):
         return True
     try:
@@ -123,7 +123,7 @@ def open_folder(path: Path) -> BagFolder:
 
 
 def _listed(named: Iterable[Path], present: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Return the files that the metadata name, as they are there, and the names of those that are not."""
+    """Return the files named in the metadata in their present form, and the names of the missing ones."""
     found, missing = [], []
     for path in named:
         names = (path.name, _other_form(path).name)
@@ -136,7 +136,7 @@ def _listed(named: Iterable[Path], present: Sequence[Path]) -> tuple[list[Path],
 
 
 def _choose_files(folder: BagFolder, listed: Sequence[Path], present: Sequence[Path]) -> None:
-    """Take each file once: under one of its names, and compressed or not."""
+    """Take each file once: under one of its names, and in one form, compressed or not."""
     folder.files = []
     taken: dict[tuple[int, int], Path] = {}
     for file in dict.fromkeys([*listed, *present]):
@@ -149,7 +149,7 @@ def _choose_files(folder: BagFolder, listed: Sequence[Path], present: Sequence[P
             folder.notes.append(f"{file.name} is left out: it is {other.name} in its other form")
         else:
             folder.files.append(file)
-            # A file that is not listed yet was begun by a recorder that died before it could say so.
+            # Begun by a recorder that died before listing it.
             if file not in listed:
                 folder.unlisted.append(file)
 
@@ -160,17 +160,16 @@ def _other_form(file: Path) -> Path:
 
 def _read_metadata(path: Path) -> str:
     if path.exists() and not path.is_file():
-        raise OSError("it is no file")  # a pipe would keep us waiting for ever
+        raise OSError("it is no file")  # reading a pipe would block for ever
     if path.stat().st_size > _MAX_METADATA:
         raise OSError(f"it has more than {_MAX_METADATA} bytes")
     return path.read_text(encoding="utf-8")
 
 
 def _load_yaml(text: str) -> Any:
-    """Return what YAML text says.
+    """Parse YAML without aliases, which can make gigabytes out of a line, and without deep nesting.
 
-    Aliases are refused, which can make gigabytes out of a line, and depth, which overflows the stack of libyaml's
-    composer and with it ends the process.
+    Depth overflows the stack of libyaml's composer, which ends the process.
     """
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     depth = 0
@@ -193,7 +192,7 @@ def _take_metadata(folder: BagFolder, text: str) -> None:
         version = int(info["version"])
         if version > METADATA_VERSION:
             folder.damage.append(f"metadata version is {version}; expected at most {METADATA_VERSION}")
-        # (rosbag2 on Windows separates folders by backslashes)
+        # rosbag2 on Windows separates folders by backslashes.
         folder.files = [folder.path / PureWindowsPath(name).name for name in info["relative_file_paths"]]
         folder.storage = str(info["storage_identifier"])
         custom = info.get("custom_data") or {}
@@ -217,10 +216,10 @@ def _counts_by_topic(info: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _missing_messages(folder: BagFolder, sources: Sequence[Source]) -> list[str]:
-    """Return a sentence for each topic of which fewer messages are there than the metadata names.
+    """Return a sentence for each topic with fewer messages than the metadata names.
 
-    More may be there: the metadata of a bag that is being recorded, or whose recorder died, is older than its files.
-    Where files are damaged or missing, it has been told already that messages are.
+    More may be there: the metadata of a running or killed recorder is older than its files. Damaged or missing files
+    are reported already.
     """
     if folder.damage or any(source.damage for source in sources):
         return []
@@ -258,12 +257,7 @@ def _file_order(file: Path) -> tuple[int, str]:
 def open_sources(folder: BagFolder, *, verify: bool | None = None) -> list[Source]:
     """Open the storage files of a bag; unreadable ones are named in ``damage`` if others can be read.
 
-    Args:
-        folder: The bag.
-        verify: Which checksums to compare; see :class:`McapSource`.
-
-    Raises:
-        BagError: None of them can be read.
+    ``verify`` is as for :class:`McapSource`. Raises a BagError if none can be read.
     """
     sources: list[Source] = []
     errors: list[BagError] = []
@@ -285,7 +279,7 @@ def open_sources(folder: BagFolder, *, verify: bool | None = None) -> list[Sourc
 
 
 def _open_one_form(file: Path, twin: Path | None, verify: bool | None) -> Source:
-    """Open a file, or the same in its other form where that is sound and the file is not."""
+    """Open a file, or its other form if only that is sound."""
     if twin is None:
         return open_source(file, verify=verify)
     try:
@@ -304,7 +298,7 @@ def _open_one_form(file: Path, twin: Path | None, verify: bool | None) -> Source
 
 
 def _leave_out_copies(folder: BagFolder, sources: list[Source]) -> None:
-    """Close files that nobody lists and whose messages all stand in another file: copies, or what a repair left."""
+    """Close unlisted files whose messages are all in another file: copies, or leftovers of a repair."""
     for source in [one for one in sources if one.path in folder.unlisted and one.stop_ns]:
         for other in sources:
             if _is_copy(source, other):
@@ -315,10 +309,10 @@ def _leave_out_copies(folder: BagFolder, sources: list[Source]) -> None:
 
 
 def _is_copy(source: Source, other: Source) -> bool:
-    """Tell whether all messages of a file are in another; of files that cannot be read whole nothing is known."""
+    """Return whether all messages of a file are in another; False if one cannot be read."""
     inside = other is not source and other.start_ns <= source.start_ns and source.stop_ns <= other.stop_ns
     try:
-        # Runs of a simulation begin at the same time, so that times alone make no copy.
+        # Simulation runs begin at the same time, so times alone prove nothing.
         return inside and _messages(source) <= _messages(other)
     except BagError:
         return False
@@ -388,7 +382,7 @@ def _metadata_from_storage(folder: BagFolder, source: Source) -> None:
 
 
 def parsed(text: Any) -> Any:
-    """Return JSON text as the value that it stands for; any other text as it is."""
+    """Return the value of JSON text; any other text unchanged."""
     if not isinstance(text, str) or text[:1] not in '{["-0123456789tfn':
         return text
     try:

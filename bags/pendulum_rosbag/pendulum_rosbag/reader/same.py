@@ -1,4 +1,4 @@
-"""Are two bags the same, message by message? The question that two runs with one seed must answer with yes."""
+"""Message-by-message comparison of two bags, as for two runs with one seed."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ __all__ = ["Difference", "same_messages"]
 
 @dataclass(slots=True)
 class Difference:
-    """The answer of :func:`same_messages`: true when the bags are equal.
+    """Result of :func:`same_messages`; true if the bags are equal.
 
     Args:
-        compared: Topic -> number of messages that were compared.
-        reasons: One sentence for each topic that differs, naming the first message that does.
+        compared: Topic -> number of compared messages.
+        reasons: One sentence for each topic that differs, with its first difference.
     """
 
     compared: dict[str, int] = field(default_factory=dict)
@@ -33,7 +33,7 @@ class Difference:
 
     @property
     def equal(self) -> bool:
-        """Whether nothing differs (and something was compared)."""
+        """Whether messages were compared and none differs."""
         return not self.reasons and bool(self.compared)
 
     def __bool__(self) -> bool:
@@ -48,15 +48,15 @@ class Difference:
 def same_messages(bag_a: Bag, bag_b: Bag, topics: Sequence[str] | None = None, *, log_times: bool = True) -> Difference:
     """Compare two bags topic by topic and message by message, each topic in order of log time.
 
-    Padding, and bytes behind a message, do not count: rclpy leaves both uninitialised. Messages of a type that
-    neither the bags nor ROS 2 Jazzy define are compared byte by byte. Messages of one topic at one log time have no
-    order, as two nodes may have published them (both the noise and the plant's run end at the last stamp, as events).
+    Padding and trailing bytes do not count: rclpy leaves both uninitialised. Types that neither the bags nor ROS 2
+    Jazzy define are compared byte by byte. Messages of one topic and log time have no order, as two nodes may have
+    published them.
 
     Args:
         bag_a: One bag.
         bag_b: The other.
         topics: Topics to compare; by default all that either bag has.
-        log_times: Compare log times too; leave that out for bags whose log time is the time of arrival.
+        log_times: Compare log times too; False for bags whose log time is the time of arrival.
     """
     answer = Difference()
     for topic in sorted(topics if topics is not None else {*bag_a.topics, *bag_b.topics}):
@@ -78,7 +78,7 @@ def same_messages(bag_a: Bag, bag_b: Bag, topics: Sequence[str] | None = None, *
 
 
 def _canonical_of(info: TopicInfo) -> Callable[[bytes], bytes]:
-    """Return what makes equal messages of a topic equal bytes."""
+    """Return a function that maps equal messages of a topic to equal bytes."""
     if info.type == "sensor_msgs/msg/JointState":
         return canonical
     try:
@@ -96,11 +96,7 @@ def _canonical_of(info: TopicInfo) -> Callable[[bytes], bytes]:
 
 
 def _first_difference(
-    topic: str,
-    clean: Callable[[bytes], bytes],
-    a: list[tuple[int, bytes]],
-    b: list[tuple[int, bytes]],
-    log_times: bool,
+    topic: str, clean: Callable[[bytes], bytes], a: list[tuple[int, bytes]], b: list[tuple[int, bytes]], log_times: bool
 ) -> str:
     if log_times:
         a, b = _ordered(a, clean), _ordered(b, clean)
@@ -115,7 +111,7 @@ def _first_difference(
 
 
 def _ordered(messages: list[tuple[int, bytes]], clean: Callable[[bytes], bytes]) -> list[tuple[int, bytes]]:
-    """Give messages of one log time an order of their own, by what is in them."""
+    """Order messages of one log time by their content."""
     ordered: list[tuple[int, bytes]] = []
     for _, group in itertools.groupby(messages, key=itemgetter(0)):
         same_time = list(group)

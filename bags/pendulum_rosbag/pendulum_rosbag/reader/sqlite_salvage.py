@@ -18,7 +18,7 @@ _SIZES = (0, 1, 2, 3, 4, 6, 8, -1, 0, 0)
 
 
 def page_size(content: bytes) -> int:
-    """Return the page size that the head of an SQLite file names, 0 when it is none."""
+    """Return the page size in the head of an SQLite file, 0 if it is none."""
     if len(content) < 100 or content[:16] != b"SQLite format 3\0":
         return 0
     size = int.from_bytes(content[16:18], "big")
@@ -27,10 +27,7 @@ def page_size(content: bytes) -> int:
 
 
 def salvaged_rows(content: bytes) -> Iterator[Row]:
-    """Yield the whole message rows on leaf pages in the order of the pages, each ``id`` once.
-
-    A writer that moves rows leaves copies of them behind.
-    """
+    """Yield the whole message rows on leaf pages in page order, each ``id`` once (moved rows leave copies)."""
     size = page_size(content)
     seen = set()
     for start in range(0, len(content) - size + 1, size):
@@ -47,7 +44,7 @@ def salvaged_rows(content: bytes) -> Iterator[Row]:
 
 
 def _row(content: bytes, size: int, cell: int) -> Row | None:
-    """Return the row of a cell; ``None`` where it is no message or not all of it is there."""
+    """Return the row of a cell; ``None`` if it is no whole message."""
     length, at = _varint(content, cell)
     row_id, at = _varint(content, at)
     payload = _payload(content, size, at, length)
@@ -68,7 +65,7 @@ def _row(content: bytes, size: int, cell: int) -> Row | None:
 
 
 def _payload(content: bytes, size: int, at: int, length: int) -> bytes:
-    """Return the bytes of a row, which may continue on overflow pages; fewer where those are lost."""
+    """Return the bytes of a row with its overflow pages; fewer if those are lost."""
     usable = size - content[20]
     least = (usable - 12) * 32 // 255 - 23
     local = length
@@ -86,7 +83,7 @@ def _payload(content: bytes, size: int, at: int, length: int) -> bytes:
 
 
 def _varint(content: bytes, at: int) -> tuple[int, int]:
-    """Return the variable-length integer that begins at a byte, and where it ends."""
+    """Return the variable-length integer at an offset, and where it ends."""
     value = 0
     for place, byte in enumerate(content[at : at + 9]):
         if place == 8:

@@ -1,4 +1,4 @@
-"""Reading rosbag2 databases (SQLite), of all schema versions, also those that a killed writer left behind."""
+"""Reading rosbag2 databases (SQLite) of all schema versions, also after their writer was killed."""
 
 from __future__ import annotations
 
@@ -20,24 +20,21 @@ from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 __all__ = ["SqliteSource"]
 
 _ROWS, _FETCHES = 256, 32
-"""Rows fetched at once, few enough to stay in the processor's cache, and fetches that make one batch."""
+"""Rows fetched at once, few enough for the processor's cache, and fetches per batch."""
 _TRIES = 5
 _LARGEST_SALVAGE = 64 << 30  # a damaged head may claim any size
-# What SQLite and numpy say to a file that is not what it claims to be: SQLite's columns hold values of any type.
+# Errors of SQLite and numpy for a wrong file: SQLite's columns hold values of any type.
 _UNREADABLE = (sqlite3.Error, BagError, ValueError, TypeError, KeyError, IndexError, OverflowError, OSError)
 _IS_MESSAGE = "typeof(data) = 'blob' AND typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer'"
-"""The last column first, so that SQLite reads the whole head of every row and refuses those that are damaged."""
+"""The last column first: SQLite then reads the whole head of each row and refuses damaged ones."""
 
 
 class SqliteSource:
     """One ``.db3`` file.
 
-    A database whose writer died in a transaction has a journal or a write-ahead log beside it. It is copied with
-    them to a temporary folder, where SQLite brings it back to its last consistent state; the bag stays untouched.
-
-    Args:
-        path: The file.
-        verify: Whether to read all messages now, and to salvage what is whole where one of them cannot be.
+    A database whose writer died in a transaction has a journal or write-ahead log alongside. It is copied with them to
+    a temporary folder, where SQLite restores its last consistent state; the bag stays untouched. ``verify`` reads all
+    messages now and salvages the whole ones if one is unreadable.
 
     Raises:
         BagError: The file cannot be opened or is no rosbag2 database.
@@ -86,11 +83,11 @@ class SqliteSource:
             self._copy = None
 
     def extras(self) -> list[Attachment | Metadata]:
-        """Return nothing: a database of rosbag2 has no place for more than messages."""
+        """Return nothing: a rosbag2 database holds only messages."""
         return []
 
     def keep(self, copy: tempfile.TemporaryDirectory[str]) -> None:
-        """Take charge of the temporary folder that the file is in."""
+        """Take ownership of the temporary folder that contains the file."""
         self._copy = copy
 
     @property
@@ -115,13 +112,13 @@ class SqliteSource:
         self._connection = sqlite3.connect(target)
 
     def _salvage(self, reason: str) -> bool:
-        """Read what is left of a torn or truncated file: the topics by SQL, the messages page by page."""
+        """Read what is left of a torn or truncated file: topics by SQL, messages page by page."""
         content = self.path.read_bytes()
         size = page_size(content)
         if not size:
             return False
         there, pages = len(content) // size, int.from_bytes(content[28:32], "big")
-        # SQLite refuses a file that is shorter than its head says, so the copy gets empty pages in place of lost ones.
+        # SQLite refuses a file that is shorter than its head says, so the copy gets empty pages for lost ones.
         missing = max(min(pages, _LARGEST_SALVAGE // size) * size - len(content), -len(content) % size)
         self._copy = tempfile.TemporaryDirectory(prefix="pendulum_rosbag_")
         copy = Path(self._copy.name, self.path.name)
@@ -143,7 +140,7 @@ class SqliteSource:
         return True
 
     def _counts(self) -> dict[int, int]:
-        """Return the number of messages by topic id, and note the time span of the file."""
+        """Return the number of messages by topic id; set the file's time span."""
         counts: dict[int, int] = {}
         if self._salvaged is not None:
             times = [time for _, _, time, _ in self._salvaged]
@@ -183,14 +180,7 @@ class SqliteSource:
                 )
             }
         counts = self._counts()
-        wanted = (
-            "id",
-            "name",
-            "type",
-            "serialization_format",
-            "offered_qos_profiles",
-            "type_description_hash",
-        )
+        wanted = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
         present = [column for column in wanted if column in columns]
         streams = []
         for row in run(f"SELECT {', '.join(present)} FROM topics ORDER BY id"):  # noqa: S608 (names from a list of ours)
@@ -216,7 +206,7 @@ class SqliteSource:
         return streams
 
     def custom_metadata(self) -> str:
-        """Return the text of ``metadata.yaml`` that the database holds (schema 3 and later), or nothing."""
+        """Return the text of ``metadata.yaml`` in the database (schema 3 and later), or nothing."""
         try:
             row = self.connection.execute("SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1").fetchone()
         except sqlite3.Error:
@@ -224,10 +214,10 @@ class SqliteSource:
         return row[0] if row and isinstance(row[0], str) else ""
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
-        """Yield all messages of some topics with start <= log time < stop, in the order of the file.
+        """Yield all messages of some topics with start <= log time < stop, in file order.
 
         Raises:
-            BagError: The file is damaged, or its recorder goes on faster than it can be read.
+            BagError: The file is damaged, or its recorder writes faster than it can be read.
         """
         if self._salvaged is not None:
             rows = [
@@ -244,7 +234,7 @@ class SqliteSource:
                 found = self._select(channels, start, stop)
             except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
                 raise BagError(f"{self.path} is damaged: {error}; try to repair the bag") from error
-            # A recorder that goes on may have moved rows while they were read.
+            # A running recorder may have moved rows meanwhile.
             if start is not None or stop is not None or sum(len(batch.times) for batch in found) == expected:
                 yield from found
                 return
@@ -253,13 +243,13 @@ class SqliteSource:
         raise BagError(f"{self.path} was written to while it was read; expected {expected} messages")
 
     def _select(self, channels: set[int], start: int | None, stop: int | None) -> list[Batch]:
-        # Counting has tested every row: the test takes half as long as reading, and is repeated for damaged files only.
+        # Counting has tested every row; the test costs half as much as reading, so it is repeated only after damage.
         conditions, values = ["rowid <= ?", *([_IS_MESSAGE] if self.damage else [])], [self._last_row]
         if not self._stored <= channels:
             conditions.append(f"topic_id IN ({', '.join('?' * len(channels))})")
             values += sorted(channels)
         if start is not None or stop is not None:
-            # The index over time finds the rows, which then come in the order of the file.
+            # The index over time finds the rows, which are then sorted into file order.
             conditions.append("rowid IN (SELECT rowid FROM messages WHERE timestamp >= ? AND timestamp < ?)")
             values += [-(2**63) if start is None else start, 2**63 - 1 if stop is None else stop]
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE {' AND '.join(conditions)} ORDER BY rowid"  # noqa: S608 (placeholders)
@@ -276,7 +266,7 @@ def _left_out(count: int) -> str:
 
 
 def _columns(rows: Sequence[tuple[int, int, bytes]]) -> tuple[Int64, Int64, Bytes, Int64]:
-    """Return topic ids, log times [ns], messages in one buffer and their sizes, of rows of a database."""
+    """Return topic ids, log times [ns], messages in one buffer and their sizes."""
     topics, times, datas = zip(*rows, strict=True)
     buffer, _, sizes = joined(datas)
     return np.array(topics), np.array(times, np.int64), buffer, sizes

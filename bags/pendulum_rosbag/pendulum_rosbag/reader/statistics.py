@@ -1,4 +1,4 @@
-"""What a recording's timing looks like: rates, gaps, jitter, latencies, duplicates and clock jumps."""
+"""Timing of a recording: rates, gaps, jitter, latencies, duplicates and clock jumps."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from pendulum_rosbag.storage.stamps import stamp_reader
 __all__ = ["BagStatistics", "Latency", "TopicStatistics", "bag_statistics", "clock_jumps", "time_statistics"]
 
 GAP_FACTOR = 1.5
-"""An interval counts as a gap when it is longer than this many median intervals."""
+"""Longest regular interval, in median intervals; a longer one is a gap."""
 BURST_FACTOR = 2.0
-"""Messages without stamps come in bursts when their mean interval is longer than this many median intervals."""
+"""Messages without stamps come in bursts if their mean interval exceeds this many median intervals."""
 _LEAST_PERIODIC = 0.5
-"""Share of the intervals that are near the median where messages have a period; events have none."""
+"""Least share of intervals near the median for messages that have a period; events have none."""
 _FEWEST_PERIODIC = 10
 TOLERATED = 0.02
-"""Share of messages that may be missing, or come twice, in a good recording."""
+"""Share of messages that may be missing or duplicate in a good recording."""
 _LASTING = 2.0
-"""How long a step has to last [s]: longer than any pause of a machine, after which messages are late, then on time."""
+"""Time that a step has to last [s]: longer than any pause of a machine, after which messages catch up."""
 _LEAST_AFTER = 5
 _LEAST_SHARE = 0.5
 _TIME_IS_CONTENT = frozenset({"std_msgs/msg/String", "rosgraph_msgs/msg/Clock"})
-"""Types whose stamps say what happened when, not when the message was made: their timing is that of the log."""
+"""Types whose stamps are content, not the time of the message: the log gives their timing."""
 _MS = 1e-6  # nanoseconds to milliseconds
 
 
 @dataclass(slots=True)
 class TopicStatistics:
-    """Timing of one topic; times in milliseconds, rates in Hz, NaN where there are too few messages.
+    """Timing of one topic; times in milliseconds, rates in Hz, NaN if there are too few messages.
 
     Args:
         type: Message type.
@@ -47,18 +47,17 @@ class TopicStatistics:
         rate: Messages per second between the first and the last.
         period: Median interval.
         jitter: Standard deviation of the intervals.
-        period_p99: 99 % of the intervals are at most that long.
+        period_p99: 99th percentile of the intervals.
         longest: Longest interval.
-        gaps: Intervals longer than 1.5 median intervals; none where messages have no period (see ``time_statistics``).
-        missing: Messages that would fill the gaps at the median interval (a late message leaves none behind).
-        duplicates: Messages that carry the stamp of an earlier one (of the same sender, where they name it).
-        backward: Messages whose stamp lies before that of the message before.
-        clock_jumps: Steps of more than 50 ms in the difference between log time and stamp that last, or that no
-            delay explains (see ``clock_jumps``).
-        unset: Messages whose stamp was never set; then log times are taken, and there is no age.
-        stamped: Whether the intervals are those between stamps; else between log times.
+        gaps: Intervals longer than 1.5 median intervals; none without a period (see ``time_statistics``).
+        missing: Messages that would fill the gaps at the median interval (a late message leaves none).
+        duplicates: Messages with the stamp of an earlier one (of the same sender, if it is named).
+        backward: Messages whose stamp lies before the previous one.
+        clock_jumps: Steps of more than 50 ms between log time and stamp (see ``clock_jumps``).
+        unset: Messages whose stamp was never set; log times are then used, and there is no age.
+        stamped: Whether intervals are between stamps rather than log times.
         age: Median of log time minus stamp.
-        age_p99: 99 % of the messages are at most that old when logged.
+        age_p99: Its 99th percentile.
     """
 
     type: str
@@ -81,16 +80,7 @@ class TopicStatistics:
 
 @dataclass(slots=True)
 class Latency:
-    """Time from a message on one topic to the message on another that carries the same stamp [ms].
-
-    Args:
-        source: Topic of the stamped message.
-        answer: Topic whose messages echo the stamp.
-        matched: Answers that were matched.
-        median: Median time.
-        p99: 99 % of the answers came within that time.
-        longest: Longest time.
-    """
+    """Time from a message on topic ``source`` to that on ``answer`` with the same stamp [ms]."""
 
     source: str
     answer: str
@@ -113,7 +103,7 @@ class BagStatistics:
     events: list[dict[str, Any]] = field(default_factory=list)
     damage: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
-    """Why it is no good recording, one sentence each; empty for a good one."""
+    """Why the recording is not good, one sentence each; empty for a good one."""
 
 
 def time_statistics(
@@ -121,15 +111,15 @@ def time_statistics(
 ) -> TopicStatistics:
     """Return the timing of one topic.
 
-    Intervals are those between stamps where messages have them (a recorder that reads in batches cannot blur them),
-    else those between log times. Messages of which fewer than half come near the median interval, as events do, or that
-    have no stamps and come in bursts, have no period that could leave gaps.
+    Intervals are between stamps if messages have them (reading in batches cannot blur them), else between log times.
+    Messages have no period, and so no gaps, if fewer than half are near the median interval (events), or if they have
+    no stamps and come in bursts.
 
     Args:
         kind: Message type.
         log_times: Log times in ascending order [ns], shape (n,).
-        stamps: Stamps of the messages [ns], shape (n,); see ``set_stamps`` for those that were never set.
-        senders: Who sent each message, shape (n,), where the messages say so.
+        stamps: Stamps of the messages [ns], shape (n,); unset ones as in ``set_stamps``.
+        senders: Sender of each message, shape (n,), if known.
     """
     result = TopicStatistics(kind, len(log_times))
     if stamps is not None and len(stamps):
@@ -157,7 +147,7 @@ def time_statistics(
     if near < _LEAST_PERIODIC or len(log_times) < _FEWEST_PERIODIC:
         return result
     result.gaps = int(np.sum(ascending > GAP_FACTOR * median))
-    # A late message makes a long interval and a short one: together they miss nothing.
+    # A late message makes a long interval and a short one, which cancel.
     result.missing = max(int(np.sum(np.rint(ascending / median) - 1)), 0)
     return result
 
@@ -178,12 +168,12 @@ def _stamp_statistics(
 
 
 def clock_jumps(log_times: Int64, stamps: Int64) -> list[int]:
-    """Return at which messages one of the two clocks jumped, as indices.
+    """Return the indices of messages at which one of the two clocks jumped.
 
     The age of a message (log time minus stamp) is the difference of the clocks plus a delay, which is never negative
-    and now and then small. So it is the *least* age that tells about the clocks: a jump is a step of more than
-    ``CLOCK_JUMP`` upwards that the least age of the next ``_LASTING`` seconds confirms, or one downwards to below the
-    least age of the seconds before. Late messages, one or a queue of them, are none.
+    and sometimes small. So the *least* age shows the clocks: a jump is a step of more than ``CLOCK_JUMP`` upwards that
+    the least age of the next ``_LASTING`` seconds confirms, or one downwards below the least age of the seconds before.
+    Late messages, single or queued, are no jumps.
 
     Args:
         log_times: Log times in ascending order [ns], shape (n,).
@@ -210,7 +200,7 @@ def clock_jumps(log_times: Int64, stamps: Int64) -> list[int]:
 
 
 def _latencies(times: dict[str, tuple[Int64, Int64]]) -> list[Latency]:
-    """Match stamps between all topics that echo each other; log times and stamps by topic [ns]."""
+    """Match stamps between topics that echo each other; ``times`` are log times and stamps by topic [ns]."""
     found = []
     for source, (sent_at, sent) in times.items():
         stamps, first = np.unique(sent, return_index=True)
@@ -223,14 +213,14 @@ def _latencies(times: dict[str, tuple[Int64, Int64]]) -> list[Latency]:
                 continue
             delays = (answered_at[same] - sent_at[first[place[same]]]) * _MS
             if np.median(delays) <= 0:
-                continue  # the other direction is the answer (or all log times are the stamps themselves)
+                continue  # the other direction is the reply (or all log times are the stamps themselves)
             median, p99 = np.quantile(delays, [0.5, 0.99])
             found.append(Latency(source, answer, int(same.sum()), float(median), float(p99), float(delays.max())))
     return found
 
 
 def _times(bag: Bag, info: TopicInfo) -> tuple[Int64, Int64 | None]:
-    """Return log times and stamps of a topic of any type; no stamps where its messages have none."""
+    """Return log times and stamps of a topic of any type; no stamps if its messages have none."""
     readable = info.serialization == "cdr" and info.type not in _TIME_IS_CONTENT
     read = stamp_reader(info.type) if readable else None
     if read is None:
@@ -252,7 +242,7 @@ def bag_statistics(bag: Bag) -> BagStatistics:
         is_joint_state = info.type == "sensor_msgs/msg/JointState" and info.serialization == "cdr"
         values = None
         if is_joint_state:
-            # A topic that is no JointState though it says so costs no other; ``array`` finds out about clocks.
+            # A topic that wrongly claims to be JointState must not cost the others; ``array`` examines the clocks.
             with contextlib.suppress(DataError):
                 values = bag[name]
                 if isinstance(values, np.ndarray) and (jumps := two_motions(values["position"])):
@@ -279,7 +269,6 @@ def bag_statistics(bag: Bag) -> BagStatistics:
 
 
 def _problems(topic: TopicStatistics) -> list[str]:
-    """Return what is wrong with the timing of a topic, in words."""
     found = []
     if topic.missing > TOLERATED * topic.count:
         found.append(f"{topic.missing} messages are missing between {topic.count}")

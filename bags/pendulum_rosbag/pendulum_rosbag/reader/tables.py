@@ -38,15 +38,15 @@ LEROBOT = "lerobot"
 """Format of :mod:`pendulum_rosbag.reader.lerobot`."""
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _ARROW_NAMES = {"bool": "bool_", "byte": "uint8", "char": "uint8", "octet": "uint8", "wstring": "string"}
-"""Names of ROS's types at Arrow, where they differ."""
+"""Arrow's names of ROS types, if they differ."""
 
 
 def to_pandas(bag: Bag, topic: str) -> pd.DataFrame:
-    """Return a topic as a table, one row a message, ordered by log time.
+    """Return a topic as a table, one row per message, ordered by log time.
 
-    One-joint JointStates have the columns of the array (units as there), those of several joints a column for each
-    quantity and joint, such as ``elbow.position``, as long as all messages name the same joints. Messages of other
-    types have a column for each field, nested fields joined by dots, arrays as lists.
+    JointStates of one joint have the array's columns and units, those of several joints a column per quantity and
+    joint, such as ``elbow.position``, if all messages name the same joints. Other types have a column per field, nested
+    fields joined by dots, arrays as lists.
 
     Raises:
         DataError: The topic is missing or its messages cannot be read.
@@ -64,7 +64,7 @@ def to_pandas(bag: Bag, topic: str) -> pd.DataFrame:
 
 
 def _joint_columns(bag: Bag, topic: str, messages: Sequence[StoredMessage]) -> dict[str, Any]:
-    """Return the columns of states of several joints; none where messages are not all of the same joints."""
+    """Return the columns of states of several joints; none if the messages' joints differ."""
     try:
         table = joint_table(bag.raw(topic), topic)
     except DataError:
@@ -81,16 +81,13 @@ def _joint_columns(bag: Bag, topic: str, messages: Sequence[StoredMessage]) -> d
 def export_bag(
     bag: Bag, folder: Path, format: str = "parquet", *, on_left_out: Callable[[str], None] = lambda sentence: None
 ) -> list[Path]:
-    """Write each topic to a file of its own, and the run metadata to ``metadata.json``; all of it or nothing.
+    """Write each topic to a file and the run metadata to ``metadata.json``, all or nothing; return the files.
 
     Args:
         bag: The bag.
         folder: Folder to create.
         format: ``parquet``, ``csv`` or ``mat`` (MATLAB's version 5).
         on_left_out: Called with a sentence for each topic that cannot be read.
-
-    Returns:
-        The files that were written.
 
     Raises:
         ParameterError: Unknown format, or pyarrow is missing.
@@ -108,7 +105,7 @@ def export_bag(
     with writing(f"folder {folder}", BagError):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as scratch:
-            # The folder appears under its name only when it is whole.
+            # The folder gets its name only when it is complete.
             place = Path(scratch, folder.name)
             place.mkdir()
             for topic in bag.topics:
@@ -130,7 +127,7 @@ def export_bag(
 
 
 def _free_path(folder: Path, topic: str, format: str, taken: Sequence[Path]) -> Path:
-    """Return a file for a topic; names that differ in slashes alone are numbered."""
+    """Return a file for a topic; names that differ only in slashes are numbered."""
     stem = topic.strip("/").replace("/", "__")
     names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
     return next(path for name in names if (path := folder / f"{name}.{format}") not in taken)
@@ -150,12 +147,12 @@ def _write_table(path: Path, table: pd.DataFrame, info: TopicInfo, format: str, 
 
 
 def _json(value: Any) -> str:
-    """Return a list as JSON, which knows neither NaN nor infinity: those become null."""
+    """Return a list as JSON, with null for NaN and infinity."""
     return json.dumps(without_nan(value), allow_nan=False)
 
 
 def _write_parquet(path: Path, table: pd.DataFrame, info: TopicInfo) -> None:
-    """Write a table whose lists have the type of their field also where all of them are empty."""
+    """Write a table; lists get their field's type even if all are empty."""
     import pyarrow as pa
     import pyarrow.parquet
 
@@ -170,7 +167,7 @@ def _write_parquet(path: Path, table: pd.DataFrame, info: TopicInfo) -> None:
 
 
 def _write_mat(path: Path, table: pd.DataFrame, start_ns: int) -> None:
-    """Write each column as a MATLAB variable with a row for each message, and ``time``: seconds from the bag's start.
+    """Write each column as a MATLAB variable, and ``time``: seconds from the bag's start.
 
     Lists of one length become a matrix, text and other lists a cell array.
     """
@@ -213,7 +210,7 @@ def _is_untyped(kind: Any) -> bool:
 
 
 def _arrow_fields(kind: str, store: Typestore, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the columns of a message type and their Arrow types, nested fields joined by dots as in the tables."""
+    """Yield a message type's columns and Arrow types, nested fields joined by dots as in the tables."""
     import pyarrow as pa
     from rosbags.interfaces import Nodetype
 
@@ -234,7 +231,7 @@ def _arrow_fields(kind: str, store: Typestore, prefix: str = "") -> Iterator[tup
 
 
 def require_pyarrow(format: str) -> None:
-    """Check that the library of Parquet is there; raise a ParameterError that says how to get it."""
+    """Raise a ParameterError with installation instructions if pyarrow is missing."""
     try:
         import pyarrow  # noqa: F401
     except ImportError as error:
@@ -247,7 +244,7 @@ def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
     row: dict[str, Any] = {}
     for field in dataclasses.fields(value):
         if str(field.type).startswith("ClassVar"):
-            continue  # constants of the type, and what rosbags adds, such as the type's name
+            continue  # constants, and what rosbags adds, such as the type's name
         item = getattr(value, field.name)
         name = f"{prefix}{field.name}"
         if dataclasses.is_dataclass(item):

@@ -1,4 +1,4 @@
-"""What a bag says of a topic, and a message as it is stored."""
+"""A bag's description of a topic, and a stored message."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _OLD_TYPE = re.compile(r"(\w+)/(\w+)")
 def ros_type(name: str) -> str:
     """Return the ROS 2 name of a message type, such as ``sensor_msgs/msg/JointState``.
 
-    Recorders of DDS call it ``sensor_msgs::msg::dds_::JointState_``, those of ROS 1 ``sensor_msgs/JointState``.
+    DDS recorders write ``sensor_msgs::msg::dds_::JointState_``, those of ROS 1 ``sensor_msgs/JointState``.
     """
     if dds := _DDS_TYPE.fullmatch(name):
         return "/".join([*dds[1].split("::"), dds[2]])
@@ -24,7 +24,7 @@ def ros_type(name: str) -> str:
 
 
 def ros_topic(name: str) -> str:
-    """Return the full ROS 2 name of a topic that a recorder noted under a relative name, or under that of DDS."""
+    """Return the full ROS 2 name of a topic recorded under a relative or a DDS name."""
     return name if name.startswith("/") else f"/{name.removeprefix('rt/')}"
 
 
@@ -35,11 +35,11 @@ class TopicInfo:
     Args:
         name: Full name.
         type: Message type, such as ``sensor_msgs/msg/JointState``.
-        count: Messages in the bag (of the whole bag, also when a time span was asked for).
-        hash: Type description hash, empty when the bag does not tell.
+        count: Messages in the whole bag, also if a time span was requested.
+        hash: Type description hash, empty if unknown.
         qos: Offered QoS profiles as the YAML text of the bag.
-        definition: Message definition text, empty when the bag has none.
-        serialization: How messages are encoded: ``cdr``, or as another writer says.
+        definition: Message definition text, empty if the bag has none.
+        serialization: Encoding of the messages, such as ``cdr``.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The last messages in bounded memory, and when they are to be written: a plant has faulted or was stopped."""
+"""The last messages in bounded memory, written when a plant faults or is stopped."""
 
 from __future__ import annotations
 
@@ -16,21 +16,16 @@ __all__ = ["MAX_BYTES", "BlackBox"]
 MAX_BYTES = 128 << 20
 """Memory for messages [bytes]; the oldest are dropped."""
 _AFTER_NS = NANOSECONDS
-"""Time that is awaited after a fault, for the stop that it causes [ns]."""
+"""Time to wait after a fault for the stop that it causes [ns]."""
 _OLDEST_NS = 2 * NANOSECONDS
-"""Age beyond which an event is a latched one of the past [ns]."""
+"""Age above which an event is a latched one from the past [ns]."""
 _STOPS = {Mode.FAULT.value, Mode.E_STOP.value}
 
 _Source = TypeVar("_Source")
 
 
 class BlackBox(Generic[_Source]):
-    """Messages of the last seconds, of any sources.
-
-    Args:
-        seconds: How long messages are kept [s].
-        max_bytes: Memory for them [bytes].
-    """
+    """Messages of the last ``seconds`` from any sources, in at most ``max_bytes`` of memory."""
 
     def __init__(self, seconds: float, max_bytes: int = MAX_BYTES) -> None:
         self._kept_ns = round(seconds * NANOSECONDS)
@@ -41,7 +36,7 @@ class BlackBox(Generic[_Source]):
         self.reason = ""
 
     def keep(self, source: _Source, items: Sequence[tuple[int, bytes]]) -> None:
-        """Take messages of a source: time of arrival [ns] and bytes."""
+        """Store messages of a source: time of arrival [ns] and bytes."""
         for time_ns, data in items:
             self._messages.append((source, time_ns, data))
             self._bytes += len(data)
@@ -49,12 +44,7 @@ class BlackBox(Generic[_Source]):
             self._bytes -= len(self._messages.popleft()[2])
 
     def poll(self, event: bytes, now_ns: int) -> None:
-        """Record whether an event reports a fault or an e-stop.
-
-        Args:
-            event: CDR bytes of a ``std_msgs/String``.
-            now_ns: Time of its arrival [ns].
-        """
+        """Record whether an event (CDR bytes of a ``std_msgs/String``) reports a fault or an e-stop."""
         try:
             said = json.loads(event[8:].rstrip(b"\0"))
             stops = said["name"] == Event.PLANT_MODE and said["mode"] in _STOPS
@@ -65,7 +55,7 @@ class BlackBox(Generic[_Source]):
             self._due_ns, self.reason = now_ns + _AFTER_NS, f"{said['mode']}: {said.get('reason', '')}"
 
     def is_due(self, now_ns: int) -> bool:
-        """Drop what is too old; return whether the rest is to be written now."""
+        """Drop messages that are too old; return whether the rest is to be written now."""
         oldest_ns = now_ns - self._kept_ns
         while self._messages and self._messages[0][1] < oldest_ns:
             self._bytes -= len(self._messages.popleft()[2])

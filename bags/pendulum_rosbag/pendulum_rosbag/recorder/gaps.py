@@ -1,4 +1,4 @@
-"""Counting messages that never arrived, from the sequence numbers that publishers give them."""
+"""Counting lost messages from the sequence numbers of publishers."""
 
 from __future__ import annotations
 
@@ -7,20 +7,17 @@ from dataclasses import dataclass
 
 __all__ = ["GapCounter"]
 
-_LARGEST_GAP = 1_000_000  # beyond this a number is taken for that of another publisher
+_LARGEST_GAP = 1_000_000  # a larger jump is another publisher's number
 _MOST_STREAMS = 64
 _PATIENCE = 200
-"""Messages of a topic after which an open sample counts as the silent publisher's next one, after a gap."""
+"""Messages of a topic until an ambiguous sample counts as the silent publisher's next one, after a gap."""
 
 
 @dataclass
 class _Doubt:
-    """The two explanations of a sample that continues no publisher, by the last number of the nearest one.
+    """A sample that continues no publisher: ``gap`` samples of the nearest one are missing, or it is another's first.
 
-    Attributes:
-        gap: Samples that are missing, if it belongs to that publisher.
-        unmet: Samples that came before it, if it is the first of another.
-        patience: Samples of the topic until it is taken for the former.
+    ``unmet`` samples came before it in the second case; ``patience`` samples of the topic later the first is assumed.
     """
 
     gap: int
@@ -29,20 +26,20 @@ class _Doubt:
 
 
 class GapCounter:
-    """Follows the sequence numbers of one topic and counts what is missing between them.
+    """Follows the sequence numbers of one topic and counts the missing ones.
 
-    DDS numbers the samples of each publisher from 1 on, but rclpy does not report which publisher a sample is from.
-    So every publisher seen so far is remembered by its last number, and a sample belongs to the one that it
-    continues. A sample that continues none is the first of a new publisher (which may have published before it was
-    matched), or there is a gap before it. If more publishers were matched than received from, both are possible, and
-    later samples decide: the publisher that it could have continued sends more, or has left, or the gap was real.
+    DDS numbers the samples of each publisher from 1, but rclpy does not report whose a sample is. So each publisher is
+    remembered by its last number, and a sample belongs to the publisher that it continues. Otherwise it is the first of
+    a new publisher (which may have published before the match) or follows a gap. If more publishers were matched than
+    received from, later samples decide: the publisher that it could continue sends more, or has left, or the gap was
+    real.
 
     Args:
-        matched: Returns how many publishers were matched since the beginning, and how many are now.
+        matched: Returns how many publishers were ever matched, and how many are now.
 
     Attributes:
-        missing: Samples that are missing between others of their publisher.
-        unmet: Samples that publishers had sent before the first that was received from them.
+        missing: Missing samples between others of their publisher.
+        unmet: Samples that publishers sent before the first one received.
     """
 
     def __init__(self, matched: Callable[[], tuple[int, int]]) -> None:
@@ -55,12 +52,12 @@ class GapCounter:
         self._doubts: dict[int, _Doubt] = {}
 
     def go_on_from(self, before: GapCounter) -> None:
-        """Take over the publishers of another subscription to the topic, by their last numbers."""
+        """Take over the publishers of another subscription to the topic."""
         self._last = list(before._last)
         self._heard = len(before._last)
 
     def see(self, sequence: int) -> int:
-        """Take note of a sample, by its number at its publisher, and return how many are found to be missing."""
+        """Count a sample by its number; return how many samples are found missing."""
         last = self._last
         before = sequence - 1
         missing = self._judge_doubts(before) if self._doubts else 0
@@ -78,8 +75,7 @@ class GapCounter:
         before = sequence - 1
         lower = max((number for number in self._last if number < sequence), default=0)
         gap = before - lower
-        # A first sample may come before the middleware has reported the match; one that is no later than all others is
-        # another publisher's in any case.
+        # A first sample may precede the report of its match; one below all others is another publisher's in any case.
         another = self._heard < total or not lower
         if another or gap > _LARGEST_GAP:
             if another:
@@ -98,7 +94,7 @@ class GapCounter:
         return gap
 
     def _judge_doubts(self, continued: int) -> int:
-        """Settle the open case of a publisher that sends more; return the gaps of those that were silent for long."""
+        """Resolve the case of a publisher that sends more; return the gaps of publishers that stayed silent."""
         if continued in self._doubts:
             self.unmet += self._doubts.pop(continued).unmet
         found = 0

@@ -29,14 +29,13 @@ class RecorderOptions:
         exclude: Pattern of topics to leave out.
         storage: ``mcap`` or ``sqlite3``.
         compression: ``None`` or ``zstd``.
-        max_size: Start a new file before this one is larger [bytes]; 0 for never.
-        max_duration: Start a new file before this one is longer [s]; 0 for never.
+        max_size: Largest storage file [bytes]; 0 for no limit.
+        max_duration: Longest time span of a storage file [s]; 0 for no limit.
         duration: Stop after this time [s]; 0 for never.
         metadata: Run metadata to store.
         log_time: ``receive`` or ``header``.
         wait: Start only when the service ``~/start`` is called.
-        black_box: Keep the last messages for so long, and write them each time that a plant faults or is stopped [s]; 0
-            to record all.
+        black_box: Length of the messages held in memory and written at each fault or stop [s]; 0 records all.
     """
 
     output: Path
@@ -86,11 +85,7 @@ class RecorderOptions:
         return topic not in ALWAYS_LEFT_OUT
 
     def unmet(self, met: Iterable[str]) -> dict[str, str]:
-        """Return the requested topics that were not published, and why each is missing.
-
-        Args:
-            met: Topics that had a publisher while there was a recorder.
-        """
+        """Return the requested topics that were not published, with reasons; ``met`` are those that had a publisher."""
         found = list(met)
         unmet = {name: "nobody published it" for name in self.topics if self.wants(name) and name not in found}
         unmet |= {name: "it is left out by the pattern of exclude" for name in self.topics if not self.wants(name)}
@@ -102,11 +97,7 @@ class RecorderOptions:
 
 
 def read_metadata(path: Path | None) -> dict[str, Any]:
-    """Return the JSON object in a file, nothing for no file.
-
-    Raises:
-        ParameterError: The file cannot be read or holds something else.
-    """
+    """Return the JSON object in a file, nothing for no file; a ParameterError if it cannot be read or is another."""
     if path is None:
         return {}
     try:

@@ -1,4 +1,4 @@
-"""Reading the parameters of all nodes, so that a bag has the values behind its data."""
+"""Parameters of all nodes, so that a bag has the values behind its data."""
 
 from __future__ import annotations
 
@@ -19,16 +19,14 @@ if TYPE_CHECKING:
 
 __all__ = ["ParameterReader"]
 
-_PATIENCE = 50  # polls of the graph before a node that does not respond is given up
+_PATIENCE = 50  # graph polls after which a node that does not respond is given up
 
 
 class ParameterReader:
     """Requests the parameters of each node that appears, and follows their changes.
 
-    Args:
-        node: The node that sends requests; its executor delivers the responses.
-        on_values: Called with all values so far (node -> parameter -> value) and the name of a node whose parameters
-            have changed after they were first read (else empty).
+    ``on_values`` is called with all values so far (node -> parameter -> value) and the name of a node whose parameters
+    changed after they were first read (else empty).
     """
 
     def __init__(self, node: Node, on_values: Callable[[Mapping[str, Mapping[str, Any]], str], None]) -> None:
@@ -42,10 +40,9 @@ class ParameterReader:
         node.create_subscription(ParameterEvent, "/parameter_events", self._on_event, qos_profile_parameter_events)
 
     def poll(self, *, forget: bool = False) -> None:
-        """Poll for new nodes, and send requests to those whose services have appeared.
+        """Send requests to new nodes whose services have appeared.
 
-        Args:
-            forget: Whether nodes that are gone lose their values; one of the same name is then read again.
+        ``forget`` drops the values of nodes that are gone; a node of the same name is then read again.
         """
         for client in self._finished:
             self._node.destroy_client(client)
@@ -68,7 +65,7 @@ class ParameterReader:
         return self._node.create_client(kind, f"{full}/{service}")
 
     def _offers(self, full: str) -> bool:
-        """Return whether a node offers its parameters on the graph: each needless client loads discovery."""
+        """Return whether the graph shows a node's parameter services: each needless client loads discovery."""
         space, _, name = full.rpartition("/")
         try:
             offered = self._node.get_service_names_and_types_by_node(name, space or "/")

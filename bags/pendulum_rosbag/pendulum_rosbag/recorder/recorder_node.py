@@ -1,4 +1,4 @@
-"""The recorder: a node that subscribes to what there is and writes it down."""
+"""The recorder node: subscribes to topics as they appear and writes them to a bag."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from pendulum_rosbag.storage.message_types import message_type
 __all__ = ["SPECS", "Recorder"]
 
 POLL_PERIOD = 0.02
-"""Time between two visits to the middleware [s]; the time of arrival is the middleware's, not that of the visit."""
+"""Period of polling the middleware [s]; the middleware stamps the arrival, so polling costs no precision."""
 DISCOVERY_PERIOD = 0.2
 """Period of graph polls [s]."""
 
@@ -53,12 +53,8 @@ SPECS = (
 class Recorder(PollingNode):
     """Subscribes to topics as they appear and hands their bytes to a :class:`RecordingSession`.
 
-    Messages are not dispatched by the executor, one wake-up each, but taken from the middleware every 20 ms, all
-    that have come: that costs a tenth, and loses no precision, because the middleware notes the time of arrival.
-
-    Args:
-        options: What to record, and how.
-        stop: Requests the runner to end the process.
+    Messages are taken from the middleware every 20 ms rather than dispatched one by one by the executor: a tenth of the
+    cost at the same precision. ``stop`` requests the runner to end the process.
 
     Raises:
         BagError: The output folder exists or cannot be created.
@@ -92,7 +88,7 @@ class Recorder(PollingNode):
         self.create_service(Trigger, "~/annotate", self._on_annotate)
         self.create_service(Trigger, "~/status", self._on_status)
         self._discover()
-        # Steady time: topics are discovered also where the system clock is set back, or simulated time stands still.
+        # Steady time: discovery must not stop when the system clock is set back or simulated time stands still.
         create_wall_timer(self, DISCOVERY_PERIOD, self._discover)
         self._leave = threading.Event()
         self._poller = threading.Thread(target=self._poll, name="bag intake", daemon=True)
@@ -230,7 +226,7 @@ class Recorder(PollingNode):
             self._tell_early(tap, session, unheard)
 
     def _write_black_box(self) -> None:
-        """Write what the black box holds to a bag of its own, if a plant has faulted or was stopped."""
+        """If a plant has faulted or was stopped, write the black box to a bag of its own."""
         box = self._black_box
         if box is None or self._session is not None or not box.is_due(time.time_ns()):
             return
@@ -273,9 +269,9 @@ class Recorder(PollingNode):
         )
 
     def _stamp(self, tap: Tap, data: bytes) -> int | None:
-        """Return the log time by header; messages without a stamp go where the stamped ones are.
+        """Return the log time by header; unstamped messages get the newest stamp.
 
-        Wall time and simulated time must not mix: what comes before the first stamp has to wait for it.
+        Wall time and simulated time must not mix, so messages before the first stamp wait for it.
         """
         stamp = tap.stamp(data) if tap.stamp is not None else None
         if stamp is None or stamp < 0:
@@ -300,7 +296,7 @@ class Recorder(PollingNode):
             publishers = self.get_publishers_info_by_topic(topic)
             if not publishers:
                 continue
-            # What others subscribe to with another type gets them nothing, and is no reason to refuse the topic.
+            # A subscription of another type receives nothing and is no reason to refuse the topic.
             published = {publisher.topic_type for publisher in publishers}
             if tap is not None:
                 published.add(tap.type_name)
@@ -315,7 +311,7 @@ class Recorder(PollingNode):
         if tap is not None:
             if tap.suits(publishers):
                 return
-            # A new publisher offers less than the subscription requests: request less, or it would never match.
+            # A new publisher offers less than was requested and would never match: request less.
             with self._lock:
                 self._take(tap, self._session)
                 del self._taps[topic]
@@ -393,11 +389,7 @@ class Recorder(PollingNode):
                     tap.topic for tap in self._taps.values() if tap.source.subscription.get_publisher_count()
                 ),
                 "topics": {
-                    name: {
-                        "received": count.received,
-                        "written": count.written,
-                        "lost": count.refused + count.missing,
-                    }
+                    name: {"received": count.received, "written": count.written, "lost": count.refused + count.missing}
                     for name, count in counts.items()
                 },
             }

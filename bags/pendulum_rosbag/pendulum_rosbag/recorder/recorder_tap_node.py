@@ -1,4 +1,4 @@
-"""One subscription of the recorder: how a topic is subscribed to, and what has arrived from it."""
+"""One subscription of the recorder: its QoS, and what has arrived."""
 
 from __future__ import annotations
 
@@ -24,15 +24,14 @@ __all__ = ["Tap", "wanted_qos"]
 DEPTH = 4000
 """Queue depth of the middleware between two polls: four seconds at 1 kHz."""
 SETTLING = 5.0
-"""Time after which a publisher and its subscription are matched at both ends [s].
+"""Time until a publisher and its subscription are matched at both ends [s].
 
-A matched publisher may deliver at once. It resends missed messages only once it has matched the subscription too,
-which took up to 2 s where recorders had been killed before.
+A publisher resends missed messages only after its own match, which took up to 2 s after recorders had been killed.
 """
 
 
 def wanted_qos(publishers: Sequence[TopicEndpointInfo]) -> tuple[bool, bool]:
-    """Return whether all publishers of a topic are reliable, and whether all keep messages for latecomers."""
+    """Return whether all publishers are reliable, and whether all are transient local."""
     return (
         all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers),
         all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers),
@@ -46,13 +45,13 @@ class Tap:
         node: The node that subscribes.
         topic: Full name.
         publishers: The topic's publishers, with their QoS.
-        before: The subscription that this one replaces; what is missed between them is counted, too.
+        before: The subscription that this one replaces; messages missed between them are counted, too.
 
     Raises:
         ImportError: The type of the messages is not installed.
 
     Attributes:
-        source: Where its messages come from; the node that made it destroys it after ``close``.
+        source: The polled input; the node destroys it after ``close``.
         announced: The session that has the topic.
     """
 
@@ -79,7 +78,7 @@ class Tap:
         self._opened = self._first_opened = time.monotonic()
         self._told_unmet = 0
         self.source = node.create_polled_input(class_of(name), topic, profile)
-        # Taken on demand, not delivered by the executor: it must be as new as the messages.
+        # Taken on demand, not delivered by the executor, so that it is as recent as the messages.
         handle = self.source.subscription.handle
         with handle:
             self._matched = rclpy_implementation.EventHandle(handle, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED)
@@ -89,7 +88,7 @@ class Tap:
 
     @property
     def is_new(self) -> bool:
-        """Whether the topic is so new here that its publishers' first messages may be missing."""
+        """Whether its publishers' first messages may be missing because the topic is new."""
         return time.monotonic() - self._first_opened < SETTLING
 
     @property
@@ -98,7 +97,7 @@ class Tap:
         return time.monotonic() - self._opened < SETTLING
 
     def suits(self, publishers: Sequence[TopicEndpointInfo]) -> bool:
-        """Return whether the subscription can match all these publishers; take note of how many they are."""
+        """Return whether the subscription matches all these publishers; update their number."""
         if len(publishers) > self.publishers:
             self._opened = time.monotonic()
         self.publishers = len(publishers)
@@ -106,13 +105,13 @@ class Tap:
         return (reliable or not self.reliable) and (latched or not self.latched)
 
     def announce(self, session: RecordingSession) -> None:
-        """Announce the topic to a session, before anything of it is reported or offered."""
+        """Announce the topic to a session once."""
         if self.announced is not session:
             session.add_topic(self.topic, self.type, self.qos)
             self.announced = session
 
     def take(self) -> Iterator[tuple[int, bytes, int]]:
-        """Yield what has arrived: time of arrival [ns] or 0, CDR bytes, and messages that are missing before it."""
+        """Yield time of arrival [ns] or 0, CDR bytes, and the number of messages missing before each."""
         see, trim = self._gaps.see, self._trim
         for data, info in self.source.messages():
             sequence = info["publication_sequence_number"]
@@ -121,15 +120,14 @@ class Tap:
     def repeats(self, session: RecordingSession | None, data: bytes) -> bool:
         """Return whether a stamped message repeats the one before it in a recording, and store it.
 
-        A plant in lockstep publishes a state again without a reply in time, and a node that has replied repeats its
-        reply.
+        In lockstep a plant repeats its state until a reply comes, and nodes repeat their replies.
         """
         before, self._newest = self._newest, (session, data)
         again = before[0] is session and before[1] == data
         return again and self.stamp is not None and (self.stamp(data) or 0) > 0
 
     def unheard(self) -> int:
-        """Return how many messages publishers had sent before the first that was received, since the last call."""
+        """Return how many messages publishers had sent before the first one received, since the last call."""
         unheard = self._gaps.unmet - self._told_unmet
         self._told_unmet = self._gaps.unmet
         return unheard

@@ -1,4 +1,4 @@
-"""A recording as a bounded queue and threads that write: delivery of messages never waits for the disk."""
+"""A recording as a bounded queue and writing threads, so that message delivery never waits for the disk."""
 
 from __future__ import annotations
 
@@ -18,21 +18,25 @@ __all__ = ["RecordingSession", "SessionReport", "TopicCount"]
 
 MAX_QUEUE_BYTES = 256 << 20
 SEAL_INTERVAL = 0.05
-"""Time between two seals [s]: with the visits to the middleware and a busy machine, a kill costs 0.1 s or so."""
+"""Time between two seals [s]: including polling and load, a kill costs about 0.1 s of messages."""
 SYNC_INTERVAL = 5.0
-"""Time between two requests to the disk to keep what it was given [s]: what a power failure may cost."""
+"""Time between two syncs to disk [s]: what a power failure may cost."""
 
 _COUNTS = "pendulum.recorder.counts"
 
 
 @dataclass(slots=True)
 class TopicCount:
-    """Messages of one topic: arrived, refused by the full queue, never arrived, safely written.
+    """Message counts of one topic.
 
-    ``early`` are those that were published between the first message that arrived and the moment at which the
-    subscription was complete: the recording of the topic begins with a gap, but nothing that was due is lost.
-    ``before`` are those that its publishers had sent before the recording of the topic began. ``repeated`` are those
-    that came again, byte by byte, in a recording by header times: the bag holds each once.
+    Attributes:
+        received: Arrived at the recorder.
+        refused: Rejected because the queue was full.
+        missing: Lost before the recorder.
+        written: Safe on disk.
+        early: Published before the subscription was complete: a gap at the start, not a loss.
+        before: Sent by its publishers before the recording of the topic began.
+        repeated: Byte-identical repetitions in a recording by header times; the bag holds each once.
     """
 
     received: int = 0
@@ -57,7 +61,7 @@ class SessionReport:
     topics: dict[str, TopicCount] = field(default_factory=dict)
     error: str = ""
     unrecorded: dict[str, str] = field(default_factory=dict)
-    """What was requested and is not in the bag, and why: a topic or a pattern of topics, and a reason."""
+    """What was requested and is not in the bag (topic or pattern), with the reason."""
 
     @property
     def failed(self) -> bool:
@@ -97,14 +101,14 @@ class SessionReport:
 
 
 class RecordingSession:
-    """Write what is offered to a bag, by threads of its own.
+    """Writes offered messages to a bag in threads of its own.
 
     Args:
         writer: The bag; the session closes it.
-        max_queue_bytes: Memory that may wait to be written [bytes]. What exceeds it is refused and counted.
+        max_queue_bytes: Memory for waiting messages [bytes]; messages beyond it are refused and counted.
         seal_interval: Time between two seals [s].
         sync_interval: Time between two syncs to disk [s]; 0 for never.
-        on_failure: Called once, from the writing thread, when the disk refuses to take more.
+        on_failure: Called once, from the writing thread, when the disk fails.
     """
 
     def __init__(
@@ -135,27 +139,20 @@ class RecordingSession:
         self._syncer.start()
 
     def add_topic(self, name: str, type: MessageType, qos: Sequence[QosProfile]) -> None:
-        """Announce a topic before its first message.
-
-        Raises:
-            BagError: The bag holds the topic with another type.
-        """
+        """Announce a topic before its first message; a BagError if the bag holds it with another type."""
         if not self.failure:
             try:
                 self.writer.add_topic(name, type, qos)
             except BagError:
-                if not self.failure:  # else the writer was closed meanwhile, by the thread that met the failure
+                if not self.failure:  # else the writing thread closed the writer after a failure
                     raise
             except OSError as error:
                 self.fail(error)
-        # Also of a topic that the disk did not take any more: what arrives of it is lost, and has to be counted.
+        # Also after a disk failure: messages of the topic are lost and have to be counted.
         self._counts.setdefault(name, TopicCount())
 
     def offer(self, topic: str, items: Sequence[tuple[int, bytes]]) -> int:
-        """Queue messages of a topic as (log time [ns], CDR bytes); return how many were refused.
-
-        Messages are refused when the queue is full (the disk does not keep up) or the disk has failed.
-        """
+        """Queue (log time [ns], CDR bytes) of a topic; return how many were refused (queue full, or disk failed)."""
         count = self._counts[topic]
         count.received += len(items)
         if self.failure or self._closed:
@@ -173,7 +170,7 @@ class RecordingSession:
         return refused
 
     def update_metadata(self, metadata: Mapping[str, Any]) -> None:
-        """Add or replace entries of the bag's metadata; a disk that has failed gets no more."""
+        """Add or replace entries of the bag's metadata, unless the disk has failed."""
         if self.failure:
             return
         try:
@@ -182,20 +179,20 @@ class RecordingSession:
             self.fail(error)
 
     def note(self, topic: str, **numbers: int) -> None:
-        """Count messages of a topic that are not in the bag, or are there already: ``missing``, ``early`` and so on."""
+        """Count messages that are not in the bag, or are there already: ``missing``, ``early`` and so on."""
         count = self._counts[topic]
         for kind, number in numbers.items():
             setattr(count, kind, getattr(count, kind) + number)
 
     def counts(self) -> dict[str, TopicCount]:
-        """Return the counts so far; ``written`` are those that are safe on disk."""
+        """Return the counts so far; ``written`` are safe on disk."""
         sealed = self.writer.sealed
         for name, count in self._counts.items():
             count.written = sealed.get(name, 0)
         return dict(self._counts)
 
     def close(self) -> SessionReport:
-        """Write what is queued, close the bag and report; once more only reports."""
+        """Write the queue, close the bag and report; repeated calls only report."""
         if not self._closed:
             self._closed = True
             self._stop.set()
@@ -206,7 +203,7 @@ class RecordingSession:
                     self._write_queue()
                     self._store_counts()
                     self.writer.close()
-                except Exception as error:  # noqa: BLE001  # whatever it is, the report must have it
+                except Exception as error:  # noqa: BLE001  # the report must have any error
                     self.fail(error)
         return SessionReport(self.writer.path, self.counts(), self.failure)
 
@@ -218,12 +215,12 @@ class RecordingSession:
             due = max(due + self._seal_interval, time.monotonic())
             try:
                 self._write_queue()
-            except Exception as error:  # noqa: BLE001  # a thread that dies in silence would record nothing any more
+            except Exception as error:  # noqa: BLE001  # a silently dead thread would record nothing more
                 self.fail(error)
                 return
 
     def _run_sync(self) -> None:
-        """Wait for the disk apart from the thread that seals: a slow disk must not delay what a kill would cost."""
+        """Sync in a thread of its own: a slow disk must not delay the seals that bound what a kill costs."""
         if not self._sync_interval:
             return
         while not self._stop.wait(self._sync_interval):
@@ -240,7 +237,7 @@ class RecordingSession:
         if items:
             self.writer.write_many(items)
         self.writer.seal()
-        # A killed recorder's bag reports missing messages, too.
+        # Also in a killed recorder's bag.
         gaps = {
             name: {"lost": count.missing + count.refused, "early": count.early, "before": count.before}
             for name, count in self._counts.copy().items()
@@ -257,14 +254,13 @@ class RecordingSession:
         self.writer.update_metadata({_COUNTS: counts})
 
     def fail(self, error: Exception) -> None:
-        """Keep what is in the bag, return unused disk space, and store the reason; the first one counts."""
+        """Close the bag, which frees unused disk space, and store the first failure's reason."""
         if self.failure:
             return
         self.failure = _reason(error)
         try:
             self.writer.close()
-        except Exception:  # noqa: BLE001  # out of disk or memory: it does not matter any more
-            # Not even the summary fits: the file as it was sealed last is complete without it.
+        except Exception:  # noqa: BLE001  # out of disk or memory: the file is complete as last sealed
             self.writer.abandon()
         if self._on_failure is not None:
             self._on_failure(self.failure)

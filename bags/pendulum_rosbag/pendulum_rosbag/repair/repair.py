@@ -1,4 +1,4 @@
-"""Mending bags that a recorder left broken: all messages that are whole go into a new, sound bag."""
+"""Repairing bags that a recorder left broken: all whole messages go to a new, sound bag."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class RepairReport:
 
     Args:
         path: The sound bag.
-        damage: What was wrong, one sentence each; empty when nothing was.
+        damage: What was wrong, one sentence each; empty for a sound bag.
         messages: Topic -> number of messages saved.
-        original: Where the broken bag is now; ``None`` when nothing had to be done.
+        original: Where the broken bag is now; ``None`` if nothing was repaired.
         kept: Attachments and metadata of other writers, by name.
         left_out: What was not copied, one sentence each.
     """
@@ -60,15 +60,10 @@ class RepairReport:
 def repair_bag(
     path: str | os.PathLike[str], output: str | os.PathLike[str] | None = None, *, force: bool = False
 ) -> RepairReport:
-    """Write all whole messages of a broken bag to a new one.
+    """Write all whole messages of a broken bag to a new one; a sound bag is left alone unless ``force``.
 
-    Without ``output`` the new bag takes the place of the broken one, which is kept as ``NAME.broken``; a single
-    storage file gets a folder ``NAME_repaired`` beside it. A sound bag is left alone.
-
-    Args:
-        path: Folder of the bag, or one storage file.
-        output: Folder for the new bag; it must not exist.
-        force: Rewrite a sound bag, too (a bag of small chunks becomes smaller).
+    Without ``output`` (a folder that must not exist) the new bag takes the place of the broken one, which becomes
+    ``NAME.broken``; a single storage file gets a folder ``NAME_repaired`` alongside it.
 
     Raises:
         BagError: There is no bag, nothing of it can be read, or the new one cannot be written.
@@ -113,7 +108,7 @@ def repair_bag(
 
 
 def _copy(sources: list[Source], hashes: dict[str, str], writer: BagWriter) -> list[str]:
-    """Copy everything, and return what could not be, in sentences."""
+    """Copy everything; return what could not be copied, in sentences."""
     left_out: list[str] = []
     for source in sources:
         streams: dict[int, Stream] = {}
@@ -135,7 +130,7 @@ def _copy(sources: list[Source], hashes: dict[str, str], writer: BagWriter) -> l
 
 
 def message_type_of(stream: Stream, type_hash: str) -> MessageType:
-    """Return the type of a topic as its file describes it, with what is known of it besides."""
+    """Return the type of a topic as its file describes it, completed by what is known of the type."""
     if stream.serialization != "cdr" or stream.type.count("/") != 2:
         return MessageType(stream.type, stream.definition, stream.hash, stream.encoding, stream.serialization)
     if stream.definition:

@@ -23,8 +23,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def repair(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
     output: Annotated[
-        Path | None,
-        out_option("Folder for the sound bag; by default it takes the place of BAG."),
+        Path | None, out_option("Folder for the sound bag; by default it takes the place of BAG.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Rewrite a sound bag, too.")] = False,
     as_json: Json = False,

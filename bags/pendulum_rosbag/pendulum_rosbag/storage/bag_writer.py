@@ -13,13 +13,7 @@ from typing import Any
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_rosbag.storage.mcap_records import Attachment, Metadata
 from pendulum_rosbag.storage.message_types import MessageType, message_type
-from pendulum_rosbag.storage.metadata_file import (
-    FileEntry,
-    MetadataFile,
-    TopicEntry,
-    encode_custom_data,
-    qos_yaml,
-)
+from pendulum_rosbag.storage.metadata_file import FileEntry, MetadataFile, TopicEntry, encode_custom_data, qos_yaml
 from pendulum_rosbag.storage.qos import QosProfile
 from pendulum_rosbag.storage.storage_file import StorageFile
 
@@ -28,12 +22,10 @@ __all__ = ["STORAGES", "BagWriter"]
 STORAGES = ("mcap", "sqlite3")
 _COMPRESSIONS = (None, "zstd")
 _SPARE = 256
-"""Bytes by which numbers in the metadata of a file may get longer until it is closed."""
+"""How many bytes longer the numbers in a file's metadata may get until it is closed."""
 
 
 class _Channels(dict[str, int]):
-    """Topic -> channel of a bag; one that was not added is refused."""
-
     def __init__(self, bag: Path) -> None:
         super().__init__()
         self._bag = bag
@@ -43,27 +35,27 @@ class _Channels(dict[str, int]):
 
 
 class BagWriter:
-    """One rosbag2 folder that is being written.
+    """One rosbag2 folder that is being written; all methods are thread-safe.
 
-    Messages that were written are in memory until ``seal`` (called by itself when ``chunk_size`` bytes have come
-    together, and by a recorder every fraction of a second); what is sealed survives the death of the process and is
-    readable by any rosbag2 reader without repair. All methods may be called from several threads.
+    Messages wait in memory until ``seal``, which is called whenever ``chunk_size`` bytes have accumulated. Sealed
+    messages survive the death of the process; any rosbag2 reader reads them without repair.
 
     Args:
         path: Folder to create; it must not exist.
         storage: ``"mcap"`` or ``"sqlite3"``.
         compression: ``None`` or ``"zstd"`` (MCAP only, chunk by chunk).
         metadata: Run metadata; values that are not strings are stored as JSON text.
-        chunk_size: Bytes of messages that are sealed together at the latest.
-        max_size: Begin a new storage file with the message that would make this one, closed, larger [bytes]; 0 for
-            never. An empty file may take half of it at most, else as much besides.
-        max_duration: Begin a new storage file with the message that would make this one longer [s]; 0 for never.
-        ros_distro: What ``metadata.yaml``, and a database, name as distribution.
+        chunk_size: Message bytes that are sealed together at the latest.
+        max_size: Largest closed storage file [bytes], 0 for no limit. An empty file may take half of it; if it takes
+            more, as much is allowed on top.
+        max_duration: Longest time span of a storage file [s], 0 for no limit.
+        ros_distro: Distribution named in ``metadata.yaml`` and in a database.
         file_stem: Beginning of the names of storage files; by default the name of the folder.
 
     Raises:
-        BagError: The folder exists or cannot be created.
+        BagError: The folder exists or cannot be created; in methods, the writer is closed.
         ParameterError: Unknown storage or compression.
+        OSError: In methods that write: the disk is full or fails. Sealed messages remain readable.
     """
 
     def __init__(
@@ -105,7 +97,7 @@ class BagWriter:
         self._files: list[FileEntry] = []
         self._lock = threading.RLock()
         self._open = True
-        # The folder appears under its name only when it is whole.
+        # The folder gets its name only when it is complete.
         self._folder = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         self._metadata = MetadataFile(self._folder, storage, ros_distro)
         try:
@@ -139,15 +131,9 @@ class BagWriter:
     def add_topic(
         self, name: str, type: str | MessageType, qos: QosProfile | Sequence[QosProfile] | None = None
     ) -> None:
-        """Announce a topic before its first message; once more with the same type does nothing.
+        """Announce a topic before its first message; a BagError if the bag has it with another type.
 
-        Args:
-            name: Full topic name, such as ``/sim/joint_states``.
-            type: Message type, such as ``sensor_msgs/msg/JointState``.
-            qos: What its publishers offer; by default reliable, keep last 10.
-
-        Raises:
-            BagError: The topic is in the bag with another type, or the writer is closed.
+        ``qos`` is what its publishers offer, by default reliable, keep last 10. Repeated calls do nothing.
         """
         described = message_type(type) if isinstance(type, str) else type
         profiles = (qos,) if isinstance(qos, QosProfile) else tuple(qos) if qos is not None else (QosProfile(),)
@@ -167,28 +153,18 @@ class BagWriter:
             self._ids[name] = len(self._ids) + 1
             self._written[name] = 0
             self._add_channel(name)
-            # The file first: readers refuse a listed topic that has no definition. But before the first message:
-            # they pass over messages of topics that are not listed.
+            # Readers refuse a listed topic without a definition, so the file is sealed before the topic is listed;
+            # they skip messages of unlisted topics, so both come before the first message.
             self._file.seal()
             self._note_sealed()
             self._update_metadata()
 
     def write(self, topic: str, log_time_ns: int, data: bytes) -> None:
-        """Add one serialised message.
-
-        Args:
-            topic: A topic that was added.
-            log_time_ns: Time of the message [ns since the epoch, or of the simulation].
-            data: CDR bytes with their four bytes of encapsulation.
-
-        Raises:
-            BagError: The topic was not added, or the writer is closed.
-            OSError: The disk is full or fails; what was sealed remains readable.
-        """
+        """Add a message: log time [ns since the epoch or of the simulation], CDR bytes with their encapsulation."""
         self.write_many([(topic, log_time_ns, data)])
 
     def write_many(self, items: Iterable[tuple[str, int, bytes]]) -> None:
-        """Add many messages ``(topic, log_time_ns, data)`` under one lock; raises as :meth:`write`."""
+        """Add many messages ``(topic, log_time_ns, data)`` under one lock; a BagError if a topic was not added."""
         messages = iter(items)
         with self._lock:
             self._require_open()
@@ -212,7 +188,6 @@ class BagWriter:
         self._span = span
 
     def _is_full(self, size: int) -> bool:
-        """Tell whether the storage file has no room for one more message of some size."""
         if not self._closing:
             self._closing = len(self._metadata.render(*self._described)) + _SPARE
             self._most = max(self._max_size, self._file.size_with(0, empty=True) + self._closing + self._max_size // 2)
@@ -224,21 +199,13 @@ class BagWriter:
         return self._file.size_with(size) + self._closing > self._most
 
     def keep(self, record: Attachment | Metadata) -> None:
-        """Put an attachment, or metadata of somebody else, into the storage file that is open now (MCAP only).
-
-        Raises:
-            BagError: The storage has no place for it, or the writer is closed.
-        """
+        """Add a copied attachment or metadata record to the current file; a BagError if the storage is not MCAP."""
         with self._lock:
             self._require_open()
             self._file.keep(record)
 
     def seal(self) -> None:
-        """Make all messages so far visible on disk; they survive the death of the process.
-
-        Raises:
-            OSError: The disk is full or fails; what was sealed before remains readable.
-        """
+        """Write all messages so far to the file."""
         with self._lock:
             self._require_open()
             self._seal(self._file.seal)
@@ -251,16 +218,10 @@ class BagWriter:
             self._update_metadata()
 
     def sync(self) -> None:
-        """Seal, and wait until what was sealed has reached the disk (it survives a power failure).
-
-        Other threads may go on writing meanwhile.
-
-        Raises:
-            OSError: The disk is full or fails; what was sealed before remains readable.
-        """
+        """Seal, and wait until the disk has it (survives a power failure); other threads may write meanwhile."""
         with self._lock:
             self._require_open()
-            # What waits for the disk is never written again: what has reached it must not be at risk later.
+            # Settled chunks are never rewritten, so what has reached the disk stays safe.
             self._seal(self._file.settle)
             descriptor = self._file.duplicate()
         try:
@@ -269,7 +230,7 @@ class BagWriter:
             os.close(descriptor)
 
     def split(self) -> None:
-        """Go on in a new storage file of the same bag."""
+        """Continue in a new storage file of the same bag."""
         with self._lock:
             self._require_open()
             self.seal()
@@ -284,11 +245,7 @@ class BagWriter:
                 self._update_metadata()
 
     def close(self) -> None:
-        """Seal, give back unused room and close; once more does nothing.
-
-        Raises:
-            OSError: The disk is full or fails; what was sealed remains readable.
-        """
+        """Seal, release unused space and close; repeated calls do nothing."""
         with self._lock:
             if not self._open:
                 return
@@ -296,7 +253,7 @@ class BagWriter:
             try:
                 self._close_file()
             finally:
-                # After the file gave back its unused room there may be space for this again.
+                # Closing the file may have freed the space that this needs.
                 self._metadata.finish(*self._described)
 
     def abandon(self) -> None:
@@ -347,7 +304,6 @@ class BagWriter:
 
     @property
     def _described(self) -> tuple[list[TopicEntry], list[FileEntry], dict[str, str]]:
-        """What the metadata are rendered from."""
         return list(self._topics.values()), self._files, self._custom
 
     def _update_metadata(self) -> None:

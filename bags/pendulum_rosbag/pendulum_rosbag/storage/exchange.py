@@ -1,4 +1,4 @@
-"""Two files that exchange their names in one step (``renameat2(2)``), which Python has no function for."""
+"""Atomic exchange of two file names (``renameat2(2)``), which Python does not offer."""
 
 from __future__ import annotations
 
@@ -14,18 +14,11 @@ __all__ = ["exchange"]
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 _CANNOT = (errno.EINVAL, errno.ENOSYS)
-"""What file systems and systems say that know no exchange."""
+"""Error codes of kernels and file systems without this operation."""
 
 
 def exchange(first: Path, second: Path) -> bool:
-    """Exchange the names of two files; nobody sees a moment in between.
-
-    Returns:
-        Whether it is done; False where this system or file system cannot.
-
-    Raises:
-        OSError: One of them is not there, or the folder cannot be written to.
-    """
+    """Exchange two file names atomically; False if the kernel or file system cannot. Raises OSError as ``rename``."""
     rename = _renameat2()
     if rename is None:
         return False

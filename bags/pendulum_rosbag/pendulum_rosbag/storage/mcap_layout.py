@@ -1,35 +1,25 @@
-"""Where the parts of an MCAP file stand while it is being written, so that it is complete at every instant.
+"""Byte layout of an MCAP file that is complete at every instant while it grows.
 
-MCAP readers find everything from the footer at the end of the file, so a file that grows by appending is broken
-whenever its writer dies. Here the file is laid out with room to grow, and the room is a private record that every
-reader skips::
+MCAP readers start at the footer at the end of the file, so a file that grows by appending is broken when its writer
+dies. This file is laid out with room to grow: a private record that every reader skips::
 
     magic  header | settled chunks | room to grow | staged chunks | summary A | summary B | data end, footer, magic
                                    ^ settled_end  ^ area.start    ^ area.stop
 
-Messages stay in the order of arrival, so chunks may overlap in log time where that is a plant's stamp: a recorder that
-sorted would hold back messages that a killed recording should contain.
-
-A chunk is written into room that no reader sees, and the summary that lists it into whichever of the two places the
-footer does not point to, each with a data end right before it, where Foxglove's reader looks for one, and a private
-record with its checksum at its end (that of the footer would have to cover the place that is written next). Two small
-writes then make it visible: a record head (opcode and length, for readers that go through the file in order) and the
-footer (for readers that use the index).
-
-What is sealed many times a second makes small chunks, and an index that grows with each of them: hours of them would
-cost more to list than to write. So small chunks are only staged. When enough have come together, one large chunk with
-the same messages is written behind the settled ones, still unseen; the footer that lists it and the record head that
-turns unused room into that chunk put it in the place of the staged ones. Whoever reads between these two writes
-finds the same messages on either way. The area of the staged chunks is used again from its start when it is full, so
-that a reader of a growing file has the time of some megabytes to read what it was shown.
-
-When the room is used up, one write far beyond the end moves the end of the file; the bytes between are a hole that
-occupies no disk. ``finish`` puts summary and footer right behind the data and cuts the rest off.
-
-Each of these commits lies within one page of memory, which the kernel copies as a whole: a process that is killed
-between any two instructions leaves the state before or after, never between. (One reader notices the moment at which
-the end of the file moves: that of Foxglove for streams insists on nothing behind the last record. A power failure is
-another matter, because the disk may reorder pages: ``sync`` bounds what it can cost.)
+- Chunk and summary are written to unseen places: the summary to whichever of A and B the footer does not name, after a
+  data end (Foxglove's reader needs it there) and with a private checksum record (a footer's checksum would cover the
+  place that is written next). Two small writes make them visible: a record head for sequential readers, then the footer
+  for index readers.
+- Sealing often makes small chunks and a long index, so small chunks are only staged. When enough have accumulated, one
+  large chunk replaces them behind the settled ones; between the two writes readers see the same messages either way.
+  The staging area is reused from its start when full, which leaves a reader of a growing file some megabytes of time.
+- When the room is used up, one write far beyond the end moves the end of the file; the hole occupies no disk space.
+  ``finish`` cuts the rest off.
+- Each commit lies within one memory page, which the kernel copies as a whole: a process killed at any instruction
+  leaves the state before or after. (Foxglove's stream reader, which accepts nothing after the last record, sees the
+  moment at which the end moves. At a power failure the disk may reorder pages: ``sync`` bounds the loss.)
+- Messages stay in order of arrival; sorting by log time would hold back messages that a killed recording should
+  contain.
 """
 
 from __future__ import annotations
@@ -60,7 +50,7 @@ _HEAD = rec.RECORD_HEAD_SIZE
 
 @dataclass(slots=True)
 class _Slot:
-    """One of the two places for a summary: from ``start``, ``capacity`` bytes, and what of it stands there."""
+    """One of the two places for a summary, and which parts of the summary it holds."""
 
     start: int
     capacity: int
@@ -73,8 +63,6 @@ class _Slot:
 
 @dataclass(frozen=True, slots=True)
 class _Area:
-    """Bytes from ``start`` to ``stop`` for staged chunks."""
-
     start: int
     stop: int
 
@@ -82,13 +70,12 @@ class _Area:
 class McapLayout:
     """The bytes of one growing MCAP file.
 
+    Methods raise OSError when the disk is full or fails; readers then see the file as before the call.
+
     Args:
         path: File to create.
         header: Magic and header record.
-        summary: What the file's summary says; its owner changes it, and calls ``publish``.
-
-    Raises:
-        OSError: The file cannot be created.
+        summary: Content of the file's summary; its owner changes it and calls ``publish``.
     """
 
     def __init__(self, path: Path, header: bytes, summary: McapSummary) -> None:
@@ -99,7 +86,7 @@ class McapLayout:
         self._size = 0
         self._slots: list[_Slot] = []
         self._live = 0
-        # Where the padding begins that is the last record before the tail: behind the staged chunks, if there are any.
+        # Start of the padding before the tail, after any staged chunks.
         self._chain_end = self.settled_end
         self._area = self._next_area = _Area(0, 0)
         self._cursor = 0
@@ -137,21 +124,17 @@ class McapLayout:
         return min(_LARGEST_GROUP, (self._area.stop - self._area.start) // 4)
 
     def can_stage(self, size: int) -> bool:
-        """Tell whether a chunk of some size fits among the staged ones."""
+        """Return whether a chunk of this size [bytes] fits into the staging area."""
         if self._chain_end == self.settled_end:
             self._begin_group()
         return self._next_stage + size + _PAGE <= self._area.stop
 
     def can_settle(self, size: int) -> bool:
-        """Tell whether a chunk of some size fits before the staged ones; without those there is always room."""
+        """Return whether a chunk of this size [bytes] fits before the staged ones; without those it always does."""
         return self._chain_end == self.settled_end or self.settled_end + size + _PAGE <= self._area.start
 
     def stage(self, chunk: Chunk) -> int:
-        """Write a small chunk and show it to readers in order; return where it begins.
-
-        Raises:
-            OSError: The disk is full or fails; nothing of the chunk is seen.
-        """
+        """Write a small chunk, show it to sequential readers and return its offset."""
         start = self._next_stage
         blob, end = self._blob(chunk.parts, start, chunk.size)
         if self._chain_end == self.settled_end:
@@ -164,11 +147,7 @@ class McapLayout:
         return start
 
     def settle(self, chunk: Chunk) -> int:
-        """Write a large chunk, which holds what is staged, and show it to readers in order instead of that.
-
-        Raises:
-            OSError: The disk is full or fails; what was staged is still there.
-        """
+        """Write a large chunk in place of the staged ones, show it to sequential readers and return its offset."""
         if self._chain_end == self.settled_end and self.settled_end + chunk.size + _PAGE > self._area.start:
             self._grow(chunk.size + _PAGE)
         start = self.settled_end
@@ -184,11 +163,7 @@ class McapLayout:
         return start
 
     def publish(self) -> None:
-        """Show the summary as it is now to readers by index.
-
-        Raises:
-            OSError: The disk is full or fails; readers see the summary before.
-        """
+        """Show the current summary to index readers."""
         slot = self._slots[1 - self._live]
         if not self._fill_slot(slot):
             self._grow(0)
@@ -197,15 +172,11 @@ class McapLayout:
         write_at(self._fd, self._tail_bytes(slot), self._tail)
 
     def duplicate(self) -> int:
-        """Return a file descriptor of its own, to wait for the disk without keeping the writer waiting."""
+        """Return a duplicate descriptor, so that waiting for the disk does not block the writer."""
         return os.dup(self._fd)
 
     def finish(self, extras: Sequence[Attachment | Metadata] = ()) -> None:
-        """Put attachments, metadata, summary and footer behind the data and cut off the unused room.
-
-        Raises:
-            OSError: The disk is full or fails; the file shows what it did.
-        """
+        """Append attachments, metadata, summary and footer to the data and cut off the unused room."""
         indexes: list[bytes] = []
         start = self._chain_end
         for extra in extras:
@@ -234,7 +205,7 @@ class McapLayout:
         os.fsync(self._fd)
 
     def abandon(self) -> None:
-        """Close without writing anything more: the file shows what was published."""
+        """Close without writing; the published content remains."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -247,7 +218,6 @@ class McapLayout:
 
     @property
     def _summary_stop(self) -> int:
-        """Where the padding behind a summary ends and the footer begins."""
         return self._size - rec.FOOTER_SIZE - len(rec.MAGIC)
 
     @property
@@ -262,18 +232,18 @@ class McapLayout:
         return [_Slot(top - 2 * capacity, capacity), _Slot(top - capacity, capacity)]
 
     def _blob(self, parts: Sequence[bytes], start: int, size: int) -> tuple[bytes, int]:
-        """Return records for byte ``start`` with the padding up to the tail behind them, and where that begins."""
+        """Return records for offset ``start``, followed by padding up to the tail, and where the padding begins."""
         end = start + size
         filler = b""
         if end % _PAGE > _PAGE - _HEAD:
-            # The next commit writes nine bytes at ``end``: they must not straddle two pages.
+            # The next commit writes nine bytes at ``end``, which must not straddle two pages.
             target = (end // _PAGE + 1) * _PAGE + _HEAD
             filler = rec.padding_head(end, target) + bytes(target - end - _HEAD)
             end = target
         return b"".join([*parts, filler, rec.padding_head(end, self._tail)]), end
 
     def _begin_group(self) -> None:
-        """Choose where the next staged chunks go, and see that there is room for the chunk that they will become."""
+        """Choose the place of the next staged chunks; ensure room for the chunk that replaces them."""
         # Messages of 31 bytes and more have index entries of 16 and, one in each chunk, 15 bytes more.
         if self.settled_end + 2 * self.group_limit + self.group_limit // 64 + 2 * _PAGE > self._area.start:
             self._grow(0)
@@ -281,7 +251,6 @@ class McapLayout:
             self._cursor = self._area.start
 
     def _make_room(self, end: int) -> None:
-        """See that the last records may reach up to byte ``end``."""
         if self._chain_end == self.settled_end:
             if end > self._area.start:
                 self._grow(end - self._chain_end)
@@ -289,12 +258,12 @@ class McapLayout:
             raise OSError(28, "No space left on device")  # (only when staged chunks could not be settled)
 
     def _fill_slot(self, slot: _Slot) -> bool:
-        """Bring a slot up to date; False when it is too small."""
+        """Update a slot; False if it is too small."""
         summary = self.summary
         description = summary.description
         body: bytes | bytearray
         if slot.described != len(description):
-            # New topics: everything behind them moves.
+            # New topics move everything after them.
             start, body = slot.start, description + summary.settled + summary.staged
         elif slot.group != summary.group:
             start = slot.start + slot.described + slot.settled
@@ -305,7 +274,7 @@ class McapLayout:
         tail, offsets_start = summary.tail(slot.start)
         tail += summary.checksum_record(tail)
         end = start + len(body) + len(tail)
-        # Before a summary stands a data end: that of the next slot is the last thing in this one.
+        # The data end before the next slot's summary is the last thing in this slot.
         if end + _HEAD > slot.start + slot.capacity - len(_DATA_END):
             return False
         if slot.described < 0:
@@ -317,29 +286,28 @@ class McapLayout:
         return True
 
     def _grow(self, needed: int) -> None:
-        """Move the end of the file away, so that ``needed`` bytes of data and larger summaries fit."""
         capacity = max(_FIRST_SLOT, -(-2 * (self.summary.size + 4 * _PAGE) // _PAGE) * _PAGE)
-        # Summaries are written anew each time, so the room keeps in proportion to them.
+        # Summaries are rewritten each time, so the room stays in proportion to them.
         room = max(min(max(_FIRST_ROOM, self.settled_end), _LARGEST_ROOM), 4 * self.summary.size)
         staging = min(max(room // 2, self._area.stop - self._area.start), 8 * _LARGEST_GROUP) // _PAGE * _PAGE
         old_size = self._size
         self._size += -(-(needed + room + staging + 2 * capacity) // _PAGE) * _PAGE
         live, keeper = self._slots[self._live], self._slots[1 - self._live]
         try:
-            # The summary in force, continued by padding up to the new end, in the place that is not in force ...
+            # Copy the current summary, padded up to the new end, into the other slot ...
             content = os.pread(self._fd, live.offsets_start - live.start, live.start)
             checksum = rec.summary_checksum_record(zlib.crc32(content))
             padding = rec.padding_head(keeper.start + len(content) + len(checksum), self._summary_stop)
             keeper.described = -1
             write_at(self._fd, _DATA_END + content + checksum + padding, keeper.start - len(_DATA_END))
-            # ... then the end of the file moves there in one write (offsets name absolute places: the copy has none).
+            # ... and move the end of the file there in one write (without offsets, which are absolute).
             write_at(self._fd, _DATA_END + rec.footer_record(keeper.start, 0) + rec.MAGIC, self._tail)
         except OSError:
             self._size = old_size
             raise
         keeper.offsets_start = keeper.start + len(content)
         self._live = 1 - self._live
-        # Readers in order learn of the new end, and the summaries move to it.
+        # Show the new end to sequential readers and move the summaries there.
         write_at(self._fd, rec.padding_head(self._chain_end, self._tail), self._chain_end)
         slots = self._place_slots(capacity)
         if not self._fill_slot(slots[0]):

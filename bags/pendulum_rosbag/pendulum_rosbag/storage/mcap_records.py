@@ -1,6 +1,6 @@
-"""MCAP records as bytes (https://mcap.dev/spec), as far as a rosbag2 file needs them.
+"""MCAP records as bytes (https://mcap.dev/spec), as far as rosbag2 files use them.
 
-Every record is an opcode (one byte), a length (uint64) and its content, little-endian throughout.
+A record is an opcode (one byte), a length (uint64) and its content, little-endian.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(0x01, 0x09)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(0x09, 0x10)
 PADDING = 0x80
-"""A private opcode (0x80 to 0xFF are free for applications): every reader skips the record."""
+"""Private opcode (0x80 to 0xFF are free for applications): readers skip the record."""
 SUMMARY_CHECKSUM = 0x81
-"""Private, too: the checksum of the records before it, back to where a summary begins."""
+"""Private opcode: checksum of the records before it, back to the beginning of a summary."""
 
 RECORD_HEAD = struct.Struct("<BQ")
 RECORD_HEAD_SIZE = RECORD_HEAD.size
@@ -65,7 +65,7 @@ _STATISTICS = struct.Struct("<QHIIIIQQI")
 
 
 def record(opcode: int, content: bytes) -> bytes:
-    """Return one whole record."""
+    """Return a complete record."""
     return RECORD_HEAD.pack(opcode, len(content)) + content
 
 
@@ -86,7 +86,7 @@ def header_record(library: str) -> bytes:
 
 def schema_record(schema_id: int, name: str, encoding: str, definition: str) -> bytes:
     """Return a message definition under an id of 1 or more."""
-    # (a definition that is no text was read with its bytes escaped)
+    # Definitions that are not UTF-8 were read with surrogate escapes.
     data = definition.encode(errors="surrogateescape")
     head = struct.pack("<H", schema_id) + _text(name) + _text(encoding) + struct.pack("<I", len(data))
     return record(SCHEMA, head + data)
@@ -95,21 +95,14 @@ def schema_record(schema_id: int, name: str, encoding: str, definition: str) -> 
 def channel_record(
     channel_id: int, schema_id: int, topic: str, message_encoding: str, metadata: Mapping[str, str]
 ) -> bytes:
-    """Return the description of one topic, whose messages are encoded in some way, such as ``cdr``."""
+    """Return a channel record: one topic and the encoding of its messages, such as ``cdr``."""
     head = struct.pack("<HH", channel_id, schema_id)
     return record(CHANNEL, head + _text(topic) + _text(message_encoding) + _text_map(metadata))
 
 
 @dataclass(frozen=True)
 class Attachment:
-    """A file inside the file: its record's content as it stands there, checksum included.
-
-    Args:
-        content: Log time, creation time, name, media type, data and checksum, as the format lays them out.
-        name: As in ``content``.
-        media_type: As in ``content``.
-        data_size: Bytes of data.
-    """
+    """An attachment: ``content`` is that of its record, with log time, names, data and checksum as laid out there."""
 
     content: bytes
     name: str
@@ -117,11 +110,11 @@ class Attachment:
     data_size: int
 
     def record(self) -> bytes:
-        """Return the whole record."""
+        """Return the complete record."""
         return record(ATTACHMENT, self.content)
 
     def index_record(self, offset: int) -> bytes:
-        """Return the summary's record of it when it begins at byte ``offset`` of the file."""
+        """Return its index record; ``offset`` is its place in the file [bytes]."""
         head = struct.pack("<QQ", offset, RECORD_HEAD_SIZE + len(self.content)) + self.content[:16]
         size = struct.pack("<Q", self.data_size)
         return record(ATTACHMENT_INDEX, head + size + _text(self.name) + _text(self.media_type))
@@ -135,11 +128,11 @@ class Metadata:
     items: Mapping[str, str]
 
     def record(self) -> bytes:
-        """Return the whole record."""
+        """Return the complete record."""
         return record(METADATA, _text(self.name) + _text_map(self.items))
 
     def index_record(self, offset: int) -> bytes:
-        """Return the summary's record of it when it begins at byte ``offset`` of the file."""
+        """Return its index record; ``offset`` is its place in the file [bytes]."""
         return record(METADATA_INDEX, struct.pack("<QQ", offset, len(self.record())) + _text(self.name))
 
 
@@ -170,20 +163,17 @@ def statistics_record(
 
 
 def summary_offset_record(opcode: int, start: int, length: int) -> bytes:
-    """Return where the summary's records of one kind stand."""
+    """Return where the summary's records of one kind begin, and their length [bytes]."""
     return record(SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, length))
 
 
 def summary_checksum_record(crc: int) -> bytes:
-    """Return the checksum of a summary in a file that grows.
-
-    That of a footer covers everything up to the footer: there, what the writer is about to show next.
-    """
+    """Return a growing file's summary checksum; that of a footer would cover bytes still to be written."""
     return record(SUMMARY_CHECKSUM, struct.pack("<I", crc))
 
 
 def footer_record(summary_start: int, summary_offset_start: int, summary: bytes | None = None) -> bytes:
-    """Return the footer; with the summary's bytes it carries their checksum, without it says "no checksum"."""
+    """Return the footer, with a checksum if the summary's bytes are given."""
     if summary is None:
         return record(FOOTER, _FOOTER.pack(summary_start, summary_offset_start, 0))
     head = RECORD_HEAD.pack(FOOTER, _FOOTER.size) + struct.pack("<QQ", summary_start, summary_offset_start)
@@ -191,7 +181,7 @@ def footer_record(summary_start: int, summary_offset_start: int, summary: bytes 
 
 
 def padding_head(start: int, stop: int) -> bytes:
-    """Return the head of a private record that fills the bytes from ``start`` to ``stop``."""
+    """Return the head of a private record that spans the bytes from ``start`` to ``stop``."""
     return RECORD_HEAD.pack(PADDING, stop - start - RECORD_HEAD_SIZE)
 
 
@@ -206,7 +196,7 @@ def chunk_index_record(
     packed_size: int,
     raw_size: int,
 ) -> bytes:
-    """Return where a chunk stands and which channels it holds (channel and place of its message index, in order)."""
+    """Return the index of a chunk; ``message_indexes`` are channels and offsets of their message indexes, in order."""
     offsets = b"".join(struct.pack("<HQ", *item) for item in message_indexes)
     return record(
         CHUNK_INDEX,

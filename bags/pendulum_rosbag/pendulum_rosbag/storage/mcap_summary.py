@@ -1,4 +1,4 @@
-"""The summary of an MCAP file that is being written: what a reader needs to know before it reads a message."""
+"""The summary of a growing MCAP file: topics, counts and the index of chunks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Compressor = Callable[[bytes], bytes]
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """A chunk with its message indexes as bytes, before it is known where they will stand."""
+    """A chunk with its message indexes as bytes, at an offset that is not yet known."""
 
     parts: list[bytes]
     size: int
@@ -29,7 +29,7 @@ class Chunk:
     raw_size: int
 
     def index_record(self, offset: int) -> bytes:
-        """Return the summary's record of this chunk when it begins at byte ``offset`` of the file."""
+        """Return its index record; ``offset`` is its place in the file [bytes]."""
         return rec.chunk_index_record(
             self.start_ns,
             self.stop_ns,
@@ -49,13 +49,10 @@ def build_chunk(
     span: tuple[int, int],
     compressor: tuple[str, Compressor] | None = None,
 ) -> Chunk:
-    """Return a chunk of records.
+    """Return a chunk of schema, channel and message records.
 
-    Args:
-        raw: Schema, channel and message records, one behind the other.
-        indexes: Channel id and its entries (log time and offset in ``raw``, uint64 each), in the order of the file.
-        span: First and last log time [ns].
-        compressor: Name as the format spells it, and function.
+    ``indexes``: channel id and entries (log time and offset in ``raw``, uint64 each), in file order; ``span``: first
+    and last log time [ns]; ``compressor``: its name in the format, and the function.
     """
     name, packed = (compressor[0], compressor[1](raw)) if compressor else ("", raw)
     text = name.encode()
@@ -74,10 +71,10 @@ def build_chunk(
 
 
 class McapSummary:
-    """Topics, counts and the index of chunks, kept as the bytes that stand in the file.
+    """Topics, counts and the index of chunks, stored as their bytes in the file.
 
-    Chunks are *staged* (small, as they were sealed) until one large, *settled* chunk takes their place. The index of
-    the settled ones grows by about 100 bytes per megabyte of messages; that of the staged ones starts again each time.
+    Small, *staged* chunks are replaced by one large, *settled* chunk. The index of settled chunks grows by about 100
+    bytes per megabyte of messages.
     """
 
     def __init__(self) -> None:
@@ -91,17 +88,16 @@ class McapSummary:
         self.group = 0
         self._settled_chunks = 0
         self.staged_chunks = 0
-        """Chunks that wait to be settled."""
         self._schemas: list[bytes] = []
         self.description = b""
-        """Records of definitions and topics: how each summary begins."""
-        # Checksums of description and settled chunks, and of these and the staged ones: continued, never made anew.
+        """Records of definitions and topics, with which each summary begins."""
+        # Running checksums: description and settled chunks; these and the staged chunks.
         self._settled_crc = 0
         self._staged_crc = 0
 
     @property
     def schemas(self) -> int:
-        """Message definitions so far; ids are given from 1 on."""
+        """Number of message definitions; ids count from 1."""
         return len(self._schemas)
 
     def add_schema(self, record: bytes) -> None:
@@ -129,13 +125,13 @@ class McapSummary:
             self.count += number
 
     def stage(self, record: bytes) -> None:
-        """Add a small chunk to the index."""
+        """Add a staged chunk's index record."""
         self.staged += record
         self._staged_crc = zlib.crc32(record, self._staged_crc)
         self.staged_chunks += 1
 
     def settle(self, record: bytes) -> None:
-        """Add a chunk that holds what the staged ones did, in their place."""
+        """Replace the staged chunks by one settled chunk's index record."""
         self.settled += record
         self._settled_crc = self._staged_crc = zlib.crc32(record, self._settled_crc)
         self._settled_chunks += 1
@@ -145,19 +141,17 @@ class McapSummary:
 
     @property
     def size(self) -> int:
-        """Bytes of all records but those that close the summary."""
+        """Bytes of all records except those that close the summary."""
         return len(self.description) + len(self.settled) + len(self.staged)
 
     def checksum_record(self, tail: bytes) -> bytes:
-        """Return the record that ends a summary in a file that grows: the checksum of the whole with this tail."""
+        """Return the checksum record that ends a growing file's summary, over the summary and this tail."""
         return rec.summary_checksum_record(zlib.crc32(tail, self._staged_crc))
 
     def tail(self, start: int, indexes: Sequence[bytes] = ()) -> tuple[bytes, int]:
-        """Return the records that close a summary which begins at byte ``start``, and where its offsets begin.
+        """Return the records that close a summary at offset ``start``, with attachment and metadata ``indexes``.
 
-        Args:
-            start: First byte of the summary in the file.
-            indexes: Index records of attachments and metadata.
+        Also returns where the summary's offsets begin [bytes].
         """
         kinds = {
             opcode: b"".join(index for index in indexes if index[0] == opcode)

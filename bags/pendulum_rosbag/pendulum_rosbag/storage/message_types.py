@@ -1,4 +1,4 @@
-"""Message definitions and type hashes that a bag carries, so that it can be read on any machine."""
+"""Message definitions and type hashes, stored in a bag so that any machine can read it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class MessageType:
         definition: Concatenated ``.msg`` text with all types that it uses; empty when unknown.
         hash: ``RIHS01_...`` type description hash; empty when unknown.
         encoding: Format of the definition: ``ros2msg``, ``ros2idl``, or empty.
-        serialization: How messages are encoded: ``cdr``, as ROS 2 does, or as another writer says (``json``).
+        serialization: Encoding of the messages: ``cdr`` in ROS 2, or another writer's (``json``).
     """
 
     name: str
@@ -45,15 +45,10 @@ def typestore() -> Typestore:
 
 @lru_cache(maxsize=256)
 def message_type(name: str, type_hash: str = "") -> MessageType:
-    """Return definition and hash of a message type.
+    """Return definition and hash of a message type; ``type_hash`` from discovery overrides the computed hash.
 
-    Types of the ROS distribution are built in; others are looked up as ``share/PACKAGE/msg/NAME.msg`` under
-    ``AMENT_PREFIX_PATH``. A type that is found nowhere is recorded without a definition: the bytes are kept, and
-    a reader that knows the type can still read them.
-
-    Args:
-        name: ``package/msg/Name``.
-        type_hash: Hash as discovery reported it; it wins over the computed one.
+    Types outside the ROS distribution are read from ``share/PACKAGE/msg/NAME.msg`` under ``AMENT_PREFIX_PATH``. An
+    unknown type has no definition; its messages are recorded all the same.
 
     Raises:
         BagError: The name has not the form ``package/msg/Name``.
@@ -68,7 +63,7 @@ def message_type(name: str, type_hash: str = "") -> MessageType:
 
 
 def _register_from_ament(name: str) -> bool:
-    """Add a type and what it uses from installed packages; False when its file is missing."""
+    """Register a type and its dependencies from installed packages; False if a file is missing."""
     from rosbags.typesys import get_types_from_msg
 
     store = typestore()

@@ -1,4 +1,4 @@
-"""``metadata.yaml`` of a rosbag2 folder (version 9), written so that it is whole at every instant."""
+"""``metadata.yaml`` of a rosbag2 folder (version 9), complete at every instant."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ __all__ = [
 METADATA_NAME = "metadata.yaml"
 METADATA_VERSION = 9
 
-# YAML allows these only escaped, JSON leaves them as they are.
 _PLAIN = re.compile("cdr|[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)+")
-"""CDR, or a name of a ROS type, which YAML takes for text without quotes."""
+"""CDR, or the name of a ROS type: YAML reads these as text without quotes."""
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
+"""YAML requires escapes for these, JSON does not write them."""
 
 
 @dataclass(slots=True)
@@ -56,13 +56,13 @@ class FileEntry:
 
 
 def yaml_string(text: str) -> str:
-    """Return a string as a double-quoted YAML scalar that every YAML parser reads back unchanged."""
+    """Return a double-quoted YAML scalar that every YAML parser reads back unchanged."""
     quoted = json.dumps(text, ensure_ascii=False)
     return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", quoted)
 
 
 def encode_custom_data(metadata: Mapping[str, Any] | None) -> dict[str, str]:
-    """Return run metadata as rosbag2 can hold it: strings; anything else becomes JSON text."""
+    """Return run metadata as rosbag2 stores it: strings; other values become JSON text."""
     return {
         str(key): value if isinstance(value, str) else json.dumps(value, default=str, sort_keys=True)
         for key, value in (metadata or {}).items()
@@ -70,7 +70,7 @@ def encode_custom_data(metadata: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def qos_yaml(profiles: Sequence[QosProfile], indent: str = "") -> str:
-    """Return offered QoS profiles as a block-style YAML list (an empty list as ``[]``)."""
+    """Return offered QoS profiles as a block-style YAML list (``[]`` if empty)."""
     if not profiles:
         return f"{indent}[]\n"
     return "".join(profile.to_yaml(indent) for profile in profiles)
@@ -79,32 +79,24 @@ def qos_yaml(profiles: Sequence[QosProfile], indent: str = "") -> str:
 class MetadataFile:
     """Renders and replaces ``metadata.yaml`` of one bag.
 
-    A recorder rewrites the file many times a second, so the text of topics and run metadata is kept and only the
-    numbers are rendered anew. And two files take turns: the next text is written over the one before the last, and they
-    exchange their names. To make a new file each time, and to give it the name of another, costs ext4 thirty times as
-    much.
-
-    Args:
-        folder: Folder of the bag.
-        storage: ``mcap`` or ``sqlite3``.
-        ros_distro: Such as ``jazzy``.
+    A recorder rewrites the file many times a second: the text of topics and run metadata is cached, and two files take
+    turns by exchanging names, because creating and renaming a new file costs ext4 thirty times as much.
     """
 
     def __init__(self, folder: Path, storage: str, ros_distro: str) -> None:
         self.path = folder / METADATA_NAME
-        # Made once: pathlib interns the parts of each new path, and twenty a second fill the interpreter's table of
-        # strings, which after ten minutes takes a megabyte more.
+        # Created once: pathlib interns the parts of each new path, which at 20 Hz cost a megabyte in ten minutes.
         self._temporary = folder / f".{METADATA_NAME}.tmp"
         self._storage = storage
         self._ros_distro = ros_distro
         self._key: tuple[Any, ...] | None = None
         self._topic_texts: list[str] = []
         self._custom_text = ""
-        # Descriptors of the file that is seen, and of the one that was before.
+        # Descriptors of the visible file and of the one before it.
         self._seen = self._spare = -1
 
     def render(self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]) -> str:
-        """Return the text for these topics, storage files (in order of time) and run metadata."""
+        """Return the text for topics, storage files (in time order) and run metadata."""
         filled = [file for file in files if file.count]
         start = min((file.start_ns for file in filled), default=0)
         stop = max((file.stop_ns for file in filled), default=0)
@@ -141,12 +133,10 @@ class MetadataFile:
         )
 
     def update(self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]) -> None:
-        """Write the file while the bag is written; a reader, and a kill at any moment, sees the old text or the new.
+        """Write the file during the recording; a reader, or a kill at any moment, sees the old text or the new.
 
-        (A reader that takes longer than until the update after the next may see parts of both.)
-
-        Raises:
-            OSError: The disk is full or fails, or somebody has taken the folder away; the file is as it was.
+        A reader that is still reading at the update after next may see parts of both. Raises OSError if the disk is
+        full or fails, or the folder was moved; the file is then unchanged.
         """
         data = self.render(topics, files, custom_data).encode()
         if not self._take_turns(data):
@@ -168,8 +158,8 @@ class MetadataFile:
         self._seen = self._spare = -1
 
     def _take_turns(self, data: bytes) -> bool:
-        """Write the file that is not seen, and let it be seen; return whether that was possible."""
-        # Somebody may have moved or replaced what is seen, and who exchanges it would bring theirs back the next time.
+        """Write the hidden file and exchange it with the visible one; False if that is not possible."""
+        # If another program replaced the visible file, an exchange would bring its file back the next time.
         if not _is_at(self._seen, self.path):
             return False
         if not _is_at(self._spare, self._temporary):
@@ -186,7 +176,6 @@ class MetadataFile:
         return True
 
     def _replace(self, data: bytes) -> None:
-        """Put a new file in the old one's place."""
         self.abandon()
         try:
             self._temporary.write_bytes(data)
@@ -197,7 +186,6 @@ class MetadataFile:
 
 
 def _is_at(descriptor: int, path: Path) -> bool:
-    """Tell whether an open file is the one of this name."""
     try:
         return descriptor >= 0 and os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

@@ -10,22 +10,15 @@ import yaml
 __all__ = ["INFINITE_NS", "QosProfile", "profiles_of"]
 
 INFINITE_NS = 2**63 - 1
-"""What rmw means by "no limit" for a deadline, a lifespan or a lease [ns]."""
+"""rmw's "no limit" for a deadline, a lifespan or a lease [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
 class QosProfile:
-    """Offered QoS of one publisher, in the words of rosbag2.
+    """Offered QoS of one publisher, in rosbag2's terms and rmw's defaults.
 
-    Args:
-        history: ``keep_last``, ``keep_all`` or ``unknown`` (discovery does not tell).
-        depth: Queue length in messages (0 when discovery does not tell).
-        reliability: ``reliable`` or ``best_effort``.
-        durability: ``volatile`` or ``transient_local``.
-        deadline_ns: Promised longest interval between messages [ns].
-        lifespan_ns: Age after which a message is worthless [ns].
-        liveliness: ``automatic`` or ``manual_by_topic``.
-        lease_ns: Liveliness lease [ns].
+    ``history`` is ``unknown`` and ``depth`` 0 if discovery does not report them; ``lifespan_ns`` is the age after which
+    a message is worthless, ``lease_ns`` the liveliness lease.
     """
 
     history: str = "keep_last"
@@ -38,7 +31,7 @@ class QosProfile:
     lease_ns: int = INFINITE_NS
 
     def to_yaml(self, indent: str) -> str:
-        """Return the profile as one item of a block-style YAML list."""
+        """Return the profile as an item of a block-style YAML list."""
         inner = indent + "  "
         return (
             f"{indent}- history: {self.history}\n"
@@ -54,7 +47,7 @@ class QosProfile:
 
     @classmethod
     def from_mapping(cls, item: dict[str, Any]) -> QosProfile:
-        """Read one profile of a ``metadata.yaml`` (version 9 names; older files use numbers)."""
+        """Read one profile of a ``metadata.yaml`` (named policies; older files use numbers)."""
         return cls(
             history=_name(item.get("history"), _HISTORY),
             depth=int(item.get("depth", 10)),
@@ -68,7 +61,7 @@ class QosProfile:
 
 
 def profiles_of(text: str) -> list[QosProfile]:
-    """Return QoS profiles from the YAML text of a bag; none where it cannot be read."""
+    """Return the QoS profiles in a bag's YAML text; none if it cannot be read."""
     try:
         items = yaml.safe_load(text) if text else []
     except yaml.YAMLError:
@@ -79,14 +72,7 @@ def profiles_of(text: str) -> list[QosProfile]:
 _HISTORY = ("system_default", "keep_last", "keep_all", "unknown")
 _RELIABILITY = ("system_default", "reliable", "best_effort", "unknown", "best_available")
 _DURABILITY = ("system_default", "transient_local", "volatile", "unknown", "best_available")
-_LIVELINESS = (
-    "system_default",
-    "automatic",
-    "manual_by_node",
-    "manual_by_topic",
-    "unknown",
-    "best_available",
-)
+_LIVELINESS = ("system_default", "automatic", "manual_by_node", "manual_by_topic", "unknown", "best_available")
 
 
 def _name(value: object, names: tuple[str, ...]) -> str:

@@ -1,7 +1,4 @@
-"""An MCAP file that is complete at every instant, also while it is being written.
-
-How the bytes are laid out for that is told in :mod:`~pendulum_rosbag.storage.mcap_layout`; here messages become chunks.
-"""
+"""An MCAP file that is complete at every instant (layout: :mod:`~pendulum_rosbag.storage.mcap_layout`)."""
 
 from __future__ import annotations
 
@@ -22,27 +19,23 @@ from pendulum_rosbag.storage.message_types import MessageType
 __all__ = ["SealedMcapFile"]
 
 _LARGEST_NUMBER = 256
-"""Staged chunks that become one at the latest, so that rare messages do not make a long index either."""
+"""Most staged chunks, so that rare messages do not make a long index either."""
 _NO_SPAN = (2**63 - 1, 0)
 _LEAST_SIZE = 576
-"""Bytes of the records of a closed file that hold no message, topic or metadata, at most."""
+"""Most bytes in a closed file besides messages, topics and metadata."""
 _CHANNEL_SIZE = 35
-"""Bytes by which a topic makes the index of a chunk, and the statistics, longer."""
+"""Bytes that a topic adds to the index of a chunk and to the statistics."""
 
 
 class SealedMcapFile:
-    """Append messages to a new MCAP file; after each ``seal`` they are in the file for every reader.
+    """Append messages to a new MCAP file; after ``seal`` every reader sees them. ``compression`` is None or "zstd".
 
-    What one seal adds is a small chunk. When about a megabyte has come together, those of the small chunks are written
-    again as one, which takes their place: the file ends up as if it had been written in one go, and neither the time
-    of a seal nor the memory of the writer grows with the length of the recording.
-
-    Args:
-        path: File to create.
-        compression: ``None`` or ``"zstd"`` (by chunk).
+    Each seal adds a small chunk. After about a megabyte the small chunks are rewritten as one: the file ends up as if
+    written in one go, and neither the time of a seal nor the writer's memory grows with the recording.
 
     Raises:
-        BagError: The file exists, or cannot be written.
+        BagError: The file exists.
+        OSError: In all methods: the disk is full or fails; the file still shows what was sealed before.
     """
 
     def __init__(self, path: Path, *, compression: str | None = None) -> None:
@@ -53,12 +46,12 @@ class SealedMcapFile:
         self._summary = McapSummary()
         self._schema_ids: dict[tuple[str, str], int] = {}
         self._sequences: dict[int, int] = {}
-        # Messages that are not sealed: records, and channel -> [log time, offset, log time, offset, ...].
+        # Unsealed messages: records, and channel -> [log time, offset, log time, offset, ...].
         self._pending: list[bytes] = []
         self._pending_size = 0
         self._pending_index: dict[int, list[int]] = {}
         self._pending_span = _NO_SPAN
-        # The same of those that are staged.
+        # The same for staged messages.
         self._group: list[bytes] = []
         self._group_size = 0
         self._group_count = 0
@@ -70,7 +63,7 @@ class SealedMcapFile:
 
     @property
     def count(self) -> int:
-        """Messages that are sealed."""
+        """Number of sealed messages."""
         return self._summary.count
 
     @property
@@ -84,16 +77,11 @@ class SealedMcapFile:
         return self._summary.stop_ns
 
     def size_with(self, size: int, *, empty: bool = False) -> int:
-        """Return what the closed file would take with one more message [bytes], metadata not counted.
-
-        Args:
-            size: Of that message [bytes].
-            empty: Leave out all messages so far.
-        """
+        """Return the closed file's size with one more message of ``size`` [bytes] (or only that one), less metadata."""
         summary = len(self._summary.description) + len(self._summary.settled) + _CHANNEL_SIZE * len(self._sequences)
         if empty:
             return _LEAST_SIZE + summary
-        # What is pending are pairs: head and content of a message, schema and channel.
+        # Pending parts come in pairs: head and content of a message, schema and channel.
         entries = 16 * (self._group_count + len(self._pending) // 2)
         message = size + 47 if size else 0
         return (
@@ -113,7 +101,7 @@ class SealedMcapFile:
         channel = rec.channel_record(channel_id, schema_id, topic, type.serialization, described)
         self._summary.add_channel(channel_id, channel)
         self._sequences[channel_id] = 0
-        # In the chunk too, so that a reader that goes through the file in order knows the topic.
+        # Also in the chunk, for sequential readers.
         self._pending += [schema, channel]
         self._pending_size += len(schema) + len(channel)
         self._stale = True
@@ -121,21 +109,10 @@ class SealedMcapFile:
     def write_many(
         self, messages: Iterator[tuple[str, int, bytes]], channels: Mapping[str, int], counts: dict[str, int], most: int
     ) -> bool:
-        """Add messages to the chunk that is being filled, until there are no more or it is full.
+        """Add messages (topic, log time [ns], CDR) until the chunk has ``most`` bytes; return whether it is full.
 
-        A loop without calls, since the time of a message is that of Python's steps.
-
-        Args:
-            messages: Topic, log time [ns] and serialised message of each; what does not fit in any more stays there.
-            channels: Topic -> channel.
-            counts: Topic -> messages, one more for each that is taken.
-            most: Size from which the chunk is full [bytes].
-
-        Returns:
-            Whether it is full, and there may be more messages.
-
-        Raises:
-            BagError: A topic has no channel; what came before is taken.
+        Counts them in ``counts``; the rest stays in the iterator. Raises BagError at a topic without channel. The loop
+        avoids calls: Python's own steps take most of the time.
         """
         pending, index, sequences = self._pending, self._pending_index, self._sequences
         pack, size, (start, stop) = rec.MESSAGE_HEADER.pack, self._pending_size, self._pending_span
@@ -161,15 +138,11 @@ class SealedMcapFile:
             self._pending_size, self._pending_span = size, (start, stop)
 
     def keep(self, record: Attachment | Metadata) -> None:
-        """Put an attachment or a metadata record behind the messages when the file is closed."""
+        """Store an attachment or a metadata record when the file is closed."""
         self._kept.append(record)
 
     def seal(self) -> None:
-        """Make everything that was written visible to readers of the file.
-
-        Raises:
-            OSError: The disk is full or fails. The file still shows what was sealed before.
-        """
+        """Write everything so far to the file."""
         if self._pending_index:
             if self._stale and self._summary.count:
                 self._publish()  # a seal before failed on its way: its chunks must be listed before more come
@@ -178,25 +151,20 @@ class SealedMcapFile:
             self._publish()
 
     def settle(self) -> None:
-        """Seal, and make one chunk of those that were sealed since the last one.
-
-        Raises:
-            OSError: The disk is full or fails. The file still shows what was sealed.
-        """
+        """Seal, and merge the staged chunks into one."""
         self.seal()
         if self._summary.staged_chunks:
             self._settle_group()
             self._publish()
 
     def duplicate(self) -> int:
-        """Return a file descriptor of its own, to wait for the disk with, which the caller closes."""
+        """Return a duplicate descriptor for waiting for the disk; the caller closes it."""
         return self._layout.duplicate()
 
     def close(self, metadata: str = "") -> None:
-        """Seal, put summary and footer behind the data, cut off the unused room and close.
+        """Seal, write summary and footer, cut off the unused room and close.
 
-        Args:
-            metadata: Text of ``metadata.yaml``, stored as rosbag2 does for files without their folder.
+        ``metadata`` is the text of ``metadata.yaml``, stored as rosbag2 does for files without their folder.
         """
         if not self._layout.is_open:
             return
@@ -205,14 +173,14 @@ class SealedMcapFile:
                 self.settle()
             finally:
                 # Also after a failed seal: on a full disk the unused room is worth giving back.
-                told = [Metadata("rosbag2", {"serialized_metadata": metadata})] if metadata else []
-                self._layout.finish([*self._kept, *told])
+                own = [Metadata("rosbag2", {"serialized_metadata": metadata})] if metadata else []
+                self._layout.finish([*self._kept, *own])
             self._layout.sync()
         finally:
             self.abandon()
 
     def abandon(self) -> None:
-        """Close without writing anything more: the file shows what was sealed."""
+        """Close without writing; the sealed content remains."""
         self._layout.abandon()
 
     # -- parts -------------------------------------------------------------------------------------------------
@@ -233,7 +201,7 @@ class SealedMcapFile:
             self._take_pending()
             self._finish_group(record)
             return
-        # A message that is too large for the room that was kept for the staged ones: those first, without it.
+        # The message is too large for the room before the staged chunks: settle those first, without it.
         self._settle_group()
         self._publish()
         chunk = self._group_chunk(with_pending=True)
@@ -263,14 +231,12 @@ class SealedMcapFile:
         return build_chunk(b"".join(parts), entries, span, self._compressor)
 
     def _add_entries(self, index: dict[int, list[bytes]]) -> None:
-        """Add the entries of what is not sealed to an index whose messages come before."""
         for channel, entries in self._pending_index.items():
             table = np.array(entries, "<u8")
             table[1::2] += np.uint64(self._group_size)
             index.setdefault(channel, []).append(table.tobytes())
 
     def _take_pending(self) -> None:
-        """Count what has been written as sealed, and keep it for the chunk that its group becomes."""
         self._add_entries(self._group_index)
         self._group.append(b"".join(self._pending))
         self._group_size += self._pending_size

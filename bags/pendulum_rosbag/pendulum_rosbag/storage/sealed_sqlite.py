@@ -1,12 +1,9 @@
-"""A rosbag2 database (SQLite) that is complete at every instant, also while it is being written.
+"""A rosbag2 database (SQLite) that is complete at every instant while it is written.
 
-SQLite itself makes a commit safe with a journal beside the file, and rosbag2 readers that open the file as immutable
-pass over journals: a killed writer leaves them a database that is empty or torn. A recording only ever appends, and
-for that the file format allows something better. Full pages of a table are written once and never again. What is not
-full yet (the last leaf and its ancestors up to the root, one page each) has two places that take turns, so that a
-commit never touches a page that the file shows. The commit itself is the write of page 1, which names the roots of all
-tables and the size of the file: one page, which the kernel copies as a whole. A process that is killed between any two
-instructions leaves the state before or after.
+SQLite makes commits safe with a journal, which rosbag2 readers that open the file as immutable ignore: a killed writer
+leaves them an empty or torn database. Here full table pages are written once. The unfinished pages (last leaf and its
+ancestors) each have two places that take turns, so a commit never touches a visible page. Page 1, which names the roots
+and the file's size, is the commit; the kernel copies one page as a whole.
 
 File format: https://www.sqlite.org/fileformat2.html (sections 1.3 header, 1.5 freelist, 1.6 b-tree pages, 2.1 records).
 """
@@ -47,13 +44,11 @@ _INDEX = "CREATE INDEX timestamp_idx ON messages (timestamp ASC)"
 
 
 class SealedSqliteFile:
-    """Append messages to a new rosbag2 database; after each ``seal`` they are in the file for every reader.
-
-    Args:
-        path: File to create.
+    """Append messages to a new rosbag2 database; after ``seal`` every reader sees them.
 
     Raises:
-        BagError: The file exists, or cannot be written.
+        BagError: The file exists.
+        OSError: In all methods: the disk is full or fails; the file still shows what was sealed before.
     """
 
     def __init__(self, path: Path, *, ros_distro: str = "jazzy") -> None:
@@ -85,17 +80,14 @@ class SealedSqliteFile:
             raise
 
     def size_with(self, size: int, *, empty: bool = False) -> int:
-        """Return what the closed file would take with one more message, at most [bytes], metadata not counted.
+        """Return a bound of the closed file's size with one more message of ``size`` [bytes], less metadata.
 
-        Args:
-            size: Of that message [bytes].
-            empty: Leave out all messages so far.
+        ``empty`` leaves out all messages so far.
         """
         if empty:
             return _EMPTY_PAGES * PAGE
         rows, last = self.count + self._pending + 1, max(self.stop_ns, self._pending_span[1])
-        # A row of the index over time: sizes, time and row id. The message takes a page of its own at worst, and two
-        # above that.
+        # Index row over time: sizes, time and row id. The message takes at worst a page of its own and two above it.
         entry = 9 + last.bit_length() // 8 + rows.bit_length() // 8
         return (self._pages.count + rows * entry // (PAGE - 64) + size // (PAGE - 4) + 6) * PAGE
 
@@ -112,19 +104,9 @@ class SealedSqliteFile:
     def write_many(
         self, messages: Iterator[tuple[str, int, bytes]], channels: Mapping[str, int], counts: dict[str, int], most: int
     ) -> bool:
-        """Add messages until there are no more or enough wait to be sealed.
+        """Add messages (topic, log time [ns], CDR) until ``most`` bytes wait; return whether they do.
 
-        Args:
-            messages: Topic, log time [ns] and serialised message of each; what is not taken stays there.
-            channels: Topic -> its id.
-            counts: Topic -> messages, one more for each that is taken.
-            most: Size of what waits from which it is enough [bytes].
-
-        Returns:
-            Whether it is enough, and there may be more messages.
-
-        Raises:
-            BagError: A topic has no id; what came before is taken.
+        Counts them in ``counts``; the rest stays in the iterator. Raises BagError at a topic without id.
         """
         heads, append = self._heads, self._tables["messages"].append
         waiting, (start, stop) = self._pending_size, self._pending_span
@@ -147,7 +129,7 @@ class SealedSqliteFile:
             self._pending_size, self._pending_span = waiting, (start, stop)
 
     def _head(self, channel_id: int, size: int) -> bytes:
-        """Return what is before the time in the row of a message of this size."""
+        """Return the part of a message's row before its time."""
         # Columns: id (NULL, it is the row id), topic_id (32 bit), timestamp (64 bit), data (blob).
         types = b"\x00\x04\x06" + varint(2 * size + 12)
         head = bytes((len(types) + 1,)) + types + struct.pack(">i", channel_id)
@@ -156,11 +138,7 @@ class SealedSqliteFile:
         return head
 
     def seal(self) -> None:
-        """Make everything that was written visible to readers of the file.
-
-        Raises:
-            OSError: The disk is full or fails. The file still shows what was sealed before.
-        """
+        """Write everything so far to the file."""
         if not (self._pending or self._stale):
             return
         self._commit()
@@ -174,26 +152,21 @@ class SealedSqliteFile:
             self._pending_span = (2**63 - 1, 0)
 
     def settle(self) -> None:
-        """Seal; there is nothing that would be written a second time."""
+        """Seal; a database rewrites nothing."""
         self.seal()
 
     def duplicate(self) -> int:
-        """Return a file descriptor of its own, to wait for the disk with, which the caller closes."""
+        """Return a duplicate descriptor for waiting for the disk; the caller closes it."""
         return os.dup(self._fd)
 
     def keep(self, record: Attachment | Metadata) -> None:
-        """Refuse what has no place in a database.
-
-        Raises:
-            BagError: Always.
-        """
+        """Raise BagError: a database has no place for attachments."""
         raise BagError(f"storage sqlite3 has no place for {record.name!r}; expected storage mcap for attachments")
 
     def close(self, metadata: str = "") -> None:
-        """Seal, add the index over time that rosbag2 seeks by, and close.
+        """Seal, add rosbag2's index over time and close.
 
-        Args:
-            metadata: Text of ``metadata.yaml``, stored as rosbag2 does for files without their folder.
+        ``metadata`` is the text of ``metadata.yaml``, stored as rosbag2 does for files without their folder.
         """
         if self._fd < 0:
             return
@@ -208,7 +181,7 @@ class SealedSqliteFile:
             self.abandon()
 
     def abandon(self) -> None:
-        """Close without writing anything more: the file shows what was sealed."""
+        """Close without writing; the sealed content remains."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -226,14 +199,14 @@ class SealedSqliteFile:
         pages.waiting[self._trunks[hidden]] = trunk.ljust(PAGE, b"\0")
         self._write_runs()
         if os.fstat(self._fd).st_size < pages.count * PAGE:
-            os.ftruncate(self._fd, pages.count * PAGE)  # places that were not used yet belong to the file, too
+            os.ftruncate(self._fd, pages.count * PAGE)  # the file includes places that are not used yet
         write_at(self._fd, self._first_page(self._trunks[hidden], len(free) + 1), 0)
         self._commits += 1
         for table in tables:
             table.confirm()
 
     def _write_runs(self) -> None:
-        """Write the waiting pages, neighbours together; they stay waiting if that fails."""
+        """Write the waiting pages, neighbours together; on failure they stay waiting."""
         waiting = self._pages.waiting
         run: list[bytes] = []
         start = 0
@@ -249,30 +222,11 @@ class SealedSqliteFile:
         waiting.clear()
 
     def _first_page(self, trunk: int, free: int) -> bytes:
-        header = b"SQLite format 3\0" + struct.pack(
-            ">HBBBBBBIIIIIIIIIIII20xII",
-            PAGE,
-            1,
-            1,
-            0,
-            64,
-            32,
-            32,
-            self._commits + 1,
-            self._pages.count,
-            trunk,
-            free,
-            1,  # schema cookie
-            4,  # schema format
-            0,
-            0,
-            1,  # UTF-8
-            0,
-            0,
-            0,
-            self._commits + 1,
-            _SQLITE_VERSION,
-        )
+        commit, tree = self._commits + 1, self._pages.count
+        header = b"SQLite format 3\0" + struct.pack(">H6B4I", PAGE, 1, 1, 0, 64, 32, 32, commit, tree, trunk, free)
+        schema_cookie, schema_format, utf8 = 1, 4, 1
+        header += struct.pack(">8I", schema_cookie, schema_format, 0, 0, utf8, 0, 0, 0)
+        header += struct.pack(">20x2I", commit, _SQLITE_VERSION)
         cells = []
         for number, (name, sql) in enumerate(_TABLES.items(), 1):
             payload = record(("table", name, name, self._tables[name].root, sql))
@@ -280,13 +234,13 @@ class SealedSqliteFile:
         return header + tree_page(struct.pack(">BHHHB", 0x0D, 0, len(cells), 0, 0), cells, PAGE - len(header))
 
     def _add_index(self) -> None:
-        """Build the index in a copy and put that in place of the file, in one step; without room for it, do not."""
+        """Replace the file by a copy with an index, in one step; skip it if there is no space."""
         copy = self.path.with_name(f".{self.path.name}.tmp")
         try:
             shutil.copyfile(self.path, copy)
             connection = sqlite3.connect(copy)
             try:
-                # The copy is worth nothing until it is whole: no journal, no waiting for the disk.
+                # An unfinished copy is discarded: no journal, no sync.
                 connection.execute("PRAGMA journal_mode = OFF")
                 connection.execute("PRAGMA synchronous = OFF")
                 connection.execute(_INDEX)
@@ -297,5 +251,5 @@ class SealedSqliteFile:
                 os.fsync(file.fileno())
             os.replace(copy, self.path)
         except (OSError, sqlite3.OperationalError):
-            # No room for the copy. The bag is whole without it; only seeking in a long one is slower.
+            # The bag is complete without the index; only seeking in a long one is slower.
             copy.unlink(missing_ok=True)

@@ -19,7 +19,7 @@ _SMALLEST_LOCAL = (PAGE - 12) * 32 // 255 - 23
 
 
 def varint(value: int) -> bytes:
-    """Return a big-endian variable-length integer as SQLite writes it (0 <= value < 2**56)."""
+    """Return SQLite's big-endian variable-length integer (0 <= value < 2**56)."""
     if value < 0x80:
         return bytes((value,))
     if value < 0x4000:
@@ -35,7 +35,7 @@ def varint(value: int) -> bytes:
 
 
 def record(values: tuple[Any, ...]) -> bytes:
-    """Return a table row: ``None``, integers and texts."""
+    """Return a table row of ``None``, integers and texts."""
     types, body = b"", b""
     for value in values:
         if value is None:
@@ -47,7 +47,7 @@ def record(values: tuple[Any, ...]) -> bytes:
             data = str(value).encode()
             types += varint(2 * len(data) + 13)
             body += data
-    return varint(len(types) + 1) + types + body  # (headers stay below 127 bytes: few columns)
+    return varint(len(types) + 1) + types + body  # few columns: headers stay below 127 bytes
 
 
 class Pages:
@@ -58,7 +58,7 @@ class Pages:
         self.waiting: dict[int, bytes] = {}
 
     def new(self) -> int:
-        """Return the number of a page behind all others."""
+        """Allocate a page and return its number."""
         self.count += 1
         return self.count
 
@@ -80,7 +80,7 @@ class Table:
         self.root = 0
 
     def append(self, row_id: int, payload: bytes) -> None:
-        """Add a row behind all others."""
+        """Append a row."""
         size = len(payload)
         cell = varint(size) + varint(row_id) + payload if size <= _LARGEST_LOCAL else self._overflowing(row_id, payload)
         if len(cell) + 2 > self._room:
@@ -112,7 +112,7 @@ class Table:
             self._rooms.append(_INTERIOR_ROOM)
         needed = 4 + len(varint(key)) + 2
         if needed > self._rooms[level]:
-            # A node is finished only when the next child comes, so that the last one is never empty.
+            # A node is finished only when the next child comes, so the last node is never empty.
             *children, (last, last_key) = self._levels[level]
             finished = self._pages.new()
             self._pages.waiting[finished] = _interior(children, last)
@@ -123,7 +123,7 @@ class Table:
         self._rooms[level] -= needed
 
     def place(self) -> None:
-        """Lay out the pages that are not full yet in the places that the file does not show."""
+        """Write unfinished pages to the places that the file does not show."""
         if not self._changed:
             return
         while len(self._places) <= len(self._levels):
@@ -137,13 +137,13 @@ class Table:
         self.root = page
 
     def confirm(self) -> None:
-        """Take note that the file shows what was placed; a commit that failed is tried in the same places."""
+        """Confirm that the file shows the placed pages; a failed commit reuses the same places."""
         if self._changed:
             self._shown = 1 - self._shown
             self._changed = False
 
     def unused(self) -> list[int]:
-        """Return the places that the file will not show once what was placed is committed."""
+        """Return the places that are free once the placed pages are committed."""
         free = self._shown if self._changed else 1 - self._shown
         return [pair[free] for pair in self._places]
 

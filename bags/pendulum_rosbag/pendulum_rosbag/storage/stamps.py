@@ -11,20 +11,19 @@ from pendulum_rosbag.storage.message_types import typestore
 __all__ = ["LOG_TIMES", "StampReader", "stamp_reader"]
 
 LOG_TIMES = ("receive", "header")
-"""Log time = when the message arrived, or what stamp it carries."""
+"""Log time: time of arrival, or the message's stamp."""
 
 StampReader = Callable[[bytes], int | None]
-"""From CDR bytes to the stamp [ns], ``None`` when this message has none."""
+"""From CDR bytes to the stamp [ns], ``None`` if the message has none."""
 
 _LITTLE = struct.Struct("<iI")
 _BIG = struct.Struct(">iI")
 
 
 def stamp_reader(type_name: str) -> StampReader | None:
-    """Return how to find the stamp in messages of a type.
+    """Return the reader of a type's stamp, ``None`` for types without one.
 
-    Types that begin with a ``std_msgs/Header`` or a time have it at their start; a ``std_msgs/String`` has it as
-    ``stamp_ns`` when its text is the JSON of an event. ``None`` for types without a stamp.
+    The stamp is a leading ``std_msgs/Header`` or time, or ``stamp_ns`` in the JSON event of a ``std_msgs/String``.
     """
     if type_name == "std_msgs/msg/String":
         return _event_stamp

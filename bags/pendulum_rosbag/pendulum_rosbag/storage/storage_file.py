@@ -1,6 +1,6 @@
-"""The port of the storage formats: one file of a bag that is being written."""
+"""The interface of a storage format: one file of a bag that is being written."""
 
-# ruff: noqa: D102 (what each does is said where it is done)
+# ruff: noqa: D102 (the implementations document the methods)
 from __future__ import annotations
 
 import os
@@ -15,7 +15,7 @@ __all__ = ["StorageFile", "write_at"]
 
 
 class StorageFile(Protocol):
-    """What a storage format offers; see :class:`~pendulum_rosbag.storage.sealed_mcap.SealedMcapFile`."""
+    """Interface of a storage format; see :class:`~pendulum_rosbag.storage.sealed_mcap.SealedMcapFile`."""
 
     path: Path
 
@@ -39,11 +39,7 @@ class StorageFile(Protocol):
 
 
 def write_at(descriptor: int, data: bytes | bytearray, offset: int) -> None:
-    """Write all bytes to a place in an open file.
-
-    Raises:
-        OSError: The disk is full or fails.
-    """
+    """Write all bytes at an offset of an open file; raises OSError if the disk is full or fails."""
     view = memoryview(data)
     while view:
         done = os.pwrite(descriptor, view, offset)
