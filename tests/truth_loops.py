@@ -13,11 +13,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.distributions import Interval
+from pendulum_bags.frequency_response.compare import compare_responses
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.record import Record
+from pendulum_bags.ranking.contender import contenders_of
+from pendulum_bags.ranking.ranking import rank
 from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.responses.certificate import Certificate, Certifier
-from pendulum_lqr.responses.gap_metric import DEFAULT_SCALING, JointScaling
+from pendulum_lqr.responses.gap_metric import DEFAULT_SCALING, JointScaling, SignalScaling
 from pendulum_lqr.responses.machine_response import Machine
 
 Array = NDArray[Any]
@@ -106,9 +110,30 @@ class Linear:
     @cached_property
     def response(self) -> Array:
         """Return the sampled response on a grid to the Nyquist frequency, shape (2 k, n)."""
+        return self.at(np.geomspace(0.05, np.pi / self.period, 1500))
+
+    def at(self, omega: Array) -> Array:
+        """Return the sampled response at some frequencies [rad/s], shape (2 k, n)."""
         A, B, C = self.sampled
-        points = np.exp(1j * np.geomspace(0.05 * self.period, np.pi, 1500))
+        points = np.exp(1j * self.period * omega)
         return (C @ np.linalg.solve(points[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex)))[:, :, 0].T
+
+    def costs(self, K: Array, noise: Array) -> tuple[Array, float]:
+        """Return the mean of 100 e^2 + 0.01 v^2 + 0.1 u^2 in runs of one joint from rest, and what is expected of it.
+
+        Args:
+            K: Gain.
+            noise: Torque that is added in each period, uniform in -1 to 1, shape (runs, n).
+        """
+        A, B, C = self.sampled
+        loop, weight = A - B @ (K[None] @ C), C.T @ (np.diag([100.0, 0.01]) + 0.1 * np.outer(K, K)) @ C
+        states, spread, found, expected = np.zeros((len(noise), len(A))), np.zeros_like(A), 0.0, 0.0
+        for push in noise.T:
+            found = found + np.einsum("ij,jk,ik->i", states, weight, states)
+            expected += float(np.trace(weight @ spread))
+            states = states @ loop.T + push[:, None] * B.T
+            spread = loop @ spread @ loop.T + B @ B.T / 3.0
+        return np.asarray(found) / noise.shape[1], expected / noise.shape[1]
 
     def modulus(self, K: Array, power: float = 1.0) -> float:
         """Return the largest eigenvalue of the sampled loop, its gain changed by a factor."""
@@ -275,6 +300,54 @@ FAMILIES: dict[str, Callable[[np.random.Generator], tuple[Linear, Linear, Array,
     "Furuta pendulum, resonance between lines": lambda random: furuta(random, random.uniform(0.001, 0.004)),
 }
 """Families of pairs; the last two are hard: what fells a loop lies where no line is."""
+
+
+def distance(name: str, seed: int) -> tuple[Interval, float] | None:
+    """Return the nu-gap that the product measures of one pair of a family, and the true one at its frequencies.
+
+    None where the recording's regulator does not hold the machine. The simulation runs at 2 ms.
+    """
+    model, truth, q, r = FAMILIES[name](np.random.default_rng([1, seed]))
+    held = model.regulator(q, r)
+    if truth.modulus(held) >= 1.0:
+        return None
+    known, top = model.model(), 47.5 if truth.joints == 1 else 100.0
+    simulation = replace(model, period=0.002, amplitude=truth.amplitude)
+    both = [estimate(measured(one, held, at, top=top)) for one, at in ((simulation, seed + 10**6), (truth, seed))]
+    scaling: SignalScaling = DEFAULT_SCALING
+    if truth.joints > 1:
+        scaling = JointScaling.of_weights(known.measured, ["-"] * len(q), list(q), r, "-")
+    found = compare_responses(both[0], both[1], known, scaling)
+    graphs = []
+    for one in (replace(model, period=truth.period), truth):
+        P = one.at(2.0 * np.pi * found.frequency) * scaling.input / scaling.outputs
+        graph = np.concatenate([np.ones((1, P.shape[1])), P])
+        graphs.append(graph / np.linalg.norm(graph, axis=0))
+    inner = np.abs(np.sum(graphs[0].conj() * graphs[1], axis=0))
+    return found.nu_gap, float(np.sqrt(np.max(np.maximum(1.0 - inner**2, 0.0))))
+
+
+def choice(seed: int, runs: int = 3, count: int = 6) -> tuple[Interval, float] | None:
+    """Return the regret of a simulation's pick that the product measures, and the true one, as shares.
+
+    None where a regulator does not hold the machine.
+    """
+    model, truth, _, _ = pendulum(np.random.default_rng([1, seed]))
+    random = np.random.default_rng([11, seed])
+    noise = random.uniform(-1.0, 1.0, (runs, 500))
+    costs: dict[str, dict[str, list[tuple[int, Any]]]] = {}
+    expected = {}
+    for i in range(count):
+        K = model.regulator(np.array([100.0, 0.01]) * 10.0 ** random.uniform(-1.5, 1.5, 2), 0.1)
+        if truth.modulus(K) >= 1.0 or model.modulus(K) >= 1.0:
+            return None
+        (own, _), (theirs, expected[f"{i}"]) = (one.costs(K, noise) for one in (model, truth))
+        costs[f"{i}"] = {
+            side: [(k, np.array([cost, 0.0, 0.0])) for k, cost in enumerate(side_costs)]
+            for side, side_costs in (("sim", own), ("hw", theirs))
+        }
+    found = rank(contenders_of(costs))
+    return found.regret_share, expected[found.pick] / min(expected.values()) - 1.0
 
 
 def certificates(name: str, seed: int, cases: int) -> Counter[str]:

@@ -10,7 +10,7 @@ import pytest
 from pendulum_bags.comparison.band import SlowClock
 from pendulum_bags.comparison.long_run import covariance, moments
 from tests.benchmarks.bench_truth import SPREADS, Setting, margins_on, misses, on_the_margin, recordings
-from tests.truth_loops import certificates
+from tests.truth_loops import certificates, choice, distance
 from tests.truth_plants import BAND, HOLD, PAIRS
 
 SAME = PAIRS["one plant at two rates"]
@@ -66,6 +66,16 @@ def test_the_mean_of_many_long_run_variances_is_that_of_a_run_without_end(known:
     truth = pair.hardware.run(long, 10_200)[:, 200:, 0].var()
     # About the windows' own means it is 0.79 and 0.84 of the truth; without what the noise does not explain, less.
     assert low < np.mean(ratios) / truth < 1.04
+
+
+def test_the_intervals_of_nu_gap_and_regret_hold_the_truth() -> None:
+    gaps = [distance("pendulum", seed) for seed in range(6)]
+    choices = [choice(seed) for seed in range(6)]
+    for found in (gaps, choices):
+        pairs = [one for one in found if one is not None]
+        assert len(pairs) >= 5
+        # 5 % in all are meant; two of six miss once in 30.
+        assert sum(not interval.low <= truth <= interval.high for interval, truth in pairs) <= 1
 
 
 @pytest.mark.parametrize(

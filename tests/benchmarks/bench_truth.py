@@ -18,11 +18,12 @@ from pendulum_bags.comparison.long_run import Disturbance
 from pendulum_bags.comparison.same_run import paired_tests, unpaired_tests
 from pendulum_bags.identification.identify_mechanism import identify_mechanism
 from pendulum_bags.identification.joint_recordings import JointRecording
+from pendulum_bags.ranking.present import REGRET_MARGIN
 from pendulum_bags.runs.series import Series, Signal
 from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_testing.balanced_machine import PRESETS, run_balanced
 from tests.benchmarks import Row, counted
-from tests.truth_loops import FAMILIES, certificates
+from tests.truth_loops import FAMILIES, certificates, choice, distance
 from tests.truth_plants import COLOURED, HOLD, OTHER, PAIRS, POWER, REAL_TIME, PlantPair
 
 DURATIONS = (5.0, 25.0, 125.0)
@@ -182,6 +183,25 @@ def certificate_rows(pool: Executor) -> Iterator[Row]:
         )
 
 
+def layer_rows(pool: Executor) -> Iterator[Row]:
+    """Yield the misses of the intervals of nu-gap and regret, and the wrong yes of the simulation's choice."""
+    for name in FAMILIES:
+        found = [one for one in pool.map(partial(distance, name), range(60)) if one is not None]
+        for side, missed in (
+            ("below", sum(true < gap.low for gap, true in found)),
+            ("above", sum(true > gap.high for gap, true in found)),
+        ):
+            yield counted(f"{name}: truth {side} the 95 % interval, nu-gap", missed, len(found), at_most=5.0)
+    for runs in (3, 10):
+        chosen = [one for one in pool.map(partial(choice, runs=runs), range(400)) if one is not None]
+        what = f"{runs} seeds"
+        below, above = (sum(one) for one in zip(*((t < r.low, t > r.high) for r, t in chosen), strict=True))
+        yield counted(f"{what}: truth below the 95 % interval, regret", below, len(chosen), at_most=5.0)
+        yield counted(f"{what}: truth above the 95 % interval, regret", above, len(chosen), at_most=5.0)
+        wrong = [regret.high <= REGRET_MARGIN for regret, true in chosen if true > REGRET_MARGIN]
+        yield counted(f"{what}: yes, of picks that cost above {REGRET_MARGIN:.0%} more", sum(wrong), len(wrong))
+
+
 def identified(seed: int, preset: str) -> tuple[int, int]:
     """Return how many intervals of a machine held upright miss its values, and their number; (0, 0) if refused."""
     run = run_balanced(preset, seed)
@@ -228,6 +248,7 @@ def rows() -> Iterator[Row]:
     blocks = [range(first, first + _AT_ONCE) for first in range(0, TRIALS, _AT_ONCE)]
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         yield from certificate_rows(pool)
+        yield from layer_rows(pool)
         yield from identification_rows(pool)
         wanted = list(settings())
         keys = list(dict.fromkeys((setting.pair, setting.apart) for _, setting in wanted))

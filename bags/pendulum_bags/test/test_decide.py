@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,14 @@ def test_a_spent_budget_leaves_it_undecided_and_says_what_it_would_take(folder: 
     (step,) = same_run_layer(found, more="make experiment").next_steps
     assert step.startswith("Record about ")
     assert "more run" in step
+    # One recording serves all joints; what takes hours is no step to take.
+    for runs, begins in ((30, "Record about 30 more runs"), (3000, "About 3000 more runs"), (None, "More runs would")):
+        needs = {
+            joint: replace(found, verdict=replace(found.verdict, more_runs=more))
+            for joint, more in (("cart", 2), ("pole", runs))
+        }
+        (step,) = answer_of(needs, more="make experiment").layers[0].next_steps
+        assert step.startswith(begins)
 
 
 def test_a_repeat_that_does_not_end_in_time_is_left_out(folder: Path) -> None:

@@ -219,6 +219,13 @@ def test_a_file_that_was_fitted_is_left_alone_by_the_next_fit_and_no_third_is_pr
     assert "--out plant.yaml)" in step
 
 
+def test_no_identification_is_recommended_from_recordings_that_one_has_refused() -> None:
+    pairs = pair(5, plant=SIMULATED.with_values(damping=2 * 11.77))
+    steps = same_run_layer(compare([pairs]), refused="the windows are too short").next_steps
+    assert steps[0] == "No plant could be identified from these recordings: the windows are too short."
+    assert not any("pendulum_bags identify" in step for step in steps)
+
+
 # -- after an identification ---------------------------------------------------------------------------------------
 
 

@@ -30,6 +30,7 @@ from pendulum_bags.commands.whole_run import (
     Periods,
     Seeds,
     SignalPeriod,
+    budget_of,
     run_whole,
     steps_of,
 )
@@ -139,7 +140,7 @@ def thesis(
     domain: Domain = None,
     margin: MarginOption = None,
     margins_file: MarginsFile = None,
-    budget: Budget = 120.0,
+    budget: Budget = None,
     only: Only = None,
     contenders: Contenders = 6,
     seeds: Seeds = 3,
@@ -201,6 +202,7 @@ def thesis(
         ramp_speed=ramp_speed,
     )
     margins = Margins.of(margins_file, margin)
+    budget = budget_of(budget, contenders, seeds)
     steps = steps_of(only, budget)
     domain = check_domain(domain)
     if (foreign := settings.foreign) is not None and plant is None and not accept_differences:

@@ -16,6 +16,7 @@ from pendulum_bags.commands.whole_run import (
     Periods,
     Seeds,
     SignalPeriod,
+    budget_of,
     run_whole,
     steps_of,
 )
@@ -64,7 +65,7 @@ def joints(
     storage: Storage = "mcap",
     margin: MarginOption = None,
     margins_file: MarginsFile = None,
-    budget: Budget = 120.0,
+    budget: Budget = None,
     only: Only = None,
     contenders: Contenders = 6,
     seeds: Seeds = 3,
@@ -121,6 +122,7 @@ def joints(
         # Before anything runs: a slip of the pen should not cost a minute.
         on = design_for(simulated)
         read_designs(design, on, linearise(on))
+    budget = budget_of(budget, contenders, seeds)
     margins, steps = Margins.of(margins_file, margin), steps_of(only, budget)
 
     def order_in(folder: Path) -> Order:

@@ -24,7 +24,18 @@ if TYPE_CHECKING:
     from pendulum_bags.verdict import Answer
     from pendulum_bags.whole.carry_out import Findings, Order, Simulated
 
-__all__ = ["Budget", "Contenders", "Design", "Only", "Periods", "Seeds", "SignalPeriod", "run_whole", "steps_of"]
+__all__ = [
+    "Budget",
+    "Contenders",
+    "Design",
+    "Only",
+    "Periods",
+    "Seeds",
+    "SignalPeriod",
+    "budget_of",
+    "run_whole",
+    "steps_of",
+]
 
 Only = Annotated[
     list[str] | None,
@@ -34,10 +45,11 @@ Only = Annotated[
     ),
 ]
 Budget = Annotated[
-    float,
+    float | None,
     typer.Option(
         help="Longest wall time of what follows the first run, where hardware is emulated: repeats, identification, "
-        "further layers, the page; 0 for that run alone [s].",
+        "further layers, the page; 0 for that run alone. By default 120 for 6 contenders under 3 seeds, and 1.5 for "
+        "each further run of the ranking [s].",
         min=0.0,
     ),
 ]
@@ -58,6 +70,11 @@ Design = Annotated[
         "before velocities; may be given again. Default: four LQRs."
     ),
 ]
+
+
+def budget_of(given: float | None, contenders: int, seeds: int) -> float:
+    """Return the budget of a run: the given one, or what its ranking needs [s]."""
+    return 120.0 + 1.5 * max(0, contenders * seeds - 18) if given is None else given
 
 
 def steps_of(only: Sequence[str] | None, budget: float) -> Sequence[str]:

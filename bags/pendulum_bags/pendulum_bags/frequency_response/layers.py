@@ -65,7 +65,8 @@ def same_plant(
     shown = Mark.YES if mark is Mark.YES else Mark.UNDECIDED
     evidence = [
         Evidence(
-            "nu-gap", "", gap.value, gap.low, gap.high, f"below {margin:.2g}", mark, difference.scaling.sentence()
+            "nu-gap", "", gap.value, gap.low, gap.high, f"below {margin:.2g}", mark,
+            f"at the measured frequencies, blind to a resonance between two. {difference.scaling.sentence()}",
         ),
         Evidence(
             "extra delay of the hardware", "ms", 1e3 * delay.value, 1e3 * delay.low, 1e3 * delay.high, "", shown,

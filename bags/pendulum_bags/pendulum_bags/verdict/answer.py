@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,7 @@ def answer_of(
     more: str = "",
     updated: Sequence[LayerResult] = (),
     how: Mapping[Layer, str] = MappingProxyType({}),
+    refused: str = "",
 ) -> Answer:
     """Return the answer of a comparison, or of those of the joints of a plant.
 
@@ -32,14 +34,19 @@ def answer_of(
         more: How to record more, where that is what is missing.
         updated: Layers that were judged again, and replace those of the folders.
         how: The command that measures a layer, where it is another than that of the recordings' plants.
+        refused: Why no plant could be identified from the recordings, as a sentence; empty where nobody tried.
 
     Raises:
         DataError: A stored layer cannot be read, is in two of the folders, or is of other plants.
     """
     results = compared if isinstance(compared, Mapping) else {"": compared}
     comparison = next(iter(results.values()))
-    layers = {joint: same_run_layer(one, more=more) for joint, one in results.items()}
+    layers = {joint: same_run_layer(one, more=more, refused=refused) for joint, one in results.items()}
     first = layers[""] if "" in layers else join_joints(layers)
+    if first.mark is Mark.UNDECIDED:
+        # One recording serves all joints: the one that needs most of it decides.
+        neediest = max(results, key=lambda joint: _needed(results[joint]))
+        first = replace(first, next_steps=layers[neediest].next_steps)
     known = {Layer.SAME_RUN, *(one.layer for one in updated)}
     others = [one for folder in folders for one in read_layers(folder, first.case) if one.layer not in known]
     commands = {**how_to_measure(comparison), **how}
@@ -48,6 +55,12 @@ def answer_of(
         others += [one for one in layers_of_files(comparison) if one.layer not in found]
     emulated = all(one.is_emulated for one in results.values())
     return sum_up([first, *updated, *others], emulated=emulated, how=commands)
+
+
+def _needed(comparison: Comparison) -> float:
+    """Return how many more runs an undecided comparison needs; infinity where more would hardly decide it."""
+    runs = comparison.verdict.more_runs
+    return math.inf if runs is None else float(runs)
 
 
 def join_joints(results: Mapping[str, LayerResult]) -> LayerResult:

@@ -29,17 +29,20 @@ __all__ = [
 _MARKS = {Outcome.EQUIVALENT: Mark.YES, Outcome.DIFFERENT: Mark.NO, Outcome.UNDECIDED: Mark.UNDECIDED}
 _MOST_REASONS = 3
 """Reasons that a sentence has with their size; it names the rest, and the table has them all."""
+_MOST_RECORDED = 1800.0
+"""Longest further recordings that are recommended [s]."""
 _MOST_RECORDINGS = 4
 """Recordings that the command names from which the plant is identified."""
 
 
-def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
+def same_run_layer(comparison: Comparison, *, more: str = "", refused: str = "") -> LayerResult:
     """Return the first layer of a comparison.
 
     Args:
         comparison: The comparison.
         more: How to record more where that is what is missing, such as ``make experiment ARGS="--budget 120"``; by
             default the number of runs is given.
+        refused: Why no plant could be identified from the recordings, as a sentence; empty where nobody tried.
     """
     verdict = comparison.verdict
     tests = verdict.tests
@@ -57,7 +60,7 @@ def same_run_layer(comparison: Comparison, *, more: str = "") -> LayerResult:
         further = ", ".join(test.quantity for test in once[_MOST_REASONS:])
         reason = "; ".join(in_words(test) for test in once[:_MOST_REASONS])
         reason += f"; also beyond its margin: {further}" if further else ""
-        steps = _remedies(comparison, failed)
+        steps = _remedies(comparison, failed, refused)
     else:
         reason = verdict.sentence.removeprefix("Undecided: ").rstrip(".")
         if tests and comparison.is_paired and not comparison.unlike_references:
@@ -208,14 +211,17 @@ def _each_once(failed: Sequence[EquivalenceTest]) -> list[EquivalenceTest]:
     return plain or list(failed)
 
 
-def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest]) -> tuple[str, ...]:
+def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest], refused: str) -> tuple[str, ...]:
     steps = []
     names = {test.quantity for test in failed}
     shapes = {name for name in names if name != "delay" and not name.startswith("mean")}
     source = " ".join(map(shlex.quote, recordings_of(comparison))) or "RUN/hw"
     late = next((test for test in failed if test.quantity == "delay"), None)
     foreign = _foreign_simulation(comparison)
-    if any(name.startswith("spread") or "less the delay" in name for name in shapes):
+    moves_otherwise = any(name.startswith("spread") or "less the delay" in name for name in shapes)
+    if moves_otherwise and refused:
+        steps.append(f"No plant could be identified from these recordings: {refused.rstrip('.')}.")
+    elif moves_otherwise:
         fitted = "" if foreign else plant_file_of(_records(comparison))
         out = _next_file(fitted)
         identify = f"python -m pendulum_bags identify {source} --out {shlex.quote(out)}"
@@ -315,7 +321,13 @@ def _what_it_takes(comparison: Comparison, more: str) -> str:
         return "Record both under a disturbance that moves them more: too little is alike to tell a delay."
     if runs is None:
         return "More runs would hardly decide it: a difference sits on its margin; state another margin, or mend it."
-    what = f"about {runs} more run{'s' if runs != 1 else ''} of {comparison.pairs[0].hardware.window.duration:.0f} s"
+    duration = comparison.pairs[0].hardware.window.duration
+    what = f"about {runs} more run{'s' if runs != 1 else ''} of {duration:.0f} s"
+    if runs * duration > _MOST_RECORDED:
+        return (
+            f"{what[0].upper()}{what[1:]} would decide it ({runs * duration / 3600.0:.2g} h): a difference sits near "
+            "its margin; state another margin, or mend it."
+        )
     if comparison.operating is not None:
         return f"Record {what} of the machine under the same {comparison.shared}."
     return f"Record {what}" + (f": {more}." if more else ", each with a seed of its own.")

@@ -145,6 +145,7 @@ class Simulated:
         folder: Of its recordings.
         budget: That of the next run where this one's did not suffice; 0 where more of it measures nothing [s].
         comparisons: Of each joint; empty before the first analysis.
+        refused: Why no other plant could be identified from these recordings; empty where nobody tried.
     """
 
     name: str
@@ -155,6 +156,7 @@ class Simulated:
     analysis: Analysis | None = None
     ranking: Ranking | None = None
     layers: list[LayerResult] = field(default_factory=list)
+    refused: str = ""
 
     @property
     def comparison(self) -> Comparison:
@@ -170,7 +172,8 @@ class Simulated:
         """Return the sum of what was measured; there is a comparison."""
         more = self.more() if self.budget else ""
         how = dict.fromkeys(Layer, more) if more else {}
-        return answer_of(self.comparisons, updated=[*self.layers, *_undefined(self.settings)], more=more, how=how)
+        layers = [*self.layers, *_undefined(self.settings)]
+        return answer_of(self.comparisons, updated=layers, more=more, how=how, refused=self.refused)
 
     def add(self, *layers: LayerResult) -> None:
         """Add layers of this plant and store them.
@@ -433,7 +436,8 @@ class _Run:
             time.sleep(_POLL)
         self.programs.children.clear()
         if code != 0:
-            raise DataError(f"no plant was identified: {_refusal(self.identification)}")
+            self.found.given.refused = _refusal(self.identification)
+            raise DataError(f"no plant was identified: {self.found.given.refused}")
         self._phase(f"comparing {PLANT_FILE}", 4.0)
         self.machine.wait(place / "hw", deadline)
         deadline.require(_ANALYSING)
