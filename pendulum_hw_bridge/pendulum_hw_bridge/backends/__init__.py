@@ -1,4 +1,4 @@
-"""Backends of the actuator port; each is one module and one line in :data:`BACKENDS`."""
+"""Backends of the actuator port: one module and one entry in :data:`BACKENDS` each."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ __all__ = ["BACKENDS", "Backend"]
 
 
 class Backend(NamedTuple):
-    """A backend.
+    """One backend.
 
     Attributes:
-        target: ``module:class``, imported when it is chosen; the class method ``from_parameters(values, clock,
-            lockstep=...)`` makes one, not connected yet.
-        parameters: Parameters of the bridge that it alone reads.
-        is_machine: Whether something moves that can hurt: the bridge's own limits are then the strict ones.
-        in_process: Whether that is done in this process: it is what the parameters say, and knows simulated time.
+        target: ``module:class``, imported when chosen; its ``from_parameters(values, clock, lockstep=...)`` makes a
+            port.
+        parameters: Bridge parameters that only this backend reads.
+        is_machine: Whether a real machine moves: the bridge's own limits are then the strict ones.
+        in_process: Whether it runs in this process: then parameters describe it and it supports simulated time.
     """
 
     target: str
@@ -32,12 +32,9 @@ class Backend(NamedTuple):
     in_process: bool = False
 
     def make(self, values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False) -> ActuatorPort:
-        """Return the port that parameters describe, not connected yet.
+        """Return the port that the parameters describe, not connected yet.
 
-        Args:
-            values: Parameters of the bridge.
-            clock: Host clock.
-            lockstep: Whether time is simulated: feedback then comes without jitter, just before each state.
+        In ``lockstep``, time is simulated: feedback comes without jitter, just before each state.
 
         Raises:
             ParameterError: A parameter of the backend is refused.
@@ -74,7 +71,7 @@ _OF_GROUPS = (
     _of_joints("joint_signs", [1.0], "-", "1, or -1 where a module turns the other way"),
     _of_joints("effort_tares", [0.0], "N m", "torque that each sensor shows when nothing pulls"),
 )
-"""Parameters of several modules; those of the only one have the same names in the singular."""
+"""Parameters of several modules; for a single module the same names in the singular."""
 
 BACKENDS: dict[str, Backend] = {
     "emulator": Backend("pendulum_hw_bridge.backends.emulator:EmulatorBackend", is_machine=False, in_process=True),
@@ -96,4 +93,4 @@ BACKENDS: dict[str, Backend] = {
         is_machine=False,
     ),
 }
-"""Backends by name; which of them emulate a pendulum says ``EMULATED_BACKENDS``, since experiments ask that too."""
+"""Backends by name; ``EMULATED_BACKENDS``, which experiments read too, lists those that emulate a pendulum."""

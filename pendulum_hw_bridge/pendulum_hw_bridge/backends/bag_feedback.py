@@ -1,8 +1,7 @@
-"""Recorded feedback out of a rosbag2 folder, read in a process of its own.
+"""Recorded feedback from a rosbag2 folder, read in a separate process.
 
-A bag is somebody else's file: it can claim gigabytes, or lead its reader astray in ways that nobody thought of. The
-process that reads it has bounds on memory and time, and hands back nothing but numbers; the one that drives an
-actuator never sees the bag.
+A bag is untrusted: it can claim gigabytes or exploit its reader. The reading process has bounds on memory and time and
+returns only numbers; the process that drives an actuator never opens the bag.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ from pendulum_msgs_py.programs.extras import how_to_install
 __all__ = ["read_bag_feedback"]
 
 _MEMORY = 1 << 30
-"""Memory that reading may take beyond what the libraries take [bytes]."""
+"""Memory that reading may use in addition to the libraries [bytes]."""
 _PATIENCE = 120
-"""Time that reading may take [s]."""
+"""CPU time that reading may use [s]."""
 _EXIT_REFUSED = 2
 
 
 def read_bag_feedback(folder: Path) -> dict[str, NDArray[np.float64]]:
     """Return ``time`` [s] and recorded quantities of a bag, as arrays by name.
 
-    The complete records on ``actuator/feedback`` are taken, else position, velocity and effort on ``joint_states``.
+    Reads the complete records on ``actuator/feedback``, else position, velocity and effort on ``joint_states``.
 
     Raises:
         DataError: The bag cannot be read within bounds, or has no such topic.
@@ -85,7 +84,7 @@ def _columns(folder: Path) -> dict[str, list[float]]:
     _bound()
     columns: dict[str, list[float]] = {}
     ending = ""
-    # AnyReader would make types, which are code, of what the bag says; the contract says what is on our topics.
+    # AnyReader would compile types that the bag defines; the contract fixes the types of our topics.
     with Reader(folder) as reader:
         for ending in ("actuator/feedback", "joint_states"):
             connections = [c for c in reader.connections if c.topic.endswith(f"/{ending}")]
@@ -124,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Read the bag named first into the file named second; a refusal is one sentence and code 2."""
     folder, result = map(Path, sys.argv[1:] if argv is None else argv)
     try:
-        # Names that a bag chose must not be those of the arguments of savez.
+        # Column names from the bag must not collide with arguments of savez.
         arrays: dict[str, Any] = {f"q_{name}": np.asarray(column) for name, column in _columns(folder).items()}
         np.savez(result, **arrays)
     except DataError as error:

@@ -1,4 +1,4 @@
-"""Ports of an emulated machine of several joints in this process: a drive, or an encoder alone, for each joint."""
+"""Ports of an emulated machine of several joints in this process: a drive or an encoder for each joint."""
 
 from __future__ import annotations
 
@@ -24,17 +24,11 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 __all__ = ["DrivePort", "JointPort", "machine_ports"]
 
 TORQUE_LOOP = Strategy.PARALLEL_PWM
-"""The one strategy of these drives beside off: a setpoint of effort, which a loop of current makes."""
+"""The only strategy of these drives besides off: an effort setpoint for a current loop."""
 
 
 class JointPort:
-    """The encoder of one joint: it is read, and has no way to give torque.
-
-    Args:
-        machine: The emulated machine; its clock must start at the present of ``clock``.
-        index: Which of its joints.
-        clock: Host clock.
-    """
+    """Encoder of joint ``index``, without torque; the machine's clock must start at the present of ``clock``."""
 
     def __init__(self, machine: EmulatedMachine, index: int, clock: Clock) -> None:
         self.machine = machine
@@ -43,7 +37,7 @@ class JointPort:
         self._connected = False
 
     def connect(self) -> ActuatorInfo:
-        """Return what the emulated module says of itself."""
+        """Return the properties of the emulated module."""
         self._connected = True
         return ActuatorInfo(
             backend="emulator",
@@ -75,7 +69,7 @@ class JointPort:
 
     @property
     def stood_still(self) -> float:
-        """Time for which the machine stood still, since nobody read it [s]."""
+        """Time for which the machine stood still because it was not read [s]."""
         return self.machine.stood_still
 
     def set_feedback_rate(self, rate: float) -> float:
@@ -86,11 +80,11 @@ class JointPort:
         return self.machine.rate
 
     def push(self, effort: float) -> None:
-        """Hold an effort on the joint itself, as a hand would [N m or N]."""
+        """Hold an external effort on the joint [N m or N]."""
         self.machine.hold_push(self._index, effort, self.now_ns())
 
     def close(self) -> None:
-        """Let go."""
+        """Release the module."""
         self._connected = False
 
     def _require_connection(self) -> None:
@@ -99,13 +93,7 @@ class JointPort:
 
 
 class DrivePort(JointPort):
-    """The drive of one joint.
-
-    Args:
-        machine: The emulated machine.
-        index: Which of its joints; it has a motor.
-        clock: Host clock.
-    """
+    """Drive of joint ``index``, which has a motor."""
 
     def __init__(self, machine: EmulatedMachine, index: int, clock: Clock) -> None:
         super().__init__(machine, index, clock)
@@ -122,7 +110,7 @@ class DrivePort(JointPort):
         return self._strategy
 
     def connect(self) -> ActuatorInfo:
-        """Return what the emulated drive says of itself."""
+        """Return the properties of the emulated drive."""
         return replace(
             super().connect(),
             strategy=self._strategy,
@@ -133,7 +121,7 @@ class DrivePort(JointPort):
         )
 
     def write(self, command: Command) -> Applied:
-        """Send a torque; it arrives after the way there."""
+        """Send a torque, which arrives after the transport delay."""
         self._require_connection()
         if ActuatorFault.SEND_FAILED in self._faults:
             raise ActuatorError("send_failed", "command could not be sent: the network refuses it")
@@ -158,13 +146,13 @@ class DrivePort(JointPort):
         return self._strategy
 
     def set_gains(self, gains: GainSet) -> GainSet:
-        """Keep gains, of which the loop of current uses none."""
+        """Store gains; the current loop uses none."""
         self._require_reach("gains")
         self._gains = gains
         return self._gains
 
     def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
-        """Set the limits: that of the effort can only be lower than the drive's own."""
+        """Set the limits; the effort limit cannot exceed the drive's own."""
         self._require_reach("limits")
         self._limits = limits
         self.machine.drives[self._motor].effort_limit = min(
@@ -179,7 +167,7 @@ class DrivePort(JointPort):
         return self.machine.drives[self._motor].lifetime
 
     def stop(self) -> None:
-        """Off, which ends the torque; lost where the way there is cut: the command lifetime then ends the torque."""
+        """Switch off; if commands are lost, the command lifetime ends the torque."""
         if not self._connected:
             return
         self._strategy = Strategy.OFF
@@ -190,7 +178,7 @@ class DrivePort(JointPort):
         self.machine.switch(self._motor, self.now_ns(), on=False)
 
     def close(self) -> None:
-        """Stop and let go."""
+        """Stop and release."""
         try:
             self.stop()
         finally:
@@ -213,7 +201,7 @@ class DrivePort(JointPort):
 
 
 def machine_ports(machine: EmulatedMachine, clock: Clock) -> tuple[JointPort, ...]:
-    """Return one port for each joint, in the order of the model: a drive where there is a motor."""
+    """Return one port per joint, in the order of the model: a drive where there is a motor."""
     driven = machine.coordinates.driven
     return tuple(
         (DrivePort if index in driven else JointPort)(machine, index, clock)

@@ -1,4 +1,4 @@
-"""Backend for an emulated X5-9 in this process, on the wall clock or on simulated time."""
+"""Backend for an emulated X5-9 in this process, on wall-clock or simulated time."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 __all__ = ["EmulatorBackend"]
 
 _CUT_OFF = {ActuatorFault.COMMANDS_LOST, ActuatorFault.SEND_FAILED, ActuatorFault.LOCKED_BY_OTHER}
-"""Faults in which settings do not reach the actuator either."""
+"""Faults that also keep settings from reaching the actuator."""
 _LOCKSTEP_LEAD_NS = 500_000
-"""In lockstep, feedback is measured this long before the state that shows it [ns]."""
+"""In lockstep, time from measurement of the feedback to the state that shows it [ns]."""
 _FIRST_STEP_NS = 1_000_000
 
 
 class EmulatorBackend:
-    """The actuator port of an :class:`EmulatedX5`.
+    """Actuator port of an :class:`EmulatedX5`.
 
     Args:
-        actuator: The emulated actuator; its clock must start at the present of ``clock``.
-        clock: Host clock; feedback carries its time.
-        seed: Seed of the jitter of commands on their way.
+        actuator: Emulated actuator; its clock must start at the present of ``clock``.
+        clock: Host clock, which stamps feedback.
+        seed: Seed of the jitter of the command delay.
     """
 
     name = "emulator"
@@ -51,7 +51,7 @@ class EmulatorBackend:
         self.actuator = actuator
         self.clock = clock or WallClock()
         self._random = np.random.Generator(np.random.Philox(key=[seed, 1]))
-        # Where time passes by itself; simulated time waits for whoever computes.
+        # On the wall clock, time passes by itself; simulated time waits for computations.
         self._computes_ahead = isinstance(self.clock, WallClock)
         self._feedback_delay_ns = round(actuator.parameters.timing.feedback_delay * NANOSECONDS)
         self._connected = False
@@ -59,13 +59,13 @@ class EmulatorBackend:
 
     @classmethod
     def from_parameters(cls, values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False) -> EmulatorBackend:
-        """Return the emulator that the bridge's parameters describe; in lockstep, one that keeps time exactly."""
+        """Return the emulator that the bridge's parameters describe; without jitter in lockstep."""
         parameters = replace(load_emulator(values["plant"]), flat=values["flat"])
-        # A first step compiles the code, for tens of seconds on a busy machine: here, where nobody waits for a cycle.
+        # The first step compiles code, for tens of seconds on a busy machine: do it before the control loop starts.
         EmulatedX5(parameters).advance_to(_FIRST_STEP_NS)
         start_ns = clock.now_ns()
         if lockstep:
-            # At this rate from the start: one that is set later begins a new raster, without the lead.
+            # Set this rate from the start: a later change would restart the raster without the lead.
             quiet = replace(
                 TimingParameters(), feedback_rate=values["feedback_rate"], feedback_jitter=0.0, delay_jitter=0.0
             )
@@ -77,11 +77,11 @@ class EmulatorBackend:
 
     @property
     def strategy(self) -> Strategy:
-        """Strategy that was last confirmed; the actuator may have changed its mind since."""
+        """Last confirmed strategy; the actuator may have changed it since."""
         return self._strategy
 
     def connect(self) -> ActuatorInfo:
-        """Return what the emulated actuator says of itself."""
+        """Return the properties of the emulated actuator."""
         self._connected = True
         self._catch_up()
         actuator = self.actuator
@@ -115,10 +115,10 @@ class EmulatorBackend:
                 return feedback
             delivery = self.actuator.next_delivery_ns
             sample = self.actuator.next_sample_ns + self._feedback_delay_ns
-            # A record on its way comes before the next one, unless it is held back.
+            # A record in transit comes before the next one, unless it is delayed.
             target = sample if delivery is None else min(delivery, sample)
             if delivery is None and self._computes_ahead:
-                # Measured while it is on its way, not when it should be there: that takes a tenth of a millisecond.
+                # Measure while the record is in transit, because that takes 0.1 ms of computing.
                 target = self.actuator.next_sample_ns
             if target > deadline or self.clock.now_ns() > deadline:
                 self.clock.wait_until(deadline)
@@ -128,7 +128,7 @@ class EmulatorBackend:
             self._catch_up()
 
     def write(self, command: Command) -> Applied:
-        """Send setpoints; they arrive after the way there."""
+        """Send setpoints, which arrive after the transport delay."""
         self._require_connection()
         limited, changed = check_command(command, self._strategy, self.actuator.limits)
         if ActuatorFault.SEND_FAILED in self.actuator.faults:
@@ -141,7 +141,7 @@ class EmulatorBackend:
         return Applied(limited, self._strategy, changed, now)
 
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
-        """Change the strategy, with first setpoints at the same instant."""
+        """Set the strategy, with first setpoints at the same instant."""
         limited = None if command is None else check_command(command, strategy, self.actuator.limits)[0]
         self._configure(strategy=strategy)
         self._strategy = self.actuator.strategy
@@ -170,12 +170,12 @@ class EmulatorBackend:
         return self.actuator.feedback_rate
 
     def push(self, torque: float) -> None:
-        """Hold a torque on the link itself, as a hand would [N m]."""
+        """Hold an external torque on the link [N m]."""
         self._catch_up()
         self.actuator.push = torque if math.isfinite(torque) else 0.0
 
     def stop(self) -> None:
-        """No torque, then strategy off; both are lost where the way there is cut."""
+        """Remove torque, then set strategy off; both are lost if the connection is cut."""
         if not self._connected:
             return
         self._catch_up()
@@ -190,7 +190,7 @@ class EmulatorBackend:
         self.actuator.configure(strategy=Strategy.OFF)
 
     def close(self) -> None:
-        """Stop and let go."""
+        """Stop and release."""
         try:
             self.stop()
         finally:

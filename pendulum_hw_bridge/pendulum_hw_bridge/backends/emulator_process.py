@@ -1,4 +1,4 @@
-"""Backend for an emulated X5-9 that runs in a process of its own, so that it outlives the bridge like a real one."""
+"""Backend for an emulated X5-9 in another process, which outlives the bridge as a real one does."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _RENEW_NS = NANOSECONDS // 2
 
 
 class EmulatorProcessBackend:
-    """The actuator port of an emulated actuator behind a UDP address.
+    """Actuator port of an emulated actuator at a UDP address.
 
     Args:
         address: ``HOST:PORT``.
-        clock: Host clock; feedback is stamped with it on receipt.
-        attempts: How often to ask one that is just starting for its settings, four times a second [-].
+        clock: Host clock, which stamps feedback on receipt.
+        attempts: Requests to an emulator that is starting, four per second [-].
     """
 
     name = "emulator_process"
@@ -59,16 +59,16 @@ class EmulatorProcessBackend:
 
     @classmethod
     def from_parameters(cls, values: Mapping[str, Any], clock: Clock, **_: Any) -> EmulatorProcessBackend:
-        """Return the port of the emulator that listens where the bridge's parameters say."""
+        """Return the port of the emulator at the address in the bridge's parameters."""
         return cls(values["emulator_address"], clock)
 
     @property
     def strategy(self) -> Strategy:
-        """Strategy that was last confirmed."""
+        """Last confirmed strategy."""
         return self._strategy
 
     def connect(self) -> ActuatorInfo:
-        """Ask the emulated actuator for its settings; waits some seconds for one that is just starting."""
+        """Request the actuator's settings; waits some seconds for an emulator that is starting."""
         attempts = _ATTEMPTS
         if self._socket is None:
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -110,16 +110,16 @@ class EmulatorProcessBackend:
             select.select([self._require_socket()], [], [], remaining)
 
     def write(self, command: Command) -> Applied:
-        """Send setpoints, checked and limited before they are sent."""
+        """Send setpoints, checked and limited first."""
         limited, changed = check_command(command, self._strategy, self._limits)
         now = self._clock.now_ns()
         self._send(wire.encode_command(limited))
         return Applied(limited, self._strategy, changed, now)
 
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
-        """Change the strategy, then send first setpoints."""
+        """Set the strategy, then send first setpoints."""
         limited = None if command is None else check_command(command, strategy, self._limits)[0]
-        # Requested is as good as set until it is confirmed: the acknowledgement may be what is lost.
+        # A requested strategy may be in force until confirmed: the acknowledgement can get lost.
         self._possible.add(strategy)
         self._strategy = Strategy(self._request({"settings": {"strategy": int(strategy)}})["strategy"])
         self._possible = {self._strategy}
@@ -147,14 +147,14 @@ class EmulatorProcessBackend:
         return float(self._request({"settings": {"feedback_rate": rate}})["feedback_rate"])
 
     def push(self, torque: float) -> None:
-        """Hold a torque on the link itself, as a hand would [N m]."""
+        """Hold an external torque on the link [N m]."""
         torque = torque if math.isfinite(torque) else 0.0
         if torque != self._push:
             self._push = torque
             self._send(wire.encode_json(wire.REQUEST, {"push": torque}))
 
     def stop(self) -> None:
-        """No torque, then strategy off; the strategy is tried several times, because a packet may be lost."""
+        """Remove torque, then set strategy off, with retries because packets can get lost."""
         driving = self._possible - {Strategy.OFF}
         if self._socket is None or not driving:
             return
@@ -169,24 +169,24 @@ class EmulatorProcessBackend:
         self._possible = {Strategy.OFF}
 
     def close(self) -> None:
-        """Stop and let go."""
+        """Stop and release."""
         try:
             self.stop()
         finally:
             self.let_go()
 
     def let_go(self) -> None:
-        """Let go without stopping: who only looked has nothing to stop, and another may be driving."""
+        """Release without stopping, for callers that only listened while another may be driving."""
         if self._socket is not None:
             self._socket.close()
         self._socket = None
 
     def status(self) -> dict[str, Any]:
-        """Return what the emulator knows of itself, the truth behind the feedback included."""
+        """Return the emulator's internal state, including the truth behind the feedback."""
         return self._request({})
 
     def configure(self, *, patience: float = _ACKNOWLEDGE, **settings: Any) -> dict[str, Any]:
-        """Change settings as they stand in a packet, asking once; return the emulator's status.
+        """Request settings in packet format, once; return the emulator's status.
 
         Args:
             patience: Time to wait for the acknowledgement [s].
@@ -198,18 +198,16 @@ class EmulatorProcessBackend:
         return self._request({"settings": settings}, attempts=1, patience=patience)
 
     def transmit(self, command: Command) -> None:
-        """Send setpoints as they are: what is wrong with them is for the emulated firmware to find."""
+        """Send setpoints unchecked: finding errors is the emulated firmware's task."""
         self._send(wire.encode_command(command))
 
     def inject(self, *faults: str) -> None:
-        """Let faults begin, by name."""
+        """Start faults, by name."""
         self._request({"inject": list(faults)})
 
     def clear_faults(self) -> None:
-        """Mend everything."""
+        """End all faults."""
         self._request({"clear_faults": True})
-
-    # --- inside ---------------------------------------------------------------------------------------------
 
     def _require_socket(self) -> socket.socket:
         if self._socket is None:
@@ -220,7 +218,7 @@ class EmulatorProcessBackend:
         try:
             self._require_socket().send(packet)
         except ConnectionRefusedError:
-            # The answer to an earlier packet: nobody listens there any more. Feedback stays away, which is seen.
+            # Reply to an earlier packet: the emulator has gone. The missing feedback shows that.
             return
         except OSError as error:
             raise ActuatorError("send_failed", f"command could not be sent: {error.strerror}") from error
@@ -232,7 +230,7 @@ class EmulatorProcessBackend:
             self._send(wire.encode_json(wire.REQUEST, {"renew": True}))
 
     def _receive(self) -> dict[str, Any]:
-        """Take in all packets that wait; return the last reply among them, or an empty object."""
+        """Receive all waiting packets; return the last reply among them, or an empty object."""
         reply: dict[str, Any] = {}
         while True:
             try:

@@ -1,8 +1,8 @@
 """Backend for a real HEBI module, through hebi-py.
 
-hebi-py checks nothing that it sends, returns views of buffers that change, and wants one thread: everything is
-checked before it is sent, copied when it is read, and a call from another thread is refused. The library is imported
-when a module is connected and never before; its licence and its wheels are not for everybody.
+hebi-py checks nothing that it sends, returns views of changing buffers and needs a single thread. So commands are
+checked, feedback is copied, and calls from another thread are refused. The library is imported only when a module is
+connected, because of its licence and its few wheels.
 """
 
 from __future__ import annotations
@@ -55,24 +55,24 @@ LOOKUP_TIMEOUT = 5.0
 ACKNOWLEDGE_MS = 200
 STOP_ATTEMPTS = 3
 STOP_ACKNOWLEDGE_MS = 15
-"""Ten times the round trip; together the attempts take less than the command lifetime [ms]."""
+"""Ten round trips; all attempts together take less than the command lifetime [ms]."""
 
 
 def connect_group(wanted: ModuleSelection, interface: str = "", look_time: float = LOOK_TIME) -> Any:
-    """Return hebi-py's group of the one module that is meant.
+    """Return hebi-py's group of the one selected module.
 
     Args:
-        wanted: Which module.
-        interface: Network address to look on; empty for all.
-        look_time: Time to look for, at least [s].
+        wanted: Module.
+        interface: Network address to search; empty for all.
+        look_time: Shortest search time [s].
 
     Raises:
-        ActuatorError: hebi-py is not installed, no such module answers, several do, or it is of another type.
+        ActuatorError: hebi-py is not installed, or the module is missing, ambiguous or of another type.
     """
     lookup = open_lookup(interface)
     patience = max(look_time, min(LOOKUP_TIMEOUT, 3.0 * look_time))
     module = select_module(discover(lookup, look_time=look_time, patience=patience), wanted, seconds=patience)
-    # By address, never by name: a twin may appear between looking and connecting.
+    # By address, never by name: a second module of that name may appear after the search.
     group = lookup.get_group_from_macs([module.mac_address], round(1000 * LOOKUP_TIMEOUT))
     if group is None:
         raise ActuatorError("module_lost", f"HEBI module {module} was seen but does not connect")
@@ -80,7 +80,7 @@ def connect_group(wanted: ModuleSelection, interface: str = "", look_time: float
 
 
 def open_lookup(interface: str = "") -> Any:
-    """Return hebi-py's ``Lookup``, on one network address or on all; on emulators for ``emulator:HOST:PORT``.
+    """Return hebi-py's ``Lookup`` on one network address or on all, or on emulators for ``emulator:HOST:PORT``.
 
     Raises:
         ActuatorError: hebi-py is not installed.
@@ -93,21 +93,21 @@ def open_lookup(interface: str = "") -> Any:
 
 
 def new_command() -> Any:
-    """Return an empty command of hebi-py for one module."""
+    """Return an empty hebi-py command for one module."""
     return import_hebi().GroupCommand(1)
 
 
 class HebiBackend:
-    """The actuator port of one HEBI module.
+    """Actuator port of one HEBI module.
 
     Args:
-        wanted: Which module.
-        clock: Host clock; feedback is stamped with it on receipt.
-        interface: Network address to look on; empty for all.
+        wanted: Module.
+        clock: Host clock, which stamps feedback on receipt.
+        interface: Network address to search; empty for all.
         drivetrain: Constants to report with a run.
         make_group: Returns hebi-py's group; by default the module is looked up on the network.
-        imitation: The group is hebi-py's imitation, which has no module to read settings or times back from.
-        log: File to which the library writes all feedback while connected; None for none.
+        imitation: The group is hebi-py's imitation, which returns neither settings nor times.
+        log: File to which the library logs all feedback while connected, or None.
     """
 
     name = "hebi"
@@ -144,7 +144,7 @@ class HebiBackend:
 
     @classmethod
     def from_parameters(cls, values: Mapping[str, Any], clock: Clock, **_: Any) -> HebiBackend:
-        """Return the port of the module that the bridge's parameters name, with the constants of its plant file."""
+        """Return the port of the module named by the bridge's parameters, with its plant's constants."""
         return cls(
             ModuleSelection.of(values),
             clock=clock,
@@ -153,15 +153,13 @@ class HebiBackend:
             drivetrain=asdict(load_emulator(values["plant"]).drivetrain),
         )
 
-    # --- port -----------------------------------------------------------------------------------------------
-
     @property
     def strategy(self) -> Strategy:
-        """Strategy that was last confirmed."""
+        """Last confirmed strategy."""
         return self._strategy
 
     def connect(self) -> ActuatorInfo:
-        """Find the module, once, and return what it says of itself."""
+        """Find the module, once, and return its properties."""
         if self._group is None:
             self._hebi = import_hebi()
             self._owner = threading.get_ident()
@@ -172,13 +170,13 @@ class HebiBackend:
             self._feedback = self._hebi.GroupFeedback(1)
             if self._log is not None:
                 start_log(group, self._log)
-            # Only now: a group that was refused must not count as connected the next time.
+            # Only now: a refused group must not count as connected on the next call.
             self._group = group
         self._own()
         info = self._read_info()
         family, name, serial, firmware = self._wanted.family, self._wanted.name, "", ""
         if info is not None:
-            # A strategy that we do not know is not ours; the bridge switches it off before anything else.
+            # An unknown strategy is not ours; the bridge switches it off first.
             number = int(info.control_strategy[0])
             self._strategy = Strategy(number) if number in set(Strategy) else Strategy.OFF
             self._possible = {self._strategy}
@@ -203,11 +201,11 @@ class HebiBackend:
         return self._clock.now_ns()
 
     def read(self, timeout: float) -> Feedback | None:
-        """Return the next feedback, copied out of the library's buffers."""
+        """Return the next feedback, copied from the library's buffers."""
         self._own()
         deadline = self._clock.now_ns() + round(timeout * NANOSECONDS)
         if self._imitation:
-            # The imitation answers at once, always: without a pace of our own the loop would spin.
+            # The imitation replies at once: without pacing the loop would spin.
             self._clock.wait_until(min(self._next_ns, deadline))
             if self._next_ns > deadline:
                 return None
@@ -227,7 +225,7 @@ class HebiBackend:
         return self._copy(record, now)
 
     def write(self, command: Command) -> Applied:
-        """Send setpoints, checked and limited before they are sent."""
+        """Send setpoints, checked and limited first."""
         self._own()
         limited, changed = check_command(command, self._strategy, self._limits)
         now = self._clock.now_ns()
@@ -237,10 +235,10 @@ class HebiBackend:
         return Applied(limited, self._strategy, changed, now)
 
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
-        """Change the strategy, with first setpoints in the same packet."""
+        """Set the strategy, with first setpoints in the same packet."""
         self._own()
         limited, _ = check_command(command or no_torque(strategy), strategy, self._limits)
-        # Requested is as good as set until it is confirmed: the acknowledgement may be what is lost.
+        # A requested strategy may be in force until confirmed: the acknowledgement can get lost.
         self._possible.add(strategy)
         self._command.clear()
         self._command.control_strategy = int(strategy)
@@ -277,7 +275,7 @@ class HebiBackend:
         return self._limits
 
     def set_command_lifetime(self, lifetime: float) -> float:
-        """Set the command lifetime [s]; zero, which would be for ever, is refused."""
+        """Set the command lifetime [s]; 0, which means infinite, is refused."""
         self._own()
         milliseconds = max(1, round(1000.0 * check_lifetime(lifetime)))
         self._group.command_lifetime = milliseconds
@@ -292,7 +290,7 @@ class HebiBackend:
         return float(self._group.feedback_frequency)
 
     def stop(self) -> None:
-        """No torque, then strategy off, acknowledged; tried several times, because a packet may be lost."""
+        """Remove torque, then set strategy off with acknowledgement, with retries because packets can get lost."""
         if self._group is None or threading.get_ident() != self._owner:
             return
         driving = self._possible - {Strategy.OFF}
@@ -315,17 +313,15 @@ class HebiBackend:
         )
 
     def close(self) -> None:
-        """Stop, and let the library's thread for this group go."""
+        """Stop, and release the group and its thread."""
         try:
             self.stop()
         finally:
             if self._log is not None and self._group is not None:
                 stop_log(self._group)
-            # Of thousands of groups one is never released: the library waits for a thread of its own that never ends.
+            # Of thousands of groups one is never released: the library waits for a thread that never ends.
             with hang_guard():
                 self._group = self._command = self._feedback = None
-
-    # --- inside ---------------------------------------------------------------------------------------------
 
     def _own(self) -> None:
         if self._group is None:
@@ -384,7 +380,7 @@ class HebiBackend:
 
 
 def _known(kind: Any, number: Any) -> int:
-    """Return a state of the firmware as ours; one that a newer firmware may have added stays a number."""
+    """Return a firmware state as our enum's value; unknown numbers of newer firmware pass unchanged."""
     try:
         return int(kind(int(number)))
     except ValueError:

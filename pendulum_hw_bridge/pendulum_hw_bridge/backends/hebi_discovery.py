@@ -1,7 +1,7 @@
-"""Who is on the network: HEBI modules with their identity, and the choice of the one that is meant.
+"""Discovery of HEBI modules on the network, and selection of one.
 
-Names are given by people and may be given twice; MAC address and serial number are not. A choice is made only when
-exactly one module fits, after the whole time of looking: the first to answer may have a twin.
+Names are not unique; MAC addresses and serial numbers are. The selection waits for the whole search time, because a
+second module of the same name may reply later, and requires exactly one match.
 """
 
 from __future__ import annotations
@@ -17,24 +17,20 @@ from pendulum_hw_bridge.port.actuator import ActuatorError
 __all__ = ["LOOK_TIME", "ModuleRecord", "ModuleSelection", "discover", "select_module"]
 
 LOOK_TIME = 2.0
-"""Time for which to look before a choice is made: ten of hebi-py's lookup periods [s]."""
+"""Search time before a selection: ten of hebi-py's lookup periods [s]."""
 _STEP = 0.25
 _ANSWER_MS = 500
 
 
 @dataclass(frozen=True)
 class ModuleRecord:
-    """One module on the network.
+    """One module on the network; ``serial``, ``type`` and ``firmware`` are empty if it did not reply.
 
     Attributes:
-        family: HEBI family.
-        name: HEBI name.
         mac_address: ``aa:bb:cc:dd:ee:ff``.
-        serial: Serial number; empty where the module did not answer.
-        type: Mechanical type, such as ``X5-9``; empty where the module did not answer.
-        firmware: Firmware revision; empty where the module did not answer.
+        type: Mechanical type, such as ``X5-9``.
         address: IP address.
-        stale: Whether it has not been heard lately.
+        stale: Whether it has been silent lately.
     """
 
     family: str
@@ -47,21 +43,17 @@ class ModuleRecord:
     stale: bool = False
 
     def __str__(self) -> str:
-        """Return who it is, in one breath."""
         marks = [self.serial or "no answer", self.mac_address, "stale" if self.stale else ""]
         return f"{self.family}/{self.name} ({', '.join(mark for mark in marks if mark)})"
 
 
 @dataclass(frozen=True)
 class ModuleSelection:
-    """Which module is meant; what is empty may be anything.
+    """Criteria for a module; empty ones match anything.
 
     Attributes:
-        family: HEBI family.
-        name: HEBI name.
-        mac_address: In any of the usual ways to write it.
-        serial: Serial number.
-        module_type: Mechanical type that it must be of, such as ``X5-9``.
+        mac_address: In any usual notation.
+        module_type: Required mechanical type, such as ``X5-9``.
     """
 
     family: str = ""
@@ -72,16 +64,15 @@ class ModuleSelection:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> ModuleSelection:
-        """Return what parameters of the bridge say; those that are not there may be anything."""
+        """Return the selection by the bridge's parameters; missing ones match anything."""
         return cls(**{field.name: values[field.name] for field in fields(cls) if field.name in values})
 
     def __str__(self) -> str:
-        """Return what was asked for."""
         marks = [text for text in (self.serial, self.mac_address) if text]
         return f"{self.family or '*'}/{self.name or '*'}" + (f" ({', '.join(marks)})" if marks else "")
 
     def names(self, module: ModuleRecord) -> bool:
-        """Tell whether a module is the one that is meant, whatever its type."""
+        """Return whether a module matches, whatever its type."""
         return (
             self.family in {"", module.family}
             and self.name in {"", module.name}
@@ -97,12 +88,12 @@ def discover(
     patience: float = 5.0,
     wait: Callable[[float], object] | None = None,
 ) -> list[ModuleRecord]:
-    """Return the modules on the network, each asked for its identity, in the order of their names.
+    """Return the modules on the network with their identity, ordered by name.
 
     Args:
         lookup: hebi-py's ``Lookup``.
-        look_time: Time for which to look in any case [s].
-        patience: Time after which to give up where nobody has answered [s].
+        look_time: Shortest search time [s].
+        patience: Search time after which to give up without any reply [s].
         wait: Waits for some seconds; by default on the wall clock.
     """
     pause = wait or threading.Event().wait
@@ -117,15 +108,10 @@ def discover(
 
 
 def select_module(modules: Sequence[ModuleRecord], wanted: ModuleSelection, *, seconds: float) -> ModuleRecord:
-    """Return the one module that is meant.
-
-    Args:
-        modules: All that were seen.
-        wanted: Which is meant.
-        seconds: For how long was looked, for the message [s].
+    """Return the one module that matches, after a search of ``seconds`` [s].
 
     Raises:
-        ActuatorError: None fits, several do, it is stale, or it is of another type.
+        ActuatorError: None or several match, or the match is stale or of another type.
     """
     listed = ", ".join(map(str, modules)) or "none"
     fitting = [module for module in modules if wanted.names(module)]
@@ -173,5 +159,5 @@ def _identify(lookup: Any, entry: Any) -> ModuleRecord:
 
 
 def _plain(text: str) -> str:
-    """Return letters and digits alone: AA-BB, aa:bb and aabb are one address, X5-9 and X5_9 one type."""
+    """Return lower-case letters and digits only: AA-BB, aa:bb and aabb are one address, X5-9 and X5_9 one type."""
     return re.sub(r"[^0-9a-z]", "", text.lower())

@@ -1,9 +1,8 @@
-"""HEBI's network with emulated modules on it, for rehearsals: ``interface`` is ``emulator:HOST:PORT[,HOST:PORT...]``.
+"""Emulated modules in place of HEBI's network, for rehearsals: ``interface`` is ``emulator:HOST:PORT[,HOST:PORT...]``.
 
-The backend ``hebi`` then runs as it is, with hebi-py's own commands and files, and only hebi-py's ``Lookup`` and
-``Group`` are ours: they speak to emulators in processes of their own. What is not imitated: the search by broadcast,
-the library's thread that asks for feedback, its feedback objects and its log, and the firmware's own checks of
-settings.
+The backend ``hebi`` runs unchanged, with hebi-py's commands and files; only ``Lookup`` and ``Group`` are replaced, and
+talk to emulator processes. Not emulated: broadcast search, the library's feedback thread, feedback objects and log, and
+the firmware's checks of settings.
 """
 
 from __future__ import annotations
@@ -34,14 +33,11 @@ _LOOK_ATTEMPTS = 2
 
 @dataclass(frozen=True)
 class EmulatedEntry:
-    """A line of the lookup, with the names of hebi-py's.
+    """Lookup entry with hebi-py's field names.
 
     Attributes:
-        family: HEBI family.
-        name: HEBI name.
-        mac_address: Made of the address: an emulator has no network card.
-        ip_address: Where it listens.
-        is_stale: Whether it has answered and does so no more.
+        mac_address: Derived from the address: an emulator has no network card.
+        is_stale: Whether it has stopped replying.
         where: ``HOST:PORT``.
     """
 
@@ -54,11 +50,11 @@ class EmulatedEntry:
 
 
 class EmulatedLookup:
-    """Stands for hebi-py's ``Lookup``.
+    """Replaces hebi-py's ``Lookup``.
 
     Args:
-        interface: ``emulator:HOST:PORT``, or several with commas between.
-        hebi: The library.
+        interface: ``emulator:HOST:PORT``, or several separated by commas.
+        hebi: Library.
 
     Raises:
         ParameterError: An address is not understood.
@@ -73,7 +69,7 @@ class EmulatedLookup:
 
     @property
     def entrylist(self) -> list[EmulatedEntry]:
-        """Modules that answer, or have answered."""
+        """Modules that reply, or have replied before."""
         entries = []
         for where in self._addresses:
             port = EmulatorProcessBackend(where, attempts=_LOOK_ATTEMPTS)
@@ -90,7 +86,7 @@ class EmulatedLookup:
         return entries
 
     def get_group_from_macs(self, addresses: list[str], timeout_ms: float) -> EmulatedGroup | EmulatedGroups | None:
-        """Return the group of the modules with these addresses, in their order, or None where one does not answer."""
+        """Return the group of the modules with these addresses, in order, or None if one does not reply."""
         where = {entry.mac_address: entry.where for entry in self._seen.values()}
         try:
             groups = [EmulatedGroup(where[address], self._hebi) for address in addresses]
@@ -100,15 +96,7 @@ class EmulatedLookup:
 
 
 class EmulatedGroup:
-    """Stands for hebi-py's ``Group`` of one module.
-
-    Args:
-        where: ``HOST:PORT`` of an emulator.
-        hebi: The library.
-
-    Raises:
-        ActuatorError: It does not answer.
-    """
+    """Replaces hebi-py's ``Group`` of one module at ``HOST:PORT``; ActuatorError if it does not reply."""
 
     size = 1
 
@@ -119,7 +107,6 @@ class EmulatedGroup:
         self._status = self._port.status()
 
     def __del__(self) -> None:
-        """Let the socket go, as the library lets its group go."""
         if "_port" in self.__dict__:
             self._port.let_go()
 
@@ -142,7 +129,7 @@ class EmulatedGroup:
         self._configure(500.0, feedback_rate=rate)
 
     def send_command(self, command: Any) -> bool:
-        """Send what a command asks for; nobody says whether it came."""
+        """Send a command without acknowledgement."""
         settings = self._settings_of(command)
         if settings:
             with contextlib.suppress(ActuatorError):
@@ -154,7 +141,7 @@ class EmulatedGroup:
         return True
 
     def send_command_with_acknowledgement(self, command: Any, timeout_ms: float) -> bool:
-        """Send what a command asks for, and tell whether the module said so in time."""
+        """Send a command, and return whether the module acknowledged in time."""
         try:
             self._configure(timeout_ms, **self._settings_of(command))
             self._send_setpoints(command)
@@ -163,12 +150,12 @@ class EmulatedGroup:
         return True
 
     def get_next_feedback(self, timeout_ms: float, reuse_fbk: Any = None) -> Any:
-        """Return the newest record under hebi-py's names, or None where none comes in time."""
+        """Return the newest record under hebi-py's names, or None after the timeout."""
         record = self._port.read(1e-3 * timeout_ms)
         return None if record is None else _feedback(record)
 
     def request_info(self, timeout_ms: float) -> Any:
-        """Return all settings in one of hebi-py's own commands, or None where the module does not answer."""
+        """Return all settings as a hebi-py command, or None if the module does not reply."""
         try:
             self._configure(timeout_ms)
         except ActuatorError:
@@ -176,19 +163,16 @@ class EmulatedGroup:
         return _Info(self._status, self._hebi)
 
     def start_log(self, directory: str, name: str) -> str:
-        """Refuse: hebi-py logs what its own network brings."""
+        """Refuse: hebi-py logs its own network only."""
         raise OSError(f"{directory}/{name}: hebi-py logs real modules only")
 
     def stop_log(self) -> None:
-        """Nothing was begun."""
-
-    # --- inside ---------------------------------------------------------------------------------------------
+        """Do nothing."""
 
     def _configure(self, timeout_ms: float, **settings: Any) -> None:
         self._status = self._port.configure(patience=1e-3 * timeout_ms, **settings)
 
     def _send_setpoints(self, command: Any) -> None:
-        """Send the setpoints that a command has, if any."""
         has = {name: _holds(command, name, self._hebi) for name in ("position", "velocity", "effort")}
         if not any(has.values()):
             return
@@ -196,7 +180,7 @@ class EmulatedGroup:
         self._port.transmit(Command(**values))
 
     def _settings_of(self, command: Any) -> dict[str, Any]:
-        """Return the settings that a command has, as they stand in a packet to the emulator."""
+        """Return the settings of a command, in packet format."""
         settings: dict[str, Any] = {}
         if _holds(command, "control_strategy", self._hebi):
             settings["strategy"] = int(command.control_strategy[0])
@@ -225,7 +209,7 @@ class EmulatedGroup:
         for end in ("min", "max"):
             if _holds(command, f"position_limit_{end}", self._hebi):
                 value = float(getattr(command, f"position_limit_{end}")[0])
-                # What is no number changes nothing here; what a real module makes of it, nobody says.
+                # NaN changes nothing here; what a real module does with it is not documented.
                 limits |= {} if math.isnan(value) else {f"position_{end}": value}
             strategy = f"{end}_position_limit_strategy"
             if _holds(command, strategy, self._hebi) and int(getattr(command, strategy)[0]) == LIMIT_DISABLED:
@@ -236,14 +220,10 @@ class EmulatedGroup:
 
 
 class EmulatedGroups:
-    """Stands for hebi-py's ``Group`` of several modules.
+    """Replaces hebi-py's ``Group`` of several modules.
 
-    Each emulator sends in a rhythm of its own, where the library asks all modules at once: a frame is complete when
-    each has sent a record, and goes without one that has sent none for a period.
-
-    Args:
-        groups: One for each module, in their order.
-        hebi: The library.
+    Emulators send asynchronously, whereas the library polls all modules at once: a frame is complete when each has sent
+    a record, and omits a module that was silent for a period.
     """
 
     def __init__(self, groups: list[EmulatedGroup], hebi: Any) -> None:
@@ -279,13 +259,13 @@ class EmulatedGroups:
             group.feedback_frequency = rate
 
     def send_command(self, command: Any) -> bool:
-        """Send each module its part; nobody says whether it came."""
-        # To all of them, whatever becomes of one.
+        """Send each module its part, without acknowledgement."""
+        # To all modules, even if one fails.
         sent = [group.send_command(_Of(command, index)) for index, group in enumerate(self._groups)]
         return all(sent)
 
     def send_command_with_acknowledgement(self, command: Any, timeout_ms: float) -> bool:
-        """Send each module its part, whatever another says, and tell whether all said so in time."""
+        """Send each module its part, and return whether all acknowledged in time."""
         said = [
             group.send_command_with_acknowledgement(_Of(command, index), timeout_ms)
             for index, group in enumerate(self._groups)
@@ -293,7 +273,7 @@ class EmulatedGroups:
         return all(said)
 
     def get_next_feedback(self, timeout_ms: float, reuse_fbk: Any = None) -> Any:
-        """Return the next frame, with the old record of a module that has sent none, or None where none comes."""
+        """Return the next frame, with the old record of a silent module, or None after the timeout."""
         deadline = time.monotonic() + 1e-3 * timeout_ms
         for index, group in enumerate(self._groups):
             if index in self._came:
@@ -311,20 +291,20 @@ class EmulatedGroups:
         return SimpleNamespace(**{name: [vars(each)[name][0] for each in self._newest] for name in names})
 
     def request_info(self, timeout_ms: float) -> Any:
-        """Return the settings of all, or None where a module does not answer."""
+        """Return the settings of all, or None if a module does not reply."""
         found = [group.request_info(timeout_ms) for group in self._groups]
         return None if None in found else _Each(found)
 
     def start_log(self, directory: str, name: str) -> str:
-        """Refuse: hebi-py logs what its own network brings."""
+        """Refuse: hebi-py logs its own network only."""
         return self._groups[0].start_log(directory, name)
 
     def stop_log(self) -> None:
-        """Nothing was begun."""
+        """Do nothing."""
 
 
 class _Of:
-    """One module's part of a command for several, as a command for one."""
+    """One module's part of a group command, as a command for one module."""
 
     def __init__(self, command: Any, index: int) -> None:
         self._view = command.create_view([index])
@@ -335,7 +315,7 @@ class _Of:
 
 
 class _Each:
-    """Settings of several modules under one name each."""
+    """Settings of several modules, as lists by name."""
 
     def __init__(self, infos: list[Any]) -> None:
         self._infos = infos
@@ -345,7 +325,7 @@ class _Each:
 
 
 class _Info:
-    """Settings in one of hebi-py's own commands, and who the module is, under the names of its ``GroupInfo``."""
+    """Settings as a hebi-py command, and the module's identity under the names of ``GroupInfo``."""
 
     def __init__(self, status: dict[str, Any], hebi: Any) -> None:
         self.family, self.name = [status["family"]], [status["name"]]
@@ -373,7 +353,7 @@ class _Info:
 
 @cache
 def _bits(name: str, hebi: Any) -> tuple[int, ...]:
-    """Return the bits by which hebi-py notes that a command has a field: where none is given, many read as 0."""
+    """Return the bits by which hebi-py marks a field as set; the values of unset fields often read as 0."""
     probe = hebi.GroupCommand(1)
     setattr(probe, name, True if name.endswith("d_on_error") else 1)
     return tuple(int(probe.refs[0].message_bitfield_[word]) for word in range(3))
@@ -385,14 +365,14 @@ def _holds(command: Any, name: str, hebi: Any) -> bool:
 
 
 def _finite(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return settings without open ends, which have no place in a packet: what is left out is open."""
+    """Return settings without infinite values: packets represent those by omission."""
     return {name: value for name, value in settings.items() if isinstance(value, str) or math.isfinite(value)}
 
 
 def _entry(where: str, status: dict[str, Any]) -> EmulatedEntry:
     host, number = wire.parse_address(where)
     packed = ipaddress.IPv4Address(socket.gethostbyname(host)).packed[2:] + number.to_bytes(2, "big")
-    # Locally administered, so that it is no real card's.
+    # Locally administered, so that it cannot be a real card's.
     mac = ":".join(f"{part:02X}" for part in (0x02, 0x00, *packed))
     return EmulatedEntry(status["family"], status["name"], mac, where, False, where)
 

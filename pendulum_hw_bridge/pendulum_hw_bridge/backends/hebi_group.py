@@ -1,7 +1,7 @@
-"""Several HEBI modules as one of hebi-py's groups: one round of packets carries the setpoints of all, one the feedback.
+"""Several HEBI modules as one hebi-py group: one round of packets carries all setpoints, one all feedback.
 
-Each driven joint has a :class:`GroupDrive`, the backend ``hebi`` on its part of the group; a passive one has a
-:class:`GroupEncoder`, which has no way to send. Modules are known by address, in the order of the joints.
+Each driven joint has a :class:`GroupDrive`, the backend ``hebi`` on its part of the group; a passive joint has a
+:class:`GroupEncoder`, which cannot send. Modules are identified by address, in the order of the joints.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ __all__ = ["GroupDrive", "GroupEncoder", "HebiGroup"]
 
 
 class HebiGroup:
-    """The modules of a plant. All calls come from one thread.
+    """Modules of a plant. All calls must come from one thread.
 
     Args:
-        joints: Name of each joint and which module it has, in the order of the model.
-        driven: Which of them have a motor that is used.
-        interface: Network address to look on; empty for all.
-        look_time: Time to look for, at least [s].
+        joints: Name and module of each joint, in the order of the model.
+        driven: Indices of the joints with a motor.
+        interface: Network address to search; empty for all.
+        look_time: Shortest search time [s].
         lookup: Returns hebi-py's ``Lookup``; by default that of the interface.
-        log: File to which the library writes all feedback while connected; None for none.
+        log: File to which the library logs all feedback while connected, or None.
     """
 
     def __init__(
@@ -84,20 +84,18 @@ class HebiGroup:
         self._stop_error: Exception | None = None
         self._users = 0
 
-    # --- life -----------------------------------------------------------------------------------------------
-
     def join(self) -> None:
-        """Count one more port; the first finds the modules, and switches all of them off.
+        """Register a port; the first finds the modules and switches all of them off.
 
         Raises:
-            ActuatorError: One is missing, silent, of another type, meant twice, or does not switch off.
+            ActuatorError: A module is missing, silent, of another type, selected twice, or does not switch off.
         """
         if self.group is None:
             self._connect()
         self._users += 1
 
     def leave(self) -> None:
-        """Count one port less; the last lets the library's thread for the group go."""
+        """Unregister a port; the last releases the group and its thread."""
         self._users -= 1
         if self._users == 0:
             if self._log is not None:
@@ -123,7 +121,7 @@ class HebiGroup:
                     "module_lost", f"HEBI module {record} is meant for {other} and for {name}; expected one for each"
                 )
             records.append(record)
-        # By address, never by name: the group has the order of the joints, whatever the modules are called.
+        # By address, never by name: the group has the order of the joints.
         group = lookup.get_group_from_macs([each.mac_address for each in records], round(1000 * LOOKUP_TIMEOUT))
         if group is None:
             listed = ", ".join(map(str, records))
@@ -144,22 +142,16 @@ class HebiGroup:
         self._packet, self._buffer = packet, hebi.GroupFeedback(group.size)
         if self._log is not None:
             start_log(group, self._log)
-        # Only now: a group that was refused must not count as connected the next time.
+        # Only now: a refused group must not count as connected on the next call.
         self.group = group
 
-    # --- packets --------------------------------------------------------------------------------------------
-
     def keep(self, index: int, command: Command) -> None:
-        """Keep a joint's setpoints for the next round of packets."""
+        """Store a joint's setpoints for the next round of packets."""
         self._stop_told = None
         self._setpoints[index] = command
 
     def send(self) -> None:
-        """Send the setpoints that were kept, all in one round.
-
-        Raises:
-            ActuatorError: They cannot be sent.
-        """
+        """Send the stored setpoints in one round; ActuatorError if that fails."""
         if not self._setpoints:
             return
         setpoints, self._setpoints = self._setpoints, {}
@@ -167,12 +159,12 @@ class HebiGroup:
             raise ActuatorError("send_failed", "commands could not be sent to the HEBI modules: network down?")
 
     def acknowledged(self, index: int, packet: Any, strategy: Strategy | None, timeout_ms: float) -> bool:
-        """Send settings of one module; tell whether all modules said in time that they have theirs.
+        """Send settings of one module; return whether all modules acknowledged in time.
 
         Args:
-            index: Which joint the settings are for.
+            index: Joint of the settings.
             packet: hebi-py's command for the group.
-            strategy: The strategy among the settings, or None.
+            strategy: Strategy among the settings, or None.
             timeout_ms: [ms].
 
         Raises:
@@ -182,18 +174,18 @@ class HebiGroup:
             raise ActuatorError("exception", f"{self.names[index]} is passive: nothing is sent to its module but off")
         self._stop_told = None
         if strategy is not None:
-            # Asked for is as good as set: the acknowledgement may be what is lost.
+            # A requested strategy may be in force: the acknowledgement can get lost.
             self._asked[index] = strategy
             self._possible[index].add(strategy)
-            # What was kept was meant for the strategy before: a duty would become a torque.
+            # Stored setpoints were for the previous strategy: a duty would become a torque.
             self._setpoints.pop(index, None)
         return bool(self.group.send_command_with_acknowledgement(packet, timeout_ms))
 
     def info(self, index: int, timeout_ms: float) -> Any:
-        """Return the settings of all modules, or None; refuse the plant where another module is not as it was left.
+        """Return the settings of all modules, or None.
 
         Raises:
-            ActuatorError: A module is another one, or has a strategy that nobody here asked for.
+            ActuatorError: A module was exchanged, or has a strategy that this group did not set.
         """
         info = self.group.request_info(timeout_ms)
         if info is not None:
@@ -201,7 +193,7 @@ class HebiGroup:
         return info
 
     def receive(self, timeout_ms: float) -> Any:
-        """Wait for the next frame of feedback; return it, or None."""
+        """Return the next frame of feedback, or None after the timeout."""
         frame = self.group.get_next_feedback(timeout_ms, self._buffer)
         if frame is not None:
             self._frame = frame
@@ -209,17 +201,14 @@ class HebiGroup:
 
     @property
     def frame(self) -> Any:
-        """The newest frame of feedback; None before the first."""
+        """Newest frame of feedback; None before the first."""
         return self._frame
 
     def stop(self, index: int) -> None:
-        """No torque, then all modules off, in one round for all joints: the next to ask is told what came of it.
-
-        Args:
-            index: Which joint asks.
+        """Remove torque and switch all modules off, in one round for all joints; later joints get the same result.
 
         Raises:
-            ActuatorError: One has not confirmed that it is off.
+            ActuatorError: A module has not confirmed that it is off.
         """
         if self._stop_told is None or index in self._stop_told:
             self._stop_told, self._stop_error = set(), None
@@ -230,8 +219,6 @@ class HebiGroup:
         self._stop_told.add(index)
         if self._stop_error is not None:
             raise self._stop_error
-
-    # --- inside ---------------------------------------------------------------------------------------------
 
     def _stop_all(self) -> None:
         self._setpoints.clear()
@@ -270,7 +257,7 @@ class HebiGroup:
         packet.position = packet.velocity = packet.effort = NO_SETPOINT
 
     def _check_info(self, info: Any, but: int | None = None) -> None:
-        """Compare what all modules tell with what they were; the strategy of one may be about to be judged."""
+        """Compare settings of all modules with the expected ones; joint ``but`` may have another strategy."""
         for index, record in enumerate(self._records):
             reads = tuple(str(getattr(info, name)[index]) for name in ("family", "name", "serial"))
             known = (record.family, record.name, record.serial)
@@ -297,7 +284,7 @@ def _answered(info: Any) -> Any:
 
 
 class _Row:
-    """One module's part of a frame or of settings, as hebi-py shows those of a group of one."""
+    """One module's part of a frame or of settings, as hebi-py's for a group of one."""
 
     def __init__(self, of_all: Any, index: int) -> None:
         self._of_all = of_all
@@ -308,12 +295,7 @@ class _Row:
 
 
 class _Part:
-    """One module's part of a packet for all, as hebi-py's command for a group of one.
-
-    Attributes:
-        packet: hebi-py's command for the group.
-        strategy: The strategy that it holds, or None.
-    """
+    """One module's part of a group ``packet``, as hebi-py's command for a group of one."""
 
     packet: Any
     strategy: Strategy | None
@@ -333,7 +315,7 @@ class _Part:
 
 
 class _Seat:
-    """One module of the group, as hebi-py's group of one; what :class:`HebiBackend` sends goes the group's way."""
+    """One module as hebi-py's group of one; commands of :class:`HebiBackend` are sent through the shared group."""
 
     size = 1
 
@@ -366,27 +348,27 @@ class _Seat:
         return None if info is None else _Row(info, self._index)
 
     def get_next_feedback(self, timeout_ms: float, reuse_fbk: Any = None) -> Any:
-        # A frame is taken at the first joint; the others look at the same one, or would see two for a state.
+        # The first joint receives a frame and the others read the same one; otherwise one state would mix two frames.
         frame = self._shared.receive(timeout_ms) if self._index == 0 else self._shared.frame
         return None if frame is None else _Row(frame, self._index)
 
 
 class _GroupPort(HebiBackend):
-    """What both kinds of port of a group have."""
+    """Common part of both ports of a group."""
 
     def __init__(self, shared: HebiGroup, index: int, clock: Clock | None = None, **options: Any) -> None:
         super().__init__(clock=clock, make_group=lambda: _Seat(shared, index), **options)
         self.shared = shared
         self._index = index
-        # A module that was never heard reads 0, which is no record.
+        # A module without any record reads 0.
         self._last_receive_us = 0
 
     def read(self, timeout: float) -> Feedback | None:
-        """Return this module's part of the newest frame, where it is new; only the first joint waits for one."""
+        """Return this module's part of the newest frame if it is new; only the first joint waits for one."""
         return super().read(timeout if self._index == 0 else 0.0)
 
     def let_go(self) -> None:
-        """Let go of the group without stopping."""
+        """Release the group without stopping."""
         if self._group is not None:
             self._group = self._command = self._feedback = None
             self.shared.leave()
@@ -396,36 +378,36 @@ class _GroupPort(HebiBackend):
 
 
 class GroupDrive(_GroupPort):
-    """The actuator port of one driven joint; setpoints leave with those of the other joints, by :meth:`flush`.
+    """Actuator port of one driven joint; :meth:`flush` sends the setpoints of all joints.
 
     Args:
-        shared: The group.
-        index: Which of its joints.
-        clock: Host clock; feedback is stamped with it on receipt.
-        options: As those of :class:`HebiBackend`.
+        shared: Group.
+        index: Joint.
+        clock: Host clock, which stamps feedback on receipt.
+        options: As for :class:`HebiBackend`.
     """
 
     def write(self, command: Command) -> Applied:
-        """Keep setpoints, checked and limited, for the next :meth:`flush`."""
+        """Store setpoints, checked and limited, for the next :meth:`flush`."""
         self._own()
         limited, changed = check_command(command, self._strategy, self._limits)
         self.shared.keep(self._index, limited)
         return Applied(limited, self._strategy, changed, self._clock.now_ns())
 
     def flush(self) -> None:
-        """Send the setpoints that all ports of the group have kept."""
+        """Send the stored setpoints of all ports of the group."""
         self._own()
         self.shared.send()
 
     def stop(self) -> None:
-        """No torque, then strategy off, on all modules of the group."""
+        """Remove torque, then set strategy off, on all modules of the group."""
         if self._group is None or threading.get_ident() != self._owner:
             return
         self._strategy = Strategy.OFF
         self.shared.stop(self._index)
 
     def close(self) -> None:
-        """Stop, and let go of the group."""
+        """Stop and release."""
         try:
             self.stop()
         finally:
@@ -433,20 +415,14 @@ class GroupDrive(_GroupPort):
 
 
 class GroupEncoder:
-    """The port of a passive joint: it is read, and has no way to give torque.
-
-    Args:
-        shared: The group.
-        index: Which of its joints.
-        clock: Host clock.
-    """
+    """Port of a passive joint, without any way to command torque."""
 
     def __init__(self, shared: HebiGroup, index: int, clock: Clock | None = None) -> None:
         self._clock = clock or WallClock()
         self._port = _GroupPort(shared, index, self._clock)
 
     def connect(self) -> ActuatorInfo:
-        """Find the module, once, and return what it says of itself; its motor reads back as off."""
+        """Find the module, once, and return its properties; its motor reads back as off."""
         return self._port.connect()
 
     def now_ns(self) -> int:
@@ -454,13 +430,13 @@ class GroupEncoder:
         return self._clock.now_ns()
 
     def read(self, timeout: float) -> Feedback | None:
-        """Return the module's part of the newest frame, where it is new."""
+        """Return the module's part of the newest frame if it is new."""
         return self._port.read(timeout)
 
     def set_feedback_rate(self, rate: float) -> float:
-        """Set the rate of the library's requests, which is that of the whole group [Hz]."""
+        """Set the request rate of the whole group [Hz]."""
         return self._port.set_feedback_rate(rate)
 
     def close(self) -> None:
-        """Let go of the group."""
+        """Release the group."""
         self._port.let_go()

@@ -1,7 +1,7 @@
-"""HEBI's library: what it calls our quantities, and its log files, written by its thread and read back by name.
+"""HEBI's library: its names of our quantities, and its log files.
 
-A ``.hebilog`` holds what the module sent, at the full feedback rate and with the module's clock, whatever happened to
-the bridge, to ROS or to the recorder.
+The library's thread writes a ``.hebilog`` at the full feedback rate with the module's clock, independently of the
+bridge, ROS and the recorder.
 """
 
 from __future__ import annotations
@@ -30,32 +30,24 @@ ATTRIBUTES = {
 """Our quantity -> attribute of hebi-py's feedback."""
 _POSITIONS = ("position", "position_command")
 _ODD = ("velocity", "effort", "velocity_command", "effort_command")
-"""Quantities that change their sign with the joint's, beside the positions."""
+"""Quantities other than positions that change sign with the joint."""
 
 
 def import_hebi() -> Any:
-    """Return hebi-py, imported now and not before.
-
-    Raises:
-        ActuatorError: It is not installed.
-    """
+    """Return hebi-py, imported on first use; ActuatorError if it is not installed."""
     try:
-        # The library greets on standard output when an optional module of its own is missing.
+        # The library prints to standard output if an optional module of its own is missing.
         with contextlib.redirect_stdout(io.StringIO()):
             import hebi
     except ImportError as error:
         raise ActuatorError("not_installed", how_to_install(error) or f"hebi-py cannot be imported: {error}") from error
-    # It releases all groups then, and of thousands of releases one never returns.
+    # The library releases all groups at exit, and of thousands of releases one never returns.
     guard_exit()
     return hebi
 
 
 def start_log(group: Any, path: Path) -> None:
-    """Let hebi-py write all feedback of a group to a file.
-
-    Raises:
-        ActuatorError: It cannot, or the file is there already.
-    """
+    """Let hebi-py log all feedback of a group; ActuatorError if it cannot or the file exists."""
     if path.exists():
         raise ActuatorError("exception", f"HEBI log {path} is there already; expected a new file")
     try:
@@ -67,17 +59,15 @@ def start_log(group: Any, path: Path) -> None:
 
 def stop_log(group: Any) -> None:
     """End the log of a group; an empty one is no error."""
-    # The library opens what it has written, and refuses a file without a record.
+    # The library opens the finished file, and refuses one without a record.
     with contextlib.suppress(Exception):
         group.stop_log()
 
 
 def read_hebilog(path: Path, *, module: int | None = None) -> dict[str, NDArray[np.float64]]:
-    """Return what a HEBI log holds: ``time`` [s] by the module's clock, and quantities by their names, in SI units.
+    """Return ``time`` [s] by the module's clock and quantities by name, in SI units, of one module of a HEBI log.
 
-    Args:
-        path: The file.
-        module: Which module of the log, from 0; None for the only one.
+    ``module`` counts from 0; None requires a log of one module.
 
     Raises:
         ActuatorError: hebi-py is not installed.
@@ -99,7 +89,7 @@ def read_hebilog(path: Path, *, module: int | None = None) -> dict[str, NDArray[
     if len(rows) < 2:
         raise DataError(f"{path} holds {len(rows)} records; expected at least 2")
     times = np.array(stamps, dtype=np.int64)
-    # The module's clock knows no network; a log without it has that of receipt.
+    # The module's clock has no network jitter; without it, the time of receipt is used.
     clock = times[:, 0] if np.all(np.diff(times[:, 0]) >= 0) and times[-1, 0] > times[0, 0] else times[:, 1]
     new = np.concatenate([[True], np.diff(clock) > 0])
     table = np.array(rows, dtype=np.float64)[new]
@@ -114,10 +104,10 @@ def to_joint(
     """Return quantities of an actuator in joint coordinates.
 
     Args:
-        quantities: As :func:`read_hebilog` returns them.
+        quantities: From :func:`read_hebilog`.
         zero: Joint angle where the actuator reads zero [rad].
         sign: 1, or -1 for an actuator mounted the other way round.
-        tare: Torque that the sensor shows when nothing pulls [N m].
+        tare: Torque that the sensor shows without load [N m].
     """
     found = dict(quantities)
     for name in _POSITIONS:

@@ -1,7 +1,4 @@
-"""Settings of a HEBI module as hebi-py's fields: what is written, and what a module tells of it.
-
-Every function takes hebi-py's command or info for one module; nothing is sent here.
-"""
+"""Conversion of settings to and from hebi-py's fields, for one module's command or info; nothing is sent here."""
 
 from __future__ import annotations
 
@@ -26,7 +23,7 @@ M_STOPS = (MStopAction.DISABLED, MStopAction.MOTOR_OFF, MStopAction.HOLD_POSITIO
 
 
 def fill_gains(command: Any, gains: GainSet) -> None:
-    """Put the gains of all loops into a command; a clamp that is infinite is none and stays out."""
+    """Put the gains of all loops into a command; infinite clamps are left out."""
     for loop in LOOPS:
         for name in GAIN_FIELDS:
             value = getattr(gains.loop(loop), name)
@@ -35,10 +32,10 @@ def fill_gains(command: Any, gains: GainSet) -> None:
 
 
 def gains_of(info: Any, wanted: GainSet) -> GainSet:
-    """Return the gains that a module tells; a clamp that was not written, because it is infinite, is not asked.
+    """Return the gains that a module reports; infinite clamps, which are never written, are taken from ``wanted``.
 
     Raises:
-        ActuatorError: The module does not tell one.
+        ActuatorError: The module does not report a gain.
     """
     loops: dict[str, PidGains] = {}
     for loop in LOOPS:
@@ -53,9 +50,9 @@ def gains_of(info: Any, wanted: GainSet) -> GainSet:
 
 
 def fill_limits(command: Any, limits: HardwareLimits) -> None:
-    """Put the safety parameters into a command; an end of the position window that is open is disabled.
+    """Put the safety parameters into a command, with open ends of the position window disabled.
 
-    Left as it is, the module might hold its position at a limit of its own there, with a torque that nobody asked for.
+    Left alone, the module might hold its position at a limit of its own there, with a torque that was not commanded.
     """
     command.effort_limit_min, command.effort_limit_max = -limits.effort, limits.effort
     command.velocity_limit_min, command.velocity_limit_max = -limits.velocity, limits.velocity
@@ -67,10 +64,10 @@ def fill_limits(command: Any, limits: HardwareLimits) -> None:
 
 
 def limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
-    """Return the safety parameters that a module tells; an end of the position window that is open is told as asked.
+    """Return the safety parameters that a module reports; open ends of the position window are taken from ``wanted``.
 
     Raises:
-        ActuatorError: It tells none, or does not switch off at an end of the window, or acts at an open one.
+        ActuatorError: A limit is not reported, an end of the window does not switch off, or an open end acts.
     """
     ends = _window(wanted)
     for end, angle in ends.items():
@@ -95,7 +92,7 @@ def limits_of(info: Any, wanted: HardwareLimits) -> HardwareLimits:
 
 
 def _window(limits: HardwareLimits) -> dict[str, float]:
-    """Return the ends of the position window, infinite where it is open [rad]."""
+    """Return the ends of the position window, infinite where open [rad]."""
     return {"min": limits.position_min, "max": limits.position_max}
 
 

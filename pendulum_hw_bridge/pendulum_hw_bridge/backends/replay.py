@@ -1,6 +1,6 @@
-"""Backend that plays recorded feedback, so that everything above the port meets real data.
+"""Backend that plays recorded feedback, to run everything above the port on real data.
 
-Setpoints change nothing in a recording; they are checked, limited and answered like those of any other backend.
+Setpoints have no effect; they are checked and limited as by any other backend.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class FeedbackRecording:
     """Feedback over time, as arrays.
 
     Args:
-        quantities: ``time`` [s], increasing, and quantities by their name in
-            :data:`pendulum_hw_bridge.port.actuator.FEEDBACK_QUANTITIES`, in SI units, all of one length. ``position``,
-            ``velocity`` and ``effort`` are required.
-        where: Where it comes from, for messages.
+        quantities: ``time`` [s], increasing, and quantities of :data:`FEEDBACK_QUANTITIES` in SI units, all of one
+            length.
+            ``position``, ``velocity`` and ``effort`` are required.
+        where: Source, for messages.
 
     Raises:
         DataError: A quantity is missing or unknown, lengths differ, or time does not increase.
@@ -88,12 +88,7 @@ class FeedbackRecording:
         return float(NANOSECONDS / np.median(np.diff(self.time_ns)))
 
     def record(self, index: int, stamp_ns: int) -> Feedback:
-        """Return one record; quantities that were not recorded are NaN, the voltage nominal.
-
-        Args:
-            index: Number of the record.
-            stamp_ns: Host time to stamp it with [ns].
-        """
+        """Return one record, stamped with host time [ns]; missing quantities are NaN, the voltage nominal."""
         values = {name: _DEFAULTS.get(name, math.nan) for name in FEEDBACK_QUANTITIES}
         values.update({name: float(column[index]) for name, column in self.columns.items()})
         return Feedback._make((stamp_ns, stamp_ns, index + 1, *(values[name] for name in FEEDBACK_QUANTITIES), *_FLAGS))
@@ -102,11 +97,8 @@ class FeedbackRecording:
 def load_feedback(path: str | Path) -> FeedbackRecording:
     """Return the recording in an NPZ file (arrays by name), a CSV file (a header of names), a HEBI log or a bag folder.
 
-    From a bag the complete records on ``actuator/feedback`` are taken, else position, velocity and effort on
-    ``joint_states``.
-
     Raises:
-        DataError: No such file, another format, or content that is refused; the message names file and place.
+        DataError: No such file, another format, or refused content; the message names file and place.
     """
     path = Path(path)
     try:
@@ -134,7 +126,7 @@ def load_feedback(path: str | Path) -> FeedbackRecording:
 def _read_npz(path: Path) -> dict[str, NDArray[np.float64]]:
     try:
         with zipfile.ZipFile(path) as archive:
-            # Zeros shrink to a thousandth: what counts is what they grow to.
+            # Zeros compress to a thousandth: bound the unpacked size.
             size = sum(entry.file_size for entry in archive.infolist())
         if size > _LIMIT:
             raise DataError(f"{path} holds {size} bytes when unpacked; expected at most {_LIMIT}")
@@ -165,12 +157,7 @@ def _read_csv(path: Path) -> dict[str, list[float]]:
 
 
 class ReplayBackend:
-    """The actuator port of a recording.
-
-    Args:
-        recording: What to play.
-        clock: Host clock; the recording starts when it is connected.
-    """
+    """Actuator port of a recording, which starts when it is connected."""
 
     name = "replay"
 
@@ -187,7 +174,7 @@ class ReplayBackend:
 
     @classmethod
     def from_parameters(cls, values: Mapping[str, Any], clock: Clock, **_: Any) -> ReplayBackend:
-        """Return the port of the recording that the bridge's parameters name."""
+        """Return the port of the recording named by the bridge's parameters."""
         if not values["replay_file"]:
             raise ParameterError(
                 "replay_file is empty; expected a bag folder, NPZ or CSV file of feedback for backend 'replay'"
@@ -196,7 +183,7 @@ class ReplayBackend:
 
     @property
     def strategy(self) -> Strategy:
-        """Strategy that was last asked for."""
+        """Last requested strategy."""
         return self._strategy
 
     @property
@@ -237,7 +224,7 @@ class ReplayBackend:
             self._clock.wait_until(deadline)
             return None
         self._clock.wait_until(due)
-        # A reader that came late gets the newest record that is due; those before it are lost, as on a network.
+        # A late reader gets the newest due record; earlier ones are lost, as on a network.
         elapsed = self._clock.now_ns() - start_ns
         newest = int(np.searchsorted(self.recording.time_ns, elapsed, side="right")) - 1
         index = max(self._index, newest)
@@ -246,48 +233,48 @@ class ReplayBackend:
         return self.recording.record(index, stamp_ns)
 
     def write(self, command: Command) -> Applied:
-        """Check and limit setpoints; the recording does not listen."""
+        """Check and limit setpoints; they have no effect."""
         self._require_start()
         limited, changed = check_command(command, self._strategy, self._limits)
         return Applied(limited, self._strategy, changed, self._clock.now_ns())
 
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
-        """Take note of a strategy."""
+        """Store a strategy."""
         self._require_start()
         check_command(command or Command(), strategy, self._limits)
         self._strategy = strategy
         return strategy
 
     def set_gains(self, gains: GainSet) -> GainSet:
-        """Take note of gains."""
+        """Store gains."""
         self._require_start()
         self._gains = gains
         return gains
 
     def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
-        """Take note of limits; setpoints are limited by them."""
+        """Store limits, which then apply to setpoints."""
         self._require_start()
         self._limits = limits
         return limits
 
     def set_command_lifetime(self, lifetime: float) -> float:
-        """Take note of a lifetime."""
+        """Store a lifetime [s]."""
         self._require_start()
         self._lifetime = check_lifetime(lifetime)
         return self._lifetime
 
     def set_feedback_rate(self, rate: float) -> float:
-        """Take note of a rate; the recording keeps its own."""
+        """Store a rate [Hz]; the recording has its own."""
         self._require_start()
         self._rate = rate
         return rate
 
     def stop(self) -> None:
-        """Take note that nothing drives."""
+        """Set the strategy off."""
         self._strategy = Strategy.OFF
 
     def close(self) -> None:
-        """Stop to play."""
+        """Stop playing."""
         self.stop()
         self._start_ns = None
 

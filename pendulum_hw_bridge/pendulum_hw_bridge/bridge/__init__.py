@@ -1,1 +1,1 @@
-"""The bridge: modules under the rules of a plant, one cycle at a time, and the parameters that make them."""
+"""Bridge between the supervisor of a plant and its modules, with its parameters."""

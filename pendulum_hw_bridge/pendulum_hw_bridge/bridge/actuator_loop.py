@@ -1,7 +1,6 @@
-"""The thread that owns the actuator: one cycle per feedback record, and jobs for it from elsewhere in between.
+"""Thread that owns the actuator: one cycle per feedback record, with jobs from other threads in between.
 
-HEBI's library wants all calls of a group from one thread, and no slow callback of ROS may stand between feedback
-and the reaction to it. What reaches the outside (publish, decide) are functions given by the node.
+HEBI's library needs all calls of a group in one thread, and slow ROS callbacks must not delay reactions to feedback.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ __all__ = ["ActuatorLoop"]
 
 _T = TypeVar("_T")
 _PATIENCE = 0.005
-"""Longest wait for feedback before commands and silence are looked at again [s]."""
+"""Longest wait for feedback before commands and silence are checked again [s]."""
 _IDLE = 0.1
 _JOIN = 5.0
 
@@ -33,16 +32,16 @@ class ActuatorLoop:
     """Runs a bridge's cycles in a thread of its own.
 
     Args:
-        bridge: Bridge and actuator; only this thread touches the actuator.
-        statistics: Gets the figures of the loop.
+        bridge: Bridge and actuator; only this thread uses the actuator.
+        statistics: Receives the loop's timing.
         on_state: Called with each new sample.
         decide: Returns the decision for now.
-        on_outcome: Called with the stamp of the state answered [ns] and what was done.
-        on_records: Called with the feedback record of each module when its cycle has ended, in an error too, when the
-            drive is off already: whoever reads these has time, and who answers the state has not.
-        take_inputs: Takes the torques that have come, each into :meth:`answered`; where none has, it waits for one, for
-            as long as it is told at most [s]. By default none ever comes.
-        answer_window: Share of the period in which to wait for answers to a state before acting [-].
+        on_outcome: Called with the stamp of the state [ns] and the outcome.
+        on_records: Called with the feedback record of each module after its cycle, off the critical path; after an
+            error,
+            when the drive is off already.
+        take_inputs: Passes received torques to :meth:`answered`, waiting at most the given time [s] for one.
+        answer_window: Share of the period to wait for commands for a state before acting [-].
         report: Called with the text of an error that ended a cycle.
     """
 
@@ -79,17 +78,11 @@ class ActuatorLoop:
         self._last_state_ns: int | None = None
         self._thread = self._start()
 
-    # --- from other threads ---------------------------------------------------------------------------------
-
     def call(self, job: Callable[[], _T], timeout: float = 5.0) -> _T:
-        """Run a job in the actuator's thread and return what it returns.
-
-        Args:
-            job: What to run.
-            timeout: Longest time to wait for it [s].
+        """Run a job in the actuator's thread and return its result, waiting at most ``timeout`` [s].
 
         Raises:
-            ActuatorError: The thread does not answer in time, or has ended.
+            ActuatorError: The job did not end in time, or the thread has ended.
         """
         if threading.current_thread() is self._thread:
             return job()
@@ -105,19 +98,17 @@ class ActuatorLoop:
             raise ActuatorError("exception", f"actuator thread did not answer within {timeout:g} s") from None
 
     def answered(self, kind: Input, command: JointCommand) -> None:
-        """Take note of an accepted command; the cycle goes on when all who answer have answered."""
+        """Register an accepted command; the cycle continues when all expected ones have come."""
         if command.stamp_ns == self._state_ns:
             self._answered.add(kind)
         if kind is Input.EFFORT_COMMAND:
             self.statistics.act_on_age(self.bridge.now_ns() - command.stamp_ns)
 
     def close(self) -> None:
-        """End the thread; the actuator is released and let go on the way out."""
+        """End the thread, which releases the actuator."""
         self._closing.set()
         self._job_waiting.set()
         self._thread.join(_JOIN)
-
-    # --- in the thread --------------------------------------------------------------------------------------
 
     def _start(self) -> threading.Thread:
         thread = threading.Thread(target=self._run, name="actuator", daemon=True)
@@ -160,7 +151,7 @@ class ActuatorLoop:
         try:
             step()
         except Exception as error:  # noqa: BLE001
-            # Whatever broke, the drive goes off first; a second break in the next cycle finds it off already.
+            # After any error the drive goes off first; an error in the next cycle finds it off already.
             self.bridge.fail("exception", f"{type(error).__name__}: {error}")
             self.bridge.release()
             self._report(f"cycle of the actuator failed: {type(error).__name__}: {error}")
@@ -189,7 +180,7 @@ class ActuatorLoop:
         self._on_outcome(sample.stamp_ns, self._decide_and_act())
 
     def _act_between(self) -> None:
-        """Between two records only what ends torque is carried out: a command that went stale need not wait."""
+        """Between two records carry out only what ends torque, because a stale command must not wait."""
         was_armed = self.bridge.supervisor.mode.armed
         drive = self._decide()
         if drive.kind is DriveKind.OFF or drive.starved:
@@ -200,7 +191,7 @@ class ActuatorLoop:
         return self.bridge.carry_out(self._decide(), was_armed=was_armed)
 
     def _awaited(self, now_ns: int) -> set[Input]:
-        """Return who answered lately: whoever is late or has never answered is not waited for."""
+        """Return the inputs to wait for: those with a fresh command."""
         supervisor = self.bridge.supervisor
         if not supervisor.mode.armed:
             return set()
@@ -208,11 +199,11 @@ class ActuatorLoop:
         return {kind for kind in answering if supervisor.gates[kind].fresh(now_ns) is not None}
 
     def _wait_for_answers(self, awaited: set[Input]) -> None:
-        """Take what has come, and wait in the window for answers to the newest state."""
+        """Receive commands, and wait in the window for those for the newest state."""
         left = self._window if awaited else 0.0
         deadline = time.monotonic() + left
         while True:
-            # Asleep at once: on a busy machine, who answers may wait for this processor.
+            # Sleep at once: on a busy machine the commander may be waiting for this processor.
             self._take_inputs(left)
             left = deadline - time.monotonic()
             if awaited <= self._answered or left <= 0.0 or self._closing.is_set():

@@ -1,4 +1,4 @@
-"""What the bridge's parameters make: the modules of a plant, its limits, and what the node tells of them."""
+"""Modules and limits of a plant, made from the bridge's parameters."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ from pendulum_msgs_py.plants.plant_parameters import (
 __all__ = ["CURRENT_LOOP", "Assembly", "assemble", "for_plant"]
 
 CURRENT_LOOP = "current_loop"
-"""How drives with a current loop make a torque, as told beside the values of ``effort_strategy``."""
+"""Reported in place of a value of ``effort_strategy`` for drives with a current loop."""
 _MEASURED_SHARE = 1.2
-"""Measured effort that is no fault yet, as a multiple of the effort limit [-]."""
+"""Limit of the measured effort, as a multiple of the effort limit [-]."""
 _DISAGREEMENT = 0.05
-"""Largest disagreement of position and velocity of a joint that turns ten times as fast as an X5-9 [rad or m]."""
+"""Largest disagreement of position and velocity of a joint ten times as fast as an X5-9 [rad or m]."""
 _FASTEST = 30.0
-"""Velocity at which the armed machine faults, where nobody says another [rad/s or m/s]."""
+"""Default velocity limit of the armed machine [rad/s or m/s]."""
 _RATE = 500.0
-"""Feedback rate where nobody says another: links of several joints fall faster than one alone [Hz]."""
+"""Default feedback rate: several links fall faster than one [Hz]."""
 _OF_ONE_MODULE = (
     "lab_file",
     "effort_strategy",
@@ -70,7 +70,7 @@ _OF_ONE_MODULE = (
     "drivetrain",
     *OF_GROUPS,
 )
-"""Parameters that mean nothing to an emulated machine of several joints: most are about the only module."""
+"""Parameters that an emulated machine of several joints does not have; most are for a single module."""
 _OF_EVERY_GROUP = (
     "effort_strategy",
     "effort_efficiency",
@@ -83,21 +83,21 @@ _OF_EVERY_GROUP = (
 )
 """Those of them that a group of HEBI modules has."""
 _SLOWEST_DRIVE = 0.1
-"""Longest delay, and longest time constant, of a drive that can be watched [s]."""
+"""Longest delay and time constant of a drive that the output check supports [s]."""
 _LEAD_NS = 500_000
-"""In lockstep, feedback is measured this long before the state that shows it [ns]."""
+"""In lockstep, time from measurement of the feedback to the state that shows it [ns]."""
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """The modules of one plant.
+    """Modules of one plant.
 
     Attributes:
         coordinates: Joints, and which of them are driven.
         limits: Limits of the supervisor.
-        described: What the plant is known to be; empty where nobody says.
-        hardware: What it is, in a few words.
-        effort_strategy: How a torque becomes a setpoint.
+        described: Known parameters of the plant; empty if unknown.
+        hardware: Short description.
+        effort_strategy: Mapping of torque to setpoints.
         mapping: That of the first drive.
         modules: Makes the modules on a host clock, not connected yet.
     """
@@ -115,8 +115,8 @@ def for_plant(specs: tuple[ParameterSpec, ...], plant: str, backend: str = "emul
     """Return the bridge's parameters with the defaults that a plant of several joints needs.
 
     Args:
-        specs: The parameters, with the defaults of an X5-9.
-        plant: Preset or file, as given.
+        specs: Parameters with the defaults of an X5-9.
+        plant: Preset or file.
         backend: Backend of the actuator port.
 
     Raises:
@@ -127,7 +127,7 @@ def for_plant(specs: tuple[ParameterSpec, ...], plant: str, backend: str = "emul
     mechanism = load_mechanism(plant)
     of_one = next(spec.default for spec in specs if spec.name == "position_window")
     assert isinstance(of_one, list)
-    # A real joint has a window in any case, as one alone has; a joint of X5-9s is as slow as one alone, too.
+    # A real joint always has a window, and several X5-9s are as slow as one.
     real = backend in BACKENDS and BACKENDS[backend].is_machine
     free = of_one if real else [0.0, 0.0]
     ends = [end for low, high in mechanism.stops for end in ((low, high) if math.isfinite(low + high) else free)]
@@ -139,15 +139,10 @@ def for_plant(specs: tuple[ParameterSpec, ...], plant: str, backend: str = "emul
 
 
 def assemble(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, lockstep: bool = False) -> Assembly:
-    """Return what parameters make.
-
-    Args:
-        values: Parameters of the bridge.
-        specs: Their table.
-        lockstep: Whether time is simulated.
+    """Return what the parameters describe; ``lockstep`` means simulated time.
 
     Raises:
-        ParameterError: They contradict each other or the plant.
+        ParameterError: The parameters contradict each other or the plant.
     """
     if is_mechanism(values["plant"]):
         return _several(values, specs, lockstep=lockstep)
@@ -232,7 +227,7 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
             gains=gains,
             effort_limit=limit,
             joint=coordinates.joints[index],
-            # Beyond the delay, what is left of an older torque falls to a twentieth within three time constants.
+            # After the delay, the rest of an older torque decays to a twentieth within three time constants.
             late=math.ceil((delay + 3.0 * actuator.time_constant) * values["feedback_rate"]),
         )
         for index, actuator, limit in zip(coordinates.driven, plant.actuators, limits.effort, strict=True)
@@ -283,7 +278,7 @@ def _group(values: Mapping[str, Any], plant: PlantParameters, limits: PlantLimit
     if values["initial_positions"] != [0.0]:
         raise ParameterError("initial_positions is for the emulator; expected it left out with backend 'hebi'")
     group = GroupAssembly(values, plant.coordinates, limits)
-    # A preset is no measurement of the machine that stands here.
+    # A preset is not a measurement of this machine.
     described: list[PlantParameters] = [] if values["plant"] in MECHANISM_PRESETS else [plant]
     return Assembly(
         plant.coordinates,

@@ -1,8 +1,7 @@
-"""The bridge between the rules of a plant and its modules: one cycle at a time, without ROS.
+"""Bridge between the supervisor of a plant and its modules, in cycles and without ROS.
 
-A cycle is ``observe`` (feedback of all modules in, checks), then ``act`` (the supervisor's decision carried out on
-the driven ones). Every way out of driving goes through ``release``: on each of them no torque, then strategy off. A
-fault of one module, driven or not, releases all.
+A cycle is ``observe`` (feedback of all modules, checks), then ``act`` (carry out the supervisor's decision). Driving
+always ends through ``release``: no torque, then strategy off. A fault of any module releases all.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ __all__ = ["Bridge", "Outcome"]
 
 _PREPARED_NS = NANOSECONDS
 _STOP_AGAIN_NS = NANOSECONDS // 10
-"""Time between two requests to modules that did not confirm that they are off [ns]."""
+"""Interval of stop requests to modules that did not confirm that they are off [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a cycle did.
+    """Result of a cycle.
 
     Attributes:
         drive: The supervisor's decision.
-        effort: What the setpoints of each driven joint stand for, after all limits [N m or N].
-        applied: What was sent to each of them; empty where nothing was.
+        effort: Effort of the setpoints of each driven joint, after all limits [N m or N].
+        applied: Setpoints sent to each of them; empty if none were.
         fault: Name of the fault that ended driving in this cycle, or an empty string.
     """
 
@@ -45,12 +44,11 @@ class Bridge:
     """Carries out a supervisor's decisions on the modules of a plant.
 
     Args:
-        modules: One for each joint, in the order of the model; all on one clock.
+        modules: One per joint, in the order of the model; all on one clock.
         supervisor: Rules and state of the plant.
 
     Raises:
-        ParameterError: The modules are not those of the supervisor's joints: another number, or a motor where the plant
-            has none.
+        ParameterError: The modules do not match the supervisor's joints and motors.
     """
 
     def __init__(self, modules: Sequence[Module], supervisor: PlantSupervisor) -> None:
@@ -73,27 +71,21 @@ class Bridge:
 
     @property
     def records(self) -> tuple[Feedback, ...]:
-        """The newest record of each module; empty before all have sent one."""
+        """Newest record of each module; empty before all have sent one."""
         records = tuple(module.feedback for module in self.modules if module.feedback is not None)
         return records if len(records) == len(self.modules) else ()
 
-    # --- life -----------------------------------------------------------------------------------------------
-
     def connect(self) -> tuple[ActuatorInfo, ...]:
-        """Connect all modules, switch off, set everything, and check that it reads back.
-
-        Raises:
-            ActuatorError: One is not there, or does not take a setting.
-        """
+        """Connect all modules, switch off, write all settings; ActuatorError if missing or not reading back."""
         return tuple(module.connect() for module in self.modules)
 
     def prepare(self) -> str:
-        """Write all settings and the strategy for effort at zero torque before arming; return why not, or "".
+        """Write all settings and the effort strategy at zero torque before arming; return why not, or "".
 
-        A module that was without power since the last time has lost its settings, and nobody would notice. If nobody
-        arms within a second, the strategy goes off again.
+        A module that lost power has silently lost its settings. Without arming within a second the strategy goes off
+        again.
         """
-        # A drive that was disarmed in this very cycle is in force still: it ends before anything is written.
+        # A drive disarmed in this very cycle is still in force: stop it before anything is written.
         if self._driving or self.stop_pending:
             self.release()
         self.supervisor.end_stop()
@@ -107,7 +99,7 @@ class Bridge:
                 module.write_settings()
             for drive in self.drives:
                 drive.idle()
-            # Writing takes its time on a network; what is seen afterwards decides.
+            # Writing takes time on a network; only feedback from afterwards counts.
             self._turn_ns = now = self.now_ns()
             if any(module.monitor.age(now) > module.monitor.period for module in self.modules):
                 self.observe(self._timeout)
@@ -123,19 +115,19 @@ class Bridge:
         return ""
 
     def release(self) -> None:
-        """No torque, then strategy off, on every module whatever another does; never raises.
+        """Remove torque, then set strategy off, on every module whatever another does; never raises.
 
-        Modules that do not confirm it are asked again.
+        Modules that do not confirm are asked again.
         """
         self._tell(self._stop_all())
 
     def insist(self) -> None:
-        """Ask modules again that have not confirmed that they are off; never raises."""
+        """Repeat the stop for modules that have not confirmed that they are off; never raises."""
         if self._stop_again_ns is not None and self.now_ns() >= self._stop_again_ns:
             self.release()
 
     def close(self) -> None:
-        """Release and let go of all modules; never raises."""
+        """Stop and release all modules; never raises."""
         errors = self._stop_all()
         self.supervisor.disarm(self.now_ns(), "bridge closes")
         self._tell(errors)
@@ -145,16 +137,14 @@ class Bridge:
             except Exception as error:  # noqa: BLE001
                 self._note(getattr(error, "fault", "exception"))
 
-    # --- cycle ----------------------------------------------------------------------------------------------
-
     def observe(self, timeout: float) -> JointSample | None:
-        """Wait for the next new feedback and check it; on a fault all drives are released before this returns.
+        """Wait for new feedback and check it; on a fault all drives are released before this returns.
 
         Args:
             timeout: Longest time to wait for each module [s].
 
         Returns:
-            The new state of the plant, or None while a module has sent no new record.
+            New state of the plant, or None while a module has sent no new record.
         """
         for module in self.modules:
             self._look_at(module, timeout)
@@ -163,23 +153,18 @@ class Bridge:
             return None
         states = [module.state(records[index]) for index, module in enumerate(self.modules)]
         position, velocity, effort = (tuple(state[part] for state in states) for part in range(3))
-        # As old as the oldest part of it.
+        # The stamp is that of the oldest record.
         self.sample = JointSample(min(record.stamp_ns for record in records), position, velocity, effort)
         return self.sample
 
     def act(self) -> Outcome:
-        """Ask the supervisor and do what it says, now."""
+        """Carry out the supervisor's decision for now."""
         now = self.now_ns()
         was_armed = self.supervisor.mode.armed
         return self.carry_out(self.supervisor.decide(now, self.sample), was_armed=was_armed)
 
     def carry_out(self, drive: Drive, *, was_armed: bool = False) -> Outcome:
-        """Do what a decision says.
-
-        Args:
-            drive: The supervisor's decision.
-            was_armed: Whether the plant was armed before it, to count faults of the supervisor.
-        """
+        """Carry out a decision; ``was_armed`` before it, to count faults of the supervisor."""
         for index, module in enumerate(self.modules):
             push = getattr(module.port, "push", None)
             if push is not None:
@@ -189,7 +174,7 @@ class Bridge:
         if drive.kind is DriveKind.OFF or not self.records:
             return self._rest(drive, was_armed)
         if not self._all_driving:
-            # Released between preparing and arming: settings may be lost, and a fault passed unseen.
+            # Released between preparing and arming: settings may be lost, or a fault may have passed unseen.
             why = f": {self.last_fault}" if self.last_fault else ""
             self.fail("not_prepared", f"drive was released before it was armed{why}; disarm, then arm again")
             return self._ended(drive, "not_prepared")
@@ -202,7 +187,7 @@ class Bridge:
             except ActuatorError as error:
                 self.fail(error.fault, module.words(str(error)))
                 return self._ended(drive, error.fault)
-        # What is kept waits for the joint that was computed last: behind a pause it answers a state long gone.
+        # Stored setpoints wait for the last joint's computation: after a stall they belong to a state long gone.
         if not self._turn():
             return self._ended(drive, "host_stalled")
         try:
@@ -213,33 +198,26 @@ class Bridge:
         return Outcome(drive, tuple(module.effort for module in self.drives), tuple(applied))
 
     def fail(self, name: str, message: str) -> None:
-        """Release all drives at once and put the plant into the fault state.
-
-        Args:
-            name: Fault, as in :data:`pendulum_hw_bridge.drive.fault_table.FAULTS`.
-            message: What was seen.
-        """
+        """Release all drives at once and set the plant's fault state; ``name`` is one of :data:`FAULTS`."""
         armed = self.supervisor.mode.armed
         if armed or self._driving:
-            # The supervisor may be held by whoever decides meanwhile: the drives do not wait for it.
+            # Another thread may hold the supervisor's lock: the drives must not wait for it.
             errors = self._stop_all()
             self._note(name)
             self.last_fault = name
-            # Named before what a stop says that failed on top of it, which would hide it.
+            # Report this fault before a failed stop, which would hide it.
             if armed:
                 self.supervisor.fault(f"{name}: {message}", self.now_ns())
             self._tell(errors)
 
-    # --- inside ---------------------------------------------------------------------------------------------
-
     def _stop_all(self) -> list[tuple[DrivenModule, Exception]]:
-        """Stop all of them and return what some say about it, which may wait."""
+        """Stop all drives; return the errors, whose report can wait."""
         errors = [(drive, error) for drive in self.drives if (error := drive.stop()) is not None]
         self._stop_again_ns = self.now_ns() + _STOP_AGAIN_NS if errors else None
         return errors
 
     def _tell(self, errors: Sequence[tuple[DrivenModule, Exception]]) -> None:
-        """Put the plant into the fault state, since modules have not confirmed that they are off."""
+        """Set the plant's fault state, because drives have not confirmed that they are off."""
         for drive, error in errors:
             name = self._note(getattr(error, "fault", "exception"))
             self.last_fault = self.last_fault or name
@@ -252,7 +230,7 @@ class Bridge:
 
     @property
     def _timeout(self) -> float:
-        """Age of feedback that is a fault; all modules have one rate [s]."""
+        """Age at which feedback counts as lost; all modules have one rate [s]."""
         return self.modules[0].monitor.timeout
 
     @property
@@ -268,7 +246,7 @@ class Bridge:
         return self._driving or self.supervisor.mode.armed
 
     def _flush(self) -> None:
-        """Let setpoints leave that ports have kept, so that those of all go out together."""
+        """Send stored setpoints of all ports together."""
         for module in self.drives:
             flush = getattr(module.port, "flush", None)
             if flush is not None:
@@ -324,17 +302,17 @@ class Bridge:
         return records
 
     def _understand(self, module: Module, fault: Fault) -> None:
-        """Take note of what a record shows of a plant at rest, which may be why it went there."""
+        """Record a fault of a plant at rest, which may explain why driving ended."""
         if fault.name == "module_restarted":
             self._note(fault.name)
         elif fault.name == "feedback_late" and self.last_fault == "feedback_lost":
-            # Until it came, nobody could tell late from lost.
+            # Only now can late be distinguished from lost.
             self.last_fault = self._note(fault.name)
             if self.supervisor.mode is Mode.FAULT and self.supervisor.reason.startswith("feedback_lost: "):
                 self.supervisor.reason = f"{fault.name}: {module.words(fault.message)}"
 
     def _turn(self) -> bool:
-        """Take note that the bridge runs; while it drives, a pause as long as the watchdog's is a fault."""
+        """Record that the bridge runs; while it drives, a stall longer than the watchdog's time is a fault."""
         last, self._turn_ns = self._turn_ns, self.now_ns()
         pause = 0.0 if last is None else (self._turn_ns - last) / NANOSECONDS
         timeout = self._timeout
@@ -355,7 +333,7 @@ class Bridge:
         now = self.now_ns()
         if was_armed and self.supervisor.mode is Mode.FAULT:
             fault = self.last_fault = self._note("supervisor")
-        # Prepared for arming it may wait, but not behind an e-stop.
+        # Prepared for arming, it may wait, but not under an e-stop.
         waits = now <= self._prepared_until_ns and self.supervisor.mode is Mode.DISARMED
         ends = self._driving and (was_armed or not waits)
         if ends:

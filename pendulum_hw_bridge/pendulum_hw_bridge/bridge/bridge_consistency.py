@@ -1,4 +1,4 @@
-"""Parameters that are allowed one by one and wrong together."""
+"""Checks of parameters that are valid alone but wrong together."""
 
 from __future__ import annotations
 
@@ -17,24 +17,21 @@ __all__ = ["check_consistency"]
 _LEAST_RATE = 20.0
 """Feedback rate below which a pendulum falls between two records [Hz]."""
 _SLOWEST = 1.0
-"""Longest time that anything may take to be noticed, on an emulator on a busy machine [s]."""
+"""Longest detection time of any fault, on an emulator on a busy machine [s]."""
 _SLOWEST_ON_HARDWARE = 0.1
-"""The same where somebody can be hurt [s]."""
+"""The same where people can be hurt [s]."""
 _SUPPLY = (18.0, 52.0)
-"""Widest window of the supply [V]: an X5-9 takes 24 to 48 V, a battery sags below, a braking motor lifts it above."""
+"""Widest supply window [V]: an X5-9 takes 24 to 48 V, batteries sag below, braking motors lift it above."""
 _LARGEST_MEASURED = PEAK_EFFORT + 2.0
-"""Largest limit of the measured torque [N m]: the peak of an X5-9, 13 N m, with room for noise and a tare."""
+"""Largest limit of the measured torque [N m]: peak of an X5-9, with margin for noise and a tare."""
 _E_STOP_INPUT = (0.05, 1.0)
-"""Silence of a button that is taken for a press [s]: shorter, one late message of 20 a second is one; longer, whoever
-pulled its plug waits."""
+"""Silence that counts as a press [s]: at 20 Hz, below this range one late message is one; above, a cut cable is noticed
+late.
+"""
 
 
 def check_consistency(values: Mapping[str, Any], limits: PlantLimits) -> None:
-    """Refuse parameters with which a fault would act too long, or commands would lapse between two cycles.
-
-    Args:
-        values: Parameters of the bridge.
-        limits: Limits of the plant.
+    """Refuse parameters with which a fault would act too long, or commands would expire between two cycles.
 
     Raises:
         ParameterError: Names the parameter, its value and what the others allow.
@@ -75,7 +72,7 @@ def check_consistency(values: Mapping[str, Any], limits: PlantLimits) -> None:
 
 
 def _check_hardware(values: Mapping[str, Any], limits: PlantLimits) -> None:
-    """Refuse what limits nothing on an X5-9; what is too small only stops it early, which hurts nobody."""
+    """Refuse limits too large to protect an X5-9; too small ones only stop it early, which is safe."""
     where = f"with backend {values['backend']!r}"
     width = max(high - low for low, high in zip(limits.position_min, limits.position_max, strict=True))
     for name, value, largest, unit, why in (

@@ -1,4 +1,4 @@
-"""Parameters of the bridge and the objects that they make: one table for ROS, README and command line."""
+"""Parameters of the bridge (one table for ROS, README and command line), and the objects made from them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ __all__ = [
 
 POSITION_LOOP_STRATEGY = 3
 _MEASURED_EFFORT_MARGIN = 1.0
-"""Measured torque beyond the effort limit that is no fault: noise, friction, a light push [N m]."""
+"""Margin of the measured torque above the effort limit: noise, friction, a light push [N m]."""
 
 
 def _fixed(name: str, default: Any, unit: str, description: str, **domain: Any) -> ParameterSpec:
@@ -215,28 +215,24 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
     ),
     *(spec for backend in BACKENDS.values() for spec in backend.parameters),
 )
-"""Parameters of the bridge beside those that every plant has."""
+"""Parameters of the bridge, without those that every plant has."""
 
 
 def plant_of(values: Mapping[str, Any]) -> PlantParameters:
-    """Return the plant file's content; it must have a drivetrain.
-
-    Raises:
-        ParameterError: No such file, or a rigid plant.
-    """
+    """Return the plant file's content; ParameterError if missing or without a drivetrain."""
     from pendulum_hw_bridge.emulation.parameters import load_emulator
 
     return load_emulator(values["plant"]).plant
 
 
 def described_plants(values: Mapping[str, Any]) -> list[PlantParameters]:
-    """Return what the plant behind the bridge is known to be; empty where nobody says.
+    """Return the known parameters of the plant behind the bridge; empty if unknown.
 
-    An emulator in this process is what it emulates: the machine ``thesis`` also the rigid plant that the thesis's
-    experiments on it give. Any other actuator is what a plant file says; a preset is none of its measurements.
+    An emulator in this process is known; ``thesis`` also as the rigid plant that the thesis identified. For any other
+    actuator a plant file counts, but not a preset, which is not a measurement of it.
 
     Raises:
-        ParameterError: as :func:`plant_of`.
+        ParameterError: As :func:`plant_of`.
     """
     emulated = BACKENDS[values["backend"]].in_process
     if not emulated and values["plant"] in PRESETS:
@@ -250,10 +246,7 @@ def described_plants(values: Mapping[str, Any]) -> list[PlantParameters]:
 def make_port(values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False) -> ActuatorPort:
     """Return the backend that the parameters name, not connected yet.
 
-    Args:
-        values: Parameters of :data:`BRIDGE_SPECS`.
-        clock: Host clock.
-        lockstep: Whether time is simulated: feedback then comes without jitter, just before each state.
+    In ``lockstep``, time is simulated: feedback comes without jitter, just before each state.
 
     Raises:
         ParameterError: A parameter of the backend is refused.
@@ -263,11 +256,7 @@ def make_port(values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False
 
 
 def require_real_time(values: Mapping[str, Any], *, lockstep: bool) -> None:
-    """Refuse simulated time with a backend that keeps its own.
-
-    Raises:
-        ParameterError: It does.
-    """
+    """Raise ParameterError for simulated time with a backend that has its own clock."""
     if lockstep and not BACKENDS[values["backend"]].in_process:
         raise ParameterError(
             f"clock is 'lockstep' with backend {values['backend']!r}; expected backend 'emulator': others keep time"
@@ -275,11 +264,7 @@ def require_real_time(values: Mapping[str, Any], *, lockstep: bool) -> None:
 
 
 def trajectory_gains(values: Mapping[str, Any]) -> GainSet:
-    """Return the gains for trajectories.
-
-    Raises:
-        ParameterError: The gains file is refused, or is for another strategy.
-    """
+    """Return the gains for trajectories; ParameterError if the file is refused or for another strategy."""
     if not values["gains_file"]:
         return DEFAULT_GAINS[POSITION_LOOP_STRATEGY]
     gains = load_gains(values["gains_file"])
@@ -294,7 +279,7 @@ def trajectory_gains(values: Mapping[str, Any]) -> GainSet:
 def effort_mapping(
     values: Mapping[str, Any], plant: PlantParameters, gains: GainSet, limits: PlantLimits, *, joint: int = 0
 ) -> EffortMapping:
-    """Return the mapping of torque to setpoints of one of the driven joints, with the limits that it keeps."""
+    """Return the mapping of torque to setpoints of one of the driven joints, with its limits."""
     drivetrain = plant.drivetrain
     if drivetrain is None:
         raise ParameterError(f"plant {plant.name!r} has no drivetrain; expected one for the effort mapping")
@@ -316,18 +301,18 @@ def supervisor_limits(
     coordinates: Coordinates = ONE_JOINT,
     lockstep: bool = False,
 ) -> PlantLimits:
-    """Return the limits that the supervisor keeps on a plant of any number of joints.
+    """Return the supervisor's limits of a plant of any number of joints.
 
     Args:
         values: Parameters of the bridge.
-        effort_limits: Those of the driven joints in the plant file [N m or N].
+        effort_limits: Limits of the driven joints in the plant file [N m or N].
         coordinates: Joints of the plant.
         lockstep: Whether time is simulated.
 
     Raises:
         ParameterError: They contradict each other or the plant.
     """
-    # A period more than the monitor has, which names the fault; this one is behind it.
+    # One period more than the monitor's timeout: the monitor names the fault first, this one backs it up.
     patience = (values["feedback_watchdog"] + 1) / values["feedback_rate"]
     return limits_from_parameters(
         values, effort_limits, coordinates=coordinates, lockstep=lockstep, feedback_timeout=patience
@@ -342,14 +327,14 @@ def bridge_settings(
     gains: GainSet,
     window: tuple[float, float] = (-math.inf, math.inf),
 ) -> BridgeSettings:
-    """Return what to set in the actuator.
+    """Return the settings of the actuator.
 
     Args:
         values: Parameters of :data:`BRIDGE_SPECS`.
         effort: Effort limit of the plant [N m].
         velocity: Velocity limit of the plant [rad/s].
         gains: For trajectories.
-        window: Angles between which the joint must stay [rad].
+        window: Allowed joint angles [rad].
 
     Raises:
         ParameterError: ``joint_sign`` is zero, or a limit is refused.
@@ -376,15 +361,7 @@ def bridge_settings(
 
 
 def safety_limits(values: Mapping[str, Any], effort: float) -> SafetyLimits:
-    """Return the limits of the feedback checks.
-
-    Args:
-        values: Parameters of :data:`BRIDGE_SPECS`.
-        effort: Effort limit of the plant [N m].
-
-    Raises:
-        ParameterError: ``voltage_window`` is not a window.
-    """
+    """Return the limits of the feedback checks, for an effort limit [N m]; ParameterError for a malformed window."""
     window = values["voltage_window"]
     if len(window) != 2:
         raise ParameterError(f"voltage_window has {len(window)} values; expected [low, high] in V")

@@ -1,4 +1,4 @@
-"""A plant of several joints on HEBI modules: what each joint's parameters make of its part of the group."""
+"""Assembly of a plant of several joints on a group of HEBI modules."""
 
 from __future__ import annotations
 
@@ -34,11 +34,7 @@ OF_GROUPS = {
 
 
 def refuse_slides(coordinates: Coordinates) -> None:
-    """Refuse a plant that modules, which turn, cannot drive or measure.
-
-    Raises:
-        ParameterError: A joint slides.
-    """
+    """Raise ParameterError if a joint slides: modules only turn."""
     for joint in coordinates.joints:
         if joint.unit != "rad":
             raise ParameterError(
@@ -48,7 +44,7 @@ def refuse_slides(coordinates: Coordinates) -> None:
 
 
 class GroupAssembly:
-    """Modules of a plant's joints, all of one HEBI group.
+    """Modules of a plant's joints, in one HEBI group.
 
     Args:
         values: Parameters of the bridge.
@@ -67,11 +63,11 @@ class GroupAssembly:
         self._plant = load_emulator(values["drivetrain"]).plant
         self._gains = bridge_parameters.trajectory_gains(values)
         self.mappings = [self._mapping(driven) for driven in range(len(coordinates.driven))]
-        # Made here as well, so that a refused parameter ends the process with its sentence.
+        # Made here too, so that a refused parameter ends the process with its message.
         self.modules(None)
 
     def modules(self, clock: Clock | None) -> list[Module]:
-        """Return the modules on a host clock, not connected yet; without one, modules that nobody connects."""
+        """Return the modules on a host clock, not connected yet; None for a check of the parameters."""
         values, coordinates = self._values, self._coordinates
         selections = map(ModuleSelection.of, self._joints)
         shared = HebiGroup(
@@ -97,7 +93,7 @@ class GroupAssembly:
             gains=self._gains,
             window=(limits.position_min[index], limits.position_max[index]),
         )
-        # As the bridge of one module reckons: the rate is told in whole nanoseconds.
+        # As for one module, whose rate is rounded to whole nanoseconds.
         period = round(NANOSECONDS / own["feedback_rate"]) / NANOSECONDS
         safety = bridge_parameters.safety_limits(own, effort)
         if driven is None:
@@ -113,7 +109,7 @@ class GroupAssembly:
 
 
 def _of_joint(values: Mapping[str, Any], coordinates: Coordinates, index: int) -> dict[str, Any]:
-    """Return the bridge's parameters with those of one joint under the names that one module has."""
+    """Return the bridge's parameters with those of one joint under their names for a single module."""
     own = dict(values)
     for several, one in OF_GROUPS.items():
         given, joints = values[several], coordinates.names

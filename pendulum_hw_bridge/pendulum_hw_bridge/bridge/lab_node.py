@@ -1,4 +1,4 @@
-"""The lab file as parameters of a node: what it says is the default, what is given beside it wins and is told."""
+"""The lab file as defaults of a node's parameters; explicit parameters take precedence and are logged."""
 
 from __future__ import annotations
 
@@ -18,10 +18,7 @@ __all__ = ["specs_of"]
 
 
 def specs_of(node: Node) -> tuple[ParameterSpec, ...]:
-    """Return the bridge's parameters, with the defaults that the plant, the backend and the lab file of a node give.
-
-    Args:
-        node: The node; none of them is declared yet.
+    """Return the bridge's parameters with defaults from the plant, backend and lab file of a node without any declared.
 
     Raises:
         ParameterError: There is no such plant, or the lab file is refused.
@@ -45,7 +42,7 @@ def specs_of(node: Node) -> tuple[ParameterSpec, ...]:
 
 
 def _read(path: str, specs: Iterable[ParameterSpec]) -> dict[str, Any]:
-    """Return the values of a lab file by parameter, each checked by the table of the bridge's parameters."""
+    """Return the values of a lab file by parameter, each checked by the table of parameters."""
     table = {spec.name: spec for spec in specs}
     places = {e.parameter: f"{section}.{name}" for section, es in LAB_ENTRIES.items() for name, e in es.items()}
     values = {}

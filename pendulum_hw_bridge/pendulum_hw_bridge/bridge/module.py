@@ -1,7 +1,7 @@
-"""One module under the bridge: what it measures, what is set in it, and which strategy is in force.
+"""One module of the bridge: feedback, settings and strategy.
 
-A :class:`Module` is only read, as the encoder of a passive joint: it has no way to give torque. A
-:class:`DrivenModule` has a motor too. Torque leaves it in one place, ``send``, where it is bounded.
+A :class:`Module` is read-only, as the encoder of a passive joint. A :class:`DrivenModule` has a motor too; all torque
+passes through its ``send``, which limits it.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ TRAJECTORY_STRATEGY = Strategy.PARALLEL_PWM
 
 
 class Module:
-    """A module that is only read.
+    """A read-only module.
 
     Args:
-        port: Where its records come from.
-        monitor: Checks of them.
-        settings: What to set in it, and how its angle becomes that of the joint.
-        joint: Name of its joint, for messages; empty where it is the only one.
+        port: Source of its records.
+        monitor: Checks of its feedback.
+        settings: Its settings, and the conversion of its angle to that of the joint.
+        joint: Name of its joint, for messages; empty for a single module.
 
     Attributes:
-        info: What it said of itself when it was connected.
-        feedback: Its newest record.
+        info: Properties reported when it was connected.
+        feedback: Newest record.
         fresh: Whether that record is in no state of the plant yet.
     """
 
@@ -56,33 +56,25 @@ class Module:
         self.fresh = False
 
     def connect(self) -> ActuatorInfo:
-        """Connect, set everything, and check that it reads back.
-
-        Raises:
-            ActuatorError: The module is not there, or does not take a setting.
-        """
+        """Connect and write all settings; ActuatorError if the module is missing or a setting does not read back."""
         self.port.connect()
         self.write_settings()
         self.info = self.port.connect()
         return self.info
 
     def write_settings(self) -> None:
-        """Write all settings, and refuse a module that does not keep each of them.
-
-        Raises:
-            ActuatorError: It does not.
-        """
+        """Write all settings; ActuatorError unless each reads back."""
         write_rate(self.port, self.settings)
 
     def take(self, feedback: Feedback) -> Fault | None:
-        """Keep a new record; return the first fault that it shows, or None."""
+        """Store a new record; return its first fault, or None."""
         fault = self.monitor.check(feedback)
         self.feedback = feedback
         self.fresh = True
         return fault
 
     def state(self, feedback: Feedback) -> tuple[float, float, float]:
-        """Return a record's position, velocity and effort as those of the joint [rad, rad/s, N m, or of a slide]."""
+        """Return a record's position, velocity and effort in joint coordinates [rad, rad/s, N m; or m, m/s, N]."""
         sign = self.settings.joint_sign
         return (
             sign * feedback.position + self.settings.joint_offset,
@@ -91,21 +83,12 @@ class Module:
         )
 
     def words(self, message: str) -> str:
-        """Return a message with the joint that it is about, where there are several."""
+        """Return a message with the joint's name, if there are several."""
         return f"{self.joint}: {message}" if self.joint else message
 
 
 class DrivenModule(Module):
-    """A module with a motor.
-
-    Args:
-        port: The actuator.
-        mapping: Torque to setpoint.
-        monitor: Checks of the feedback.
-        settings: What to set in the actuator.
-        joint: Name of its joint, for messages; empty where it is the only one.
-        check: Kind of the check that the output is what was asked for.
-    """
+    """A module with a motor; ``mapping`` converts torque to setpoints, ``check`` is the class of its output check."""
 
     port: ActuatorPort
 
@@ -137,15 +120,11 @@ class DrivenModule(Module):
 
     @property
     def effort(self) -> float:
-        """Torque at the joint that the setpoints in force stand for, after all limits [N m]."""
+        """Joint torque of the setpoints in force, after all limits [N m]."""
         return self.settings.joint_sign * self._effort
 
     def connect(self) -> ActuatorInfo:
-        """Connect, switch off, set everything, and check that it reads back.
-
-        Raises:
-            ActuatorError: The actuator is not there, or does not take a setting.
-        """
+        """Connect, switch off, write all settings; ActuatorError if missing or a setting does not read back."""
         self.port.connect()
         self._confirm(self.port.set_strategy(Strategy.OFF), Strategy.OFF)
         self._strategy = Strategy.OFF
@@ -154,48 +133,35 @@ class DrivenModule(Module):
         return self.info
 
     def write_settings(self) -> None:
-        """Write all settings, the gains limited, and refuse a module that does not keep each of them.
-
-        Raises:
-            ActuatorError: It does not.
-        """
+        """Write all settings, with limited gains; ActuatorError unless each reads back."""
         self._output.gains = self.mapping.limited_gains(self._motor.state.voltage)
         write_settings(self.port, self.settings, self._output.gains)
 
     def take(self, feedback: Feedback) -> Fault | None:
-        """Keep a new record; return the first fault that it shows, or None."""
+        """Store a new record; return its first fault, or None."""
         fault = super().take(feedback)
         self._motor.update(feedback)
         return fault
 
     def idle(self) -> None:
-        """Put the strategy for effort in force, at zero torque.
-
-        Raises:
-            ActuatorError: It cannot be sent, or does not read back.
-        """
+        """Set the effort strategy at zero torque; ActuatorError if that fails or does not read back."""
         self.send(self.mapping.strategy, no_torque(self.mapping.strategy))
 
     def carry_out(self, drive: Drive, index: int, feedback: Feedback) -> Applied:
-        """Send what a decision says for one of the driven joints.
-
-        Args:
-            drive: The supervisor's decision.
-            index: Which of the driven joints this one is.
-            feedback: The newest record.
+        """Send a decision's setpoints for driven joint ``index``; ``feedback`` is the newest record.
 
         Raises:
-            ActuatorError: It cannot be sent, or the strategy does not read back.
+            ActuatorError: Sending failed, or the strategy does not read back.
         """
         applied = self.send(*self._setpoints(drive, index, feedback))
         self._effort = self.mapping.effort_of(applied.command, self._motor.state, feedback.pwm_command)
         return applied
 
     def send(self, strategy: Strategy, command: Command) -> Applied:
-        """Send setpoints, bounded, and change the strategy with them where another is in force.
+        """Send limited setpoints, with a change of strategy if another is in force.
 
         Raises:
-            ActuatorError: They cannot be sent, or the strategy does not read back.
+            ActuatorError: Sending failed, or the strategy does not read back.
         """
         command = self.mapping.bounded(command, self._motor.state)
         now = self.port.now_ns()
@@ -209,9 +175,9 @@ class DrivenModule(Module):
         return applied
 
     def stop(self) -> Exception | None:
-        """No torque, then strategy off; return why the module has not confirmed it, never raise."""
+        """Remove torque, then set strategy off; return why the module has not confirmed it, never raise."""
         self._strategy = Strategy.OFF
-        # No torque is in force any more: the next hand-over must not begin with that of an earlier drive.
+        # No torque is in force any more: the next handover must not start with that of an earlier drive.
         self._effort = self._handover_left = 0.0
         self.monitor.stopped()
         try:
@@ -230,11 +196,11 @@ class DrivenModule(Module):
                 return mapping.strategy, no_torque(mapping.strategy)
             return mapping.strategy, mapping.command(sign * drive.effort[index], self._motor.state)
         if drive.handover > self._handover_left:
-            # The torque in force passes on with the speed that the link has: neither the setpoints' nor zero.
+            # The handover takes over the torque in force at the link's present speed, not at the setpoint's or zero.
             self._handover = mapping.handover(self._effort, feedback.pwm_command, feedback.velocity, self._motor.state)
         self._handover_left = drive.handover
         offset, speed = self._handover
-        # A duty that stands still while a setpoint moves is stuck: even in hold the setpoint moves, by less than shows.
+        # A constant duty under a moving setpoint is stuck: so the setpoint moves even in hold, invisibly little.
         self._dither = -self._dither
         velocity = sign * drive.velocity[index]
         place = sign * (drive.position[index] - self.settings.joint_offset)

@@ -1,4 +1,4 @@
-"""All parameters of the bridge's node: its own, and those of every plant with the defaults that a machine needs."""
+"""All parameters of the bridge's node: its own, and those of every plant with defaults for a machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _HARDWARE_DEFAULTS: dict[str, ParameterValue] = {
     "starvation_limit": 30.0,
     "realtime_priority": -1,
 }
-"""What a simulated plant can do without and a real one cannot."""
+"""Limits that a real plant needs and a simulated one does not."""
 
 SPECS: tuple[ParameterSpec, ...] = (
     *BRIDGE_SPECS,

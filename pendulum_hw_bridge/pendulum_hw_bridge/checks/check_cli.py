@@ -29,9 +29,9 @@ from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 __all__ = ["main"]
 
 EXIT_NOT_READY = 1
-"""Exit code where an item of the checklist is not as it should be."""
+"""Exit code if an item of the checklist fails."""
 EXIT_BUSY = 3
-"""Exit code where this computer was too busy to judge the actuator, and nothing else was wrong."""
+"""Exit code if this computer was too busy to judge the actuator, and nothing else failed."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 

@@ -1,4 +1,4 @@
-"""A line of the checklist, and the list of them."""
+"""Items of the checklist."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from pendulum_msgs_py.errors import PendulumError
 __all__ = ["HOST_ITEM", "CheckItem", "Checklist", "error_item"]
 
 HOST_ITEM = "this computer keeps time"
-"""Name of the line that is not about the actuator."""
+"""Name of the one item that is not about the actuator."""
 
 
 @dataclass(frozen=True)
 class CheckItem:
-    """One line of the checklist.
+    """One item of the checklist.
 
     Attributes:
         name: What was checked.
-        passed: Whether it is as it should be; None where it could not be judged, or was not tried.
-        seen: What was seen, with unit.
-        expected: What should be.
-        hint: What to do about it where it has not passed, a sentence or nothing.
+        passed: Whether it passed; None if not judged or not tried.
+        seen: Measured value, with unit.
+        expected: Expected value.
+        hint: What to do if it has not passed, a sentence or nothing.
     """
 
     name: str
@@ -33,16 +33,16 @@ class CheckItem:
 
 
 def error_item(error: PendulumError) -> CheckItem:
-    """Return the line of an error that ended the check of a module."""
+    """Return the item of an error that ended the check of a module."""
     return CheckItem(error.fault if isinstance(error, ActuatorError) else "parameter", False, str(error), "no error")
 
 
 @dataclass
 class Checklist:
-    """The checklist, gone through.
+    """Results of the checklist.
 
     Attributes:
-        items: The lines.
+        items: Items in order.
         figures: Rate [Hz], jitter, latencies and loss, by name with unit.
         host_busy: Whether this computer was too busy to judge the actuator's timing.
     """
@@ -53,15 +53,15 @@ class Checklist:
 
     @property
     def ready(self) -> bool:
-        """Whether nothing speaks against arming."""
+        """Whether arming is permitted."""
         return not self.host_busy and not self.refused
 
     @property
     def refused(self) -> bool:
-        """Whether something is wrong that is not this computer's being busy."""
+        """Whether an item failed for another reason than this computer being busy."""
         return any(item.passed is False and item.name != HOST_ITEM for item in self.items)
 
     @property
     def untried(self) -> list[str]:
-        """Lines that were not tried."""
+        """Names of items that were not tried."""
         return [item.name for item in self.items if item.passed is None]

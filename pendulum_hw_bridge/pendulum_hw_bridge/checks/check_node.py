@@ -1,4 +1,4 @@
-"""What the bridge would be told on the same command line, read as the bridge itself reads it, for the checklist."""
+"""Parameters and modules for the checklist, from the command line as the bridge reads it."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def bridge_values(ros_arguments: Sequence[str], given: Mapping[str, graph.Parame
     """Return the parameters that the bridge would have.
 
     Args:
-        ros_arguments: ``--ros-args`` and what follows: parameters, files of parameters, names.
-        given: Further parameters, which win.
+        ros_arguments: ``--ros-args`` and the arguments after it.
+        given: Further parameters, which take precedence.
 
     Raises:
         ParameterError: A parameter, a file or the lab file is refused.
@@ -44,7 +44,7 @@ def bridge_values(ros_arguments: Sequence[str], given: Mapping[str, graph.Parame
     except Exception as error:
         raise ParameterError(f"ROS arguments are not understood: {' '.join(str(error).split())}") from error
     try:
-        # Nobody talks to it: it only reads, under the bridge's own name, what the bridge would read.
+        # This node only reads parameters, under the bridge's own name.
         node = Node("bridge", context=context, start_parameter_services=False, enable_rosout=False)
         try:
             return NodeParameters(node, specs_of(node)).values

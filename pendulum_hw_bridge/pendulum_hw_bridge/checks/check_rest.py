@@ -1,4 +1,4 @@
-"""What a pendulum at rest tells of its mounting: where zero is, what hangs there, which way is counter-clockwise."""
+"""Checks of the mounting of a pendulum at rest: zero, load and sign."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def rest_items(
     window: tuple[float, float],
     hangs: bool,
 ) -> list[CheckItem]:
-    """Judge angle and torque of a pendulum at rest: it hangs at zero, and carries what hangs at that angle."""
+    """Check angle and torque of a pendulum at rest: hanging is zero, and the torque is that of its weight."""
     sign = settings.joint_sign
     angle = sign * float(np.mean([record.position for record in records])) + settings.joint_offset
     torque = sign * float(np.mean([record.effort for record in records])) - settings.effort_tare
@@ -77,7 +77,7 @@ def _friction_angle(plant: PlantParameters) -> float:
 def sign_item(
     port: ActuatorPort, settings: BridgeSettings, hand: Hand | None, progress: Callable[[str], None]
 ) -> CheckItem:
-    """Judge by a nudge whether counter-clockwise is positive; without a hand it stays untried."""
+    """Check by a nudge whether counter-clockwise is positive; untried without a hand."""
     name, expected = "counter-clockwise is positive", "the angle grows"
     if hand is None:
         return CheckItem(name, None, "not tried", expected, "try it without --no-nudge")

@@ -1,9 +1,8 @@
-"""How regularly an actuator's feedback comes, and whom to blame where it does not: the actuator or this computer.
+"""Timing of an actuator's feedback, and whether the actuator or this computer causes irregularities.
 
-Each record bears two times: the module's own, when it was measured, and ours, when it arrived. The module's times say
-whether the module is regular and what was lost; ours, less theirs, how long the way took; and a pulse of our own, which
-asks to be woken every 2 ms, whether this computer could have noticed at all. So does whoever reads: a thread that has
-worked waits longer for its turn than one that slept, and what it misses looks like a module's gap.
+The module's stamps show its regularity and losses; host stamps less module stamps, the transport time. A thread that
+wakes every 2 ms shows whether this computer could have noticed, and so does the reader: a thread that has worked waits
+longer for its turn than one that slept, and the records that it misses look like a module's gap.
 """
 
 from __future__ import annotations
@@ -22,26 +21,26 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 __all__ = ["PULSE", "HostWatch", "Punctuality", "TimingFigures", "measure"]
 
 PULSE = 0.002
-"""Time for which a pulse sleeps, and a reader waits for a record, at most [s]."""
+"""Longest sleep of the watching thread and longest wait of a reader [s]."""
 _LOST_GAP = 1.5
-"""Distance of two records from which on one is missing between them, in periods [-]."""
+"""Interval from which a record is missing in between, in periods [-]."""
 
 
 class Punctuality(Protocol):
-    """Measures how late this computer wakes who asked for it."""
+    """Measures how late this computer wakes threads."""
 
     def start(self) -> None:
         """Begin."""
 
     def poll(self) -> None:
-        """Note that whoever reads is awake, which asked to be by the end of a pulse after it was last."""
+        """Record that the reader is awake, which it should be within a pulse of the previous call."""
 
     def stop(self) -> Sequence[float]:
-        """End, and return how late each waking was [s]."""
+        """End, and return the lateness of each waking [s]."""
 
 
 class HostWatch:
-    """A thread that asks to be woken every 2 ms, and notes how late it was; so it does for whoever reads."""
+    """Measures the lateness of a thread that wakes every 2 ms, and of the reader."""
 
     def __init__(self) -> None:
         self._stopping = threading.Event()
@@ -58,14 +57,14 @@ class HostWatch:
         self._thread.start()
 
     def poll(self) -> None:
-        """Note that whoever reads is awake."""
+        """Record that the reader is awake."""
         now, before = time.monotonic(), self._looked
         self._looked = now
         if before is not None:
             self._late.append(max(0.0, now - before - PULSE))
 
     def stop(self) -> Sequence[float]:
-        """End, and return how late each waking was [s]."""
+        """End, and return the lateness of each waking [s]."""
         self._stopping.set()
         if self._thread is not None:
             self._thread.join()
@@ -80,18 +79,18 @@ class HostWatch:
 
 @dataclass(frozen=True)
 class TimingFigures:
-    """Figures of one stretch of feedback.
+    """Timing of a stretch of feedback.
 
     Attributes:
-        records: How many came [-].
+        records: Number received [-].
         rate: By the module's clock [Hz].
         jitter: Standard deviation of the period, by the module's clock [s].
         longest_gap: Between two records, by the module's clock [s].
-        missing: How many never came [-].
-        way_p99: Time on the way beyond that of the fastest, 99th percentile [s].
+        missing: Number of lost records [-].
+        way_p99: Transport time beyond the shortest, 99th percentile [s].
         way_worst: The longest [s].
-        host_p99: How late this computer wakes, 99th percentile [s].
-        host_worst: The latest [s].
+        host_p99: Lateness of this computer's wakings, 99th percentile [s].
+        host_worst: The largest [s].
     """
 
     records: int
@@ -106,17 +105,17 @@ class TimingFigures:
 
     @property
     def lost(self) -> float:
-        """Share of records that never came [-]."""
+        """Share of lost records [-]."""
         return self.missing / (self.missing + self.records)
 
 
 def measure(records: Sequence[Feedback], period: float, lateness: Sequence[float]) -> TimingFigures:
-    """Return the figures of a stretch of feedback.
+    """Return the timing of a stretch of feedback.
 
     Args:
-        records: At least two, in their order.
+        records: At least two, in order.
         period: Nominal period [s].
-        lateness: How late this computer woke in the meantime [s]; empty where time is simulated.
+        lateness: Lateness of this computer's wakings [s]; empty in simulated time.
     """
     measured = np.array([record.hardware_ns for record in records], dtype=np.int64)
     way = np.array([record.stamp_ns for record in records], dtype=np.int64) - measured
@@ -124,7 +123,7 @@ def measure(records: Sequence[Feedback], period: float, lateness: Sequence[float
     way = (way - way.min()) / NANOSECONDS
     missing = int(np.sum(np.maximum(0, np.rint(gaps[gaps > _LOST_GAP * period] / period) - 1)))
     span = float(gaps.sum())
-    # What got lost does not make the module slow: its period is that of the neighbours that both came.
+    # Lost records must not count as jitter: use the intervals of neighbours only.
     whole = gaps[gaps <= _LOST_GAP * period]
     regular = whole if whole.size else gaps
     late = np.asarray(lateness if len(lateness) else [0.0])

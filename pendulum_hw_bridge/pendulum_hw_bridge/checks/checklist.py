@@ -1,6 +1,6 @@
-"""The checklist that a lab goes through before it arms: every item measured or read back, none assumed.
+"""Checklist before arming: every item is measured or read back, none assumed.
 
-It is judged by the settings and limits with which the bridge would drive, and by the bridge's own checks of feedback.
+It uses the settings and limits with which the bridge would drive, and the bridge's own checks of feedback.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ __all__ = [
 
 _LISTEN = 1.0
 _LISTEN_TO_LOSSES = 5.0
-"""Time to listen for once records were lost: one of 98 is more than 1 %, and says little of the next hundred [s]."""
+"""Listening time after losses: one of 98 records is more than 1 %, but a poor estimate [s]."""
 _STRETCHES = 5
-"""Stretches of listening until one is found in which this computer keeps time [-]."""
+"""Attempts to find a stretch in which this computer is punctual [-]."""
 _AT_REST = 0.05
 _MAX_JITTER = 0.25
 _MAX_LOST = 0.01
 _LOSS_ITEM = "no feedback gets lost"
 _PUNCTUAL = (0.25, 1.0)
-"""How late this computer may wake for the actuator to be blamed: 99 % of the times, and ever, in periods [-]."""
+"""Lateness of this computer up to which the actuator is judged: 99th percentile and largest, in periods [-]."""
 _ACKNOWLEDGEMENTS = 20
 
 
@@ -72,18 +72,18 @@ def run_checklist(
     host: Punctuality | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Checklist:
-    """Go through the checklist; the motor never gets another duty than zero, and is off at the end.
+    """Run the checklist; the duty is always zero, and the motor is off at the end.
 
     Args:
-        port: The actuator, not connected yet.
-        settings: What the bridge would set.
+        port: Actuator, not connected yet.
+        settings: Settings that the bridge would write.
         limits: Limits of the feedback.
-        plant: Link and drivetrain: how much torque hangs at which angle, and how far friction may hold it off zero.
-        window: Angles between which the pendulum must be, in joint coordinates [rad].
-        hand: Who nudges the link, for its sign; None leaves the sign untried.
+        plant: Weight and friction of link and drivetrain.
+        window: Allowed joint angles [rad].
+        hand: Nudges the link to test the sign; None leaves the sign untried.
         hangs: Whether the pendulum hangs; False for one that lies flat.
-        host: Measures how late this computer wakes; by default on the wall clock.
-        progress: Called with what is being done.
+        host: Measures lateness of this computer; by default on the wall clock.
+        progress: Called with a text before each step.
     """
     found = Checklist()
     items = found.items
@@ -119,14 +119,14 @@ def run_checklist(
 
 
 def identity(info: ActuatorInfo) -> str:
-    """Return who answers, in words."""
+    """Return the actuator's identity as text."""
     serial = f", serial {info.serial}" if info.serial else ""
     firmware = f", firmware {info.firmware}" if info.firmware else ""
     return f"{info.backend} {info.family}/{info.name}{serial}{firmware}"
 
 
 def setting_items(port: ActuatorPort, settings: BridgeSettings, mapping: EffortMapping | None) -> list[CheckItem]:
-    """Write all settings, and judge whether each reads back; with the mapping, what the motor makes at the limit."""
+    """Write all settings and check that each reads back; with the mapping, report the torque at the limit."""
     lifetime = port.set_command_lifetime(settings.command_lifetime)
     rate = port.set_feedback_rate(settings.feedback_rate)
     limits, joint = port.set_limits(settings.limits), settings.limits.joint
@@ -158,7 +158,7 @@ def setting_items(port: ActuatorPort, settings: BridgeSettings, mapping: EffortM
 
 
 def acknowledgement_item(port: ActuatorPort, settings: BridgeSettings, found: Checklist) -> CheckItem:
-    """Judge how long the module takes to answer that it is off."""
+    """Check how long the module takes to acknowledge that it is off."""
     times = []
     for _ in range(_ACKNOWLEDGEMENTS):
         start = port.now_ns()
@@ -182,9 +182,9 @@ def listen(
     found: Checklist,
     progress: Callable[[str], None],
 ) -> list[Feedback]:
-    """Listen until a stretch is found in which this computer kept time, and judge that; a busy moment passes.
+    """Listen until this computer is punctual during a stretch, and check the timing of that one.
 
-    Where nothing is wrong but that records are missing, their share is judged together with a longer stretch.
+    If losses are the only failure, a longer stretch is added before judging their share.
     """
     period, seconds, again = 1.0 / settings.feedback_rate, _LISTEN, ""
     before: TimingFigures | None = None
@@ -203,7 +203,7 @@ def listen(
         lines = _timing(figures, settings, limits)
         late = figures.host_p99 > _PUNCTUAL[0] * period or figures.host_worst > _PUNCTUAL[1] * period
         refused = [line.name for line in lines if not line.passed]
-        # Regular feedback on a late computer is regular; only irregular feedback needs somebody to blame.
+        # On a late computer, regular feedback is still regular; only irregular feedback cannot be judged.
         found.host_busy = late and bool(refused)
         if found.host_busy:
             again = " again: this computer was busy"
@@ -238,7 +238,7 @@ def _stretch(port: EncoderPort, host: Punctuality, seconds: float) -> tuple[list
                 records.append(record)
     finally:
         lateness = host.stop()
-    # What waited since before belongs to no stretch.
+    # The first record waited since before the stretch.
     return records[1:], lateness
 
 
@@ -287,7 +287,7 @@ def _timing(figures: TimingFigures, settings: BridgeSettings, limits: SafetyLimi
 
 
 def monitor_item(records: Sequence[Feedback], monitor: SafetyMonitor) -> CheckItem:
-    """Let the bridge's own monitor look at what came: what it would fault on is no state to arm in."""
+    """Check that the bridge's own monitor finds no fault in the records."""
     for record in records:
         fault = monitor.check(record) if monitor.is_new(record) else None
         if fault is not None:
@@ -298,13 +298,13 @@ def monitor_item(records: Sequence[Feedback], monitor: SafetyMonitor) -> CheckIt
 def state_items(
     records: list[Feedback], limits: SafetyLimits, joint: Joint = ONE_JOINT.joints[0], name: str = "pendulum"
 ) -> list[CheckItem]:
-    """Judge what a module tells of itself while nobody drives it.
+    """Check the state of a module at rest.
 
     Args:
-        records: What it told.
+        records: Its feedback.
         limits: Limits of the feedback.
-        joint: Its joint, whose units the lines have.
-        name: What is at rest.
+        joint: Its joint, for units.
+        name: Name of what is at rest.
     """
     last = records[-1]
     finite = all(
@@ -348,14 +348,14 @@ def state_items(
 
 
 def strategy_item(port: ActuatorPort, strategy: Strategy, name: str) -> CheckItem:
-    """Judge whether a strategy can be set, at no torque, and switch it off again."""
+    """Check that a strategy can be set without torque, and switch it off again."""
     reads = port.set_strategy(strategy)
     port.stop()
     return CheckItem(name, reads is strategy, reads.name, strategy.name)
 
 
 def _name(kind: type[IntEnum], number: int) -> str:
-    """Return a state in words; one that a newer firmware may have added stays a number."""
+    """Return a state in words; unknown ones of newer firmware as a number."""
     return kind(number).name.lower() if number in [int(state) for state in kind] else f"unknown ({number})"
 
 

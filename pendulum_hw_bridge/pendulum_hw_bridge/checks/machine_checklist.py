@@ -1,6 +1,6 @@
-"""The checklist of a machine of several modules: the lines of one module for each joint, by the joints' names.
+"""Checklist of a machine of several modules: the items of one module for each joint.
 
-A driven joint is set, read back, listened to, and tried at no effort; a passive joint is only read.
+Drives are set, read back, listened to, and tried at zero effort; encoders of passive joints are only read.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["names_problem", "run_machine_checklist"]
 
 _LEAST_ZERO_TOLERANCE = 0.15
-"""Distance from zero at which a link still hangs [rad]."""
+"""Tolerance of the zero of a hanging link [rad]."""
 _EFFORT_TOLERANCE = 0.05
-"""Mean effort of a drive that is off, as a share of its limit [-]."""
+"""Tolerance of the mean effort of a drive that is off, as a share of its limit [-]."""
 
 
 def run_machine_checklist(
@@ -46,16 +46,16 @@ def run_machine_checklist(
     host: Callable[[], Punctuality] = HostWatch,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Checklist:
-    """Go through the checklist; no motor gets an effort, and all are off at the end.
+    """Run the checklist; no motor gets an effort, and all are off at the end.
 
-    Where modules are not those of the joints, nothing is set in any of them.
+    If modules do not match the joints, nothing is set in any of them.
 
     Args:
         modules: One for each joint, in the plant's order, not connected yet.
         parameters: The plant.
-        windows: Positions between which each joint must be [rad or m].
-        host: Makes what measures how late this computer wakes.
-        progress: Called with what is being done.
+        windows: Allowed positions of each joint [rad or m].
+        host: Makes a measurement of this computer's lateness.
+        progress: Called with a text before each step.
     """
     found = Checklist()
     try:
@@ -79,12 +79,7 @@ def run_machine_checklist(
 
 
 def names_problem(reported: Sequence[str], joints: Sequence[str]) -> str:
-    """Return in words why modules are not those of the joints, one for each and in their order; empty where they are.
-
-    Args:
-        reported: What each module says that it is called.
-        joints: Names of the joints.
-    """
+    """Return why reported module names differ from those of the joints or their order; empty if they match."""
     problems = [f"{name} is there {count} times" for name, count in Counter(reported).items() if count > 1]
     problems += [f"{name} is missing" for name in joints if name not in reported]
     problems += [f"{name} is no joint of this plant" for name in dict.fromkeys(reported) if name not in joints]
@@ -163,7 +158,7 @@ def _rest_items(
     parameters: PlantParameters,
     window: tuple[float, float],
 ) -> list[CheckItem]:
-    """Judge position and effort of a joint that nobody drives."""
+    """Check position and effort of a joint at rest."""
     joint, own = parameters.coordinates.joints[index], parameters.joints[index]
     position, _, effort = (float(value) for value in np.mean([module.state(record) for record in records], axis=0))
     items = [
@@ -200,7 +195,7 @@ def _rest_items(
 
 
 def _largest_weight(parameters: PlantParameters, index: int, joint: Joint) -> float:
-    """Return the largest torque of gravity about a hinge, the others at 0; 0 where none acts or it slides [N m]."""
+    """Return the largest gravity torque about a hinge, other joints at 0; 0 for a slide [N m]."""
     if joint.unit == "m":
         return 0.0
     step, packed, potential = 1e-4, parameters.packed, parameters.mechanism.potential
@@ -224,7 +219,7 @@ def _add(found: Checklist, part: Checklist, joint: str) -> None:
 
 
 def _judge_host_once(found: Checklist) -> None:
-    """Keep one line about this computer: the first that says that it was too busy, or else the first."""
+    """Reduce the items on this computer to one: the first failed, else the first."""
     lines = [item for item in found.items if item.name == HOST_ITEM]
     if lines:
         kept = next((line for line in lines if not line.passed), lines[0])

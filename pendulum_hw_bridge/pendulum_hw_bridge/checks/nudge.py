@@ -1,6 +1,6 @@
-"""Which way is counter-clockwise: a hand turns the link a little, and the joint angle has to grow.
+"""Sign of a joint: a hand turns the link a little counter-clockwise, and the joint angle must grow.
 
-No torque is needed, and nothing else tells: a pendulum with mirrored angle and torque obeys the same equation.
+Only this reveals the sign: a pendulum with mirrored angle and torque obeys the same equation. No torque is needed.
 """
 
 from __future__ import annotations
@@ -15,43 +15,38 @@ from pendulum_hw_bridge.port.feedback_stream import feedback_for
 __all__ = ["EMULATED_NUDGE", "NUDGE_ANGLE", "EmulatedHand", "Hand", "Person", "hand_of", "watch_nudge"]
 
 NUDGE_ANGLE = 0.1
-"""Turn that counts as a nudge [rad]; six degrees, far above what a touch does."""
+"""Rotation that counts as a nudge [rad]: six degrees, far more than a touch."""
 EMULATED_NUDGE = 6.0
 """Torque of the emulated hand [N m]: half a rad/s against the shorted winding."""
 _PATIENCE = 30.0
 
 
 class Hand(Protocol):
-    """Who turns the link."""
+    """Turns the link."""
 
     def begin(self) -> None:
-        """Begin to turn."""
+        """Start turning."""
 
     def end(self, *, seen: bool = True) -> None:
-        """Let go; the turn was seen or not."""
+        """Release; ``seen`` if the rotation was detected."""
 
 
 @dataclass
 class Person:
-    """A person, who is asked in words.
-
-    Attributes:
-        say: Shows a sentence.
-        way: Which way they shall turn it.
-    """
+    """A person, prompted through ``say`` to turn the link in direction ``way``."""
 
     say: Callable[[str], None]
     way: str = "COUNTER-CLOCKWISE"
 
     def begin(self) -> None:
-        """Ask for it."""
+        """Show the prompt."""
         self.say(
             f"The motor gets no torque. Turn the link by hand, slowly, a little {self.way} as you look at it "
             f"(about 10 degrees), then let go. Waiting for {_PATIENCE:g} s."
         )
 
     def end(self, *, seen: bool = True) -> None:
-        """Say whether it was seen."""
+        """Report whether the rotation was detected."""
         self.say("Seen; let go." if seen else "Nothing was seen; let go.")
 
 
@@ -60,7 +55,7 @@ class EmulatedHand:
     """A torque on the link of an emulated actuator.
 
     Attributes:
-        push: The emulator's, [N m].
+        push: Sets the emulator's external torque [N m].
         direction: 1 for counter-clockwise, -1 for clockwise.
     """
 
@@ -72,12 +67,12 @@ class EmulatedHand:
         self.push(self.direction * EMULATED_NUDGE)
 
     def end(self, *, seen: bool = True) -> None:
-        """Let go."""
+        """Release."""
         self.push(0.0)
 
 
 def hand_of(port: ActuatorPort, say: Callable[[str], None], *, clockwise: bool = False) -> Hand:
-    """Return the emulated hand of an emulator, and a person elsewhere, for a turn counter-clockwise or clockwise."""
+    """Return the emulated hand of an emulator, or a person elsewhere, for either direction."""
     push = getattr(port, "push", None)
     if push is not None:
         return EmulatedHand(push, -1 if clockwise else 1)
@@ -85,17 +80,10 @@ def hand_of(port: ActuatorPort, say: Callable[[str], None], *, clockwise: bool =
 
 
 def watch_nudge(port: ActuatorPort, hand: Hand, *, patience: float = _PATIENCE) -> float:
-    """Return by how far the actuator turned when the hand turned the link [rad], in its own sign.
-
-    Zero where nothing moved within the patience.
-
-    Args:
-        port: The actuator, with its strategy off.
-        hand: Who turns.
-        patience: Longest time to wait [s].
+    """Return the rotation by the hand [rad], in the actuator's own sign; 0 without one within ``patience`` [s].
 
     Raises:
-        ActuatorError: Feedback stays away.
+        ActuatorError: Feedback stops.
     """
     start: float | None = None
     seen = False

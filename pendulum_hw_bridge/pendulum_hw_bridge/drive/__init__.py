@@ -1,1 +1,1 @@
-"""How a torque becomes a setpoint, and what of a drive's feedback is believed."""
+"""Mapping of torque to setpoints, and checks of the drive's feedback."""

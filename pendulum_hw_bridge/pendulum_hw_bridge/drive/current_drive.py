@@ -1,4 +1,4 @@
-"""Drives with a current loop: a torque is commanded as such, and what they report must follow it."""
+"""Drives with a current loop: torque is commanded directly, and the measured effort must follow it."""
 
 from __future__ import annotations
 
@@ -18,48 +18,38 @@ __all__ = ["CurrentCheck", "CurrentMapping"]
 
 _RECORDS = 4
 _WRONG = 3
-"""Of so many records, so many with another torque than commanded are a fault: one packet may get lost."""
+"""Wrong records of ``_RECORDS`` that make a fault: single packets may get lost."""
 _SHARE = 0.1
-"""Share of the effort limit by which the measured effort may differ from those commanded [-]."""
+"""Tolerance of the measured effort, as a share of the effort limit [-]."""
 
 
 @dataclass(frozen=True)
 class CurrentMapping(EffortMapping):
-    """Torque to setpoint where the drive makes the torque: the same number, within the effort limit.
+    """Identity from torque to effort setpoint, within the effort limit.
 
     Args:
-        late: Records for which a torque may still be that of an older setpoint, since the drive has a delay [-].
+        late: Records for which the effort of an older setpoint may still show, because the drive has a delay [-].
     """
 
     late: int = 0
 
     def bounded(self, command: Command, motor: MotorState) -> Command:
-        """Return setpoints within the effort limit; there are no others than those of effort.
-
-        Args:
-            command: The setpoints.
-            motor: Supply and motor speed, which decide nothing here.
-        """
+        """Return the effort setpoint within the effort limit; all other setpoints are dropped."""
         limit = self.effort_limit
         effort = command.effort if math.isnan(command.effort) else min(limit, max(-limit, command.effort))
         return replace(Command(), effort=effort)
 
     def largest_effort(self, speed: float) -> float:
-        """Return the largest torque at a speed [rad/s], which the current loop keeps at the limit [N m]."""
+        """Return the effort limit, which the current loop holds at any speed [N m]."""
         return self.effort_limit
 
     def limited_gains(self, voltage: float) -> GainSet:
-        """Return the gains as they are: the current loop has none of its own, whatever the voltage [V]."""
+        """Return the gains unchanged: the current loop has none that can be set."""
         return self.gains
 
 
 class CurrentCheck(OutputCheck):
-    """Checks that the measured effort is one of those commanded lately, or between them.
-
-    Args:
-        mapping: Torque to setpoint, with the effort limit.
-        pwm_limit: Largest duty [-].
-    """
+    """Checks that the measured effort lies within the range of recently commanded efforts."""
 
     def __init__(self, mapping: EffortMapping, pwm_limit: float = 1.0) -> None:
         super().__init__(mapping, pwm_limit)
@@ -68,22 +58,16 @@ class CurrentCheck(OutputCheck):
         self._differs: deque[bool] = deque(maxlen=_RECORDS)
 
     def reset(self) -> None:
-        """Forget earlier records: another strategy begins, or none."""
+        """Forget earlier records after a change of strategy."""
         super().reset()
         self._before.clear()
         self._before.append(0.0)
         self._differs.clear()
 
     def check(self, feedback: Feedback, strategy: Strategy, candidates: Sequence[Command]) -> Fault | None:
-        """Return the fault that a record shows, or None.
-
-        Args:
-            feedback: The record.
-            strategy: Strategy that was set, not off.
-            candidates: Setpoints that may be in force, the likeliest first.
-        """
+        """Return the fault that a record shows, or None; ``candidates`` may be in force, the likeliest first."""
         efforts = [0.0 if math.isnan(each.effort) else each.effort for each in candidates]
-        # The loop lags: it may still be on its way from what was commanded before.
+        # The current loop lags, so earlier setpoints may still show.
         known = [*efforts, *self._before]
         self._before.append(efforts[0])
         room, unit = _SHARE * self.mapping.effort_limit, self.mapping.joint.effort_unit

@@ -1,4 +1,4 @@
-"""Less torque before none: the limit falls with the winding's temperature, before a hot motor is cut off."""
+"""Derating: the torque limit falls with the winding temperature before the cut-off disarms a hot motor."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ __all__ = ["Derating"]
 
 @dataclass(frozen=True)
 class Derating:
-    """The share of the torque limit that a temperature leaves: 1 up to ``start``, then falling to 0 at ``end``.
+    """Torque limit as a function of winding temperature: full up to ``start``, then linear to 0 at ``end``.
 
     Attributes:
-        start: Winding temperature from which on the limit falls; 0 for no derating [degC].
-        end: Winding temperature at which nothing is left, that of the cut-off [degC].
+        start: Winding temperature at which derating starts; 0 disables it [degC].
+        end: Winding temperature of the cut-off [degC].
     """
 
     start: float
     end: float
 
     def __post_init__(self) -> None:
-        """Refuse a derating that begins after the cut-off."""
         if self.start and not 0.0 < self.start < self.end:
             raise ParameterError(
                 f"derating_temperature is {self.start} degC; expected 0 (none), or > 0 and less than "
@@ -30,21 +29,12 @@ class Derating:
             )
 
     def share(self, temperature: float) -> float:
-        """Return the share of the limit that is left, 0 to 1; of a temperature that is no number, all is left.
-
-        The cut-off, and the fault of a reading that is none, are others' to name.
-        """
+        """Return the remaining share of the limit, 0 to 1; 1 for NaN, which the safety monitor reports."""
         if not self.start or not temperature > self.start:
             return 1.0
         return max(0.0, (self.end - temperature) / (self.end - self.start))
 
     def clamp(self, effort: float, limit: float, temperature: float) -> float:
-        """Return a torque within what is left of its limit.
-
-        Args:
-            effort: Wanted torque [N m].
-            limit: Torque limit of the cold motor [N m].
-            temperature: Of the winding [degC].
-        """
+        """Return a torque within the derated limit [N m]; ``temperature`` is the winding's [degC]."""
         left = limit * self.share(temperature)
         return min(left, max(-left, effort))

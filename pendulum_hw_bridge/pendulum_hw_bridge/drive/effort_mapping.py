@@ -1,17 +1,14 @@
-"""How a wanted joint torque becomes a setpoint of the firmware: the strategy is part of the plant.
-
-Three ways, by the parameter ``effort_strategy``:
+"""Mapping of joint torque to firmware setpoints, by the parameter ``effort_strategy``.
 
 ``direct_pwm``
-    u = tau R / (eta N V K_t): feed-forward only, the duty that makes the torque at standstill. The motor's back-EMF
-    stays in the plant as its damping; the thesis's b_c holds for this one.
+    u = tau R / (eta N V K_t): feed-forward only. Back-EMF stays in the plant as damping, as in the thesis's b_c.
 ``direct_pwm_compensated``
-    u = (tau R / (eta N K_t) + c K_e N q') / V: the back-EMF is fed forward too, and with it most of b_c is gone.
+    u = (tau R / (eta N K_t) + c K_e N q') / V: back-EMF is fed forward too, which removes most of b_c.
 ``effort_loop``
-    The firmware's own torque loop (strategy 3, effort setpoint alone) takes most of b_c away by feedback.
+    The firmware's torque loop (strategy 3, effort setpoint alone), which removes most of b_c by feedback.
 
-V is the measured supply voltage. Whatever the way, :meth:`EffortMapping.bounded` keeps what is sent inside the effort
-limit, and :meth:`EffortMapping.limited_gains` the firmware's own loops.
+V is the measured supply voltage. :meth:`EffortMapping.bounded` limits setpoints and :meth:`EffortMapping.limited_gains`
+the firmware's loops to the effort limit.
 """
 
 from __future__ import annotations
@@ -30,13 +27,13 @@ from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 __all__ = ["EffortMapping", "EffortStrategy"]
 
 _START_SHARE = 0.3
-"""Share of the effort limit that position control may spend on a speed which is not there yet [-]."""
+"""Share of the effort limit that position control may spend on a speed not reached yet [-]."""
 _DITHER = 4.5e-4
-"""Duty that position control adds and takes away in turn, two of the firmware's steps: 0.02 N m of an X5-9 [-]."""
+"""Amplitude of the alternating duty of position control: two firmware steps, 0.02 N m of an X5-9 [-]."""
 
 
 class EffortStrategy(str, Enum):
-    """Ways to make a torque; the value is that of the parameter."""
+    """Values of the parameter ``effort_strategy``."""
 
     DIRECT_PWM = "direct_pwm"
     DIRECT_PWM_COMPENSATED = "direct_pwm_compensated"
@@ -48,15 +45,14 @@ class EffortMapping:
     """Torque to setpoint and back.
 
     Args:
-        kind: Which way.
+        kind: Strategy.
         drivetrain: Constants of motor and gears.
-        efficiency: eta, share of the motor's torque that is believed to reach the output [-].
-        compensation: c, share of the back-EMF that is compensated; 1 leaves no margin for a hot winding, on which
-            the compensation is too strong [-].
+        efficiency: eta, assumed share of the motor's torque that reaches the output [-].
+        compensation: c, share of the back-EMF that is compensated; 1 overcompensates on a hot winding [-].
         gains: Gains of the firmware's loops under strategy 3.
-        effort_limit: Largest torque that a setpoint may stand for [N m].
-        velocity_limit: Largest speed that position control may be asked for [rad/s].
-        joint: The joint that is moved, whose units messages have.
+        effort_limit: Largest torque of a setpoint [N m].
+        velocity_limit: Largest speed setpoint of position control [rad/s].
+        joint: Actuated joint, for the units in messages.
     """
 
     kind: EffortStrategy
@@ -69,7 +65,6 @@ class EffortMapping:
     joint: Joint = field(default=ONE_JOINT.joints[0], compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse constants that would make the torque meaningless."""
         if not 0.0 < self.efficiency <= 1.0:
             raise ParameterError(f"effort_efficiency is {self.efficiency}; expected > 0 and <= 1")
         if not 0.0 <= self.compensation <= 1.0:
@@ -80,36 +75,29 @@ class EffortMapping:
 
     @property
     def strategy(self) -> Strategy:
-        """Strategy of the firmware under which the torque is made."""
+        """Firmware strategy that produces the torque."""
         return Strategy.PARALLEL_PWM if self.kind is EffortStrategy.EFFORT_LOOP else Strategy.DIRECT_PWM
 
     def pwm_per_torque(self, voltage: float | None = None) -> float:
-        """Return the duty for one newton metre at standstill, R / (eta N V K_t) [1/(N m)].
-
-        Args:
-            voltage: Supply voltage V; None for the drivetrain's nominal one [V].
-        """
+        """Return the duty for 1 N m at standstill, R / (eta N V K_t), by default at nominal voltage [1/(N m)]."""
         drive = self.drivetrain
         supply = drive.supply_voltage if voltage is None else voltage
         return drive.winding_resistance / (self.efficiency * drive.gear_ratio * supply * drive.torque_constant)
 
     def back_emf_pwm(self, velocity: float, voltage: float) -> float:
-        """Return the duty that a speed at the output takes up, K_e N q' / V [-]."""
+        """Return the duty that cancels the back-EMF at an output speed, K_e N q' / V [-]."""
         return self.drivetrain.back_emf_constant * self.drivetrain.gear_ratio * velocity / voltage
 
     def motor_effort(self, pwm: float, velocity: float, voltage: float) -> float:
-        """Return the torque at the joint that a duty makes at a motor speed, (u V - K_e N q') K_t N eta / R [N m]."""
+        """Return the joint torque of a duty at a motor speed, (u V - K_e N q') K_t N eta / R [N m]."""
         return (pwm - self.back_emf_pwm(velocity, voltage)) / self.pwm_per_torque(voltage)
 
     def largest_effort(self, speed: float) -> float:
-        """Return the largest torque of the motor at a speed of the joint [rad/s]: limit and braking [N m].
+        """Return the largest motor torque at a joint speed [rad/s]: effort limit plus back-EMF braking [N m].
 
-        It drives with the limit at most. A motor that turns brakes without any duty, and a duty that opposes the motion
-        adds to that; no setpoint takes it away.
+        No setpoint removes the braking torque, and a duty that opposes the motion adds to it.
         """
         return self.effort_limit + abs(self.motor_effort(0.0, speed, self.drivetrain.supply_voltage))
-
-    # --- effort control -------------------------------------------------------------------------------------
 
     def command(self, effort: float, motor: MotorState) -> Command:
         """Return the setpoints for a wanted torque [N m]."""
@@ -118,12 +106,9 @@ class EffortMapping:
         return Command(pwm=effort * self.pwm_per_torque(motor.voltage) + self._compensated_pwm(motor))
 
     def effort_of(self, command: Command, motor: MotorState, pwm_in_force: float) -> float:
-        """Return the torque that setpoints stand for: the inverse of :meth:`command`, after limits [N m].
+        """Return the torque of setpoints, the inverse of :meth:`command` after limits [N m].
 
-        Args:
-            command: The setpoints.
-            motor: As they were made for.
-            pwm_in_force: Duty that the firmware reports; what counts under position control [-].
+        Under position control, the firmware's reported duty ``pwm_in_force`` [-] counts.
         """
         if math.isfinite(command.effort):
             return command.effort
@@ -139,20 +124,14 @@ class EffortMapping:
             return 0.0
         return self.compensation * self.back_emf_pwm(motor.velocity, motor.voltage)
 
-    # --- limits ---------------------------------------------------------------------------------------------
-
     def bounded(self, command: Command, motor: MotorState) -> Command:
-        """Return setpoints that make no more torque than the limit, as far as one sensor at least tells the truth.
-
-        Args:
-            command: The setpoints.
-            motor: Supply and motor speed.
-        """
+        """Return setpoints that stay within the torque limit as long as one speed sensor is right."""
         limit = self.effort_limit
         duty = limit * self.pwm_per_torque(motor.voltage)
         emf = self.back_emf_pwm(1.0, motor.voltage) if self.kind is not EffortStrategy.DIRECT_PWM else 0.0
         low, high = max(-1.0, -duty + emf * motor.lowest), min(1.0, duty + emf * motor.highest)
-        # A speed costs duty. Given in advance, a blocked link would get it as torque: only so much more than there is.
+        # A velocity setpoint costs duty, which a blocked link would receive as torque: limit how far it may lead the
+        # speed.
         start = self._start_velocity(motor.voltage)
         return replace(
             command,
@@ -162,10 +141,10 @@ class EffortMapping:
         )
 
     def limited_gains(self, voltage: float) -> GainSet:
-        """Return the gains with outputs that make no more torque than the limit at standstill, at a supply voltage [V].
+        """Return gains whose outputs stay within the torque limit at standstill, at a supply voltage [V].
 
-        The position loop has what :meth:`bounded` leaves it beside the velocity loop, which may add what a speed up
-        to the limit takes. The torque loop has the limit, and so reaches no speed that direct PWM would not.
+        The velocity loop may add the duty for a speed up to the limit; the position loop has what :meth:`bounded`
+        leaves. The torque loop has the limit alone, so it reaches no speed that direct PWM would not.
         """
         duty = self.effort_limit * self.pwm_per_torque(voltage)
         moving = _START_SHARE * duty + self.back_emf_pwm(self.velocity_limit, voltage)
@@ -178,8 +157,8 @@ class EffortMapping:
         )
 
     def _start_velocity(self, voltage: float) -> float:
-        """Return the speed for which the velocity loop puts out its share of the limit at standstill [rad/s]."""
-        # The firmware may normalise with the nominal voltage or with the present one: the lower makes more duty.
+        """Return the speed setpoint at which the velocity loop spends its share of the limit at standstill [rad/s]."""
+        # The firmware may normalise with nominal or present voltage: assume the lower, which gives more duty.
         forward = self.back_emf_pwm(1.0, min(voltage, self.drivetrain.supply_voltage))
         slope = self.gains.velocity.feed_forward * forward + self.gains.velocity.kp
         share = _START_SHARE * self.effort_limit * self.pwm_per_torque(voltage)
@@ -187,22 +166,19 @@ class EffortMapping:
 
     @property
     def dither(self) -> float:
-        """Move of the position setpoint that shows in the duty of a loop that works, and nowhere else [rad]."""
+        """Alternating move of the position setpoint: visible in the duty of a working loop only [rad]."""
         return _DITHER / self.gains.position.kp if self.gains.position.kp > 0.0 else 0.0
 
-    # --- hand-over ------------------------------------------------------------------------------------------
-
     def handover(self, effort: float, pwm: float, velocity: float, motor: MotorState) -> tuple[float, float]:
-        """Return offsets of position [rad] and velocity setpoint [rad/s] with which strategy 3 begins at a duty.
+        """Return offset of position [rad] and velocity setpoint [rad/s] with which strategy 3 takes over a duty.
 
-        Strategy 3 has no input for a feed-forward of PWM: its position loop takes the torque, its velocity loop what
-        the speed adds to it.
+        Strategy 3 has no PWM feed-forward: its position loop takes over the torque, its velocity loop the back-EMF.
 
         Args:
             effort: Torque in force [N m].
             pwm: Duty in force [-].
-            velocity: Measured speed of the link [rad/s].
-            motor: Supply and motor speed.
+            velocity: Measured link speed [rad/s].
+            motor: Supply voltage and motor speed.
         """
         gains = self.gains
         if gains.position.kp <= 0.0 or not math.isfinite(pwm):
@@ -216,5 +192,5 @@ class EffortMapping:
 
 
 def _clip(value: float, low: float, high: float) -> float:
-    # NaN ("loop off") stays what it is.
+    # NaN ("loop off") passes unchanged.
     return value if math.isnan(value) else min(high, max(low, value))

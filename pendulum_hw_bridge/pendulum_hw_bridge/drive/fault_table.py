@@ -1,4 +1,4 @@
-"""The faults of the bridge: one table of names, and what each means."""
+"""Names and meanings of the bridge's faults."""
 
 from __future__ import annotations
 
@@ -37,12 +37,11 @@ FAULTS = {
     "not_connected": "the actuator is used before it is connected",
     "not_installed": "hebi-py is not installed",
 }
-"""Faults by name and what each means."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault: its name in :data:`FAULTS` and a sentence with the values."""
+    """Name of a fault in :data:`FAULTS`, and a sentence with the values."""
 
     name: str
     message: str

@@ -1,8 +1,7 @@
-"""What may be believed of supply voltage and motor speed, which decide the torque that a duty makes.
+"""Conservative estimates of supply voltage and motor speed, which decide the torque of a duty.
 
-A record can be wrong for once. A voltage that reads too low would ask for too much duty, a speed that reads too high
-for too much compensation; so the voltage is the highest of some records, and the speed is bounded by what the motor's
-angle says.
+Single records can be wrong, and too low a voltage or too high a speed would increase the duty. So the voltage is the
+maximum over some records, and the change of the motor's angle bounds the speed.
 """
 
 from __future__ import annotations
@@ -18,25 +17,25 @@ from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 __all__ = ["MOTOR_SPEED_LIMIT", "MotorState", "MotorWatch"]
 
 MOTOR_SPEED_LIMIT = 25_000.0 * 2.0 * math.pi / 60.0
-"""Speed at which the firmware takes the drive back, before the gears [rad/s]. Source: HEBI, X-series, 25 000 rpm."""
+"""Speed at which the firmware reduces the duty, before the gears [rad/s]. Source: HEBI, X-series, 25 000 rpm."""
 _VOLTAGE_RECORDS = 5
 _SPAN_NS = 10_000_000
-"""Time over which the motor's angle tells a speed, at least [ns]."""
+"""Shortest time over which the motor's angle is differentiated [ns]."""
 _LONGEST_SPAN_NS = 10 * _SPAN_NS
 _ANGLE_STEP = math.pi / 3.0
-"""Step of the motor's angle, before the gears [rad]: six commutations a turn."""
+"""Resolution of the motor's angle, before the gears [rad]: six commutations per turn."""
 _SLACK = 0.25
-"""Change of the motor's speed, at the output, within the span, beside the step of the angle [rad/s]."""
+"""Allowed change of motor speed within the span, at the output, in addition to the angle's resolution [rad/s]."""
 
 
 class MotorState(NamedTuple):
-    """Supply and motor speed, as far as they may be believed.
+    """Supply voltage and motor speed at the output.
 
     Attributes:
-        voltage: Supply voltage, rather too high than too low [V].
-        velocity: Motor speed at the output side of the gears [rad/s].
-        lowest: The lowest speed that any of the sensors tells, at most 0 [rad/s].
-        highest: The highest speed that all of them bear out, at least 0 [rad/s].
+        voltage: Supply voltage, upper estimate [V].
+        velocity: Motor speed [rad/s].
+        lowest: Lowest speed of any sensor, at most 0 [rad/s].
+        highest: Highest speed that all sensors confirm, at least 0 [rad/s].
     """
 
     voltage: float
@@ -46,13 +45,7 @@ class MotorState(NamedTuple):
 
 
 class MotorWatch:
-    """Judges voltage and speed of feedback records in their order.
-
-    Args:
-        drivetrain: Constants of motor and gears.
-        voltage_min: Lowest supply voltage that is believed [V].
-        voltage_max: Highest; also what is assumed before the first record [V].
-    """
+    """Estimates voltage and speed from consecutive records; voltages [V] outside the window are clipped to it."""
 
     def __init__(self, drivetrain: SeriesElasticParameters, voltage_min: float, voltage_max: float) -> None:
         self._gear_ratio = drivetrain.gear_ratio

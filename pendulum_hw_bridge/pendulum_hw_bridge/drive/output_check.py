@@ -1,8 +1,7 @@
-"""Whether the duty on the motor is the one that setpoints and gains ask for, and no more than the limit allows.
+"""Check that the motor's duty follows from setpoints and gains, and respects the torque limit.
 
-The firmware reports its duty with every record. Under direct PWM it is what was sent. Under strategy 3 it follows from
-setpoints, gains and the same record's position and velocity; of the torque loop, whose derivative acts between two
-records, only the largest output and whether it moves at all can be told.
+Every record contains the duty. Under strategy 3 it follows from setpoints, gains and measured position and velocity.
+The torque loop's derivative acts between records, so only its range and whether it moves can be checked.
 """
 
 from __future__ import annotations
@@ -21,33 +20,28 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 __all__ = ["OutputCheck"]
 
 _RECORDS = 4
-"""Records that are looked at together; a fault shows in three of them, or in all four stands still."""
+"""Records of one decision: three wrong ones are a fault, or four with the same duty."""
 _WRONG = 3
 _TOLERANCE = 0.015
-"""Disagreement of a duty that is none [-]: 0.6 N m of an X5-9 at 36 V."""
+"""Tolerated disagreement of the duty [-]: 0.6 N m of an X5-9 at 36 V."""
 _FORWARD_TOLERANCE = 0.15
-"""The same as a share of the velocity's feed-forward, which the firmware normalises with a voltage of its own [-]."""
+"""Additional share of the velocity feed-forward: the firmware normalises with a voltage of its own [-]."""
 _STILL = 5e-4
-"""Change of what is asked for at which a duty that does not change at all is stuck; its steps are 2.4e-4 [-]."""
+"""Change of the expected duty at which a constant duty is stuck; firmware steps are 2.4e-4 [-]."""
 _STILL_EFFORT = 0.02
-"""The same under the torque loop: noise of the measured torque moves what is asked for [-]."""
+"""The same under the torque loop, where noise of the measured torque moves the expected duty [-]."""
 _CYCLES = 4
-"""Cycles of the firmware after which a low-pass has forgotten that the output was thrown against a clamp [-]."""
+"""Firmware cycles after which the output low-pass has settled from a clamp [-]."""
 _OPPOSED_TIME = 0.008
-"""Time for which a duty that stands still may be the opposite of what is asked for [s]."""
+"""Time for which a constant duty may oppose the expected one [s]."""
 _EFFORT_MARGIN = (1.1, 0.5)
-"""A motor's torque is too much above this multiple of the limit and so much more [-, N m]."""
+"""Motor torque is a fault above this multiple of the limit plus this margin [-, N m]."""
 _NEAR_SPEED_LIMIT = 0.9
-"""Share of the largest speed above which the firmware may take the duty back [-]."""
+"""Share of the largest speed above which the firmware may reduce the duty [-]."""
 
 
 class OutputCheck:
-    """Checks the duty of feedback records in their order.
-
-    Args:
-        mapping: Torque to duty, with the effort limit and the nominal voltage.
-        pwm_limit: Largest duty that is sent [-].
-    """
+    """Checks the duty of consecutive feedback records; ``pwm_limit`` is the largest duty that is sent [-]."""
 
     def __init__(self, mapping: EffortMapping, pwm_limit: float = 1.0) -> None:
         self.mapping = mapping
@@ -59,20 +53,14 @@ class OutputCheck:
         self._opposed_since_ns: int | None = None
 
     def reset(self) -> None:
-        """Forget earlier records: another strategy begins, or none."""
+        """Forget earlier records after a change of strategy."""
         self._wrong.clear()
         self._duties.clear()
         self._too_much = 0
         self._opposed_since_ns = None
 
     def check(self, feedback: Feedback, strategy: Strategy, candidates: Sequence[Command]) -> Fault | None:
-        """Return the fault that the duty of a record shows, or None.
-
-        Args:
-            feedback: The record.
-            strategy: Strategy that was set, not off.
-            candidates: Setpoints that may be in force, the likeliest first.
-        """
+        """Return the fault that the duty of a record shows, or None; ``candidates`` are ordered by likelihood."""
         return self._check_effort(feedback) or (
             self._check_loops(feedback, candidates) if strategy is Strategy.PARALLEL_PWM else None
         )
@@ -84,7 +72,7 @@ class OutputCheck:
             self._too_much += 1
             return self._effort_fault("not known") if self._too_much >= _WRONG else None
         still, moving = mapping.motor_effort(pwm, 0.0, voltage), mapping.motor_effort(pwm, velocity, voltage)
-        # A motor that is turned against its will brakes, whatever the duty: that torque is the turner's.
+        # A back-driven motor brakes whatever the duty: that torque is not the drive's.
         effort = max(min(still, moving), -max(still, moving))
         factor, margin = _EFFORT_MARGIN
         self._too_much = self._too_much + 1 if effort > factor * mapping.effort_limit + margin else 0
@@ -97,7 +85,7 @@ class OutputCheck:
 
     def _check_loops(self, feedback: Feedback, candidates: Sequence[Command]) -> Fault | None:
         pwm = feedback.pwm_command
-        # The firmware may normalise its feed-forward of velocity with the nominal voltage or with the present one.
+        # The firmware may normalise its velocity feed-forward with nominal or present voltage.
         voltages = (self.mapping.drivetrain.supply_voltage, feedback.voltage)
         wanted = [(c, self._expected(c, feedback, voltage)) for c in candidates for voltage in voltages]
         self._wrong.append(not any(self._agrees(feedback, command, duty) for command, duty in wanted))
@@ -109,7 +97,7 @@ class OutputCheck:
         duties, asked = [duty for duty, _ in self._duties], [duty for _, duty in self._duties]
         still = len(duties) == _RECORDS and min(duties) == max(duties)
         threshold = _STILL
-        # Of any: a record may still show the torque loop that the newest setpoints switched off.
+        # Any candidate: a record may still show the torque loop that the newest setpoints switched off.
         if any(math.isfinite(candidate.effort) for candidate in candidates):
             loop = self.gains.effort
             threshold = math.inf if _clamped(loop, pwm) else _STILL_EFFORT
@@ -120,7 +108,7 @@ class OutputCheck:
         return None
 
     def _opposes(self, feedback: Feedback, wanted: float, still: bool) -> bool:
-        """Whether a duty that stands still has been the opposite of what is asked for, for too long."""
+        """Return whether a constant duty has opposed the expected one for too long."""
         opposed = (
             still and feedback.pwm_command * wanted < 0.0 and min(abs(feedback.pwm_command), abs(wanted)) > _TOLERANCE
         )
@@ -143,13 +131,13 @@ class OutputCheck:
             return True
         if abs(feedback.velocity) > _NEAR_SPEED_LIMIT * MOTOR_SPEED_LIMIT / self.mapping.drivetrain.gear_ratio:
             return min(0.0, wanted) - tolerance <= pwm <= max(0.0, wanted) + tolerance
-        # What an integral, a derivative or a dead zone does between two records cannot be told from one of them.
+        # The effect of an integral, a derivative or a dead zone between two records is unknown.
         largest = gains.position.max_output + gains.velocity.max_output + tolerance
         return not _memoryless(gains) and abs(pwm) <= largest
 
     def _expected(self, command: Command, feedback: Feedback, voltage: float) -> float:
         gains, mapping = self.gains, self.mapping
-        # The firmware's normalisation of a torque assumes an efficiency of its own; the clamp is what counts here.
+        # The firmware's torque normalisation assumes an unknown efficiency; the clamp is what counts here.
         torque_forward, speed_forward = mapping.pwm_per_torque(), mapping.back_emf_pwm(1.0, voltage)
         duty = _output(gains.position, command.position, feedback.position, 0.0)
         duty += _output(gains.velocity, command.velocity, feedback.velocity, speed_forward)
@@ -166,15 +154,14 @@ def _output(gains: PidGains, target: float, measured: float, normaliser: float) 
 
 
 def _clamped(gains: PidGains, duty: float) -> bool:
-    """Whether a duty stands at a clamp, or is what the low-pass leaves where the output goes from clamp to clamp.
+    """Return whether a duty is at a clamp, or a value that the low-pass leaves between two clamps.
 
-    A setpoint that steps throws the derivative against the other clamp for a cycle, and back: records of one phase of
-    that read one duty each time, whether it happens once in long or every few cycles. Any other duty between the
-    clamps has no reason to stand still.
+    A setpoint step throws the derivative to the other clamp for a cycle and back. Records at one phase of that repeat
+    one duty, for single steps and for steps every few cycles. Any other constant duty between the clamps is stuck.
     """
     new, old = gains.output_lowpass, 1.0 - gains.output_lowpass
     shares = [new * old**cycle for cycle in range(_CYCLES)]
-    # Every few cycles: what is left of the throw before adds up.
+    # With steps every few cycles, the remainders of earlier ones add up.
     shares += [new * old**cycle / (1.0 - old**every) for every in range(2, _CYCLES + 1) for cycle in range(every)]
     low, high = gains.min_output, gains.max_output
     left = [each for share in shares for each in (high - share * (high - low), low + share * (high - low))]

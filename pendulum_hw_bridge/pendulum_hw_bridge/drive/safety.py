@@ -1,7 +1,6 @@
-"""What the bridge does not believe: checks of each feedback record, each with a named fault.
+"""Checks of each feedback record that only an actuator needs, each with a named fault.
 
-The common rules of a plant (position window, velocity, age of the measurement, command rules) are the supervisor's;
-here stand those that only an actuator has. Pure: one record in, named faults out.
+The supervisor has the rules common to all plants (position window, velocity, age of the measurement, commands).
 """
 
 from __future__ import annotations
@@ -31,37 +30,37 @@ __all__ = ["FAULTS", "Fault", "SafetyLimits", "SafetyMonitor"]
 
 _COUNT = 3
 _MOTION_TIME = 0.2
-"""Time over which position and velocity are compared: even a slow ramp moves further than they may differ [s]."""
+"""Time over which position and velocity are compared: even a slow ramp exceeds the tolerance in it [s]."""
 _GAP = 1.6
-"""Periods between two records with none missing, at most: each may come 0.3 of one early or late [-]."""
+"""Longest interval, in periods, without a missing record: each may be 0.3 periods early or late [-]."""
 _CURRENT_TIME = 0.5
-"""Time within which wrong winding currents count together [s]."""
+"""Time within which wrong winding currents are counted together [s]."""
 _WAY = 1e-3
-"""Longest that a command takes to arrive, as a rule [s]."""
+"""Longest usual transport time of a command [s]."""
 _CURRENT_SHARE = 0.2
-"""Share of an expected winding current by which it may differ beside its tolerance [-]."""
+"""Tolerance of the winding current in addition to the absolute one, as a share of the expected one [-]."""
 _WRONG_COMMANDS = 2
-"""Records that show a wrong setpoint to be a fault: one packet may get lost, two in a row do not on a cable [-]."""
+"""Records with a wrong setpoint that make a fault: on a cable, single packets get lost, two in a row do not [-]."""
 _WRONG_COMMAND_TIME = 0.008
 """Time for which a wrong setpoint must be in force to be a fault [s]."""
 _CLAMPED_SHARE = 0.9
-"""Share of the largest speed above which the firmware may take the duty back [-]."""
+"""Share of the largest speed above which the firmware may reduce the duty [-]."""
 _SENSED = ("position", "velocity", "effort", "motor_position", "motor_velocity", "deflection", "winding_current")
-"""Quantities of which at least one differs from record to record, be it by noise."""
+"""Quantities of which noise changes at least one from record to record."""
 _VOLTAGE_CHANGE = 0.15
-"""Share by which the supply may differ from what it was a moment ago [-]."""
+"""Allowed relative deviation of the supply voltage from its moving average [-]."""
 _VOLTAGE_WEIGHT = 0.02
-"""Weight of a record in what the supply was a moment ago [-]: half a second at 100 Hz."""
+"""Weight of a record in that average [-]: half a second at 100 Hz."""
 
 
 class SafetyMonitor:
-    """Checks feedback records in their order; remembers what it needs for checks over several.
+    """Checks consecutive feedback records.
 
     Args:
-        limits: The limits.
+        limits: Limits.
         period: Nominal feedback period [s].
         drivetrain: Constants for the check of the winding current, or None.
-        joint: The joint that is measured, whose units messages have.
+        joint: Measured joint, for the units in messages.
     """
 
     def __init__(
@@ -102,11 +101,11 @@ class SafetyMonitor:
 
     @property
     def timeout(self) -> float:
-        """Age of feedback that is a fault [s]."""
+        """Age at which feedback counts as lost [s]."""
         return self.limits.feedback_cycles * self.period
 
     def note_sent(self, command: Command, strategy: Strategy, sent_ns: int) -> None:
-        """Take note of what was sent, to compare with what the module then acts on."""
+        """Record what was sent, to compare it with the setpoints in force."""
         if strategy is not self._strategy:
             self._sent.clear()
             self._strategy = strategy
@@ -116,18 +115,18 @@ class SafetyMonitor:
         self._sent.append((sent_ns, sent_ns, command))
 
     def left(self, left_ns: int) -> None:
-        """Take note of a time at which the newest setpoints had left, and not only begun to [ns]."""
+        """Record the time at which sending the newest setpoints had finished [ns]."""
         if self._sent:
             sent_ns, _, command = self._sent.pop()
             self._sent.append((sent_ns, left_ns, command))
 
     def stopped(self) -> None:
-        """Take note that nothing is commanded any more."""
+        """Record that commanding has ended."""
         self._strategy = Strategy.OFF
         self._wrong_currents = 0
 
     def is_new(self, feedback: Feedback) -> bool:
-        """Return whether a record is one that was not seen before, and remember when one last was."""
+        """Return whether a record is new, and record the time of the last new one."""
         last = self._last
         fresh = last is None or (feedback.sequence != last.sequence and feedback.hardware_ns != last.hardware_ns)
         self._repeated = 0 if fresh else self._repeated + 1
@@ -140,11 +139,7 @@ class SafetyMonitor:
         return math.inf if self._last_new_ns is None else (now_ns - self._last_new_ns) / NANOSECONDS
 
     def silence(self, now_ns: int) -> Fault | None:
-        """Return the fault of feedback that stays away, or None.
-
-        Args:
-            now_ns: Host clock [ns].
-        """
+        """Return the fault of missing feedback, or None; ``now_ns`` is host time [ns]."""
         if self._last_new_ns is None:
             return None
         age = self.age(now_ns)
@@ -162,7 +157,7 @@ class SafetyMonitor:
         return None
 
     def check(self, feedback: Feedback) -> Fault | None:
-        """Return the first fault that a new record shows, or None; also kept as ``present``."""
+        """Return the first fault of a new record, or None; also stored in ``present``."""
         fault = (
             self._check_values(feedback)
             or self._check_continuity(feedback)
@@ -177,8 +172,6 @@ class SafetyMonitor:
         self._last = feedback
         self.present = fault
         return fault
-
-    # --- checks ---------------------------------------------------------------------------------------------
 
     def _check_values(self, feedback: Feedback) -> Fault | None:
         own = self.joint
@@ -199,13 +192,13 @@ class SafetyMonitor:
                 f"module's clock went back by {(last.hardware_ns - feedback.hardware_ns) / NANOSECONDS:.3f} s",
             )
         if feedback.hardware_ns > 0:
-            # The smallest offset ever seen is that of the fastest way; what exceeds it waited somewhere.
+            # The smallest offset so far is that of the fastest transport; any excess is waiting time.
             if self._clock_offset_ns is None or offset < self._clock_offset_ns:
                 self._clock_offset_ns = offset
             late = (offset - self._clock_offset_ns) / NANOSECONDS
-            # What the module does is compared with what it had by then: a busy host reads records late.
+            # Compare with the commands that had arrived by then: a busy host reads records late.
             self._measured_ns = feedback.hardware_ns + self._clock_offset_ns
-            # Two crystals part by some 50 ppm: let the reference follow slowly.
+            # Two crystals drift apart by some 50 ppm: let the reference follow slowly.
             self._clock_offset_ns += round(1e-4 * self.period * NANOSECONDS)
             if late > self.timeout:
                 return Fault(
@@ -239,7 +232,7 @@ class SafetyMonitor:
                 f"winding is at {feedback.winding_temperature:.0f} degC; "
                 f"expected at most {limits.winding_temperature:.0f} degC",
             )
-        # Compares false with its limit, and takes no torque away.
+        # NaN compares false with its limit and causes no derating.
         known = math.isfinite(feedback.winding_temperature)
         self._unknown_temperatures = 0 if known else self._unknown_temperatures + 1
         if self._unknown_temperatures >= _COUNT:
@@ -267,7 +260,7 @@ class SafetyMonitor:
         return None
 
     def _check_voltage(self, feedback: Feedback) -> Fault | None:
-        """Compare the supply with what it was lately: the mapping of torque to duty depends on it."""
+        """Compare the supply voltage with its average: the mapping of torque to duty depends on it."""
         usual = feedback.voltage if self._voltage is None else self._voltage
         self._voltage = usual + _VOLTAGE_WEIGHT * (feedback.voltage - usual)
         wrong = abs(feedback.voltage - usual) > _VOLTAGE_CHANGE * usual
@@ -283,13 +276,13 @@ class SafetyMonitor:
         elapsed = math.inf if last is None else (feedback.hardware_ns - last.hardware_ns) / NANOSECONDS
         expected = math.nan if last is None else 0.5 * (feedback.velocity + last.velocity) * elapsed
         if last is None or not (elapsed < 2.0 * self.timeout and math.isfinite(expected + last.position)):
-            # What happened in between is not known: the comparison begins anew.
+            # The motion in between is unknown: restart the comparison.
             self._motion.clear()
             expected = 0.0
         else:
             jump, allowed = feedback.position - last.position - expected, self.limits.position_jump
             if elapsed > _GAP * self.period:
-                # Records are missing, and what the velocity was meanwhile is not known.
+                # Records are missing, so the velocity in between is unknown.
                 allowed += self._unseen_speed * (elapsed - self.period)
                 expected += jump
             if abs(jump) > allowed:
@@ -312,7 +305,6 @@ class SafetyMonitor:
         return None
 
     def _check_command(self, feedback: Feedback) -> Fault | None:
-        """Compare what the module acts on with what was sent lately."""
         settled = self._measured_ns - self._strategy_since_ns > self.timeout * NANOSECONDS
         if self._strategy is Strategy.OFF or not settled:
             self._wrong_commands = 0
@@ -328,7 +320,7 @@ class SafetyMonitor:
         tolerance = self.limits.pwm_tolerance if direct else self.limits.command_tolerance
         good = any(_same(acts, candidate, tolerance) for candidate in candidates)
         if not good and direct and abs(feedback.velocity) > self._clamped_speed:
-            # Near its speed limit the firmware takes the duty back, never up and never round.
+            # Near its speed limit the firmware reduces the duty; it never increases or reverses it.
             good = any(min(0.0, candidate) <= acts <= max(0.0, candidate) for candidate in candidates)
         if good:
             self._wrong_commands = 0
@@ -353,7 +345,7 @@ class SafetyMonitor:
         return self.output.check(feedback, self._strategy, self._in_force(self._measured_ns))
 
     def _in_force(self, measured_ns: int) -> list[Command]:
-        """Return the commands that a record may show: the newest to have arrived by its time, and neighbours."""
+        """Return the commands that a record may show: the newest that had arrived, and those under way."""
         window = round((1.2 * self.period + _WAY) * NANOSECONDS)
         arrived = [command for _, left, command in self._sent if left <= measured_ns - round(_WAY * NANOSECONDS)]
         recent = [command for sent, left, command in self._sent if sent <= measured_ns <= left + window]
@@ -375,7 +367,7 @@ class SafetyMonitor:
             resistance,
         )
         wrong = not abs(feedback.winding_current - expected) <= tolerance + _CURRENT_SHARE * abs(expected)
-        # So little is asked for that no current at all would do as well: such a record neither accuses nor excuses.
+        # Too small a current to distinguish from none: the record neither confirms nor clears a fault.
         tells = abs(expected) > tolerance / (1.0 - _CURRENT_SHARE)
         lapsed = feedback.stamp_ns - self._wrong_current_ns > _CURRENT_TIME * NANOSECONDS
         if wrong and (lapsed or not self._wrong_currents):
@@ -396,7 +388,7 @@ def _or_zero(value: float) -> float:
 
 
 def _same(acts: float, sent: float, tolerance: float) -> bool:
-    """Whether a loop acts on what was sent; one that was switched off may say so, or report a zero."""
+    """Return whether a loop acts on the setpoint sent; a loop that is off may report NaN or 0."""
     if math.isnan(sent):
         return math.isnan(acts) or acts == 0.0
     return abs(acts - sent) <= tolerance

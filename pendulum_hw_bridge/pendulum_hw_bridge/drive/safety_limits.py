@@ -11,19 +11,19 @@ __all__ = ["SafetyLimits"]
 
 @dataclass(frozen=True)
 class SafetyLimits:
-    """Limits of the checks.
+    """Limits of :class:`SafetyMonitor`.
 
     Attributes:
         winding_temperature: Largest winding temperature [degC].
         voltage_min: [V].
         voltage_max: [V].
-        measured_effort: Largest torque that the spring may show [N m].
+        measured_effort: Largest torque measured by the spring [N m].
         position_jump: Largest change of position beyond that of the velocity, in one cycle [rad].
-        position_disagreement: Largest disagreement of position and integrated velocity in a fifth of a second [rad].
-        winding_current: Largest disagreement of the winding current; 0 switches the check off [A].
-        command_tolerance: Largest difference between the setpoint sent and the one in force [rad or N m].
-        pwm_tolerance: The same for a PWM duty; the firmware's steps are 2.4e-4 [-].
-        feedback_cycles: Feedback periods without a record at which it counts as lost [-].
+        position_disagreement: Largest disagreement of position and integrated velocity in 0.2 s [rad].
+        winding_current: Largest disagreement of the winding current; 0 disables the check [A].
+        command_tolerance: Largest difference between setpoint sent and in force [rad or N m].
+        pwm_tolerance: The same for a duty; firmware steps are 2.4e-4 [-].
+        feedback_cycles: Feedback periods without a record after which feedback counts as lost [-].
     """
 
     winding_temperature: float = 120.0
@@ -38,7 +38,6 @@ class SafetyLimits:
     feedback_cycles: int = 3
 
     def __post_init__(self) -> None:
-        """Refuse limits that limit nothing."""
         for name, unit in (
             ("winding_temperature", "degC"),
             ("measured_effort", "N m"),

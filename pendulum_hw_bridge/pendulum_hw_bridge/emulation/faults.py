@@ -1,4 +1,4 @@
-"""Faults that the emulated actuator can be given, by name: what fails on real drives, cables and networks."""
+"""Faults of the emulated actuator, as on real drives, cables and networks."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ __all__ = ["ActuatorFault", "distort"]
 
 
 class ActuatorFault(str, Enum):
-    """A fault of actuator, sensor or link to it, with what it stands for in ``meaning``."""
+    """A fault of actuator, sensor or connection, described by ``meaning``."""
 
     meaning: str
 
     def __new__(cls, value: str, meaning: str = "") -> ActuatorFault:
-        """Keep the name as the value, and the meaning beside it."""
+        """Use the name as value."""
         fault = str.__new__(cls, value)
         fault._value_ = value
         fault.meaning = meaning
@@ -58,13 +58,7 @@ class ActuatorFault(str, Enum):
 
 
 def distort(feedback: Feedback, faults: set[ActuatorFault], frozen: Feedback | None) -> Feedback:
-    """Return a feedback record as the faulty sensors would give it.
-
-    Args:
-        feedback: The true record.
-        faults: Faults in force.
-        frozen: Record at the moment a freeze began.
-    """
+    """Return a record as faulty sensors would give it; ``frozen`` is the record at the start of a freeze."""
     changes: dict[str, Any] = {}
     fault = ActuatorFault
     if fault.POSITION_NAN in faults:

@@ -1,9 +1,8 @@
-"""The X5-9's firmware: PID loops and control strategies 0 to 4, one cycle of 1 ms at a time.
+"""Firmware of the X5-9: PID loops and control strategies 0 to 4, in cycles of 1 ms.
 
-Plain scalar code on arrays of floats, which :mod:`.kernel` has compiled. Gains are rows of 14 numbers in the order
-of :data:`pendulum_hw_bridge.port.gains.GAIN_FIELDS`; the memory of a loop is a row of 5.
-
-Source: HEBI documentation, "Control strategies" and "Gains".
+Scalar code on arrays, compiled by :mod:`.kernel`. Gains are rows of 14 numbers in the order of
+:data:`pendulum_hw_bridge.port.gains.GAIN_FIELDS`; the memory of a loop is a row of 5. Source: HEBI documentation,
+"Control strategies" and "Gains".
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ def pid_step(
     normaliser: float,
     period: float,
 ) -> float:
-    """Return the output of one PID loop after one cycle; a target of NaN switches the loop off and forgets.
+    """Return the output of one PID loop after one cycle; a NaN target switches the loop off and resets it.
 
     out = kp e + ki int e + kd e' + ff target normaliser + punch sgn e, clamped, low-passed.
 
@@ -117,12 +116,14 @@ def control_pwm(
     velocity_normaliser: float,
     period: float,
 ) -> float:
-    """Return the PWM duty that a strategy makes of its setpoints, -1 to 1 [-].
+    """Return the PWM duty of a strategy, -1 to 1 [-].
 
     Args:
-        strategy: 0 off; 1 direct PWM (``setpoints[EFFORT]`` is the duty); 2 effort loop around torque and what the
-            position and velocity loops add to it; 3 three loops, each giving PWM, clipped and added; 4 effort loop
-            around torque and the position loop's, plus a velocity loop giving PWM.
+        strategy: 0 off; 1 direct PWM (``setpoints[EFFORT]`` is the duty); 2 effort loop around torque plus outputs of
+            position
+            and velocity loops; 3 three loops, each giving PWM, clipped and added; 4 effort loop around torque plus
+            output of
+            the position loop, plus a velocity loop giving PWM.
         gains: (3, 14).
         memory: (3, 5), changed in place.
         setpoints: Position [rad], velocity [rad/s], effort [N m] or PWM; NaN for a loop that is off.

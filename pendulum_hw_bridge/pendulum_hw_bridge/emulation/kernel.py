@@ -1,7 +1,7 @@
 """Inner loop of the emulator: motor, gears, spring, link, temperatures and firmware in steps of 0.25 ms.
 
-The equations are those of :mod:`pendulum_msgs_py.dynamics.series_elastic`, called here, not copied. Semi-implicit
-Euler: velocities first, then positions with the new velocities; dry friction implicitly, hysteresis exactly.
+It calls the equations of :mod:`pendulum_msgs_py.dynamics.series_elastic`. Semi-implicit Euler: velocities first, then
+positions with the new velocities; dry friction implicitly, hysteresis exactly.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ STATES = (
     "spring_torque",
     "heat",
 )
-"""Names of the state vector's entries, all at the output side of the gears; ``heat`` sums i^2 R [J]."""
+"""Entries of the state vector, at the output side of the gears; ``heat`` sums i^2 R [J]."""
 
 CONSTANTS = (
     "gear_ratio",
@@ -89,7 +89,7 @@ CONSTANTS = (
     "enabled",
     *TERM_PARAMETERS,
 )
-"""Names of the constant vector's entries."""
+"""Entries of the constant vector."""
 
 _QM, _VM, _Q, _V, _Z, _TW, _TH, _TB, _PWM, _I, _TAU, _HEAT = range(12)
 (
@@ -136,9 +136,9 @@ _QM, _VM, _Q, _V, _Z, _TW, _TH, _TB, _PWM, _I, _TAU, _HEAT = range(12)
 ) = range(len(CONSTANTS) - len(TERM_PARAMETERS))
 
 _CLAMP_BAND = 0.05
-"""Share of the velocity clamp over which the firmware takes the drive back to nothing."""
+"""Share of the velocity clamp over which the firmware reduces the duty to zero [-]."""
 
-# Under names of this module, by which what compiles finds them.
+# Module-level names, by which the compiler finds the functions.
 _resistance_at = _sea.winding_resistance_at
 _winding_current = _sea.winding_current
 _spring_torque = _sea.spring_torque
@@ -165,13 +165,13 @@ LAYOUT = np.dtype(
     ],
     align=True,
 )
-"""What the compiled loop reads and writes: the arguments of :func:`advance`."""
+"""Arguments of :func:`advance` in the memory of the compiled loop."""
 
 
 class Actuator:
-    """The emulated actuator's numbers in one piece of memory, and its steps in machine code where it can be had.
+    """State of the emulated actuator in one block of memory, stepped by machine code if available.
 
-    Elsewhere numba compiles the same function in this process, and without numba Python runs it: the same bit by bit.
+    Otherwise numba compiles the same function in this process, or Python runs it, with identical bits.
 
     Attributes:
         state: Entries as in :data:`STATES`.
@@ -189,7 +189,7 @@ class Actuator:
         self.gains: Array = entries["gains"]
         self.memory: Array = entries["memory"]
         self.setpoints: Array = entries["setpoints"]
-        # What is written for each call: numpy would take several times as long.
+        # Arguments that change with each call: numpy would take several times as long.
         self._numbers: Any = structure_of(LAYOUT).from_buffer(self._whole.data)
         self._loop = _machine_code()
 
@@ -246,9 +246,9 @@ def advance(
         memory: (3, 5), of the firmware's loops.
         setpoints: Position, velocity, effort (or PWM); NaN for off.
         strategy: 0 to 4.
-        link_torque: Torque on the link itself, held over the steps [N m].
+        link_torque: External torque on the link, constant over the steps [N m].
         first_step: Number of the first step since power-up: the firmware runs every fourth.
-        steps: How many steps.
+        steps: Number of steps.
     """
     period = STEP * STEPS_PER_CYCLE
     for number in range(first_step, first_step + steps):
@@ -273,7 +273,7 @@ def advance(
             setpoints[2] = asked
             pwm = min(max(pwm, -constants[_ULIMIT]), constants[_ULIMIT])
             if pwm * state[_VM] > 0.0:
-                # The firmware takes the drive back as the motor nears its speed limit.
+                # The firmware reduces the duty as the motor nears its speed limit.
                 room = (constants[_VCLAMP] - abs(state[_VM])) / (_CLAMP_BAND * constants[_VCLAMP])
                 pwm *= min(max(room, 0.0), 1.0)
             if (state[_Q] > constants[_QMAX] and pwm > 0.0) or (state[_Q] < constants[_QMIN] and pwm < 0.0):

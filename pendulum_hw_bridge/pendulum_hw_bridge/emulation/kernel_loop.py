@@ -1,4 +1,4 @@
-"""The emulated actuator in machine code, for the compiler's process alone."""
+"""The emulated actuator in machine code, imported by the compiler's process only."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["actuator_loop"]
 
 
 def actuator_loop() -> Any:
-    """Return the steps of the emulated actuator, compiled."""
+    """Return the compiled steps of the emulated actuator."""
     steps = compile_tree(advance, exact=True)
 
     @entry(LAYOUT)

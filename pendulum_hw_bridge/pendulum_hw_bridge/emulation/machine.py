@@ -1,7 +1,7 @@
-"""An emulated machine of several joints on its own clock: a mechanism, drives at some joints, encoders at all.
+"""Emulated machine of several joints on its own clock: a mechanism with drives and encoders.
 
-The equations are those of the simulator, called here; the drives are its own. ``advance_to`` is the only way in which
-time passes, and two machines with one seed and one sequence of calls give the same feedback.
+It uses the simulator's equations and drives of its own. Only ``advance_to`` advances time, and machines with the same
+seed and sequence of calls give the same feedback.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_del
 __all__ = ["EmulatedMachine"]
 
 _STEP_NS = 1_000_000
-"""Longest step of the integration [ns]."""
+"""Longest integration step [ns]."""
 _CATCH_UP_NS = NANOSECONDS
-"""Longest time that is caught up with in one go [ns]: a second costs about 30 ms, a minute would block the actuator's
-thread for two seconds."""
+"""Longest time to catch up with at once [ns]: 1 s costs some 30 ms, a minute would block the actuator's thread for 2 s.
+"""
 _KEPT = 1000
 """Records of a joint that wait to be fetched; older ones are lost, as on a network."""
 
 
 class _Drive:
-    """What one drive does: off, or with a torque in force until its lifetime ends."""
+    """State of one drive: off, or with a torque in force until its lifetime ends."""
 
     def __init__(self, effort_limit: float) -> None:
         self.effort_limit = effort_limit
@@ -60,16 +60,15 @@ class EmulatedMachine:
     """A mechanism with drives and encoders.
 
     Args:
-        plant: The mechanism; joints with an actuator have a drive.
+        plant: Mechanism; joints with an actuator have a drive.
         hardware: Constants of drives and encoders.
         seed: Seed of sensor noise.
         position: n positions at the start, at rest; None for 0 [rad or m].
         start_ns: Time at the start [ns].
-        rate: Feedback records per second [Hz].
+        rate: Feedback rate [Hz].
 
     Raises:
-        ParameterError: The start has another number of joints, is not finite or beyond an end stop, or the drives have
-            different delays.
+        ParameterError: The start does not fit the joints or their end stops, or the drives have different delays.
     """
 
     def __init__(
@@ -92,7 +91,7 @@ class EmulatedMachine:
         self.drives = tuple(_Drive(limit) for limit in plant.effort_limits)
         for drive in self.drives:
             drive.temperature = own.ambient
-        # The same for all drives: what acts, acts in the order in which it arrived.
+        # The same delay for all drives: torques act in the order of arrival.
         self._delay = common_delay(plant)
         self.constants = tuple(
             own.constants(joints[index], limit)
@@ -119,25 +118,23 @@ class EmulatedMachine:
         self._sequence = 0
         self._outboxes: tuple[deque[Feedback], ...] = tuple(deque(maxlen=_KEPT) for _ in joints)
 
-    # --- what is outside ------------------------------------------------------------------------------------
-
     @property
     def state(self) -> tuple[Vector, Vector, Vector]:
-        """The truth at the last event: positions, velocities and the efforts of the drives, 0 at passive joints."""
+        """True positions, velocities and drive efforts (0 at passive joints) at the last event."""
         return self._position, self._velocity, self._effort
 
     @property
     def rate(self) -> float:
-        """Feedback records per second [Hz]."""
+        """Feedback rate [Hz]."""
         return NANOSECONDS / self._period_ns
 
     @property
     def stood_still(self) -> float:
-        """Time for which nobody moved it on, and it stood still instead of catching up [s]."""
+        """Time for which it was not advanced, and stood still instead of catching up [s]."""
         return self._stood_still_ns / NANOSECONDS
 
     def set_rate(self, rate: float) -> None:
-        """Send another number of records per second, from now on [Hz]."""
+        """Set the feedback rate from now on [Hz]."""
         if not (math.isfinite(rate) and 0.0 < rate <= 1000.0):
             raise ParameterError(f"feedback_rate is {rate} Hz; expected > 0 and <= 1000 Hz")
         period_ns = round(NANOSECONDS / rate)
@@ -146,13 +143,7 @@ class EmulatedMachine:
             self._next_sample_ns = self._now_ns
 
     def switch(self, index: int, now_ns: int, *, on: bool) -> None:
-        """Switch a drive on, without torque, or off; what was on its way to it is lost.
-
-        Args:
-            index: Which of the driven joints.
-            now_ns: When [ns].
-            on: Whether on.
-        """
+        """Switch driven joint ``index`` on, without torque, or off; commands in transit are lost."""
         self.advance_to(now_ns, wholly=True)
         self._inbox = [item for item in self._inbox if item[2] != index]
         heapq.heapify(self._inbox)
@@ -160,30 +151,30 @@ class EmulatedMachine:
         self._end(index)
 
     def set_lifetime(self, index: int, lifetime: float) -> None:
-        """Let a drive act on a command for so long after its arrival [s]."""
+        """Set a drive's command lifetime after arrival [s]."""
         self.drives[index].lifetime = check_lifetime(lifetime)
 
     def deliver(self, index: int, effort: float, sent_ns: int) -> None:
-        """Send a torque to a drive; it arrives after the way there, and acts after the drive's transport delay.
+        """Send a torque to a drive; it acts after command delay and transport delay.
 
         Args:
-            index: Which of the driven joints.
+            index: Index of the driven joint.
             effort: [N m or N]; NaN for none.
-            sent_ns: When it is sent [ns].
+            sent_ns: Time of sending [ns].
         """
         self._deliveries += 1
         arrival_ns = sent_ns + round(self.hardware.command_delay * NANOSECONDS)
         heapq.heappush(self._inbox, (arrival_ns, self._deliveries, index, effort))
 
     def hold_push(self, index: int, effort: float, now_ns: int) -> None:
-        """Hold an effort on a joint itself, as a hand would; one that is no number counts for none [N m or N]."""
+        """Hold an external effort on a joint [N m or N]; NaN is none."""
         effort = effort if math.isfinite(effort) else 0.0
         if effort != self.push[index]:
             self.advance_to(now_ns, wholly=True)
             self.push = (*self.push[:index], effort, *self.push[index + 1 :])
 
     def feedback(self, index: int, until_ns: int) -> Feedback | None:
-        """Return the newest record of a joint that has reached the host by a time, and drop older ones."""
+        """Return the newest record of a joint that has arrived by a time [ns], and drop older ones."""
         newest = None
         outbox = self._outboxes[index]
         while outbox and outbox[0].stamp_ns <= until_ns:
@@ -191,18 +182,18 @@ class EmulatedMachine:
         return newest
 
     def next_arrival_ns(self, index: int) -> int:
-        """Return when the next record of a joint will reach the host, as far as anybody can tell [ns]."""
+        """Return the expected arrival of a joint's next record [ns]."""
         outbox = self._outboxes[index]
         if outbox:
             return outbox[0].stamp_ns
         return self._next_sample_ns + round(self.hardware.feedback_delay * NANOSECONDS)
 
     def advance_to(self, time_ns: int, *, wholly: bool = False) -> None:
-        """Let everything happen that is due by a time, of a long one the last second alone.
+        """Process everything due by a time [ns], of a long time only the last second.
 
         Args:
-            time_ns: The time [ns].
-            wholly: Move the mechanism on to that very time, not only to the last event before it.
+            time_ns: Time [ns].
+            wholly: Integrate to that very time, not only to the last event before it.
         """
         self._skip(time_ns - self._next_sample_ns - _CATCH_UP_NS)
         while True:
@@ -221,10 +212,8 @@ class EmulatedMachine:
         if wholly:
             self._flow(time_ns)
 
-    # --- inside ---------------------------------------------------------------------------------------------
-
     def _skip(self, late_ns: int) -> None:
-        """Let a time pass in which the mechanism stands still [ns]; a command's lifetime goes by all the same."""
+        """Let time pass while the mechanism stands still [ns]; command lifetimes still expire."""
         if late_ns > 0:
             late_ns -= late_ns % self._period_ns
             self._now_ns += late_ns
@@ -263,12 +252,12 @@ class EmulatedMachine:
         )
 
     def _end(self, index: int) -> None:
-        """End a drive's torque, that which is still to act as well."""
+        """End a drive's torque, including delayed ones."""
         self.drives[index].end()
         self._acts = deque(item for item in self._acts if item[1] != index)
 
     def _happen(self, time_ns: int) -> None:
-        # A torque that ends in the instant in which the next arrives has ended.
+        # Expiry comes before an arrival at the same instant.
         for index, drive in enumerate(self.drives):
             if drive.expires_ns is not None and drive.expires_ns <= time_ns:
                 drive.expiries += 1
@@ -287,7 +276,7 @@ class EmulatedMachine:
         if not drive.on or ActuatorFault.COMMANDS_LOST in self.faults[joint]:
             return
         limit = drive.effort_limit
-        # What is no number is no torque: clamping would make the full one of it.
+        # NaN is no torque: clamping would turn it into full torque.
         drive.accepted = min(limit, max(-limit, effort)) if math.isfinite(effort) else math.nan
         drive.expires_ns = arrival_ns + round(drive.lifetime * NANOSECONDS)
         delay_ns = round(self._delay * NANOSECONDS)
@@ -296,7 +285,7 @@ class EmulatedMachine:
     def _sample(self) -> None:
         self._sequence += 1
         for index, faults in enumerate(self.faults):
-            # Drawn before anything may be lost: a fault of one joint changes the noise of no other.
+            # Draw noise before anything may be lost: a fault of one joint must not change the noise of others.
             noise = self._random.standard_normal(2)
             if ActuatorFault.FEEDBACK_LOST not in faults:
                 record = self._measure(index, float(noise[0]), float(noise[1]))
@@ -338,7 +327,7 @@ class EmulatedMachine:
         drive, constants = self.drives[motor], self.constants[motor]
         current, resistance = self._electric(motor)
         back_emf = constants.back_emf_constant * constants.gear_ratio * velocity
-        # Off, the bridge of the motor is open: there is no duty, and no current whatever the speed.
+        # When off, the motor's bridge is open: no duty, and no current at any speed.
         duty = (resistance * current + back_emf) / own.supply_voltage if drive.on else math.nan
         return record._replace(
             effort=self._effort[index] + own.effort_noise * drive.effort_limit * of_effort,

@@ -1,4 +1,4 @@
-"""Constants of the emulated actuator: drivetrain and link from a plant file, plus sensors, timing and temperatures."""
+"""Constants of the emulated actuator: drivetrain and link from a plant file, sensors, timing and temperatures."""
 
 from __future__ import annotations
 
@@ -31,26 +31,25 @@ __all__ = [
 ]
 
 FIRMWARE_EFFICIENCY = 0.65
-"""Efficiency that the firmware's feed-forward of torque assumes [-]."""
+"""Efficiency assumed by the firmware's torque feed-forward [-]."""
 SPEED_CONSTANT_RPM = 1530.0
-"""Motor speed constant K_v that the firmware's feed-forward of velocity assumes [rpm/V]."""
+"""Motor speed constant K_v assumed by the firmware's velocity feed-forward [rpm/V]."""
 
 
 @dataclass(frozen=True)
 class SensorParameters:
-    """Noise and steps of the feedback.
+    """Noise and resolution of the feedback.
 
-    Source: steps and deflection noise (at most 0.2 mrad) measured on a public log of an X5; position and velocity
-        noise inferred.
+    Source: resolution and deflection noise (at most 0.2 mrad) measured on a public log of an X5; position and velocity
+    noise inferred.
 
     Attributes:
-        position_step: Step of the output encoder [rad].
+        position_step: Resolution of the output encoder [rad].
         velocity_noise: Standard deviation of the velocity [rad/s].
-        effort_noise: Half width of uniform noise on the effort; the deflection's follows from the stiffness, 0.15
-            mrad at 100 N m/rad [N m].
-        motor_position_step: Step of the rotor angle, before the gears [rad].
+        effort_noise: Half width of uniform noise on the effort, 0.15 mrad of deflection at 100 N m/rad [N m].
+        motor_position_step: Resolution of the rotor angle, before the gears [rad].
         pwm_step: [-].
-        motor_current_step: Step of the supply current [A].
+        motor_current_step: Resolution of the supply current [A].
         voltage_step: [V].
         idle_current: Supply current of the electronics [A].
     """
@@ -88,15 +87,7 @@ class TimingParameters:
 
 @dataclass(frozen=True)
 class EmulatorParameters:
-    """Everything that makes one emulated actuator.
-
-    Attributes:
-        plant: Link (inertia, damping, gravity) and drivetrain.
-        thermal: Heat.
-        sensors: Feedback noise and steps.
-        timing: Feedback rate and delays.
-        flat: The pendulum lies flat on a table: no gravity.
-    """
+    """Constants of one emulated actuator; ``flat`` means without gravity."""
 
     plant: PlantParameters
     thermal: ThermalParameters = field(default_factory=ThermalParameters)
@@ -105,7 +96,6 @@ class EmulatorParameters:
     flat: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse a plant without drivetrain: there would be nothing to emulate."""
         if self.plant.drivetrain is None:
             raise ParameterError(
                 f"plant {self.plant.name!r} has no drivetrain; expected one with motor, gears and spring, such as "
@@ -123,11 +113,7 @@ class EmulatorParameters:
         return replace(self, plant=self.plant.with_values(drivetrain=replace(self.drivetrain, **changes)))
 
     def shorted_winding_damping(self, temperature: float) -> float:
-        """Return the back-EMF damping with the whole motor at a temperature [N m s/rad].
-
-        Args:
-            temperature: Of winding and magnets [degC].
-        """
+        """Return the back-EMF damping with winding and magnets at a temperature [degC], in [N m s/rad]."""
         drive, beta = self.drivetrain, self.thermal.magnet_coefficient
         return shorted_winding_damping(
             torque_constant_at(temperature, drive.torque_constant, beta),
@@ -137,15 +123,9 @@ class EmulatorParameters:
         )
 
     def constants(self, limits: HardwareLimits, supply_voltage: float, enabled: bool) -> Array:
-        """Return the constant vector of the kernel.
-
-        Args:
-            limits: Limits that the firmware keeps.
-            supply_voltage: Present supply voltage [V].
-            enabled: Whether the motor may be driven (motion stop, temperature).
-        """
+        """Return the kernel's constant vector at a supply voltage [V]; ``enabled`` if the motor may be driven."""
         drive, thermal = self.drivetrain, self.thermal
-        # The firmware normalises with nominal constants: it does not know the temperature of its winding.
+        # The firmware normalises with nominal constants: it does not know its winding's temperature.
         effort_normaliser = drive.winding_resistance / (
             drive.gear_ratio * drive.supply_voltage * drive.torque_constant * FIRMWARE_EFFICIENCY
         )
@@ -200,8 +180,8 @@ class EmulatorParameters:
 def load_emulator(plant: str | Path = "thesis", *, heating: bool = False) -> EmulatorParameters:
     """Return the emulator of a preset (one of ``EMULATOR_PRESETS``) or of a plant file with a drivetrain.
 
-    ``thesis`` is the machine on which the thesis's experiments give its M_c, b_c and G_c; as a rigid plant, without
-    drivetrain, the preset of the same name is what those experiments found.
+    ``thesis`` is the machine on which the thesis's experiments give its M_c, b_c and G_c; the rigid preset of that name
+    is their result.
 
     Raises:
         ParameterError: No such preset or file, or a plant without drivetrain.
@@ -219,7 +199,7 @@ def load_emulator(plant: str | Path = "thesis", *, heating: bool = False) -> Emu
     drivetrain = parameters.drivetrain
     thermal = ThermalParameters()
     if drivetrain is not None:
-        # The thesis's b_c is that of a motor that never warmed up; a hand at 1 rad/s heats the winding by 50 K.
+        # The thesis's b_c is that of a cold motor; a hand at 1 rad/s heats the winding by 50 K.
         thermal = ThermalParameters(
             ambient=drivetrain.winding_temperature, isothermal=str(plant) == "thesis" and not heating
         )

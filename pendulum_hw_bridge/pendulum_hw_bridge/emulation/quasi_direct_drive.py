@@ -1,8 +1,8 @@
-"""The drivetrain of an emulated machine of several joints: a strong motor behind few gears, with a current loop.
+"""Drivetrain of an emulated machine of several joints: a strong motor with low gear ratio and current loop.
 
-An X5-9 turns at 1.5 rad/s and brakes with 11.8 N m s/rad: it swings up nothing of several joints. Machines of that
-kind have quasi-direct drives, whose motors are driven by current: what is commanded is torque, and is there a
-millisecond later. Source of the order of the constants: B. Katz, A low cost modular actuator for dynamic robots, 2018.
+An X5-9 turns at 1.5 rad/s and brakes with 11.8 N m s/rad, too slow to swing up several joints. Quasi-direct drives
+command torque through the current, with a lag of 1 ms. Source of the magnitudes: B. Katz, A low cost modular actuator
+for dynamic robots, 2018.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ __all__ = ["QuasiDirectDrive"]
 
 @dataclass(frozen=True)
 class QuasiDirectDrive:
-    """Constants of the drives and encoders of one machine; the effort limit of each is the plant file's.
+    """Constants of drives and encoders of one machine; the plant file has the effort limits.
 
     Attributes:
         gear_ratio: Motor turns per turn of the joint [-].
-        pinion_radius: Of a joint that slides: travel per turn of the gears' output [m/rad].
+        pinion_radius: For a slide: travel per turn of the gears' output [m/rad].
         peak_current: Winding current at the effort limit [A].
         winding_resistance: At 20 degC [ohm].
         supply_voltage: [V].
         current_loop: First-order lag of the current loop [s].
-        encoder_counts: Steps of each encoder in a turn; a motor's sits before its gears [-].
-        velocity_noise: Standard deviation of the velocity [rad/s], times the radius where a joint slides.
+        encoder_counts: Encoder steps per turn; a motor's encoder is before its gears [-].
+        velocity_noise: Standard deviation of the velocity [rad/s], times the radius for a slide.
         effort_noise: Standard deviation of the measured effort, as a share of the effort limit [-].
         feedback_delay: From measurement to the host [s].
-        command_delay: From the host to the drive, beside the plant file's transport delay [s].
-        ambient: Temperature around it [degC].
-        thermal_resistance: From winding to surroundings [K/W].
-        thermal_time: Time in which the winding warms up [s].
+        command_delay: From the host to the drive, in addition to the plant file's transport delay [s].
+        ambient: Ambient temperature [degC].
+        thermal_resistance: From winding to ambient [K/W].
+        thermal_time: Thermal time constant of the winding [s].
     """
 
     gear_ratio: float = 6.0
@@ -53,20 +53,15 @@ class QuasiDirectDrive:
     thermal_time: float = 60.0
 
     def scale(self, joint: Joint) -> float:
-        """Return how far a joint moves for a radian at the output of the gears [rad/rad or m/rad]."""
+        """Return the joint's travel per radian at the gears' output [rad/rad or m/rad]."""
         return 1.0 if joint.turns or joint.unit == "rad" else self.pinion_radius
 
     def step(self, joint: Joint, *, driven: bool) -> float:
-        """Return the step of a joint's encoder [rad or m]."""
+        """Return the resolution of a joint's encoder [rad or m]."""
         return 2.0 * math.pi / self.encoder_counts * self.scale(joint) / (self.gear_ratio if driven else 1.0)
 
     def constants(self, joint: Joint, effort_limit: float) -> SeriesElasticParameters:
-        """Return motor and gears of one joint as the checks of the bridge take them; there is no spring to speak of.
-
-        Args:
-            joint: Which one.
-            effort_limit: Its largest effort [N m or N].
-        """
+        """Return motor and gears of a joint with an effort limit [N m or N], for the bridge's checks; no spring."""
         gear_ratio = self.gear_ratio / self.scale(joint)
         per_ampere = effort_limit / self.peak_current / gear_ratio
         return SeriesElasticParameters(

@@ -1,4 +1,4 @@
-"""What the emulated actuator's sensors make of its state: noise, steps, and the firmware's own flags."""
+"""Sensors of the emulated actuator: noise, resolution and firmware flags."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def measure(
     voltage: float,
     random: np.random.Generator,
 ) -> Feedback:
-    """Return a feedback record of a state, without times and without what concerns senders and buttons.
+    """Return a feedback record of a state, without times, senders and buttons.
 
     Args:
         state: Entries as in :data:`pendulum_hw_bridge.emulation.kernel.STATES`.
@@ -33,7 +33,7 @@ def measure(
         parameters: Constants.
         limits: Limits of the firmware.
         voltage: Supply voltage [V].
-        random: Draws the noise: three numbers a record, whatever its values.
+        random: Source of noise: a constant number of draws per record.
     """
     drive, sensors = parameters.drivetrain, parameters.sensors
     motor_position, motor_velocity, position, velocity, _, winding, housing, body, pwm, current = state.tolist()[:10]
@@ -46,7 +46,7 @@ def measure(
         sequence=0,
         position=_step(position, sensors.position_step),
         velocity=velocity + noise,
-        # The sensor is the spring without its hysteresis: that is where loading and unloading differ.
+        # The sensor is the spring without its hysteresis, which makes loading and unloading differ.
         effort=spring_torque(-deflection, 0.0, drive.stiffness, drive.stiffness_hardening, 0.0),
         position_command=float(setpoints[0]),
         velocity_command=float(setpoints[1]),

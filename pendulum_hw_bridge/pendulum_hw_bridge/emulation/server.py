@@ -1,4 +1,4 @@
-"""An emulated actuator that lives in a process of its own and answers on UDP, whoever uses it and however they end."""
+"""Server process of an emulated actuator on UDP, independent of its clients."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from pendulum_msgs_py.errors import ParameterError, PendulumError
 __all__ = ["EmulatorIdentity", "EmulatorServer"]
 
 _LEASE = 2.0
-"""Time for which a listener gets feedback after its last packet [s]."""
+"""Time for which a client receives feedback after its last packet [s]."""
 _BATCH = 64
 _TIMESTAMPS = 35
-"""``SO_TIMESTAMPNS`` of Linux, which :mod:`socket` does not name: the system time at which a packet came."""
+"""``SO_TIMESTAMPNS`` of Linux, missing in :mod:`socket`: system time of a packet's arrival."""
 _TIME = struct.Struct("@ll")
 _NOTES = socket.CMSG_SPACE(_TIME.size)
 _UNREACHABLE = {ActuatorFault.COMMANDS_LOST, ActuatorFault.LOCKED_BY_OTHER}
@@ -36,15 +36,7 @@ Address = tuple[str, int]
 
 @dataclass(frozen=True)
 class EmulatorIdentity:
-    """What an emulated module says of itself.
-
-    Attributes:
-        family: HEBI family.
-        name: HEBI name; empty for that of its plant.
-        serial: Serial number.
-        type: Mechanical type.
-        firmware: Firmware revision.
-    """
+    """Identity that an emulated module reports; an empty name stands for that of its plant."""
 
     family: str = "emulated"
     name: str = ""
@@ -57,10 +49,10 @@ class EmulatorServer:
     """Serves one emulated actuator.
 
     Args:
-        actuator: The actuator; its clock must start at the present of ``clock``.
+        actuator: Actuator; its clock must start at the present of ``clock``.
         address: Host and port to listen on; port 0 takes any.
         clock: Wall time [ns].
-        identity: What it says of itself.
+        identity: Reported identity.
 
     Raises:
         PendulumError: The address is in use or not ours.
@@ -83,7 +75,7 @@ class EmulatorServer:
             self._socket.close()
             raise PendulumError(f"emulator cannot listen on {address[0]}:{address[1]}: {error.strerror}") from error
         self._socket.setblocking(False)
-        # Of the kernel: a busy machine keeps this process from running, and no packet from reaching a real module.
+        # Kernel timestamps: a busy machine delays this process, but would not delay packets to a real module.
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
         self._turned_ns = 0
@@ -96,7 +88,7 @@ class EmulatorServer:
         return str(host), int(port)
 
     def serve(self, running: Callable[[], bool]) -> None:
-        """Serve until ``running`` says no; it is asked at least ten times a second."""
+        """Serve while ``running()``, which is called at least ten times a second."""
         try:
             while running():
                 self._turn(0.1)
@@ -119,7 +111,7 @@ class EmulatorServer:
                     packet, notes, _, sender = self._socket.recvmsg(wire.MAX_PACKET, _NOTES)
                 except (BlockingIOError, ConnectionRefusedError):
                     break
-                # Never before what has been computed, whatever the system clock does.
+                # Never before the computed state, whatever the system clock does.
                 self._receive(packet, sender, min(now, max(self._turned_ns, now - _age_ns(notes))))
         self._turned_ns = now
         actuator.advance_to(now)
@@ -207,7 +199,7 @@ class EmulatorServer:
 
 
 def _age_ns(notes: Sequence[tuple[int, int, bytes]]) -> int:
-    """Return for how long a packet has waited for this process [ns]; 0 where the kernel does not tell."""
+    """Return how long a packet has waited for this process [ns]; 0 without a kernel timestamp."""
     for level, kind, data in notes:
         if (level, kind, len(data)) == (socket.SOL_SOCKET, _TIMESTAMPS, _TIME.size):
             seconds, nanoseconds = _TIME.unpack(data)

@@ -30,13 +30,13 @@ class ThermalParameters:
         winding_capacity: C_w [J/K].
         housing_capacity: C_h [J/K].
         body_capacity: C_b [J/K].
-        ambient: Temperature of the room [degC].
-        max_winding: Temperature at which the firmware takes the motor off [degC].
-        critical_winding: Temperature at which it begins to limit the output [degC].
-        magnet_coefficient: Relative change of K_t and K_e per kelvin of the magnets [1/K]. Sm2Co17 loses 0.035 % of
-            its flux per kelvin; with copper's 0.4 %/K the shorted-winding damping is then 11.87, 11.76 and
-            10.84 N m s/rad at 20, 22 and 40 degC.
-        isothermal: Keep all temperatures as they are at the start.
+        ambient: Ambient temperature [degC].
+        max_winding: Temperature at which the firmware switches the motor off [degC].
+        critical_winding: Temperature at which it starts to limit the output [degC].
+        magnet_coefficient: Relative change of K_t and K_e per kelvin of the magnets [1/K]. Sm2Co17 loses 0.035 % of its
+            flux per kelvin; with copper's 0.4 %/K the shorted-winding damping is then 11.87, 11.76 and 10.84 N m s/rad
+            at 20, 22 and 40 degC.
+        isothermal: Keep all temperatures constant.
     """
 
     winding_housing: float = 4.626
@@ -52,7 +52,6 @@ class ThermalParameters:
     isothermal: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse constants with which heat would flow uphill."""
         for name, unit in (
             ("winding_housing", "K/W"),
             ("housing_body", "K/W"),
@@ -72,11 +71,5 @@ class ThermalParameters:
 
 
 def torque_constant_at(temperature: float, constant: float, coefficient: float) -> float:
-    """Return K_t (or K_e) with the magnets at a temperature, K (1 + beta (T - 20)).
-
-    Args:
-        temperature: Of the magnets, which sit at the housing [degC].
-        constant: K at 20 degC.
-        coefficient: beta, negative [1/K].
-    """
+    """Return K_t (or K_e) with the magnets, at the housing, at a temperature [degC]: K (1 + beta (T - 20))."""
     return constant * (1.0 + coefficient * (temperature - 20.0))

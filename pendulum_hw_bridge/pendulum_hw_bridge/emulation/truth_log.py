@@ -1,4 +1,4 @@
-"""The truth behind the feedback on file: what the motor did, whoever was told what."""
+"""True motion and torque of the emulated actuator, written to a file."""
 
 from __future__ import annotations
 
@@ -13,20 +13,17 @@ from pendulum_msgs_py.whole_file import writing
 __all__ = ["COLUMNS", "truth_log"]
 
 COLUMNS = ("time_ns", "position", "velocity", "motor_torque", "pwm")
-"""Fields of :class:`LinkState` that are kept [ns, rad, rad/s, N m, -]."""
+"""Logged fields of :class:`LinkState` [ns, rad, rad/s, N m, -]."""
 
 
 @contextmanager
 def truth_log(path: Path) -> Iterator[Callable[[LinkState], None]]:
-    """Open a CSV file with a row for each millisecond of an emulated actuator; what it gives is for its ``trace``.
+    """Open a new CSV file with a row per millisecond; yields a function for the actuator's ``trace``.
 
-    Each row is on the file system before the next, so that it is kept whatever ends the process.
-
-    Args:
-        path: File to write anew.
+    Each row is flushed before the next, so that it survives any end of the process.
 
     Raises:
-        PendulumError: It cannot be written.
+        PendulumError: The file cannot be written.
     """
     with writing(f"truth of the emulator {path}", PendulumError):
         file = path.open("w", buffering=1, encoding="ascii")

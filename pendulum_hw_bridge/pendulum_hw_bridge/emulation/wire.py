@@ -1,7 +1,7 @@
-"""Packets between an emulated actuator in a process of its own and those who use it, over UDP as with a real module.
+"""Packets between an emulated actuator process and its clients, over UDP as with a real module.
 
-Connectionless on purpose: when the bridge dies, nobody tells the actuator. Setpoints and feedback are fixed structs,
-settings are small JSON objects that are answered.
+Connectionless on purpose: the actuator is not informed when the bridge dies. Setpoints and feedback are fixed structs;
+settings are JSON requests with replies.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _FEEDBACK = struct.Struct(f"<{_INTEGERS}q{len(Feedback._fields) - _INTEGERS - _F
 
 
 def kind_of(packet: bytes) -> bytes:
-    """Return the kind of a packet, empty for one that is not ours."""
+    """Return the kind of a packet, empty if unknown."""
     kind = packet[: len(COMMAND)]
     return kind if kind in {COMMAND, FEEDBACK, REQUEST, REPLY} else b""
 
@@ -59,7 +59,7 @@ def encode_command(command: Command) -> bytes:
 
 
 def decode_command(packet: bytes) -> Command | None:
-    """Return the setpoints of a packet, or None where it has another length or holds an infinity."""
+    """Return the setpoints of a packet, or None for a wrong length or an infinite value."""
     if len(packet) != len(COMMAND) + _COMMAND.size:
         return None
     values = _COMMAND.unpack_from(packet, len(COMMAND))
@@ -72,7 +72,7 @@ def encode_feedback(feedback: Feedback) -> bytes:
 
 
 def decode_feedback(packet: bytes) -> Feedback | None:
-    """Return the record of a packet, or None where it has another length."""
+    """Return the record of a packet, or None for a wrong length."""
     if len(packet) != len(FEEDBACK) + _FEEDBACK.size:
         return None
     values = list(_FEEDBACK.unpack_from(packet, len(FEEDBACK)))
@@ -86,7 +86,7 @@ def encode_json(kind: bytes, value: dict[str, Any]) -> bytes:
 
 
 def decode_json(packet: bytes) -> dict[str, Any]:
-    """Return the object in a request or reply; empty where there is none."""
+    """Return the object in a request or reply, or an empty one."""
     try:
         value = json.loads(packet[len(REQUEST) :])
     except (ValueError, RecursionError):
@@ -95,7 +95,7 @@ def decode_json(packet: bytes) -> dict[str, Any]:
 
 
 def gains_to_json(gains: GainSet) -> dict[str, Any]:
-    """Return gains as JSON; a clamp at infinity is left out."""
+    """Return gains as JSON, without infinite clamps."""
     loops = {
         loop: {name: value for name in GAIN_FIELDS if math.isfinite(value := float(getattr(gains.loop(loop), name)))}
         for loop in LOOPS
@@ -104,11 +104,7 @@ def gains_to_json(gains: GainSet) -> dict[str, Any]:
 
 
 def gains_from_json(value: dict[str, Any]) -> GainSet:
-    """Return the gains in a JSON object.
-
-    Raises:
-        ParameterError: It lacks a loop, or a gain is refused.
-    """
+    """Return the gains in a JSON object; ParameterError if it lacks a loop or a gain is refused."""
     try:
         return GainSet(int(value["strategy"]), *(PidGains(**value[loop]) for loop in LOOPS))
     except (KeyError, TypeError, ValueError) as error:
@@ -116,7 +112,7 @@ def gains_from_json(value: dict[str, Any]) -> GainSet:
 
 
 def limits_to_json(limits: HardwareLimits) -> dict[str, Any]:
-    """Return limits as JSON; a window without an end is left open."""
+    """Return limits as JSON, without infinite ends of the window."""
     value: dict[str, Any] = {
         "effort": limits.effort,
         "velocity": limits.velocity,
@@ -130,11 +126,7 @@ def limits_to_json(limits: HardwareLimits) -> dict[str, Any]:
 
 
 def limits_from_json(value: dict[str, Any]) -> HardwareLimits:
-    """Return the limits in a JSON object.
-
-    Raises:
-        ParameterError: It is not understood, or a limit is refused.
-    """
+    """Return the limits in a JSON object; ParameterError if it is not understood or a limit is refused."""
     try:
         return HardwareLimits(**{**value, "m_stop": MStopAction(value["m_stop"])})
     except (KeyError, TypeError, ValueError) as error:
@@ -142,11 +134,7 @@ def limits_from_json(value: dict[str, Any]) -> HardwareLimits:
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Return host and port of ``HOST:PORT``.
-
-    Raises:
-        ParameterError: It is something else.
-    """
+    """Return host and port of ``HOST:PORT``; ParameterError for anything else."""
     host, colon, port = text.rpartition(":")
     if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise ParameterError(f"emulator address is {text!r}; expected HOST:PORT, such as 127.0.0.1:17590")

@@ -1,7 +1,7 @@
-"""An emulated X5-9 on its own clock: commands arrive, feedback leaves, physics goes on whoever listens.
+"""Emulated X5-9 on its own clock, independent of hosts, sockets and wall time.
 
-It knows nothing of hosts, sockets or wall clocks. ``advance_to`` is the only way in which time passes, and two
-emulators with one seed and one sequence of calls give the same feedback, bit by bit.
+Only ``advance_to`` advances time, and emulators with the same seed and sequence of calls give identical feedback, bit
+by bit.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from pendulum_msgs_py.errors import ParameterError
 __all__ = ["EmulatedX5", "HandTorque", "LinkState"]
 
 HandTorque = Callable[[float, float, float], float]
-"""Torque of a hand on the link as a function of time [s], position [rad] and velocity [rad/s]; returns [N m]."""
+"""Torque of a hand on the link [N m] as a function of time [s], position [rad] and velocity [rad/s]."""
 
 _HAND_STEPS = 4
 _FAULT_VOLTAGE = {ActuatorFault.VOLTAGE_LOW: 18.0, ActuatorFault.VOLTAGE_HIGH: 52.0}
@@ -51,7 +51,7 @@ _OPEN_CIRCUIT = 1e9
 
 
 class LinkState(NamedTuple):
-    """What link and motor really do: the truth behind the feedback.
+    """True state of link and motor.
 
     Attributes:
         time_ns: Actuator time [ns].
@@ -124,8 +124,6 @@ class EmulatedX5:
         self.place(position)
         self._refresh()
 
-    # --- what is outside ------------------------------------------------------------------------------------
-
     @property
     def now_ns(self) -> int:
         """Actuator time, in steps of 0.25 ms [ns]."""
@@ -133,7 +131,7 @@ class EmulatedX5:
 
     @property
     def link(self) -> LinkState:
-        """The truth, which no sensor sees."""
+        """True state, not available from sensors."""
         state, drive = self._state.tolist(), self.parameters.drivetrain
         return LinkState(
             time_ns=self.now_ns,
@@ -148,7 +146,7 @@ class EmulatedX5:
         )
 
     def place(self, position: float, temperature: float | None = None) -> None:
-        """Put the link at rest somewhere, the spring carrying its weight and the motor at one temperature.
+        """Put the link at rest at a position [rad], its weight carried by the spring.
 
         Args:
             position: [rad].
@@ -173,10 +171,10 @@ class EmulatedX5:
         command_lifetime: float | None = None,
         feedback_rate: float | None = None,
     ) -> None:
-        """Change settings of the firmware, as an acknowledged command does; changing the strategy ends all loops."""
+        """Change settings of the firmware, as an acknowledged command does; a new strategy resets all loops."""
         if strategy is not None:
             self.strategy = Strategy(strategy)
-            # Setpoints still on their way were meant for the strategy before, and were sent before.
+            # Setpoints in transit were sent for the previous strategy.
             self._inbox.clear()
             self._end_command()
         if gains is not None:
@@ -196,13 +194,13 @@ class EmulatedX5:
         self._refresh()
 
     def inject(self, fault: ActuatorFault) -> None:
-        """Let a fault begin now."""
+        """Start a fault now."""
         self.faults.add(ActuatorFault(fault))
         self._frozen = self._last
         self._fault_sequence = self._sequence
         if fault is ActuatorFault.MODULE_REBOOT:
-            # What was never saved in the module is lost: limits, gains, what the motion stop does. Lifetime and rate
-            # live in the host's library, which sends them with each packet.
+            # Unsaved settings are lost: limits, gains, M-stop action. Lifetime and rate are stored in the host's
+            # library, which sends them with each packet.
             self.configure(
                 strategy=Strategy.OFF,
                 gains=DEFAULT_GAINS[3],
@@ -221,32 +219,30 @@ class EmulatedX5:
         self._refresh()
 
     def clear_faults(self) -> None:
-        """Mend everything; a module that rebooted or changed its strategy stays as it is."""
+        """End all faults; a module that rebooted or changed its strategy stays as it is."""
         self.faults.clear()
         self._frozen = None
         self._actuator.gains[:] = gain_rows(self.gains)
         self._refresh()
 
-    # --- commands and time ----------------------------------------------------------------------------------
-
     def deliver(self, command: Command, arrival_ns: int, sender: int = 1) -> None:
-        """Let a command arrive at a time not before now.
+        """Deliver a command at a time not before now.
 
         Args:
-            command: Setpoints; the strategy in force decides what they mean.
+            command: Setpoints; the strategy in force decides their meaning.
             arrival_ns: Actuator time of arrival [ns].
-            sender: Who sends; while a lifetime runs, others are locked out.
+            sender: Sender; others are locked out during a command lifetime.
         """
         self._deliveries += 1
         heapq.heappush(self._inbox, (max(arrival_ns, self.now_ns), self._deliveries, sender, command))
 
     @property
     def next_sample_ns(self) -> int:
-        """When the next feedback record will be measured [ns]."""
+        """Time of the next measurement [ns]."""
         return self._next_sample_ns
 
     def feedback(self, until_ns: int) -> Feedback | None:
-        """Return the newest record that has reached the host by a time, and drop older ones."""
+        """Return the newest record that has arrived by a time [ns], and drop older ones."""
         newest = None
         while self._outbox and self._outbox[0][0] <= until_ns:
             newest = self._outbox.popleft()[1]
@@ -254,15 +250,11 @@ class EmulatedX5:
 
     @property
     def next_delivery_ns(self) -> int | None:
-        """When the next record under way will reach the host [ns], or None where none is under way."""
+        """Arrival of the next record in transit [ns], or None."""
         return self._outbox[0][0] if self._outbox else None
 
     def advance_to(self, time_ns: int) -> None:
-        """Let time pass, with everything that happens on the way.
-
-        Args:
-            time_ns: Actuator time to reach, to the next lower 0.25 ms [ns].
-        """
+        """Let time pass, with all events, up to ``time_ns`` rounded down to 0.25 ms [ns]."""
         while True:
             target = time_ns
             if self._inbox:
@@ -274,8 +266,6 @@ class EmulatedX5:
             if target >= time_ns and not self._due(time_ns):
                 return
             self._events(target)
-
-    # --- inside ---------------------------------------------------------------------------------------------
 
     def _due(self, time_ns: int) -> bool:
         return (
@@ -319,7 +309,7 @@ class EmulatedX5:
             jitter = min(timing.feedback_jitter, 0.1 * period) * float(self._random.standard_normal())
             jitter = min(max(jitter, -0.3 * period), 0.3 * period)
             nominal = round(NANOSECONDS * period)
-            # Jitter around a regular raster: a late record does not make all later ones late.
+            # Jitter around a regular raster: a late record does not delay later ones.
             self._raster_ns = (self._raster_ns if self._samples > 1 else time_ns) + nominal
             self._next_sample_ns = max(self._raster_ns + round(NANOSECONDS * jitter), time_ns + kernel.STEP_NS)
 
@@ -330,7 +320,7 @@ class EmulatedX5:
             return
         if self._expires_ns is not None and self._lock_holder not in {None, sender}:
             return
-        # The strategy in force decides what the field means, whatever the sender meant by it.
+        # The strategy in force decides what the field means, whatever the sender meant.
         self._setpoints[:] = (command.position, command.velocity, command.effort_field)
         self.last_command_ns = time_ns
         self._expires_ns = time_ns + round(self.command_lifetime * NANOSECONDS)
@@ -344,7 +334,7 @@ class EmulatedX5:
 
     @property
     def voltage(self) -> float:
-        """Supply voltage at present [V]."""
+        """Present supply voltage [V]."""
         for fault, voltage in _FAULT_VOLTAGE.items():
             if fault in self.faults:
                 return voltage

@@ -1,1 +1,1 @@
-"""The programs of a lab: zero, sign, tare and proofs; module files, scans, the emulator."""
+"""Programs for the lab: zero, sign, tare and proofs; module files, scans, the emulator."""

@@ -41,7 +41,7 @@ def convert(
             sign=values.get("joint_sign", 1),
             tare=values.get("effort_tare", 0.0),
         )
-    # A quantity that was never there (a loop that was off, an older firmware) would be a column of nothing.
+    # Omit quantities without values (a loop that was off, an older firmware).
     kept = {name: column for name, column in quantities.items() if np.all(np.isfinite(column))}
     for name in ("position", "velocity", "effort"):
         if name not in kept:

@@ -1,4 +1,4 @@
-"""``emulator``: emulate the X5-9; ``emulator_fault``: let the emulator fail; ``emulator_hand``: turn the link a bit."""
+"""``emulator``: emulate the X5-9; ``emulator_fault``: inject faults; ``emulator_hand``: turn the link a little."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ def emulator(
     clock = SteadyWallClock()
     parameters = replace(load_emulator(plant, heating=heating), flat=flat)
     actuator = EmulatedX5(parameters, seed=seed, position=position, start_ns=clock())
-    # Code is compiled before anybody listens: the first seconds are not real time otherwise.
+    # Compile before listening: the first seconds would not be in real time.
     actuator.advance_to(clock())
     identity = EmulatorIdentity(family, name, serial, module_type)
     server = EmulatorServer(actuator, wire.parse_address(address), clock, identity)
     host, port = server.address
-    # No other program keeps a real module from running.
+    # A real module does not compete with other programs for a processor.
     run_ahead(thread_numbers())
     print(f"emulated X5-9 ({parameters.plant.name}) listens on {host}:{port}", flush=True)
     with nullcontext() if truth is None else truth_log(truth) as actuator.trace:
@@ -108,7 +108,7 @@ def emulator_fault(
         backend.clear_faults()
     if faults:
         backend.inject(*faults)
-    # Not closed, which would stop a motor that another drives.
+    # Not closed, because that would stop a motor that another program drives.
     if as_json:
         print(json.dumps({"in_force": backend.status()["faults"]}))
         return
@@ -140,7 +140,7 @@ def emulator_hand(
                 raise ParameterError(f"link turned by {turned:.2f} rad; expected {angle:g} rad: is the motor driven?")
     finally:
         hand.end()
-        # An answer to a later request shows that the hand has let go.
+        # A reply to a later request proves that the hand has released.
         backend.status()
         backend.let_go()
     print(f"turned by {turned:+.2f} rad, and let go")

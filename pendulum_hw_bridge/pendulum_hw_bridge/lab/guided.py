@@ -1,4 +1,4 @@
-"""Guided procedures of a lab: each says what it will do before it does it, and measures what the lab file then holds.
+"""Guided procedures of a lab: each announces its action, then measures values for the lab file.
 
 Pure: the actuator is a port, the person a dialogue, time the port's clock.
 """
@@ -28,7 +28,7 @@ __all__ = [
 
 _REST_WINDOW = 2.0
 _REST_TRAVEL = 5e-4
-"""Largest drift within the window that is rest [rad]; noise of the encoder is averaged out."""
+"""Largest drift within the window that counts as rest [rad]; encoder noise is averaged out."""
 _REST_PATIENCE = 120.0
 _LARGEST_TARE = 1.0
 
@@ -40,17 +40,17 @@ class Dialogue(Protocol):
         """Show a sentence."""
 
     def go_on(self, text: str) -> None:
-        """Show a sentence and wait until the person agrees; raises where they do not."""
+        """Show a sentence and wait for consent; raises without it."""
 
 
 @dataclass(frozen=True)
 class MountedZero:
-    """How an actuator is mounted.
+    """Mounting of an actuator.
 
     Attributes:
-        sign: 1 where it counts counter-clockwise.
+        sign: 1 if it counts counter-clockwise, else -1.
         offset: Joint angle where the actuator reads zero [rad].
-        play: Distance between the two places at which friction lets it rest [rad].
+        play: Distance between the two rest positions due to friction [rad].
     """
 
     sign: int
@@ -59,10 +59,10 @@ class MountedZero:
 
 
 def find_zero_and_sign(port: ActuatorPort, dialogue: Dialogue, hand: Hand, other_hand: Hand) -> MountedZero:
-    """Find where the pendulum hangs and which way the actuator counts; the motor gets no torque.
+    """Find the actuator's zero and sign; the motor gets no torque.
 
-    Friction lets a pendulum rest a little off its lowest point, on the side it came from: zero is the middle between
-    the rests after a turn to either side.
+    Friction stops a pendulum slightly off its lowest point, on the side it came from: zero is the middle between the
+    rest positions after a turn to either side.
 
     Args:
         port: Connected, strategy off.
@@ -71,7 +71,7 @@ def find_zero_and_sign(port: ActuatorPort, dialogue: Dialogue, hand: Hand, other
         other_hand: Turns clockwise.
 
     Raises:
-        ActuatorError: Nothing turns, nothing comes to rest, or both turns go one way.
+        ActuatorError: The link does not turn, does not come to rest, or both turns have one direction.
     """
     dialogue.go_on(
         "Zero and sign. The motor gets no torque. You will turn the link a little counter-clockwise, let it come to "
@@ -99,12 +99,12 @@ def find_zero_and_sign(port: ActuatorPort, dialogue: Dialogue, hand: Hand, other
 
 
 def measure_tare(port: ActuatorPort, settings: BridgeSettings, plant: PlantParameters, dialogue: Dialogue) -> float:
-    """Return what the torque sensor shows beyond what hangs there, in joint coordinates [N m].
+    """Return the torque sensor's reading beyond the link's weight, in joint coordinates [N m].
 
     Args:
         port: Connected, strategy off.
         settings: Zero and sign of the joint.
-        plant: How much torque hangs at which angle.
+        plant: Weight of the link.
         dialogue: The person.
 
     Raises:
@@ -137,7 +137,7 @@ def _turned(port: ActuatorPort, hand: Hand) -> float:
 
 
 def _rest(port: ActuatorPort, dialogue: Dialogue) -> float:
-    """Wait until it rests; return where, in the actuator's own angle [rad]."""
+    """Wait for rest; return the actuator's angle [rad]."""
     deadline = port.now_ns() + round(_REST_PATIENCE * NANOSECONDS)
     dialogue.say("Waiting for it to come to rest ...")
     while port.now_ns() < deadline:
@@ -161,7 +161,7 @@ def _listen(port: ActuatorPort, seconds: float) -> list[Feedback]:
 
 
 def expect_numbers(record: Feedback) -> None:
-    """Refuse feedback that is no number: no angle can be judged by it, and none may reach the lab file."""
+    """Refuse NaN or infinite feedback, which must not reach the lab file."""
     for what, value, unit in (
         ("position", record.position, "rad"),
         ("velocity", record.velocity, "rad/s"),

@@ -54,11 +54,9 @@ class _Terminal:
         self._yes = yes
 
     def say(self, text: str) -> None:
-        """Show a sentence."""
         self._console.print(text, markup=False, soft_wrap=True)
 
     def go_on(self, text: str) -> None:
-        """Show a sentence and wait for Enter."""
         self._console.print(f"\n{text}", markup=False, style="bold", soft_wrap=True)
         if self._yes:
             return
@@ -259,22 +257,22 @@ def restore(
 
 
 def _ours(file: Path, limits_of: Callable[[HardwareLimits], HardwareLimits]) -> bool:
-    """Whether a module tells the limits that the bridge sets with a lab file."""
+    """Return whether a module has the limits that the bridge sets with a lab file."""
     try:
         wanted = _as_the_bridge(file)[0].settings.limits
         expect_limits(limits_of(wanted), wanted)
     except PendulumError:
-        # Others, or a lab file that the bridge does not take: nothing was set with it.
+        # Other limits, or an invalid lab file: nothing was set with it.
         return False
     return True
 
 
 def _as_the_bridge(file: Path) -> tuple[DrivenModule, PlantParameters]:
-    """Return the module of a lab file as the bridge makes it, not connected, and what it drives."""
+    """Return the module of a lab file as the bridge makes it, not connected, and its plant."""
     from pendulum_hw_bridge.checks.check_node import bridge_values, machine_of
 
     values = bridge_values([], {"lab_file": str(file)})
-    # Before the rest: it refuses a plant of several joints.
+    # First, because it refuses a plant of several joints.
     plant = plant_of(values)
     (module,) = machine_of(values).modules(WallClock())
     assert isinstance(module, DrivenModule)
@@ -283,7 +281,7 @@ def _as_the_bridge(file: Path) -> tuple[DrivenModule, PlantParameters]:
 
 @contextlib.contextmanager
 def _machine(file: Path) -> Iterator[tuple[DrivenModule, PlantParameters]]:
-    """Connect the machine of a lab file; on every way out its motor is off."""
+    """Connect the machine of a lab file; its motor is off afterwards, however the block ends."""
     module, plant = _as_the_bridge(file)
     with afterwards(module.port.close):
         module.port.connect()
@@ -292,7 +290,7 @@ def _machine(file: Path) -> Iterator[tuple[DrivenModule, PlantParameters]]:
 
 @contextlib.contextmanager
 def _proves(file: Path, procedure: str) -> Iterator[None]:
-    """Strike an older proof off the lab file where a machine does not stand a new one."""
+    """Remove an older proof from the lab file if the machine fails a new one."""
     try:
         yield
     except ActuatorError:

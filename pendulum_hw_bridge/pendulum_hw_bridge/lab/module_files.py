@@ -1,8 +1,7 @@
-"""What a module was set to before us: gains, safety parameters and M-stop action, kept in files and given back.
+"""Backup and restore of a module's gains, safety parameters and M-stop action.
 
-The files are HEBI's own XML, written and read by hebi-py, so that HEBI Scope reads them too; but hebi-py writes six
-decimals, so numbers are written again with all their digits. An emulator keeps its gains in the same format and its
-limits in JSON.
+The files are HEBI's XML, written and read by hebi-py, so HEBI Scope reads them too. hebi-py writes six decimals, so
+numbers are rewritten with all digits. An emulator's gains have the same format, its limits are JSON.
 """
 
 from __future__ import annotations
@@ -34,28 +33,28 @@ GAINS = "gains.xml"
 SAFETY = "safety.xml"
 LIMITS = "limits.json"
 ENDS = "position_limit_strategies.json"
-"""What happens at either end of the position limits: hebi-py's file has one entry for both."""
+"""Actions at either end of the position limits: hebi-py's file has one entry for both."""
 _END_NAMES = ("min_position_limit_strategy", "max_position_limit_strategy")
 _ANSWER_MS = 500
 _ATTEMPTS = 3
 _WRITERS = {GAINS: "write_gains", SAFETY: "write_safety_params"}
 _DECIMAL = re.compile(r"-?\d+\.\d+")
-"""A number of which hebi-py may have left digits out; whole ones are choices."""
+"""Number that hebi-py may have rounded; integers are choices."""
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?inf")
 _HALF = ".unfinished"
-"""End of the name of a folder that is not whole yet."""
+"""Suffix of an unfinished folder."""
 
 
 def backup_group(group: Any, folder: Path) -> list[Path]:
     """Write gains, safety parameters and M-stop action of a HEBI module; return the files.
 
     Args:
-        group: hebi-py's group of the one module.
-        folder: Where; it must be new, so that an older state is never lost.
+        group: hebi-py's group of one module.
+        folder: New folder, so that an older backup is never lost.
 
     Raises:
-        ActuatorError: The module does not answer.
-        ParameterError: The folder is there already, or cannot be made.
+        ActuatorError: The module does not reply.
+        ParameterError: The folder exists, or cannot be made.
     """
     info = _info(group)
     names = (GAINS, SAFETY, ENDS)
@@ -63,26 +62,24 @@ def backup_group(group: Any, folder: Path) -> list[Path]:
         _write(info, half / GAINS)
         _write(info, half / SAFETY)
         (half / ENDS).write_text(json.dumps(_ends_of(info)) + "\n", encoding="utf-8")
-        # hebi-py says nothing where a disk is full.
+        # hebi-py reports no error when a disk is full.
         if not all((half / name).is_file() and (half / name).stat().st_size for name in names):
             raise OSError(errno.ENOSPC, "not all of it was written: is the disk full?")
     return [folder / name for name in names]
 
 
 def restore_group(group: Any, folder: Path, make_command: Callable[[], Any], say: Callable[[str], None]) -> None:
-    """Send a module the gains, safety parameters and M-stop action of :func:`backup_group`, and read them back.
-
-    No setpoint is sent, so nothing moves.
+    """Send a module the settings of :func:`backup_group`, and read them back; no setpoint is sent, so nothing moves.
 
     Args:
-        group: hebi-py's group of the one module.
-        folder: Where they are.
+        group: hebi-py's group of one module.
+        folder: Folder of the backup.
         make_command: Makes an empty ``GroupCommand`` for one module.
-        say: Shows a sentence, where it is broken off with some of it in force.
+        say: Shows a warning if some settings may be in force after an error.
 
     Raises:
         ActuatorError: The module does not acknowledge, or other values read back.
-        ParameterError: A file is missing or not understood; nothing was sent then.
+        ParameterError: A file is missing or not understood; nothing was sent.
     """
     _expect_whole(folder)
     ends = _read_ends(folder / ENDS)
@@ -98,7 +95,7 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any], say
             _set_open_ends(command, folder / name)
             for end, strategy in ends.items():
                 setattr(command, end, strategy)
-        # An empty command of hebi-py reads as position 0; said to be none, nothing can be taken for a wish to move.
+        # An empty command of hebi-py reads as position 0; NaN cannot be taken for a setpoint.
         command.position = command.velocity = command.effort = math.nan
         commands.append((name, command))
     with _told_if_broken_off(folder, say):
@@ -111,16 +108,16 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any], say
 
 
 def limits_of_group(group: Any, wanted: HardwareLimits) -> HardwareLimits:
-    """Return the limits that a HEBI module tells; ``wanted`` says at which ends it should switch off.
+    """Return the limits that a HEBI module reports; ``wanted`` has the ends at which it should switch off.
 
     Raises:
-        ActuatorError: The module does not answer, or does otherwise at an end.
+        ActuatorError: The module does not reply, or acts differently at an end.
     """
     return limits_of(_info(group), wanted)
 
 
 def _expect_group(info: Any, folder: Path, ends: dict[str, int]) -> None:
-    # Not beside the backup, which may lie on a medium that is full or read-only.
+    # Not next to the backup, whose medium may be full or read-only.
     with tempfile.TemporaryDirectory(prefix="pendulum_module_") as temporary:
         for name in (GAINS, SAFETY):
             now = Path(temporary, name)
@@ -150,7 +147,7 @@ def backup_emulator(port: ActuatorPort, folder: Path) -> list[Path]:
 
 
 def restore_emulator(port: ActuatorPort, folder: Path, say: Callable[[str], None]) -> None:
-    """Give a connected emulator what :func:`backup_emulator` kept, and read it back; ``say`` as for a group."""
+    """Restore a backup of :func:`backup_emulator` and read it back; ``say`` as for a group."""
     _expect_whole(folder)
     gains = load_gains(folder / GAINS)
     try:
@@ -164,7 +161,7 @@ def restore_emulator(port: ActuatorPort, folder: Path, say: Callable[[str], None
 
 @contextlib.contextmanager
 def _told_if_broken_off(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """Say what a module may be left with, whether it or the person (Ctrl-C) broke off: half of two sets is neither."""
+    """Warn if an error or Ctrl-C may have left a mixture of two sets of settings."""
     try:
         yield
     except BaseException:
@@ -176,7 +173,7 @@ def _told_if_broken_off(folder: Path, say: Callable[[str], None]) -> Iterator[No
 
 
 def _set_open_ends(command: Any, path: Path) -> None:
-    """Set position limits that a file has as infinite: hebi-py reads them as no number, and would send that."""
+    """Set infinite position limits of a file: hebi-py reads them as NaN and would send that."""
     try:
         position = ElementTree.parse(path).getroot().find("position")
         ends = {} if position is None else {end: position.findtext(f"{end}_limit") for end in ("min", "max")}
@@ -191,7 +188,7 @@ def _set_open_ends(command: Any, path: Path) -> None:
 
 
 def _write(info: Any, path: Path) -> None:
-    """Let hebi-py write a file of settings, and give its numbers the digits that hebi-py leaves out."""
+    """Let hebi-py write a file of settings, and restore the digits that it omits."""
     getattr(info, _WRITERS[path.name])(str(path))
     if not path.is_file() or not path.stat().st_size:
         return  # (the caller asks whether there was room)
@@ -199,7 +196,7 @@ def _write(info: Any, path: Path) -> None:
     for part in tree.getroot():
         for element in part:
             field = f"{part.tag}_{element.tag}"
-            # Limits are called "position_limit_min" by hebi-py and "<position><min_limit>" in its file.
+            # hebi-py names a limit "position_limit_min", its file "<position><min_limit>".
             end = element.tag.removesuffix("_limit")
             field = f"{part.tag}_limit_{end}" if end != element.tag else field
             value = getattr(info, field, None)
@@ -215,7 +212,7 @@ def _is_decimal(text: str | None) -> bool:
 
 
 def _values(path: Path) -> dict[str, Any]:
-    """Return what a file of settings holds by place: single precision where it is a number, as a module keeps it."""
+    """Return the values of a settings file by place, numbers in single precision as in the module."""
     found: dict[str, Any] = {}
     for part in ElementTree.parse(path).getroot():
         for element in (part, *part):
@@ -232,8 +229,8 @@ def _ends_of(info: Any) -> dict[str, int]:
 
 def _read_ends(path: Path) -> dict[str, int]:
     if not path.exists():
-        # Kept before there was such a file: one strategy for both ends, in the file of safety parameters. No backup
-        # that broke off looks like it, for a folder bears its name once it is whole.
+        # An older backup has one strategy for both ends, in the file of safety parameters. It cannot be an unfinished
+        # one, because a folder gets its name when it is complete.
         return {}
     try:
         content = json.loads(read_text(path, "backup"))
@@ -252,14 +249,14 @@ def _info(group: Any) -> Any:
 
 @contextlib.contextmanager
 def _new(folder: Path) -> Iterator[Path]:
-    """Make a folder beside that of a backup, which gets its name when it is whole; half of one is taken away."""
+    """Make a temporary folder that is renamed when complete, and removed otherwise."""
     if folder.exists():
         raise ParameterError(f"backup {folder} is there already; expected a new folder")
-    # Absolute, for "." has no name.
+    # Absolute, because "." has no name.
     whole = folder.absolute()
     half = whole.with_name(whole.name + _HALF)
     try:
-        # A program that was killed can leave one; it was never a backup.
+        # A killed program can leave an unfinished folder.
         shutil.rmtree(half, ignore_errors=True)
         half.mkdir(parents=True)
     except OSError as error:

@@ -1,10 +1,8 @@
-"""Proofs of a lab: that a motor's torque ends with the command lifetime, and with the motion stop. Both turn it gently.
+"""Proofs that the motor's torque ends with the command lifetime, and with the motion stop. Both turn the motor gently.
 
-Commands continue until the end of the torque has been seen, and live for 250 ms meanwhile: with the usual lifetime of
-50 ms, expiry would end the duty within the 60 ms allowed, and a button that only sets its flag would be proved. Each
-proof counts from the last record (or command) that certainly had the duty.
-
-Pure: the actuator is a port, the person a dialogue, time the port's clock.
+For the motion stop, commands continue with a lifetime of 250 ms until the torque has ended: expiry of the usual 50 ms
+would end the duty within the allowed 60 ms, and a button that only sets its flag would pass. Each proof counts from the
+last record (or command) that certainly had the duty. Pure: port and dialogue are arguments, time is the port's clock.
 """
 
 from __future__ import annotations
@@ -34,24 +32,24 @@ from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 __all__ = ["PROOF_DUTY", "prove_lifetime", "prove_m_stop"]
 
 PROOF_DUTY = 0.01
-"""Duty for proofs: about 0.4 N m at 36 V, which lifts the thesis's pendulum by less than 15 degrees [-]."""
+"""Duty of proofs: about 0.4 N m at 36 V, which lifts the thesis's pendulum by less than 15 degrees [-]."""
 _PROOF_SECONDS = 0.3
 _PRESS_SECONDS = 20.0
 _LARGEST_TRAVEL = 1.0
-"""Largest turn of the link under the duty for proofs [rad]: twice what a swing of the thesis's pendulum overshoots."""
+"""Largest rotation under that duty [rad]: twice the overshoot of the thesis's pendulum."""
 _ENDS_WITHIN = 0.06
 """Time within which the M-stop must end the duty [s]."""
 _LEAST_RATE = 50.0
-"""Least feedback rate that shows a duty end within that time, with a record to spare [Hz]."""
+"""Least feedback rate that resolves this time, with a record to spare [Hz]."""
 _NO_DUTY = 1e-9
 _SILENT_PERIODS = 10
-"""Feedback periods without feedback after which a proof is broken off [-]."""
+"""Feedback periods without feedback after which a proof is aborted [-]."""
 _MARGIN_PERIODS = 2
-"""Feedback periods by which the end of the duty may be seen late [-]."""
+"""Feedback periods by which the end of the duty may show late [-]."""
 _LEAST_MARGIN = 0.02
-"""Time by which it may be seen late in any case: computer and network take some, at whatever rate [s]."""
+"""Smallest such margin, for computer and network at any rate [s]."""
 _LIFETIME_MEANWHILE = 0.25
-"""Command lifetime while a motion stop is proved [s]: commands that get lost must not be what ends the duty."""
+"""Command lifetime during the proof of the motion stop [s]: lost commands must not end the duty."""
 
 
 def prove_lifetime(
@@ -61,17 +59,17 @@ def prove_lifetime(
     checks: SafetyLimits | None = None,
     drivetrain: SeriesElasticParameters | None = None,
 ) -> float:
-    """Drive gently, fall silent, and return for how long the motor kept its duty [s].
+    """Drive gently, stop sending, and return for how long the duty lasted [s].
 
     Args:
         port: Connected, strategy off.
-        settings: The command lifetime and the limits that the bridge will set.
+        settings: Command lifetime and limits that the bridge will set.
         dialogue: The person.
-        checks: Limits of the checks of feedback; None for the usual ones.
-        drivetrain: Which torque the duty makes; None for that of an X5-9.
+        checks: Limits of the feedback checks; None for the defaults.
+        drivetrain: Maps the duty to torque; None for an X5-9.
 
     Raises:
-        ActuatorError: The duty never came, a limit was left, or it did not end by itself in time, or nobody can tell.
+        ActuatorError: No duty, a limit was exceeded, the duty did not end in time, or feedback did not show when.
     """
     dialogue.go_on(
         f"Proof of the command lifetime. THE MOTOR WILL TURN GENTLY: duty {PROOF_DUTY:g} (about 0.4 N m) for "
@@ -113,20 +111,20 @@ def prove_m_stop(
     checks: SafetyLimits | None = None,
     drivetrain: SeriesElasticParameters | None = None,
 ) -> float:
-    """Drive gently until somebody presses the motion stop, and return for how long the motor kept its duty [s].
+    """Drive gently until the motion stop is pressed, and return for how long the duty lasted [s].
 
-    The duty is commanded on meanwhile, with a longer command lifetime, or that would end it whether the motion stop
-    does or not.
+    The duty is still commanded afterwards, with a longer lifetime, so that only the motion stop can end it.
 
     Args:
         port: Connected, strategy off.
-        settings: The command lifetime and the limits that the bridge will set.
+        settings: Command lifetime and limits that the bridge will set.
         dialogue: The person.
-        checks: Limits of the checks of feedback; None for the usual ones.
-        drivetrain: Which torque the duty makes; None for that of an X5-9.
+        checks: Limits of the feedback checks; None for the defaults.
+        drivetrain: Maps the duty to torque; None for an X5-9.
 
     Raises:
-        ActuatorError: Nobody pressed it in time, a limit was left, or it did not end the duty, or nobody can tell.
+        ActuatorError: Not pressed in time, a limit was exceeded, the duty did not end in time, or feedback did not show
+            when.
     """
     if settings.limits.m_stop is not MStopAction.MOTOR_OFF:
         raise ActuatorError(
@@ -170,12 +168,7 @@ def prove_m_stop(
 
 
 class _GentleDrive:
-    """The duty for proofs: each record is judged before it is driven on.
-
-    Attributes:
-        begin_ns: When it began [ns].
-        sent_ns: When the last command was sent [ns].
-    """
+    """Duty of proofs; each record is checked before the next command. Stamps in [ns]."""
 
     def __init__(
         self,
@@ -195,15 +188,11 @@ class _GentleDrive:
         self.begin_ns = self.sent_ns = self._newest_ns = port.now_ns()
 
     def read(self, *, may_be_pressed: bool = False) -> Feedback:
-        """Return the next record, within all limits.
-
-        Args:
-            may_be_pressed: The motion stop may be; else that is a fault as any other.
-        """
+        """Return the next record within all limits; a pressed motion stop is a fault unless permitted."""
         period = 1.0 / self._settings.feedback_rate
         for _ in range(_SILENT_PERIODS + 1):
             record = self._port.read(period)
-            # One that is older than the one before it, or the same again, says nothing of what is.
+            # Older or repeated records do not show the present state.
             if record is not None and record.stamp_ns >= self._newest_ns and self._monitor.is_new(record):
                 self._newest_ns = record.stamp_ns
                 if may_be_pressed and record.m_stop:
@@ -227,7 +216,7 @@ class _GentleDrive:
             raise ActuatorError(fault.name, fault.message)
 
     def command(self, record: Feedback) -> None:
-        """Command the duty, where the newest record's voltage lets it."""
+        """Command the duty, if permitted at the newest record's voltage."""
         effort = self._mapping.motor_effort(PROOF_DUTY, 0.0, record.voltage)
         _expect_allowed(effort, record.voltage, self._settings)
         command = Command(pwm=PROOF_DUTY)
@@ -243,12 +232,12 @@ class _GentleDrive:
             )
 
     def expects_nothing(self) -> None:
-        """Let the motor lose the duty that it was commanded."""
+        """Expect the end of the duty."""
         self._monitor.stopped()
 
 
 def _while_pressed(drive: _GentleDrive, record: Feedback, settings: BridgeSettings) -> Iterator[Feedback]:
-    """Yield the first record with the motion stop pressed, and those behind it; the duty is commanded on."""
+    """Yield records while the motion stop is pressed; the duty is still commanded."""
     while True:
         if not record.m_stop:
             raise ActuatorError("m_stop", "motion stop was released during its proof; expected it to be held pressed")
@@ -269,7 +258,7 @@ def _has_duty(record: Feedback) -> bool:
 
 
 def _expect_driven_until(pressed_ns: int, driven_ns: int | None, heard_ns: int) -> int:
-    """Return when the motor last had its duty [ns]; refuse a stop pressed without one, or when nobody could see."""
+    """Return when the motor last had its duty [ns]; refuse a press without duty or without feedback."""
     silence = (pressed_ns - heard_ns) / NANOSECONDS
     if driven_ns is not None and silence > _ENDS_WITHIN:
         raise ActuatorError(
@@ -287,15 +276,15 @@ def _expect_driven_until(pressed_ns: int, driven_ns: int | None, heard_ns: int) 
 
 
 def _end_of_duty(records: Iterator[Feedback], since_ns: int, limit: float) -> float:
-    """Return after which time a motor that should lose its duty has lost it for good [s]; more than the limit if late.
+    """Return when the duty has ended for good [s]; more than the limit if late.
 
     Args:
-        records: Feedback; it is looked at until one is from beyond the limit, since a duty may come back.
-        since_ns: When the motor certainly had its duty, and should begin to lose it [ns].
-        limit: Longest time that it may take [s].
+        records: Feedback, read until beyond the limit because a duty may return.
+        since_ns: Time at which the motor certainly had its duty, and should start to lose it [ns].
+        limit: Longest permitted time [s].
 
     Raises:
-        ActuatorError: Feedback paused when it ended: nobody can tell whether it was in time.
+        ActuatorError: Feedback paused when it ended, so that the time is unknown.
     """
     limit_ns = round(limit * NANOSECONDS)
     shown, ended = 0, None
@@ -311,7 +300,7 @@ def _end_of_duty(records: Iterator[Feedback], since_ns: int, limit: float) -> fl
             break
     if ended is None:
         return shown / NANOSECONDS
-    # A busy computer must not condemn a machine that has lost its torque in time.
+    # A busy computer must not condemn a machine whose torque ended in time.
     if ended > limit_ns and 2 * (ended - shown) > limit_ns:
         raise ActuatorError(
             "feedback_lost",
@@ -323,7 +312,7 @@ def _end_of_duty(records: Iterator[Feedback], since_ns: int, limit: float) -> fl
 
 
 def _expect_allowed(effort: float, voltage: float, settings: BridgeSettings) -> None:
-    """Refuse a torque beyond the effort limit: the firmware's own limit does not bind a duty."""
+    """Refuse a torque beyond the effort limit: the firmware's limit does not apply to a duty."""
     if not effort <= settings.limits.effort:
         raise ActuatorError(
             "settings",
@@ -333,7 +322,7 @@ def _expect_allowed(effort: float, voltage: float, settings: BridgeSettings) -> 
 
 
 def _expect_inside(record: Feedback, settings: BridgeSettings, begin: float) -> None:
-    """Refuse to drive on outside the limits that the bridge keeps, or where the link turns on and on."""
+    """Refuse to continue outside the bridge's limits, or after too large a rotation."""
     limits, turned = settings.limits, abs(record.position - begin)
     if not limits.position_min <= record.position <= limits.position_max:
         raise ActuatorError(

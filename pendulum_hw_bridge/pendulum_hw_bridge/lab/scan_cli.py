@@ -30,7 +30,7 @@ from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 __all__ = ["main"]
 
 EXIT_NONE_CHOSEN = 1
-"""Exit code where no module, or more than one, is meant."""
+"""Exit code if not exactly one module matches."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -104,7 +104,7 @@ def _modules(values: dict[str, Any], look_time: float) -> list[ModuleRecord]:
         return []
     finally:
         port.let_go()
-    # An emulator has no network card; it is known by where it listens.
+    # An emulator has no network card; its address identifies it.
     return [
         ModuleRecord(
             tells["family"],

@@ -1,1 +1,1 @@
-"""The bridge's node, the e-stop's, and that of the thesis's two experiments."""
+"""Nodes of the bridge, of the e-stop input and of the thesis's two experiments."""

@@ -1,8 +1,8 @@
 """``bridge``: connect a HEBI actuator, or its emulator, to ROS.
 
-A lifecycle node. ``configure`` connects the actuator and reads its settings back, ``activate`` lets states flow and
-arming be asked for; ``deactivate``, ``cleanup``, ``shutdown``, SIGINT, SIGTERM and every error end with no torque
-and then strategy off.
+A lifecycle node: ``configure`` connects the actuator and reads its settings back, ``activate`` publishes states and
+permits arming. ``deactivate``, ``cleanup``, ``shutdown``, SIGINT, SIGTERM and every error end with no torque, then
+strategy off.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ __all__ = ["BridgeNode", "main"]
 
 _SLOW_PERIOD = 0.5
 _FEEDBACK_QOS = qos.STATE
-"""As deep as that of the states: in lockstep, half a second of wall time is hundreds of records."""
+"""As deep as that of states: in lockstep, half a second of wall time is hundreds of records."""
 
 
 def _logged(transition: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
-    """Say why a transition failed: rclpy swallows exceptions in transitions without a word."""
+    """Log why a transition failed, because rclpy swallows exceptions in transitions."""
 
     @functools.wraps(transition)
     def guarded(self: BridgeNode, state: LifecycleState) -> TransitionCallbackReturn:
@@ -73,7 +73,7 @@ class BridgeNode(LifecycleNode, PollingNode):
     """
 
     loop_type = ActuatorLoop
-    """What turns the bridge's cycles in real time."""
+    """Class of the real-time loop."""
 
     def __init__(self, stop: Callable[[], None], **options: Any) -> None:
         super().__init__("bridge", enable_logger_service=True, **options)
@@ -88,7 +88,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._active = False
         self._loop: ActuatorLoop | None = None
         self._bridge: Bridge | None = None
-        # Made here, so that a refused parameter ends the process with its sentence.
+        # Made here, so that a refused parameter ends the process with its message.
         self._assembly = assembly = assemble(values, specs, lockstep=self._lockstep)
         self._mapping = assembly.mapping
         self._described_plants = describe_plants(assembly.described)
@@ -146,7 +146,7 @@ class BridgeNode(LifecycleNode, PollingNode):
             self._autostart()
 
     def close(self) -> None:
-        """Disarm, no torque, strategy off; a last zero torque is published, so that a recording shows it."""
+        """Disarm, remove torque, set strategy off, and publish a last zero torque for recordings."""
         stamp_ns = self._interface.clock()
         self._interface.safe_stop("bridge ends")
         self.release_actuator()
@@ -156,7 +156,7 @@ class BridgeNode(LifecycleNode, PollingNode):
             self._e_stop_input.close()
 
     def release_actuator(self) -> None:
-        """Let go of the actuator, on whichever way."""
+        """Stop and release the actuator."""
         self._active = False
         if self._lockstep_loop is not None:
             self._lockstep_loop.paused = True
@@ -169,18 +169,16 @@ class BridgeNode(LifecycleNode, PollingNode):
         self._bridge = None
 
     def run_due(self) -> float | None:
-        """Let the lockstep loop do what is due; return when it wants to be called again [s], None in real time."""
+        """Run the lockstep loop's due step; return the time until the next [s], None in real time."""
         if self._lockstep_loop is not None:
             return self._lockstep_loop.run_due()
-        # Who commands is counted at rest as well, where the actuator's thread takes no torques: no states flow.
+        # Count commanders at rest too, when the actuator's thread takes no inputs because no states are published.
         if self._loop is None or not self._loop.active:
             self._interface.wait_for_inputs(0.0)
         return None
 
     def _make_clock(self) -> Clock:
         return WallClock()
-
-    # --- lifecycle -----------------------------------------------------------------------------------------
 
     @_logged
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -207,7 +205,7 @@ class BridgeNode(LifecycleNode, PollingNode):
 
     @_logged
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let states flow; arming is a request of its own."""
+        """Publish states; arming is a separate request."""
         assert self._bridge is not None
         if self._lockstep_loop is not None:
             self._observe_now(self._lockstep_loop.now_ns)
@@ -219,20 +217,20 @@ class BridgeNode(LifecycleNode, PollingNode):
 
     @_logged
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Disarm; states stop."""
+        """Disarm and stop publishing states."""
         self._quieten("bridge deactivated")
         return TransitionCallbackReturn.SUCCESS
 
     @_logged
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let go of the actuator."""
+        """Release the actuator."""
         self._quieten("bridge cleaned up")
         self.release_actuator()
         return TransitionCallbackReturn.SUCCESS
 
     @_logged
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let go of the actuator and end the process."""
+        """Release the actuator and end the process."""
         self._quieten("bridge shut down")
         self.release_actuator()
         self._stop_runner()
@@ -240,13 +238,12 @@ class BridgeNode(LifecycleNode, PollingNode):
 
     @_logged
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let go of the actuator after an error in a transition."""
+        """Release the actuator after an error in a transition."""
         self._quieten("error in a transition")
         self.release_actuator()
         return TransitionCallbackReturn.SUCCESS
 
     def _fail(self, transition: str, error: Exception) -> TransitionCallbackReturn:
-        """Log why a transition failed and release the actuator."""
         self.failure = error
         known = isinstance(error, PendulumError)
         self.get_logger().error(str(error) if known else f"{transition}: {type(error).__name__}: {error}")
@@ -304,8 +301,6 @@ class BridgeNode(LifecycleNode, PollingNode):
         if self._bridge is not None and self._bridge.stop_pending:
             self.get_logger().error(f"{self._bridge.last_fault}: press the motion stop, cut the supply")
 
-    # --- arming --------------------------------------------------------------------------------------------
-
     def _prepare(self) -> str:
         if self._e_stop_input is not None and (reason := self._e_stop_input.reason):
             return reason
@@ -317,7 +312,7 @@ class BridgeNode(LifecycleNode, PollingNode):
             return str(error)
 
     def _prepare_drive(self, bridge: Bridge) -> str:
-        """Prepare in the thread of the actuator; what was measured meanwhile is the newest that anybody knows."""
+        """Prepare in the actuator's thread, and use the newest sample from there."""
         refusal = bridge.prepare()
         # In lockstep no time passes meanwhile, and samples have stamps of their own.
         if not self._lockstep:
@@ -330,8 +325,6 @@ class BridgeNode(LifecycleNode, PollingNode):
 
     def _call(self, job: Callable[[], Any], timeout: float = 5.0) -> Any:
         return job() if self._loop is None else self._loop.call(job, timeout)
-
-    # --- cycle ---------------------------------------------------------------------------------------------
 
     def _on_outcome(self, stamp_ns: int, outcome: Outcome) -> None:
         self._interface.publish_applied(stamp_ns, outcome.effort)
@@ -346,7 +339,7 @@ class BridgeNode(LifecycleNode, PollingNode):
             self._loop.answered(kind, command)
 
     def _advance(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, Vector]:
-        """Carry out a decision, let simulated time pass until a stamp, and return what is measured then."""
+        """Carry out a decision, advance simulated time to a stamp, and return sample and effort."""
         bridge = self._bridge
         assert bridge is not None
         outcome = bridge.carry_out(self._derated(drive), was_armed=self._supervisor.mode.armed)
@@ -354,7 +347,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         return self._observe_now(stamp_ns), outcome.effort
 
     def _derated(self, drive: Drive) -> Drive:
-        """Return a decision with its torque within what the winding's temperature leaves of the limit."""
+        """Return a decision with its torque within the derated limit."""
         bridge = self._bridge
         if bridge is None or not bridge.records or drive.kind is not DriveKind.EFFORT:
             return drive
@@ -371,7 +364,7 @@ class BridgeNode(LifecycleNode, PollingNode):
         sample = bridge.observe(0.0)
         if sample is None:
             return None
-        # Before the first step nobody need be listening yet, and two runs must publish the same.
+        # Before the first step subscribers may be missing, and two runs must publish the same.
         assert self._lockstep_loop is not None
         if self._lockstep_loop.started:
             self._feedback.publish(encode_feedback(bridge.records, self._several, stamp_ns))
@@ -382,10 +375,8 @@ class BridgeNode(LifecycleNode, PollingNode):
             self._interface.sample = sample
         return sample
 
-    # --- slow ----------------------------------------------------------------------------------------------
-
     def _publish_slow(self, stamp_ns: int | None = None) -> None:
-        """Publish temperature and supply: by wall time, or in lockstep by simulated time, as all else."""
+        """Publish temperature and supply by wall time, in lockstep by simulated time."""
         if self._bridge is None or not self._bridge.records or not self._active:
             return
         feedback = self._hottest(self._bridge)
@@ -409,7 +400,7 @@ class BridgeNode(LifecycleNode, PollingNode):
 
     @staticmethod
     def _hottest(bridge: Bridge) -> Feedback:
-        """Return the newest record of the drive with the hottest winding; there is one."""
+        """Return the newest record of the drive with the hottest winding."""
         records = [drive.feedback for drive in bridge.drives if drive.feedback is not None]
         return max(records, key=lambda record: record.winding_temperature)
 
@@ -446,13 +437,13 @@ class BridgeNode(LifecycleNode, PollingNode):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the bridge, or with ``--check`` the checklist that comes before arming."""
+    """Run the bridge, or with ``--check`` the checklist before arming."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if "--check" in arguments:
         from pendulum_hw_bridge.checks.check_cli import main as check
 
         arguments.remove("--check")
-        # With the mark of ROS's arguments the checklist takes the bridge's own defaults.
+        # With ROS arguments the checklist uses the bridge's own defaults.
         return check(arguments if "--ros-args" in arguments else [*arguments, "--ros-args"])
     return run_node(
         BridgeNode,

@@ -1,4 +1,4 @@
-"""A button or a joystick as e-stop: what was pressed latches, and so does silence, for a cable may be cut."""
+"""A button or joystick as e-stop: a press latches, and so does silence, because a cable may be cut."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["EStopInput"]
 
 
 class EStopInput:
-    """Says whether a button that has to be heard all the time lets the plant go on. Used from two threads.
+    """Decides whether a periodically published button allows operation. Used from two threads.
 
     Args:
         timeout: Silence that counts as a press [s].
@@ -16,29 +16,20 @@ class EStopInput:
 
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout
-        # One value, so that the other thread never reads what was pressed with the time of another message.
+        # One tuple, so that the other thread never combines state and time of different messages.
         self._heard: tuple[bool, int] | None = None
         self._publishers = 1
 
     def count(self, publishers: int) -> None:
-        """Take note of how many publish on the topic: of two, one would hide that the other is silent."""
+        """Store the number of publishers: with two, one would hide the silence of the other."""
         self._publishers = publishers
 
     def hear(self, *, pressed: bool, now_ns: int) -> None:
-        """Take note of a message.
-
-        Args:
-            pressed: What it says.
-            now_ns: When it came, by a clock that does not jump [ns].
-        """
+        """Store a message and its time by a monotonic clock [ns]."""
         self._heard = pressed, now_ns
 
     def reason(self, now_ns: int) -> str:
-        """Return why the plant must be stopped, or an empty string.
-
-        Args:
-            now_ns: The same clock [ns].
-        """
+        """Return why the plant must be stopped, or an empty string; same clock [ns]."""
         heard, publishers = self._heard, self._publishers
         if heard is None:
             return "e-stop button was never heard"

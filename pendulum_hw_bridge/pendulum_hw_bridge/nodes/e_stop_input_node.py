@@ -1,4 +1,4 @@
-"""The topic of an e-stop button, heard in a thread of its own: neither a flood nor an arming actuator delays it."""
+"""Subscription of an e-stop button in a thread of its own: neither message floods nor arming delay it."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from pendulum_msgs_py.ros.timers import create_wall_timer
 __all__ = ["EStopInputServer"]
 
 _LOOKS = 4
-"""Looks at the silence within its limit [-]."""
+"""Checks of the silence within its limit [-]."""
 _WAITING = 100
-"""Messages that may wait for the thread: with one, the release that follows a press would take its place [-]."""
+"""Queue depth: with 1, a release right after a press would replace it [-]."""
 
 
 class EStopInputServer:
-    """Listens to ``e_stop_input`` of a node and presses its e-stop.
+    """Subscribes to ``e_stop_input`` of a node and triggers its e-stop.
 
     Args:
-        owner: The node whose e-stop it is.
+        owner: Node of the e-stop.
         timeout: Silence that counts as a press [s].
-        press: Latches the e-stop, with the reason; called in the server's thread, must be quick and wait for nobody.
-        latched: Tells whether it is latched already.
+        press: Latches the e-stop with a reason; called in the server's thread and must not block.
+        latched: Returns whether it is latched already.
     """
 
     def __init__(self, owner: Node, timeout: float, press: Callable[[str], None], latched: Callable[[], bool]) -> None:
@@ -37,7 +37,7 @@ class EStopInputServer:
         self._press, self._latched = press, latched
         self._thread = EStopThread(owner, "e_stop_input", press)
         node = self._thread.node
-        # Best effort: it hears every publisher, and a late message of a button is worth nothing.
+        # Best effort: it matches every publisher, and a late message of a button is worthless.
         qos = QoSProfile(depth=_WAITING, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._topic = owner.resolve_topic_name(names.E_STOP_INPUT)
         node.create_subscription(Bool, self._topic, self._on_message, qos)
@@ -51,12 +51,12 @@ class EStopInputServer:
         return self._input.reason(time.monotonic_ns())
 
     def close(self) -> None:
-        """Stop to listen."""
+        """Stop listening."""
         self._thread.close()
 
     def _on_message(self, message: Bool) -> None:
         self._input.hear(pressed=bool(message.data), now_ns=time.monotonic_ns())
-        # Latched here: by the next look the button may be released again.
+        # Latch here: by the next check the button may be released again.
         if message.data and not self._latched():
             self._press("e-stop button is pressed")
 

@@ -1,4 +1,4 @@
-"""How a trial of an experiment answers the states of a plant: the procedure node without ROS."""
+"""Responses of an experiment's trial to the states of a plant: the procedure node without ROS."""
 
 from __future__ import annotations
 
@@ -21,13 +21,7 @@ Event = tuple[int, str, dict[str, Any]]
 
 @dataclass
 class TrialAnswer:
-    """What a trial says to a state.
-
-    Attributes:
-        effort: Torque of the drive [N m], None for no answer.
-        push: Torque on the link [N m], None for no answer.
-        events: To record.
-    """
+    """Response to a state: torque of drive and link [N m], None for no message, and events to record."""
 
     effort: float | None = 0.0
     push: float | None = None
@@ -35,11 +29,7 @@ class TrialAnswer:
 
 
 class Trial:
-    """One trial, from its start to its end.
-
-    Args:
-        number: Of the trial, from 1.
-    """
+    """One trial; numbers start at 1."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -61,21 +51,16 @@ class Trial:
         self._asked_to_finish = self.started
 
     def hear(self, event: str) -> str:
-        """Take note of an event of the plant (JSON); return why the trial has failed, or an empty string."""
+        """Process an event of the plant (JSON); return why the trial has failed, or an empty string."""
         return ""
 
     def answer(self, sample: JointSample) -> TrialAnswer:
-        """Return what to say to a state."""
+        """Return the response to a state."""
         raise NotImplementedError
 
 
 class HandTrial(Trial):
-    """The link is turned by hand while the drive is held at zero torque.
-
-    Args:
-        number: Of the trial.
-        motion: The simulated hand; None for a person, who ends the trial by asking for it.
-    """
+    """The link is turned by a simulated hand, or (None) by a person who ends the trial; the drive has zero torque."""
 
     def __init__(self, number: int, motion: HandMotion | None) -> None:
         super().__init__(number)
@@ -110,8 +95,8 @@ class StaircaseTrial(Trial):
 
     Args:
         number: Of the trial.
-        phases: The phases in their order.
-        release: Whether a command of zero torque takes over at the end; otherwise the plant holds the last angle.
+        phases: Phases in order.
+        release: Whether zero torque is commanded at the end; otherwise the plant holds the last angle.
     """
 
     def __init__(self, number: int, phases: Sequence[Phase], *, release: bool = True) -> None:
@@ -124,12 +109,12 @@ class StaircaseTrial(Trial):
         self._asked = False
 
     def start(self, sample: JointSample) -> None:
-        """Begin with a state: the trajectory is asked for in place of an answer to it."""
+        """Begin with a state, by sending the trajectory in place of a response."""
         super().start(sample)
         self._asked = True
 
     def hear(self, event: str) -> str:
-        """Learn when the plant has taken up the trajectory, or that it will not."""
+        """Detect that the plant has started or refused the trajectory."""
         try:
             content = json.loads(event)
         except json.JSONDecodeError:
@@ -147,7 +132,7 @@ class StaircaseTrial(Trial):
         return ""
 
     def answer(self, sample: JointSample) -> TrialAnswer:
-        """Return no torque while the plant follows, so that it keeps following; zero before and after."""
+        """Return no torque while the plant follows, so that it continues; zero before and after."""
         if self.start_ns is None:
             return TrialAnswer()
         if self.finished:
@@ -180,14 +165,14 @@ class StaircaseTrial(Trial):
 
 
 def join_phases(phases: Sequence[Phase]) -> tuple[Trajectory, list[float]]:
-    """Return one trajectory through all phases, and the time at which each begins [s]."""
+    """Return one trajectory through all phases, and the start time of each [s]."""
     points: list[TrajectoryPoint] = []
     times = []
     now = 0.0
     for phase in phases:
         times.append(now)
         for point in phase.trajectory.points:
-            # Where one phase ends and the next begins there is one point, not two.
+            # One point, not two, where phases meet.
             if not points or now + point.time > points[-1].time + 1e-9:
                 points.append(TrajectoryPoint(now + point.time, point.position, point.velocity))
         now += phase.trajectory.duration if phase.hold == 0.0 else phase.hold

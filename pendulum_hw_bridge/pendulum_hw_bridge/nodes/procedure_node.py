@@ -1,7 +1,7 @@
-"""``procedure``: play one trial of the thesis's two identification experiments on the bridge.
+"""``procedure``: run one trial of the thesis's two identification experiments on the bridge.
 
-``hand``: the drive is held at zero torque while a simulated hand turns the link through ``push``, or a person does.
-``staircase``: the bridge follows steps of 10 degrees. Phases stand in the bag as events with exact stamps.
+``hand``: the drive has zero torque while a simulated hand turns the link through ``push``, or a person does.
+``staircase``: the bridge follows steps of 10 degrees. Phases are recorded as events with exact stamps.
 """
 
 from __future__ import annotations
@@ -49,15 +49,13 @@ SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("autostart", False, "", "Start with the first state, without a call of ~/start.", read_only=True),
     REALTIME_PRIORITY,
 )
-"""All parameters of the node."""
 
 
 class ProcedureNode(Node):
-    """One trial: answers each state of the plant until the trial is over.
+    """One trial: responds to each state of the plant until the trial is over, with zero torque before and after.
 
-    Before and after the trial the answer is zero torque. In simulated time a staircase ends on its last step, held:
-    when a command of zero torque would take over depends on how busy the machine is, and what is recorded must not.
-    Events: ``trial_start``, the phases, ``trial_end``, ``trial_failed``.
+    In simulated time a staircase ends held on its last step: the time at which zero torque takes over would depend on
+    the load of the machine. Events: ``trial_start``, the phases, ``trial_end``, ``trial_failed``.
 
     Args:
         stop: Asks the runner to end the process.
@@ -95,7 +93,7 @@ class ProcedureNode(Node):
         if sample is None or (self._newest_ns is not None and sample.stamp_ns < self._newest_ns):
             return
         if sample.stamp_ns == self._newest_ns:
-            # A plant in lockstep repeats a state whose answer it missed.
+            # A plant in lockstep repeats a state whose command it missed.
             self._send()
             return
         self._newest_ns = sample.stamp_ns
@@ -104,7 +102,7 @@ class ProcedureNode(Node):
             self._asked_to_start = False
             trial.start(sample)
             if isinstance(trial, StaircaseTrial):
-                # The trajectory is the answer to this state: a plant in lockstep takes it up at this very stamp.
+                # The trajectory is the response to this state: a plant in lockstep starts it at this very stamp.
                 self._trajectory.publish(trajectory_to_message(trial.trajectory))
         answer = trial.answer(sample)
         for stamp_ns, name, details in answer.events:
@@ -139,11 +137,7 @@ class ProcedureNode(Node):
 
 
 def make_trial(values: dict[str, Any], *, release: bool = True) -> Trial:
-    """Return the trial that the parameters describe.
-
-    Args:
-        values: Of the parameters, by name.
-        release: Whether a staircase ends with a command of zero torque, or held.
+    """Return the trial that the parameters describe; with ``release`` a staircase ends with zero torque, else held.
 
     Raises:
         ParameterError: They describe none.

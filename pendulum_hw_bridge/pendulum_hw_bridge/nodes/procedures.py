@@ -1,8 +1,8 @@
-"""The thesis's experiments on the actuator, as pure values: a hand that turns the link, and the gravity staircase.
+"""The thesis's experiments on the actuator: a hand that turns the link, and the gravity staircase.
 
 Experiment 1 (inertia, damping): the pendulum lies flat, PWM is 0, a hand moves it from 0 to pi and back, in both
-directions, six trials. Experiment 2 (gravity): the pendulum hangs; steps of 10 degrees to 90 and back, then to -90
-and back, each a ramp and a hold.
+directions, six trials. Experiment 2 (gravity): the pendulum hangs; steps of 10 degrees to 90 and back, then to -90 and
+back, each a ramp and a hold.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ HAND_TRIALS = 6
 """Trials of experiment 1."""
 
 _HAND_FEEL = 11.8
-"""Torque that the hand has learnt to give for a velocity [N m s/rad]."""
+"""Feed-forward torque of the hand per velocity [N m s/rad]."""
 _HAND_STIFFNESS = 15.0
 _HAND_DAMPING = 0.2
 _TREMOR_TONES = 6
 _TREMOR_HERTZ = (0.3, 1.5)
 _TREMOR_RADIANS = 0.05
 _FASTEST = 1.05
-"""Largest speed of the hand [rad/s]: at b = 11.77 N m s/rad it gives 12.4 N m, and the actuator stands 13 N m."""
+"""Largest speed of the hand [rad/s]: at b = 11.77 N m s/rad it takes 12.4 N m; the actuator withstands 13 N m."""
 
 
 @dataclass(frozen=True)
 class HandMotion:
     """One trial of experiment 1: a hand turns the link from 0 to pi (or -pi), rests, and comes back.
 
-    The hand follows a minimum-jerk path with a tremor of a few slow tones on top. It gives the torque that the motion
-    is known to take, and corrects softly: a stiff hand that reacts once in 10 ms would shake the link on its spring.
+    The hand follows a minimum-jerk path with a tremor of a few slow tones, by feed-forward and a soft correction: a
+    stiff hand at 100 Hz would excite the spring.
 
     Attributes:
         direction: 1 for counter-clockwise first, -1 for clockwise.
@@ -66,14 +66,7 @@ class HandMotion:
         return 3.0 * self.rest + sum(self.strokes)
 
     def reference(self, time: float) -> tuple[float, float]:
-        """Return where the hand wants the link, and how fast.
-
-        Args:
-            time: Since the start of the trial [s].
-
-        Returns:
-            Angle [rad] and velocity [rad/s].
-        """
+        """Return the hand's reference angle [rad] and velocity [rad/s] at a time since the start [s]."""
         out, back = self.strokes
         since_out = time - self.rest
         since_back = since_out - out - self.rest
@@ -93,13 +86,7 @@ class HandMotion:
         )
 
     def torque(self, time: float, position: float, velocity: float) -> float:
-        """Return the torque of the hand on the link [N m].
-
-        Args:
-            time: Since the start of the trial [s].
-            position: Of the link [rad].
-            velocity: Of the link [rad/s].
-        """
+        """Return the hand's torque on the link [N m], by time since the start [s] and link state [rad, rad/s]."""
         wanted, wanted_rate = self.reference(time)
         correction = _HAND_STIFFNESS * (wanted - position) + _HAND_DAMPING * (wanted_rate - velocity)
         return _HAND_FEEL * wanted_rate + correction
@@ -107,14 +94,14 @@ class HandMotion:
 
 @dataclass(frozen=True)
 class Phase:
-    """One phase of an experiment, as it stands in the bag's events.
+    """One phase of an experiment, as in the events of a bag.
 
     Attributes:
         name: ``dynamic`` for a ramp, ``static`` for a hold.
         trial: Number of the trial, from 1.
         angle: Angle reached or held [rad].
         upwards: Whether the step leads away from hanging down.
-        trajectory: The ramp; for a hold a trajectory of one point.
+        trajectory: Ramp; for a hold a trajectory of one point.
         hold: Time to hold after the trajectory [s].
     """
 
@@ -130,8 +117,8 @@ def hand_trials(seed: int, *, trials: int = HAND_TRIALS, start: float = 0.0) -> 
     """Return the trials of experiment 1, alternating in direction.
 
     Args:
-        seed: Seed of durations and tremor; a trial does not depend on how many others there are.
-        trials: How many.
+        seed: Seed of durations and tremor; a trial does not depend on the number of trials.
+        trials: Number of trials.
         start: Angle at which each trial starts and ends [rad].
 
     Source:
@@ -143,12 +130,7 @@ def hand_trials(seed: int, *, trials: int = HAND_TRIALS, start: float = 0.0) -> 
 
 
 def staircase_angles(step: float = 10.0, top: float = 90.0) -> tuple[float, ...]:
-    """Return the angles of the staircase in their order: 0 to 90, back, to -90 and back [rad].
-
-    Args:
-        step: Height of a step [deg].
-        top: Highest angle, a multiple of the step [deg].
-    """
+    """Return the angles of the staircase [rad]: 0 to ``top`` [deg] by ``step`` [deg], back, and the same to -top."""
     count = round(top / step) if step > 0.0 else 0
     if count < 1 or abs(count * step - top) > 1e-9 * top:
         raise ParameterError(f"staircase step is {step} deg and top {top} deg; expected top a multiple of step > 0")
@@ -163,13 +145,7 @@ def staircase(
     top: float = 90.0,
     hold: float = 2.0,
 ) -> Iterator[Phase]:
-    """Yield the phases of one trial of experiment 2: a ramp to each angle, then a hold.
-
-    Args:
-        trial: Number of the trial, from 1.
-        step: [deg].
-        top: [deg].
-        hold: Time to hold each step [s].
+    """Yield the phases of a trial of experiment 2: a ramp to each angle [deg], then a hold [s].
 
     Source:
         Thesis, section "Determination of Gravitational force coefficient of the system".
@@ -200,7 +176,7 @@ def _hand_trial(seed: int, index: int, start: float) -> HandMotion:
 
 
 def _slowed(motion: HandMotion) -> HandMotion:
-    """Return the motion with so much of its tremor that it stays below the largest speed."""
+    """Return the motion with its tremor scaled down to the largest speed."""
     stroke = replace(motion, tremor=())
     share = 1.0
     for time in np.arange(0.0, motion.duration, 0.02):
@@ -218,6 +194,6 @@ def _minimum_jerk(time: float, duration: float) -> tuple[float, float]:
 
 
 def _envelope(time: float, duration: float) -> tuple[float, float]:
-    """Return the strength of the tremor within a stroke, 0 to 1 to 0, and its rate [1/s]."""
+    """Return the tremor's amplitude factor within a stroke, 0 to 1 to 0, and its rate [1/s]."""
     x = min(1.0, max(0.0, time / duration))
     return math.sin(math.pi * x) ** 2, math.pi / duration * math.sin(2.0 * math.pi * x)

@@ -1,1 +1,1 @@
-"""The actuator port: what the bridge asks of any drive, its settings, and its clocks."""
+"""Actuator port: the interface of the bridge to any drive, its settings and clocks."""

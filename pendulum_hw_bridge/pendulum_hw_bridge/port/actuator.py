@@ -1,7 +1,7 @@
-"""The actuator port: everything that the bridge asks of a drive, whichever backend stands behind it.
+"""Actuator port: the only interface of the bridge to a drive.
 
-A backend (HEBI module, emulated X5-9, emulator in another process, replay of a bag) implements
-:class:`ActuatorPort`; nothing above this module knows which one it talks to.
+Each backend (HEBI module, emulated X5-9, emulator in another process, replay of a bag) implements
+:class:`ActuatorPort`; nothing above depends on which one it is.
 """
 
 from __future__ import annotations
@@ -41,19 +41,15 @@ __all__ = [
 ]
 
 PEAK_EFFORT = 13.0
-"""Peak torque of an X5-9, by its datasheet [N m]."""
+"""Peak torque of an X5-9. Source: HEBI datasheet [N m]."""
 NO_SETPOINT = math.nan
-"""Setpoint of a loop that is switched off, by HEBI's convention."""
+"""Setpoint of a loop that is off, by HEBI's convention."""
 MAX_COMMAND_LIFETIME = 5.0
-"""Longest command lifetime that the firmware knows [s]."""
+"""Longest command lifetime of the firmware [s]."""
 
 
 class ActuatorError(FaultError):
-    """The actuator cannot do what was asked, or has gone.
-
-    Attributes:
-        fault: Name of the fault, as in the README's fault table.
-    """
+    """The actuator cannot do what was requested, or is lost; ``fault`` is a name of the README's fault table."""
 
     def __init__(self, fault: str, message: str) -> None:
         super().__init__(message)
@@ -62,20 +58,17 @@ class ActuatorError(FaultError):
 
 @contextmanager
 def afterwards(action: Callable[[], object]) -> Iterator[None]:
-    """Stop or let go of a motor, whatever ends what is within; an error of that hides none that was before.
-
-    Args:
-        action: Such as a port's ``stop``.
+    """Run an action that stops or releases a motor, however the block ends, without hiding the block's error.
 
     Raises:
-        ActuatorError: That of what is within, with what became of the action; or the action's own.
+        ActuatorError: That of the block, with the action's error appended; or the action's own.
     """
     try:
         yield
     except ActuatorError as error:
         try:
             action()
-        # Whatever else went wrong: what was wrong with the machine comes first.
+        # Any error of the action: the fault of the machine comes first.
         except Exception as failed:  # noqa: BLE001
             raise ActuatorError(error.fault, f"{error}; and then: {failed}") from error
         raise
@@ -101,7 +94,7 @@ class Strategy(IntEnum):
 
 
 class TemperatureState(IntEnum):
-    """What the firmware does about its temperature."""
+    """Temperature protection of the firmware."""
 
     NORMAL = 0
     CRITICAL = 1
@@ -110,7 +103,7 @@ class TemperatureState(IntEnum):
 
 
 class LimitState(IntEnum):
-    """Where a quantity lies with respect to its safety limit."""
+    """Position of a quantity relative to its safety limit."""
 
     BELOW = 0
     AT_LOWER = 1
@@ -121,7 +114,7 @@ class LimitState(IntEnum):
 
 
 class CommandLock(IntEnum):
-    """Who holds the command lifetime."""
+    """Owner of the command lifetime."""
 
     UNLOCKED = 0
     LOCKED_BY_OTHER = 1
@@ -129,7 +122,7 @@ class CommandLock(IntEnum):
 
 
 def state_name(kind: type[IntEnum], number: int) -> str:
-    """Return the name of a state of the firmware; of one that a newer firmware has added, its number."""
+    """Return the name of a firmware state, or its number if a newer firmware added it."""
     try:
         return kind(number).name
     except ValueError:
@@ -137,7 +130,7 @@ def state_name(kind: type[IntEnum], number: int) -> str:
 
 
 class MStopAction(str, Enum):
-    """What the motion-stop button does to a module."""
+    """Effect of the motion stop on a module."""
 
     DISABLED = "disabled"
     MOTOR_OFF = "motor_off"
@@ -145,19 +138,19 @@ class MStopAction(str, Enum):
 
 
 class Feedback(NamedTuple):
-    """One complete record of feedback; everything that the thesis records and what a safe bridge has to watch.
+    """One feedback record: everything that the thesis records and that the safety checks need.
 
     Attributes:
         stamp_ns: Host time of receipt [ns].
-        hardware_ns: The actuator's own time of measurement [ns].
-        sequence: Number of the record; a number that does not grow means stale feedback.
+        hardware_ns: Actuator time of measurement [ns].
+        sequence: Record number; feedback is stale if it does not grow.
         position: Output angle [rad].
         velocity: Output velocity [rad/s].
         effort: Joint torque measured through the spring [N m].
         position_command: Setpoint in force; NaN where the loop is off [rad].
         velocity_command: Setpoint in force [rad/s].
         effort_command: Setpoint in force [N m].
-        pwm_command: PWM duty that the firmware puts on the motor, -1 to 1 [-].
+        pwm_command: PWM duty that the firmware applies, -1 to 1 [-].
         motor_current: Current taken from the supply [A].
         winding_current: Estimated winding current [A].
         motor_position: Rotor angle, before the gears [rad].
@@ -172,10 +165,8 @@ class Feedback(NamedTuple):
         processor_temperature: Measured in the processor [degC].
         m_stop: Whether the motion stop is pressed.
         temperature_state: See :class:`TemperatureState`.
-        lock: Who holds the command lifetime.
-        position_limit: See :class:`LimitState`.
-        velocity_limit: See :class:`LimitState`.
-        effort_limit: See :class:`LimitState`.
+        lock: See :class:`CommandLock`.
+        position_limit, velocity_limit, effort_limit: See :class:`LimitState`.
     """
 
     stamp_ns: int
@@ -234,7 +225,7 @@ FEEDBACK_QUANTITIES: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Setpoints for one command lifetime; a loop without setpoint (NaN) is off.
+    """Setpoints for one command lifetime; a loop whose setpoint is NaN is off.
 
     Attributes:
         position: [rad].
@@ -250,29 +241,22 @@ class Command:
 
     @property
     def effort_field(self) -> float:
-        """What the effort field of a packet carries: the duty under direct PWM [-], else the effort [N m]."""
+        """Effort field of a packet: the duty under direct PWM [-], else the effort [N m]."""
         return self.effort if math.isnan(self.pwm) else self.pwm
 
 
 def no_torque(*strategies: Strategy) -> Command:
-    """Return the setpoints that make no torque under a strategy; under each of several where it is uncertain.
+    """Return setpoints that give no torque under any of the strategies that may be in force.
 
-    Under direct PWM that is a duty of zero, under every other strategy no setpoint at all: an effort of zero wakes the
-    torque loop, which drives against the torque that the spring holds.
+    Under direct PWM alone that is duty 0. Under all others it is no setpoint at all: effort 0 would enable the torque
+    loop, which drives against the torque that the spring holds.
     """
     return Command(pwm=0.0) if set(strategies) == {Strategy.DIRECT_PWM} else Command()
 
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """What a command became: the setpoints that were sent, after limits, and under which strategy.
-
-    Attributes:
-        command: The setpoints as sent.
-        strategy: Strategy in force.
-        limited: Whether a limit changed a setpoint.
-        sent_ns: Host time of sending [ns].
-    """
+    """Setpoints and strategy that were sent at ``sent_ns`` [ns], and whether a limit changed a setpoint."""
 
     command: Command
     strategy: Strategy
@@ -282,7 +266,7 @@ class Applied:
 
 @dataclass(frozen=True)
 class HardwareLimits:
-    """Limits that the firmware itself keeps, behind those of the bridge.
+    """Limits enforced by the firmware, in addition to those of the bridge.
 
     Attributes:
         effort: Largest effort setpoint [N m].
@@ -290,8 +274,8 @@ class HardwareLimits:
         position_min: Lower end of the position window [rad].
         position_max: Upper end [rad].
         pwm: Largest PWM duty [-].
-        m_stop: What the motion stop does.
-        joint: The joint that is moved, whose units messages have.
+        m_stop: Effect of the motion stop.
+        joint: Actuated joint, for the units in messages.
     """
 
     effort: float = PEAK_EFFORT
@@ -303,7 +287,6 @@ class HardwareLimits:
     joint: Joint = field(default=ONE_JOINT.joints[0], compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse limits that limit nothing."""
         for name, unit in self.units:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -317,26 +300,19 @@ class HardwareLimits:
 
     @property
     def units(self) -> tuple[tuple[str, str], ...]:
-        """Names and units of the limits that are one number."""
+        """Names and units of the scalar limits."""
         return ("effort", self.joint.effort_unit), ("velocity", self.joint.velocity_unit), ("pwm", "of the supply")
 
 
 @dataclass(frozen=True)
 class ActuatorInfo:
-    """What a connected actuator says of itself, read back and not assumed.
+    """Properties that a connected actuator reports.
 
     Attributes:
-        backend: Name of the backend.
-        family: HEBI family.
-        name: HEBI name.
-        serial: Serial number.
-        firmware: Firmware revision.
-        strategy: Strategy in force.
         feedback_rate: [Hz].
         command_lifetime: [s].
-        limits: Limits of the firmware.
-        gains: Gains in force, or None where the backend cannot read them back.
-        drivetrain: Constants by name, where known (for records of a run).
+        gains: Gains in force, or None where the backend cannot read them.
+        drivetrain: Constants by name, where known.
     """
 
     backend: str
@@ -353,22 +329,22 @@ class ActuatorInfo:
 
 
 class EncoderPort(Protocol):
-    """What is only read: there is no way to give torque. Methods may be called from one thread only."""
+    """Read-only port without any way to command torque. Methods may be called from one thread only."""
 
     def connect(self) -> ActuatorInfo:
-        """Find the module, and return what it says of itself."""
+        """Find the module and return its properties."""
 
     def now_ns(self) -> int:
         """Return the clock of the feedback stamps [ns]."""
 
     def read(self, timeout: float) -> Feedback | None:
-        """Return the next feedback record, or None where none came within the timeout [s]."""
+        """Return the next feedback record, or None after the timeout [s]."""
 
     def set_feedback_rate(self, rate: float) -> float:
-        """Set the feedback rate [Hz] and return what reads back."""
+        """Set the feedback rate [Hz] and return the value read back."""
 
     def close(self) -> None:
-        """Let go of the module; a motor is stopped first."""
+        """Release the module; a motor is stopped first."""
 
 
 @runtime_checkable
@@ -380,22 +356,19 @@ class ActuatorPort(EncoderPort, Protocol):
         """Strategy in force."""
 
     def write(self, command: Command) -> Applied:
-        """Send setpoints for one command lifetime; return what was really sent, after limits."""
+        """Send setpoints for one command lifetime; return those sent, after limits."""
 
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
-        """Change the strategy, with first setpoints in the same packet, and return the one that reads back.
-
-        Without ``command`` there is no torque afterwards.
-        """
+        """Set the strategy, with ``command`` or no torque in the same packet; return the one read back."""
 
     def set_gains(self, gains: GainSet) -> GainSet:
-        """Set the gains of all loops and return what reads back."""
+        """Set the gains of all loops and return those read back."""
 
     def set_limits(self, limits: HardwareLimits) -> HardwareLimits:
-        """Set the firmware's limits and return what reads back."""
+        """Set the firmware's limits and return those read back."""
 
     def set_command_lifetime(self, lifetime: float) -> float:
-        """Set the command lifetime [s], > 0, and return what reads back."""
+        """Set the command lifetime [s], > 0, and return the value read back."""
 
     def stop(self) -> None:
-        """Make it safe: no torque, then strategy off. Safe to call at any time, twice, and after a failure."""
+        """Remove torque, then set strategy off. Safe to call at any time, twice, and after a failure."""

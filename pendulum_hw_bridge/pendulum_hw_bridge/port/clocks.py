@@ -1,4 +1,4 @@
-"""Clocks of the bridge: the wall's, and one that only moves when somebody waits for it."""
+"""Clocks of the bridge: wall time, and simulated time that advances by waiting."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Clock", "SteppedClock", "WallClock"]
 
 
 class Clock(Protocol):
-    """What tells the time and waits for it."""
+    """A clock that can be waited for."""
 
     def now_ns(self) -> int:
         """Return the time [ns]."""
@@ -21,7 +21,7 @@ class Clock(Protocol):
 
 
 class WallClock:
-    """Wall time that never jumps."""
+    """Monotonic wall time."""
 
     def __init__(self) -> None:
         self._clock = SteadyWallClock()
@@ -38,11 +38,7 @@ class WallClock:
 
 
 class SteppedClock:
-    """Simulated time: waiting takes none.
-
-    Args:
-        start_ns: Time at the start [ns].
-    """
+    """Simulated time from ``start_ns`` [ns]: waiting returns at once."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
@@ -52,5 +48,5 @@ class SteppedClock:
         return self._now_ns
 
     def wait_until(self, time_ns: int) -> None:
-        """Move on to a time [ns]; never back."""
+        """Advance to a time [ns]; never back."""
         self._now_ns = max(self._now_ns, time_ns)

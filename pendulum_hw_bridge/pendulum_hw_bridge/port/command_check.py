@@ -1,4 +1,4 @@
-"""What the bridge sends to an actuator, checked before: the firmware takes any number without complaint."""
+"""Checks of setpoints before they are sent: the firmware accepts any number."""
 
 from __future__ import annotations
 
@@ -11,11 +11,7 @@ __all__ = ["check_command", "check_lifetime"]
 
 
 def check_lifetime(lifetime: float) -> float:
-    """Return the command lifetime if it is one that ends [s].
-
-    Raises:
-        ParameterError: Zero (which the firmware takes for "for ever"), negative, too long or not finite.
-    """
+    """Return a command lifetime [s]; ParameterError if 0 (infinite to the firmware), negative, too long or NaN."""
     if not (math.isfinite(lifetime) and 0.0 < lifetime <= MAX_COMMAND_LIFETIME):
         raise ParameterError(
             f"command_lifetime is {lifetime} s; expected > 0 and <= {MAX_COMMAND_LIFETIME:g} s "
@@ -25,12 +21,7 @@ def check_lifetime(lifetime: float) -> float:
 
 
 def check_command(command: Command, strategy: Strategy, limits: HardwareLimits) -> tuple[Command, bool]:
-    """Return the command within the limits, and whether that changed it.
-
-    Args:
-        command: What the bridge wants.
-        strategy: Strategy in force.
-        limits: The firmware's limits; kept here too, because the firmware takes any number without complaint.
+    """Return the command within the firmware's limits, and whether that changed it.
 
     Raises:
         ParameterError: A setpoint is infinite, or does not exist under this strategy.

@@ -1,8 +1,7 @@
-"""The complete feedback records of all modules as one standard message: a JointState whose names are the quantities.
+"""Feedback records of all modules as one ``sensor_msgs/JointState``, without ROS: records in, CDR bytes out.
 
-``sensor_msgs/JointState`` is the one standard message with a stamp, labels and numbers; ``name[i]`` is the quantity
-and ``position[i]`` its value in SI units. Of several modules the joint stands before it. Without ROS: records in, CDR
-bytes out.
+JointState is the one standard message with stamp, labels and numbers. ``name[i]`` is the quantity, prefixed by the
+joint if there are several modules; ``position[i]`` is its value in SI units.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from pendulum_msgs_py.contract.cdr import encode_joints
 __all__ = ["QUANTITIES", "encode_feedback"]
 
 QUANTITIES = tuple(FEEDBACK_QUANTITIES)
-"""Names of the quantities in a message, in their order."""
+"""Names of the quantities of a message, in order."""
 
 _FIRST = Feedback._fields.index(QUANTITIES[0])
 _SLICE = slice(_FIRST, _FIRST + len(QUANTITIES))
@@ -32,8 +31,8 @@ def encode_feedback(records: Sequence[Feedback], joints: tuple[str, ...] = (), s
 
     Args:
         records: One of each module.
-        joints: Names of their joints, which stand before the quantities: ``cart/position``; none for the only module.
-        stamp_ns: Stamp of the message; by default the time of receipt of the oldest record, as of the state [ns].
+        joints: Names of their joints, as prefixes (``cart/position``); none for a single module.
+        stamp_ns: Stamp of the message; by default the oldest time of receipt, as of the state [ns].
     """
     stamp = min(record.stamp_ns for record in records) if stamp_ns is None else stamp_ns
     return encode_joints(

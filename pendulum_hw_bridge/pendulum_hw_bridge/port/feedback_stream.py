@@ -1,4 +1,4 @@
-"""Feedback as it comes, and a word as soon as it stays away: nobody waits half a minute for a module that has gone."""
+"""Stream of feedback records that fails as soon as the module stays silent."""
 
 from __future__ import annotations
 
@@ -10,20 +10,12 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 __all__ = ["LONGEST_SILENCE", "feedback_for"]
 
 LONGEST_SILENCE = 1.0
-"""Time without a record after which a module counts as lost to a procedure [s]."""
+"""Time without a record after which a procedure considers a module lost [s]."""
 _WAIT = 0.05
 
 
 def feedback_for(port: ActuatorPort, seconds: float) -> Iterator[Feedback]:
-    """Yield the records that come within a time.
-
-    Args:
-        port: The actuator, connected.
-        seconds: For how long to listen, by the port's clock [s].
-
-    Raises:
-        ActuatorError: No record came for :data:`LONGEST_SILENCE`.
-    """
+    """Yield the records of the next ``seconds``; ActuatorError after :data:`LONGEST_SILENCE` without one."""
     heard_ns = port.now_ns()
     end_ns = heard_ns + round(seconds * NANOSECONDS)
     while port.now_ns() < end_ns:

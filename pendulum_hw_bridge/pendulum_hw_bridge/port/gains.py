@@ -1,7 +1,6 @@
-"""PID sets of the three firmware loops: typed, checked, with the X5-9's defaults, and HEBI's own gains file.
+"""PID gains of the three firmware loops, with the X5-9's defaults and HEBI's gains file.
 
-The file format is the XML that HEBI Scope and hebi-py write (``group_gains``), so that the gains of a real module
-and of the emulator are one and the same file.
+The file is the XML of HEBI Scope and hebi-py (``group_gains``), so a real module and the emulator share one file.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ __all__ = [
 ]
 
 LOOPS = ("position", "velocity", "effort")
-"""The loops of the firmware, in its own order."""
+"""Loops of the firmware, in its order."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class PidGains:
         kp: Proportional gain [output / input].
         ki: Integral gain [output / (input s)].
         kd: Derivative gain [output s / input].
-        feed_forward: Share of the (normalised) setpoint that goes straight to the output [-].
+        feed_forward: Share of the (normalised) setpoint added to the output [-].
         dead_zone: Error that counts as none [input].
         i_clamp: Largest integral term [output].
         punch: Added to the output in the direction of the error, outside the dead zone [output].
@@ -69,7 +68,7 @@ class PidGains:
     d_on_error: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse gains with which the loop would be undefined; the firmware would take them without a word."""
+        """Refuse invalid gains, which the firmware would accept silently."""
         for item in fields(self):
             value = getattr(self, item.name)
             infinite_allowed = item.name in {"min_target", "max_target"}
@@ -91,7 +90,7 @@ class PidGains:
 
 @dataclass(frozen=True)
 class GainSet:
-    """Gains of the three loops and the strategy that they were made for (1 to 4)."""
+    """Gains of the three loops, and the strategy that they are for (1 to 4)."""
 
     strategy: int
     position: PidGains
@@ -124,18 +123,18 @@ DEFAULT_GAINS: Mapping[int, GainSet] = {
 """Default gains of the X5-9 by strategy. Source: HEBI, "Default gains", X5-9."""
 
 GAIN_FIELDS = tuple(item.name for item in fields(PidGains))
-"""Names of a loop's gains, in the order of the dataclass; also the element names of HEBI's file."""
+"""Names of a loop's gains, in order; also the element names of HEBI's file."""
 
 
 def limit_output(gains: PidGains, output: float) -> PidGains:
-    """Return the gains of a loop whose output lies within +-``output``, or closer where it did before."""
+    """Return the gains of a loop with its output clamped to +-``output``, or to its tighter clamps."""
     return replace(gains, min_output=max(gains.min_output, -output), max_output=min(gains.max_output, output))
 
 
 def differing_gain(reads: GainSet, wanted: GainSet) -> str:
-    """Return which gain reads back as another than wanted, as a sentence, or an empty string.
+    """Return a sentence on the first gain that reads back differently, or an empty string.
 
-    A clamp at infinity is none, and is not written; the module keeps single precision.
+    Infinite clamps are not written and not compared; the module stores single precision.
     """
     for loop in LOOPS:
         for name in GAIN_FIELDS:
@@ -146,10 +145,10 @@ def differing_gain(reads: GainSet, wanted: GainSet) -> str:
 
 
 def load_gains(path: str | Path) -> GainSet:
-    """Return the gains in a HEBI gains file; gains that it leaves out keep the default of its strategy.
+    """Return the gains in a HEBI gains file; missing gains have the default of its strategy.
 
     Raises:
-        ParameterError: No such file, not XML, an unknown element, or a value that is refused; names file and gain.
+        ParameterError: No such file, not XML, an unknown element, or a refused value; names file and gain.
     """
     text = read_text(path, "gains file")
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -180,19 +179,15 @@ def load_gains(path: str | Path) -> GainSet:
 
 
 def write_gains(path: str | Path, gains: GainSet) -> Path:
-    """Write a HEBI gains file that :func:`load_gains` reads back to the same gains.
-
-    Raises:
-        ParameterError: The file cannot be written.
-    """
+    """Write a HEBI gains file that :func:`load_gains` reads back; ParameterError if it cannot be written."""
     root = ElementTree.Element("group_gains")
     ElementTree.SubElement(root, "control_strategy").text = str(gains.strategy)
     for loop in LOOPS:
         element = ElementTree.SubElement(root, loop)
         for name in GAIN_FIELDS:
             value = getattr(gains.loop(loop), name)
-            # hebi-py takes a switch for a whole number, and refuses 1.0. An open clamp is written as such: left out, it
-            # would be read as the default of the strategy.
+            # hebi-py parses a switch as an integer and refuses 1.0. Infinite clamps are written, because a missing one
+            # would read as the strategy's default.
             text = str(int(value)) if name == "d_on_error" else repr(float(value))
             ElementTree.SubElement(element, name).text = text
     ElementTree.indent(root)
@@ -205,7 +200,7 @@ def write_gains(path: str | Path, gains: GainSet) -> Path:
 def _number(element: ElementTree.Element, path: str | Path) -> float:
     text = (element.text or "").strip()
     try:
-        # A group file lists one value per module; ours is a group of one.
+        # A group file lists one value per module; ours has one module.
         return float(text)
     except ValueError as error:
         raise ParameterError(f"gains file {path}: {element.tag} is {text!r}; expected one number") from error

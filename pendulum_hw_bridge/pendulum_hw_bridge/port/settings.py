@@ -1,4 +1,4 @@
-"""Settings of the actuator: written, read back, and every one of them compared."""
+"""Settings of the actuator: written, read back and compared."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ __all__ = ["BridgeSettings", "expect_limits", "write_limits", "write_rate", "wri
 
 @dataclass(frozen=True)
 class BridgeSettings:
-    """What the bridge sets in the actuator when it connects and each time it arms.
+    """Settings that the bridge writes when it connects and each time it arms.
 
     Attributes:
         feedback_rate: [Hz].
-        command_lifetime: [s]; a killed bridge drives for this long and no longer.
+        command_lifetime: Longest time that a killed bridge keeps driving [s].
         limits: Limits of the firmware.
         gains: Gains of the loops, before they are limited.
         joint_offset: Joint angle where the actuator reads zero [rad].
         joint_sign: 1, or -1 for an actuator mounted the other way round.
-        effort_tare: Torque that the sensor shows at the joint when nothing pulls [N m].
+        effort_tare: Torque that the sensor shows at the joint without load [N m].
     """
 
     feedback_rate: float = 100.0
@@ -36,16 +36,7 @@ class BridgeSettings:
 
 
 def write_settings(port: ActuatorPort, settings: BridgeSettings, gains: GainSet) -> None:
-    """Write lifetime, rate, limits and gains, and refuse a module that does not keep each of them.
-
-    Args:
-        port: A connected actuator.
-        settings: What to write.
-        gains: Gains, their outputs limited.
-
-    Raises:
-        ActuatorError: Not acknowledged, or something reads back as another value.
-    """
+    """Write lifetime, rate, limits and (limited) gains; ActuatorError unless each reads back."""
     write_limits(port, settings)
     differs = differing_gain(port.set_gains(gains), gains)
     if differs:
@@ -53,15 +44,7 @@ def write_settings(port: ActuatorPort, settings: BridgeSettings, gains: GainSet)
 
 
 def write_limits(port: ActuatorPort, settings: BridgeSettings) -> None:
-    """Write lifetime, rate and limits, and refuse a module that does not keep each of them.
-
-    Args:
-        port: A connected actuator.
-        settings: What to write.
-
-    Raises:
-        ActuatorError: Not acknowledged, or something reads back as another value.
-    """
+    """Write lifetime, rate and limits; ActuatorError unless each reads back."""
     lifetime = port.set_command_lifetime(check_lifetime(settings.command_lifetime))
     _expect("command lifetime", lifetime, settings.command_lifetime, "s")
     write_rate(port, settings)
@@ -69,29 +52,13 @@ def write_limits(port: ActuatorPort, settings: BridgeSettings) -> None:
 
 
 def write_rate(port: EncoderPort, settings: BridgeSettings) -> None:
-    """Write the feedback rate, and refuse a module that does not keep it.
-
-    Args:
-        port: A connected module.
-        settings: What to write.
-
-    Raises:
-        ActuatorError: Not acknowledged, or another rate reads back.
-    """
+    """Write the feedback rate; ActuatorError unless it reads back."""
     rate = port.set_feedback_rate(settings.feedback_rate)
     _expect("feedback rate", rate, settings.feedback_rate, "Hz")
 
 
 def expect_limits(reads: HardwareLimits, wanted: HardwareLimits) -> None:
-    """Refuse limits that are others than wanted.
-
-    Args:
-        reads: What a module tells.
-        wanted: What it should tell.
-
-    Raises:
-        ActuatorError: Names the first that differs.
-    """
+    """Raise ActuatorError for the first limit that reads back differently."""
     for what, unit in wanted.units:
         _expect(f"{what} limit", getattr(reads, what), getattr(wanted, what), unit)
     for what in ("position_min", "position_max"):
@@ -104,6 +71,6 @@ def expect_limits(reads: HardwareLimits, wanted: HardwareLimits) -> None:
 
 
 def _expect(what: str, reads: float, wanted: float, unit: str) -> None:
-    # The module keeps single precision, and the lifetime whole milliseconds.
+    # The module stores single precision, and the lifetime in whole milliseconds.
     if not math.isclose(reads, wanted, rel_tol=1e-5, abs_tol=6e-4 if unit == "s" else 1e-6):
         raise ActuatorError("settings", f"{what} reads back as {reads:g} {unit}; expected {wanted:g} {unit}")
