@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import signal
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +16,9 @@ from pendulum_bags.comparison import Margins
 from pendulum_bags.experiments.deadline import BudgetSpentError, Deadline
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
-from pendulum_bags.experiments.machine import Machine, MachineRun
+from pendulum_bags.experiments.machine import Machine, MachineRun, record_listed
 from pendulum_bags.experiments.progress import PhaseProgress
-from pendulum_bags.experiments.repeats import record_simulation
+from pendulum_bags.experiments.repeats import record_simulation, record_spec
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.runs.run_data import read_run
@@ -28,6 +31,7 @@ from pendulum_msgs_py.errors import BagError, DataError, FaultError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_msgs_py.programs.terminal import make_console
 from pendulum_sim.exports.model_files import mjcf
+from pendulum_testing.fixtures import wait_for
 
 NOISE = {"kind": "uniform", "amplitude": 2.5, "hold_time": 0.01}
 
@@ -137,16 +141,38 @@ def test_waiting_for_a_recording_ends_with_the_budget(tmp_path: Path) -> None:
             machine.wait(tmp_path / "a", Deadline(0.1))
 
 
-def test_recordings_pause_between_two_runs(tmp_path: Path) -> None:
-    runs = [MachineRun(tmp_path / name, RunSpec(disturbance=NOISE, duration=0.2)) for name in "ab"]
-    with Machine(tmp_path, runs) as machine:
+def test_a_program_that_starts_late_records_nothing_yet_and_begins_when_it_may(tmp_path: Path) -> None:
+    with Machine(tmp_path, [MachineRun(tmp_path / "a", RunSpec(disturbance=NOISE, duration=0.2))]) as machine:
         assert machine.rests()
         machine.start()
-        while not machine.rests():
-            threading.Event().wait(0.02)
-        assert not (tmp_path / "b").exists()
+        assert machine._child is not None
+        # As beside a busy computer, on which it takes minutes.
+        machine._child.process.send_signal(signal.SIGSTOP)
+        assert machine.rests()
+        machine._child.process.send_signal(signal.SIGCONT)
         machine.resume()
-        machine.wait(tmp_path / "b", Deadline(60.0))
+        machine.wait(tmp_path / "a", Deadline(60.0))
+
+
+def test_recordings_pause_between_two_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hold, busy, listed = (tmp_path / name for name in ("hold", "busy", "runs.json"))
+    spec = RunSpec(disturbance=NOISE, duration=0.2)
+    listed.write_text(json.dumps([{"bag": str(tmp_path / name), "spec": spec.to_json()} for name in "ab"]))
+    seen = []
+
+    def record(bag: Path, spec: RunSpec, **more: Any) -> None:
+        seen.append((bag.name, hold.exists(), busy.exists()))
+        record_spec(bag, spec, **more)
+        hold.touch()
+
+    monkeypatch.setattr("pendulum_bags.experiments.machine.record_spec", record)
+    program = threading.Thread(target=record_listed, args=[listed])
+    program.start()
+    wait_for(lambda: hold.exists() and not busy.exists(), 60.0, "the pause behind the first")
+    hold.unlink()
+    program.join(60.0)
+    assert seen == [("a", False, True), ("b", False, True)]
+    assert not busy.exists()
 
 
 def _answer(mark: Mark, choice: Mark) -> Answer:

@@ -27,8 +27,8 @@ __all__ = ["Machine", "MachineRun", "record_listed"]
 
 _ENDED = "ended: "
 """Begins the line that the program prints when a run has ended: its bag, and why it failed, as JSON."""
-_HOLD, _REST = "hold", "rest"
-"""Files that ask the program not to begin a run, and that tell that it waits."""
+_HOLD, _BUSY = "hold", "busy"
+"""Files that ask the program not to begin a run, and that are there while it records one."""
 _POLL = 0.05
 _ENDING = 25.0
 """Time that the program has to end its own, in two waves [s]."""
@@ -54,7 +54,7 @@ class Machine:
         self._processes = ProcessSet(folder / "logs" / "machine", {})
         self._child: Child | None = None
         self._interrupted = False
-        self._hold, self._rest = (folder / "logs" / "machine" / name for name in (_HOLD, _REST))
+        self._hold, self._busy = (folder / "logs" / "machine" / name for name in (_HOLD, _BUSY))
         self._read, self._ends = 0, dict[str, tuple[bool, str]]()
 
     def __enter__(self) -> Machine:
@@ -87,7 +87,7 @@ class Machine:
             return
         self._processes.__enter__()
         listed = self._processes.log_folder / "runs.json"
-        self._rest.unlink(missing_ok=True)
+        self._busy.unlink(missing_ok=True)
         write_json(listed, [{"bag": str(run.bag.resolve()), "spec": run.spec.to_json()} for run in self.runs])
         command = [sys.executable, "-m", "pendulum_bags", "experiment", "run", str(listed)]
         # In a domain of its own, whichever the experiment has.
@@ -104,11 +104,14 @@ class Machine:
             shutil.rmtree(run.bag, ignore_errors=True)
 
     def rests(self) -> bool:
-        """Let no run begin before :meth:`resume`; return whether the one that is being recorded has ended."""
+        """Let no run begin before :meth:`resume`; return whether none is being recorded.
+
+        Not whether the program has stopped at the file: beside a busy computer it may take minutes to start.
+        """
         if self._child is None or self._child.process.poll() is not None:
             return True
         self._hold.touch()
-        return self._rest.exists()
+        return not self._busy.exists()
 
     def resume(self) -> None:
         """Record the runs that are left, or begin where nothing was started."""
@@ -166,17 +169,19 @@ def record_listed(listed: Path) -> None:
     Args:
         listed: JSON file with the bag and the run of each.
     """
-    hold, rest = (listed.with_name(name) for name in (_HOLD, _REST))
+    hold, busy = (listed.with_name(name) for name in (_HOLD, _BUSY))
     with open_pool() as hosts:
         for entry in json.loads(listed.read_text(encoding="utf-8")):
-            if hold.exists():
-                rest.touch()
-                while hold.exists():
-                    time.sleep(_POLL)
-                rest.unlink(missing_ok=True)
+            # Each side writes its own file before it reads the other's: no run begins beside one that holds it.
+            busy.touch()
+            while hold.exists():
+                busy.unlink(missing_ok=True)
+                time.sleep(_POLL)
+                busy.touch()
             stopped, reason = False, ""
             try:
                 record_spec(Path(entry["bag"]), RunSpec.from_json(entry["spec"]), hosts=hosts)
             except FaultError as error:
                 stopped, reason = isinstance(error, PlantStoppedError), str(error)
             print(_ENDED + json.dumps([entry["bag"], stopped, reason]), flush=True)
+            busy.unlink(missing_ok=True)
