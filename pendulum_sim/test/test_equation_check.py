@@ -62,7 +62,7 @@ def write_model(path: Path, feature: str) -> Path:
     damping = 10.0 ** draw.uniform(-2.5, 0.5) * inertia * rate
     friction, gear = draw.choice([0.0, 0.0, 0.03, 0.1]) * weight, draw.choice([1.0, 2.0, 0.5])
     limit = 10.0 ** draw.uniform(-0.3, 1.0) * weight
-    timestep = draw.choice([0.0005, 0.001, 0.002, 0.005])
+    timestep = draw.choice([0.002, 0.002, 0.005, 0.005])
     integrator = draw.choice(["Euler", "implicitfast", "RK4", "implicit"])
     up = draw.choice([1, -1])
     damped, joint, body, option = f'damping="{damping}"', "", "", ""
@@ -146,7 +146,7 @@ def test_a_motor_behind_a_spring_is_named_and_not_taken_for_a_delay(tmp_path: Pa
 def test_the_tolerance_is_five_per_cent_of_the_motion(inertia: float, agrees: bool) -> None:
     parameters = load_plant("dfki").with_values(coulomb_friction=0.0, load_friction=0.0)
     heavier = parameters.with_values(inertia=inertia * parameters.inertia)
-    one, other = (joint_plant(make_plant(each, 0.002)) for each in (heavier, parameters))
+    one, other = (joint_plant(make_plant(each, 0.005)) for each in (heavier, parameters))
     assert check_equation(one, other).agrees == agrees
 
 
@@ -226,7 +226,6 @@ gymnasium.register("Odd-v0", entry_point=Odd)
     [
         ({}, ""),
         ({"noise": 1e-4}, ""),
-        ({"dt": 0.05}, ""),
         # Under its largest torque it turns by more than half a turn within a period.
         ({"dt": 0.1}, ""),
         ({"dead": 0.05}, "a dead zone of the action (below about 0.05"),
@@ -246,13 +245,11 @@ gymnasium.register("Odd-v0", entry_point=Odd)
             {"angle_unit": 1.0 / math.pi},
             "another unit of the angle that is read than of the start (put at -3.14 rad, it is read as -1.00 rad)",
         ),
-        ({"speed_unit": 0.1}, "or a unit of velocity: its angle moves 10 times as far"),
         ({"lag": 0.05, "kept": 1}, "a reset that leaves something behind (with the same seed a run differs by"),
         ({"delay": 3}, "a delay (an effort acts 30 ms later)"),
         ({"lag": 0.05}, "a lag of the effort"),
         ({"clip": 1.0}, "an action that is clipped (beyond about 1 N m more does nothing; the limit is 5 N m)"),
         ({"skip": 4}, "ms instead of 10 ms (frame skip)"),
-        ({"skip": 10}, "ms instead of 10 ms (frame skip)"),
         ({"speed_unit": 180.0 / math.pi}, "or a unit of velocity: its angle moves 0.0175 times as far"),
         ({"drag": 0.01}, "quadratic damping"),
         ({"dry": 0.3}, "dry friction"),
@@ -312,12 +309,12 @@ def test_environments_that_need_no_adapter_agree_at_their_coarse_period(name: st
 @pytest.mark.parametrize("name", ["double_pendulum", "cart_pole", "furuta"])
 def test_several_joints_are_judged_one_by_one(name: str) -> None:
     parameters = load_mechanism(name)
-    one, other = (MechanismPlant(parameters, 0.002) for _ in range(2))
+    one, other = (MechanismPlant(parameters, 0.005) for _ in range(2))
     assert check_equation(one, other).agrees
     joints = list(parameters.joints)
     last = len(joints) - 1
     change = {f"{parameters.coordinates.names[last]}.damping": joints[last].damping + 0.05}
-    softer = MechanismPlant(parameters.with_values(change), 0.002)
+    softer = MechanismPlant(parameters.with_values(change), 0.005)
     found = check_equation(softer, other)
     assert not found.agrees
     assert found.errors[last] > TOLERANCE
