@@ -1,4 +1,4 @@
-"""Costs of controllers from folders of runs: studies, or any bags with metadata of their controller and side."""
+"""Costs of controllers from runs: studies, bags that name their controller and side, and trials of any format."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from pendulum_bags.comparison.metrics import episode_of, metrics_of
 from pendulum_bags.experiments.run_spec import SIDES, RunSpec
 from pendulum_bags.ranking.contender import Contender, contenders_of
 from pendulum_bags.ranking.joint_choice import joint_cost_parts
+from pendulum_bags.ranking.trials import Trial, joint_parts, names_its_run, run_of
 from pendulum_bags.runs.case import IDENTITY, Case
 from pendulum_bags.runs.find_bags import bags_below
-from pendulum_bags.runs.run_data import is_emulated, read_run
+from pendulum_bags.runs.run_data import RunData, is_emulated, joints_of, read_run
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.errors import DataError, ParameterError, PendulumError
 from pendulum_rosbag.reader import read_bag
@@ -51,16 +52,24 @@ def cost_parts(metrics: Mapping[str, float | None], duration: float, weights: Se
     return parts
 
 
-def collect_contenders(folders: Sequence[Path], weights: Sequence[float] = WEIGHTS) -> tuple[list[Contender], Case]:
+def collect_contenders(
+    folders: Sequence[Path],
+    weights: Sequence[float] = WEIGHTS,
+    trials: Sequence[Trial] = (),
+    *,
+    plant: str = "",
+) -> tuple[list[Contender], Case]:
     """Return the controllers that ran on both sides, from all runs below some folders, and the plants that ran.
 
     Args:
         folders: Studies, run folders, or folders of bags.
         weights: q11, q22 and r of the cost.
+        trials: Further runs.
+        plant: Whose LQR weighs recordings of several joints.
 
     Raises:
         DataError: There are no runs, those of one side are of two plants, or a recording that may be one is damaged:
-            it may be the run that fell.
+            it may be the run that fell; or costs of several kinds are mixed.
         ParameterError: A weight is negative or no number.
     """
     if not all(math.isfinite(weight) and weight >= 0.0 for weight in weights):
@@ -71,16 +80,28 @@ def collect_contenders(folders: Sequence[Path], weights: Sequence[float] = WEIGH
         if not folder.is_dir():
             raise DataError(f"{folder} is no folder; expected one with runs")
         _collect(folder, weights, runs, unread)
+    for number, trial in enumerate(trials):
+        try:
+            # Under a seed that no other has: runs of one seed share their disturbance.
+            runs.append(_trial_run(trial, weights, plant, -1 - number if trial.seed is None else trial.seed))
+        except PendulumError as error:
+            unread.append(str(error))
     if unread:
         more = f"; and {len(unread) - _NAMED} more" if len(unread) > _NAMED else ""
         raise DataError(
             f"{len(unread)} of {len(runs) + len(unread)} recordings cannot be ranked, and a run that is left out may "
-            f"be one that fell: {'; '.join(unread[:_NAMED])}{more}. Repair them (python -m pendulum_rosbag repair "
-            "BAG), or move them out of the folder"
+            f"be one that fell: {'; '.join(unread[:_NAMED])}{more}. Repair them"
+            + " (python -m pendulum_rosbag repair BAG)" * any(" bag " in one or "states" in one for one in unread)
+            + ", or leave them out of folder and table"
         )
     if not runs:
         where = ", ".join(map(str, folders))
-        raise DataError(f"{where} holds no runs; expected a study, or bags that say which controller ran on which side")
+        raise DataError(
+            f"{where} holds no runs; expected a study, bags that say which controller ran on which side, "
+            "recordings as FOLDER/simulation/CONTROLLER/FILE and FOLDER/hardware/CONTROLLER/FILE, or a table of trials"
+        )
+    if len(kinds := {trial.kind for trial in trials} | {"file" for _ in runs[len(trials) :]}) > 1:
+        raise DataError(f"the trials have {' and '.join(sorted(kinds))}; expected one kind of them")
     costs: dict[str, dict[str, list[tuple[int, Array | None]]]] = {}
     for run in runs:
         costs.setdefault(run.name, {"sim": [], "hw": []})[run.side].append((run.seed, run.parts))
@@ -123,6 +144,18 @@ def _collect(folder: Path, weights: Sequence[float], runs: list[_Run], unread: l
             runs += [] if found is None else [found]
 
 
+def _trial_run(trial: Trial, weights: Sequence[float], plant: str, seed: int) -> _Run:
+    if trial.reading is None:
+        parts = None if trial.cost is None else np.array([trial.cost])
+    elif joints := joints_of(trial.reading):
+        parts = joint_parts(trial.reading, joints, plant)
+    else:
+        parts = _upright_parts(run_of(trial, needs_input=weights[2] > 0.0), weights, str(trial.reading))
+    if trial.reading is not None:
+        trial.reading.forget()
+    return _Run(trial.controller, trial.side, seed, parts, trial.side == "sim", "")
+
+
 def _why(error: Exception) -> str:
     return str(error) if isinstance(error, (PendulumError, OSError)) else f"{type(error).__name__}: {error}"
 
@@ -159,18 +192,22 @@ def _recorded_run(bag: Path, weights: Sequence[float]) -> _Run | None:
     if damage:
         # What is lost may be the record of the run, or the moment in which it fell.
         raise DataError(f"bag {bag} is damaged: {', '.join(damage)}")
-    side = str(facts.get("side") or str(facts.get("namespace", "")).strip("/"))
-    if not isinstance(facts.get("controller"), Mapping) or side not in {"sim", "hw"}:
+    side = names_its_run(facts)
+    if not side:
         return None
     run = read_run(bag)
     name, seed = _name(facts), int(facts.get("seed") or 0)
-    episode = episode_of(run.window)
-    parts = None
-    # (no comparison with a number is true of NaN)
-    if not np.max(np.abs(episode.error)) > _FALLEN:
-        who = f"{name} on {side} under seed {seed}"
-        parts = _parts(metrics_of(episode), float(episode.t[-1]), weights, who)
+    parts = _upright_parts(run, weights, f"{name} on {side} under seed {seed}")
     return _Run(name, side, seed, parts, side == "sim" or is_emulated(run), str(facts.get(IDENTITY, "")))
+
+
+def _upright_parts(run: RunData, weights: Sequence[float], who: str) -> Array | None:
+    """Return the parts of the cost of a run that is to stay upright, shape (3,); None where it fell."""
+    episode = episode_of(run.window)
+    # (no comparison with a number is true of NaN)
+    if np.max(np.abs(episode.error)) > _FALLEN:
+        return None
+    return _parts(metrics_of(episode), float(episode.t[-1]), weights, who)
 
 
 def _name(facts: Mapping[str, Any]) -> str:

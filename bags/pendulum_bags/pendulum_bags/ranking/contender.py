@@ -22,7 +22,8 @@ class Contender:
 
     Attributes:
         name: Its name.
-        sim, hw: Parts of the cost, one row for each run (by seed), shape (runs, 3); no rows for a side that failed.
+        sim, hw: Parts of the cost, one row for each run (by seed), shape (runs, 3); no rows for a side that failed. Of
+            costs from a table shape (runs, 1), of scores their negatives.
         sim_failed, hw_failed: How many runs failed on each side.
         sim_seeds, hw_seeds: Seeds of the rows; none where they are not known.
         emulated: Whether the hardware was emulated, in all runs.
@@ -43,7 +44,7 @@ class Contender:
         return float("inf") if failed or not rows.size else float(rows.sum(axis=1).mean())
 
     def parts(self, side: str) -> Array:
-        """Return the mean parts on a side, shape (3,)."""
+        """Return the mean parts on a side, shape (3,); of costs from a table shape (1,)."""
         rows = self.sim if side == "sim" else self.hw
         return np.asarray(rows.mean(axis=0), dtype=np.float64)
 
@@ -75,7 +76,7 @@ def contenders_of(
 def _side(runs: Sequence[tuple[int, Array | None]]) -> tuple[Array, int, tuple[int, ...]]:
     """Return rows by seed, how many runs failed, and the seeds of the rows."""
     kept = sorted(((seed, parts) for seed, parts in runs if parts is not None), key=lambda run: run[0])
-    rows = np.array([parts for _, parts in kept], dtype=np.float64).reshape(-1, len(PARTS))
+    rows = np.array([parts for _, parts in kept], dtype=np.float64).reshape(len(kept), -1 if kept else len(PARTS))
     return rows, len(runs) - len(kept), tuple(seed for seed, _ in kept)
 
 
@@ -90,7 +91,8 @@ def refuse_no_number(contenders: Sequence[Contender]) -> None:
             for i, row in enumerate(rows):
                 if not np.all(np.isfinite(row)):
                     run = f"under seed {seeds[i]}" if seeds else f"in run {i + 1} of {len(rows)}"
-                    costs = ", ".join(f"{part} {value:g}" for part, value in zip(PARTS, row, strict=True))
+                    named = PARTS if row.size == len(PARTS) else ("cost",)
+                    costs = ", ".join(f"{part} {value:g}" for part, value in zip(named, row, strict=True))
                     raise DataError(f"the cost of {one.name} on {side} {run} is {costs}; expected finite numbers")
 
 

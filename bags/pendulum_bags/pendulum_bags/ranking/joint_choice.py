@@ -5,15 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.joint_run import fall_time
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_msgs_py.contract.names import EFFORT_COMMAND, JOINT_STATES
-from pendulum_msgs_py.plants.plant_parameters import load_mechanism
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_rosbag.reader import read_bag
 
-__all__ = ["COST", "joint_cost_parts"]
+__all__ = ["COST", "cost_of_motion", "joint_cost_parts"]
 
 COST = "Cost: mean of x' Q x + u' R u with the weights of the plant's own LQR, whatever design ran."
 
@@ -40,6 +41,21 @@ def joint_cost_parts(place: Path, spec: RunSpec) -> Array | None:
             states = opened.joints(f"{spec.namespace}/{JOINT_STATES}")
             effort = opened.joints(f"{spec.namespace}/{EFFORT_COMMAND}").effort
         stamps, position, velocity = states.stamp_ns, states.position, states.velocity
+    return cost_of_motion(plant, stamps, position, velocity, effort)
+
+
+def cost_of_motion(
+    plant: PlantParameters, stamps: NDArray[np.int64], position: Array, velocity: Array, effort: Array
+) -> Array | None:
+    """Return the parts of the mean cost of a motion, shape (3,); None where the plant fell.
+
+    Args:
+        plant: Whose LQR weighs.
+        stamps: Shape (s,) [ns].
+        position: Of its n joints, shape (s, n) [rad or m].
+        velocity: Likewise [rad/s or m/s].
+        effort: Of the motors, shape (e, m) [N m or N].
+    """
     if fall_time(plant, stamps, position) is not None:
         return None
     q, r = plant.mechanism.weights

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from pendulum_bags.distributions import Interval
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.figures.table import Table
@@ -39,12 +40,12 @@ class Words:
     """What a ranking is called by, which depends on how its runs were made.
 
     Attributes:
-        more: Options that record more.
+        more: What records more.
         in_frequency: The experiment that compares the plants in frequency; empty where that was done.
         cost: What the cost is, as a sentence.
     """
 
-    more: str = "--seeds 10"
+    more: str = "record more seeds: --seeds 10"
     in_frequency: str = "experiment frequency_response"
     cost: str = "Cost: mean of q11 e² + q22 v² + r u², that of the thesis's LQR unless other weights were asked for."
 
@@ -74,12 +75,17 @@ def same_choice(ranking: Ranking, words: Words = Words(), case: Case = UNKNOWN) 
     srcc = f"{ranking.srcc.value:.3f}" if np.isfinite(ranking.srcc.value) else "nothing that can be told"
     if np.isfinite(ranking.srcc.low):
         srcc += f" ({ranking.srcc.low:.3f} to {ranking.srcc.high:.3f})"
+    what = "Scores" if ranking.of_scores else "Costs"
+    low, high = ranking.spearman_ends
+    ends_of_ranks = f" ({low:.2f} to {high:.2f} over the runs)" if np.isfinite(low) else ""
     sentence = (
-        f"The simulation picks {ranking.pick}, {fails or _regret_words(ranking)}. Costs correlate with {srcc}; "
+        f"The simulation picks {ranking.pick}, {fails or _regret_words(ranking)}. {what} correlate with {srcc}, ranks "
+        f"with {ranking.spearman:.2f}{ends_of_ranks}; "
         f"{len(ranking.wrong)} of {ranking.pairs} pairs are in the wrong order, {len(sure)} of them surely."
     )
     if sure:
         sentence += f" The dearest: {sure[0].picked} before {sure[0].better}, because {sure[0].reason}."
+    sentence += f" {ranking.few}" if ranking.few else ""
     unit = "of the cost"
     ends = [100.0 * end if np.isfinite(end) else None for end in share]
     note = fails.removeprefix("which ") or ranking.no_interval or _unbounded(ranking)
@@ -95,21 +101,21 @@ def same_choice(ranking: Ranking, words: Words = Words(), case: Case = UNKNOWN) 
             note,
         ),
         Evidence("SRCC (Pearson)", "", ranking.srcc.value, ranking.srcc.low, ranking.srcc.high, "", mark),
-        Evidence("rank correlation (Spearman)", "", ranking.spearman, mark=mark),
+        Evidence("rank correlation (Spearman)", "", ranking.spearman, *ranking.spearman_ends, "", mark),
         Evidence("MMRV", unit, ranking.mmrv.value, ranking.mmrv.low, ranking.mmrv.high, "", mark),
         Evidence("pairs surely in the wrong order", "", float(len(sure)), None, None, f"of {ranking.pairs}", mark),
         *(Evidence("fails on one side only", "", None, mark=Mark.NO, note=name) for name in ranking.failures),
     )
-    steps = (f"record more seeds: {words.more}",) if mark is Mark.UNDECIDED else ()
+    steps = (words.more,) if mark is Mark.UNDECIDED else ()
     if mark is Mark.NO:
         where = f"compare the plants in frequency, where {ranking.pick} works"
         steps = (f"{where}: {words.in_frequency}",) if words.in_frequency else ()
     percent = [100.0 * value for value in share]
-    dearer = f"{percent[0]:.0f} % dearer than {ranking.best}"
+    dearer = f"{percent[0]:.0f} % {'below' if ranking.of_scores else 'dearer than'} {ranking.best}"
     if np.isinf(share[0]):
         dearer = fails or f"though {_unbounded(ranking)}"
     reason = {
-        Mark.YES: f"the simulation's pick costs at most {percent[2]:.0f} % more on the hardware than the best of "
+        Mark.YES: f"the simulation's pick is on the hardware at most {percent[2]:.0f} % worse than the best of "
         f"{len(ranking.names)}",
         Mark.NO: f"the simulation would have picked {ranking.pick}, {dearer}",
         Mark.UNDECIDED: f"the regret of the simulation's pick has no interval: {ranking.no_interval}"
@@ -128,7 +134,8 @@ def _regret_words(ranking: Ranking) -> str:
     interval = f"95 % interval {100.0 * share.low:.1f} to {100.0 * share.high:.1f} %"
     if ranking.no_interval:
         interval = f"no interval: {ranking.no_interval}"
-    return f"{same}: a regret of {100.0 * share.value:.1f} % ({interval})"
+    size = f"{ranking.regret.value:.3g}, " if ranking.of_scores else ""
+    return f"{same}: a regret of {size}{100.0 * share.value:.1f} % ({interval})"
 
 
 def _unbounded(ranking: Ranking) -> str:
@@ -160,24 +167,35 @@ def ranking_figure(ranking: Ranking) -> Figure:
     sentence = f"{int(able.sum())} controllers; SRCC {ranking.srcc.value:.3f}, MMRV {ranking.mmrv.value:.3g}." + (
         f" {failed} more failed on a side and are not drawn." if failed else ""
     )
-    panel = Panel("cost in simulation [-]", "cost on hardware [-]", traces, x_log=True, y_log=True)
-    return Figure("ranking", "Costs of the controllers on both sides", sentence, [panel], panel_height=360)
+    what = "score" if ranking.of_scores else "cost"
+    log = bool(np.all(span > 0.0)) and not ranking.of_scores
+    panel = Panel(f"{what} in simulation [-]", f"{what} on hardware [-]", traces, x_log=log, y_log=log)
+    return Figure(
+        "ranking", f"{what.capitalize()}s of the controllers on both sides", sentence, [panel], panel_height=360
+    )
 
 
 def ranking_rows(ranking: Ranking) -> list[tuple[str, ...]]:
     """Return a row for each contender, best on the hardware first: rank and cost on both sides."""
-    order = np.argsort(np.argsort(ranking.sim, kind="stable"), kind="stable")
+    costs = -np.array(ranking.sim) if ranking.of_scores else np.array(ranking.sim)
+    order = np.argsort(np.argsort(costs, kind="stable"), kind="stable")
+    means = ranking.means or [Interval(np.nan, np.nan, np.nan)] * len(ranking.names)
     return [
-        (name, str(i + 1), str(int(order[i]) + 1), _cost(hw), _cost(sim))
-        for i, (name, sim, hw) in enumerate(zip(ranking.names, ranking.sim, ranking.hw, strict=True))
+        (name, str(i + 1), str(int(order[i]) + 1), _cost(hw, mean), _cost(sim))
+        for i, (name, sim, hw, mean) in enumerate(zip(ranking.names, ranking.sim, ranking.hw, means, strict=True))
     ]
 
 
-_HEAD = ("controller", "rank on hardware", "rank in simulation", "cost on hardware", "cost in simulation")
+def _head(ranking: Ranking) -> tuple[str, ...]:
+    what = "score" if ranking.of_scores else "cost"
+    return "controller", "rank on hardware", "rank in simulation", f"{what} on hardware (95 %)", f"{what} in simulation"
 
 
-def _cost(value: float) -> str:
-    return f"{value:.4g}" if np.isfinite(value) else "failed"
+def _cost(value: float, mean: Interval | None = None) -> str:
+    if not np.isfinite(value):
+        return "failed"
+    ends = f" ({mean.low:.4g} to {mean.high:.4g})" if mean and np.isfinite(mean.low) else ""
+    return f"{value:.4g}{ends}"
 
 
 def _pair_rows(ranking: Ranking) -> list[tuple[str, ...]]:
@@ -196,7 +214,7 @@ def _pair_rows(ranking: Ranking) -> list[tuple[str, ...]]:
 
 def ranking_tables(ranking: Ranking, words: Words = Words()) -> list[Table]:
     """Return the table of the contenders, and that of the pairs in the wrong order."""
-    tables = [Table("Controllers", words.cost, _HEAD, ranking_rows(ranking))]
+    tables = [Table("Controllers", words.cost, _head(ranking), ranking_rows(ranking))]
     if ranking.wrong:
         tables.append(
             Table(
@@ -249,17 +267,17 @@ def write_ranking(
     )
 
 
-def print_ranking(console: Console, ranking: Ranking) -> None:
+def print_ranking(console: Console, ranking: Ranking, words: Words = Words()) -> None:
     """Print contenders, wrong pairs and the layer's sentence."""
-    table = number_table("Costs on both sides", *_HEAD)
+    table = number_table("Both sides", *_head(ranking))
     for row in ranking_rows(ranking):
         table.add_row(*row)
     console.print(table)
-    layer = same_choice(ranking)
+    layer = same_choice(ranking, words)
     console.print(f"{layer.layer.title}: {layer.mark.value}", style="bold")
     console.print(layer.sentence, markup=False)
     console.print(
         f"MMRV {ranking.mmrv.value:.3g} (95 % interval {ranking.mmrv.low:.3g} to {ranking.mmrv.high:.3g}), in units of "
-        "the cost.",
+        f"the {'score' if ranking.of_scores else 'cost'}.",
         markup=False,
     )

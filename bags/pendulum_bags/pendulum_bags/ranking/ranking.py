@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ import scipy
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.distributions import Interval
+from pendulum_bags.distributions import Interval, mean_interval
 from pendulum_bags.ranking.contender import PARTS, Contender, compared_runs, refuse_no_number
 from pendulum_bags.ranking.regret import regret_share
 from pendulum_msgs_py.errors import DataError
@@ -32,6 +33,8 @@ __all__ = ["Ranking", "WrongPair", "mmrv", "rank"]
 
 _REPLICATES = 2000
 _LEAST = 3
+_MANY = 9
+"""Contenders from which on chance is not named."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,9 @@ class Ranking:
         pick_failed: How many of the pick's runs on the hardware failed.
         pick_runs: How many there were.
         no_interval: Why the regret has no interval, as text; empty where it has one.
+        spearman_ends: 95 % interval of the rank correlation over the runs; NaN where none was repeated.
+        means: Of each contender on the hardware, with its 95 % interval over the runs.
+        of_scores: Whether costs are scores, of which more is better.
     """
 
     names: Sequence[str]
@@ -94,6 +100,23 @@ class Ranking:
     pick_failed: int = 0
     pick_runs: int = 0
     no_interval: str = ""
+    spearman_ends: tuple[float, float] = (math.nan, math.nan)
+    means: Sequence[Interval] = ()
+    of_scores: bool = False
+
+    @property
+    def few(self) -> str:
+        """What so few contenders show by chance, as a sentence; empty of many."""
+        n = len(self.names)
+        if n >= _MANY or not math.isfinite(self.spearman):
+            return ""
+        ranks = np.arange(n)
+        apart = np.sum((np.array(list(permutations(ranks))) - ranks) ** 2, axis=1)
+        chance = float(np.mean(1.0 - 6.0 * apart / (n * (n * n - 1.0)) >= self.spearman - 1e-9))
+        return (
+            f"{n} controllers are few: by chance the best of them is picked in 1 of {n} cases, and a rank "
+            f"correlation of {self.spearman:.2f} or more arises in {100.0 * chance:.0f} %."
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON values; infinities and what does not exist as None."""
@@ -111,12 +134,15 @@ def _mmrv(sim: Array, hw: Array) -> Array:
     return np.asarray(np.mean(np.max(np.abs(hw[:, :, None] - hw[:, None, :]) * wrong, axis=2), axis=1))
 
 
-def rank(contenders: Sequence[Contender], generator: np.random.Generator | None = None) -> Ranking:
+def rank(
+    contenders: Sequence[Contender], generator: np.random.Generator | None = None, *, of_scores: bool = False
+) -> Ranking:
     """Return a simulation's ranking of contenders, judged by the hardware's.
 
     Args:
         contenders: At least three, with runs on both sides.
         generator: Of the bootstrap.
+        of_scores: Whether the costs are negatives of scores.
 
     Raises:
         DataError: There are too few, fewer than two succeed on both sides, or a cost is no finite number.
@@ -133,20 +159,22 @@ def rank(contenders: Sequence[Contender], generator: np.random.Generator | None 
     order = np.argsort(hw, kind="stable")
     pick = int(np.argmin(sim))
     wrong = [
-        _pair(contenders[i], contenders[j], sim[j] - sim[i], hw[i] - hw[j])
+        _pair(contenders[i], contenders[j], sim[j] - sim[i], hw[i] - hw[j], of_scores=of_scores)
         for i in range(len(contenders))
         for j in range(len(contenders))
         if sim[i] < sim[j] and hw[i] > hw[j]
     ]
     low, high = np.percentile(_violations(contenders, generator), [2.5, 97.5])
     chosen = contenders[pick]
-    share, no_interval = regret_share(contenders, pick)
+    share, no_interval = regret_share(contenders, pick, of_scores=of_scores)
     least = float(hw.min())
-    regret = Interval(float(raw["hw"][pick]) - least, *(least * end for end in (share.low, share.high)))
+    regret = Interval(float(raw["hw"][pick]) - least, *(abs(least) * end for end in (share.low, share.high)))
+    sign = -1.0 if of_scores else 1.0
+    means = [mean_interval(sign * contenders[i].hw.sum(axis=1)) for i in order]
     return Ranking(
         [contenders[i].name for i in order],
-        [float(raw["sim"][i]) for i in order],
-        [float(raw["hw"][i]) for i in order],
+        [sign * float(raw["sim"][i]) for i in order],
+        [sign * float(raw["hw"][i]) for i in order],
         _pearson(raw["sim"][able], raw["hw"][able]),
         float(scipy.stats.spearmanr(sim, hw).statistic),
         Interval(mmrv(sim, hw), float(low), float(high)),
@@ -160,6 +188,9 @@ def rank(contenders: Sequence[Contender], generator: np.random.Generator | None 
         chosen.hw_failed,
         chosen.hw_failed + len(chosen.hw),
         no_interval,
+        _ends_of_ranks(contenders, generator),
+        [Interval(*one) for one in means],
+        of_scores,
     )
 
 
@@ -167,7 +198,7 @@ def _capped(costs: Array) -> Array:
     """Return costs, shape (..., n), in which a failure is a little dearer than the dearest success of the n."""
     able = np.isfinite(costs)
     top = np.max(costs, axis=-1, keepdims=True, where=able, initial=-np.inf)
-    return np.where(able, costs, 1.001 * np.where(np.isfinite(top), top, 1.0))
+    return np.where(able, costs, np.where(np.isfinite(top), top + 0.001 * np.abs(top), 1.001))
 
 
 def _pearson(sim: Array, hw: Array) -> Interval:
@@ -177,6 +208,29 @@ def _pearson(sim: Array, hw: Array) -> Interval:
     found = scipy.stats.pearsonr(sim, hw)
     low, high = found.confidence_interval(0.95)
     return Interval(float(found.statistic), float(low), float(high))
+
+
+def _ends_of_ranks(contenders: Sequence[Contender], generator: np.random.Generator) -> tuple[float, float]:
+    """Return the 95 % interval of Spearman's correlation over the runs; NaN where neither side has repeated ones.
+
+    The mean cost of each contender is drawn as Student's t of its runs allows it; of a single run it stays.
+    """
+    drawn = {}
+    for side in ("sim", "hw"):
+        columns = []
+        for one in contenders:
+            costs = (one.sim if side == "sim" else one.hw).sum(axis=1)
+            fails, n = not np.isfinite(one.cost(side)), costs.size
+            error = 0.0 if fails or n < 2 else float(costs.std(ddof=1)) / math.sqrt(n)
+            mean = np.inf if fails else float(costs.mean())
+            columns.append(mean + error * generator.standard_t(max(n - 1, 1), _REPLICATES))
+        drawn[side] = scipy.stats.rankdata(_capped(np.stack(columns, axis=1)), axis=1)
+    if all(np.all(one == one[0]) for one in drawn.values()) and not any(len(one.hw) > 1 for one in contenders):
+        return math.nan, math.nan
+    a, b = (one - one.mean(axis=1, keepdims=True) for one in drawn.values())
+    found = np.sum(a * b, axis=1) / np.maximum(np.sqrt(np.sum(a * a, axis=1) * np.sum(b * b, axis=1)), 1e-300)
+    low, high = np.percentile(found, [2.5, 97.5])
+    return float(low), float(high)
 
 
 def _violations(contenders: Sequence[Contender], generator: np.random.Generator) -> Array:
@@ -203,7 +257,7 @@ def _violations(contenders: Sequence[Contender], generator: np.random.Generator)
     return _mmrv(*(np.take_along_axis(costs[side], chosen, axis=1) for side in ("sim", "hw")))
 
 
-def _pair(picked: Contender, better: Contender, sim: float, hw: float) -> WrongPair:
+def _pair(picked: Contender, better: Contender, sim: float, hw: float, *, of_scores: bool) -> WrongPair:
     if not np.isfinite(picked.cost("hw")):
         return WrongPair(picked.name, better.name, sim, math.inf, True, f"{picked.name} fails on the hardware")
     if not np.isfinite(better.cost("sim")):
@@ -217,11 +271,18 @@ def _pair(picked: Contender, better: Contender, sim: float, hw: float) -> WrongP
     part = int(np.argmax(change))
     on_sim, on_hw = picked.parts("sim")[part], picked.parts("hw")[part]
     other_sim, other_hw = better.parts("sim")[part], better.parts("hw")[part]
-    words = {"angle": "angle error", "velocity": "velocity", "torque": "torque"}[PARTS[part]]
-    reason = (
-        f"the {words} of {picked.name} costs {on_sim:.3g} in simulation and {on_hw:.3g} on the hardware, that of "
-        f"{better.name} {other_sim:.3g} and {other_hw:.3g}"
-    )
+    if change.size == 1:
+        word, sign = ("scores", -1.0) if of_scores else ("costs", 1.0)
+        reason = (
+            f"{picked.name} {word} {sign * on_sim:.3g} in simulation and {sign * on_hw:.3g} on the hardware, "
+            f"{better.name} {sign * other_sim:.3g} and {sign * other_hw:.3g}"
+        )
+    else:
+        words = {"angle": "angle error", "velocity": "velocity", "torque": "torque"}[PARTS[part]]
+        reason = (
+            f"the {words} of {picked.name} costs {on_sim:.3g} in simulation and {on_hw:.3g} on the hardware, that of "
+            f"{better.name} {other_sim:.3g} and {other_hw:.3g}"
+        )
     if not sure:
         reason += "; the difference on the hardware is within the scatter of its runs"
     return WrongPair(picked.name, better.name, sim, hw, sure, reason)

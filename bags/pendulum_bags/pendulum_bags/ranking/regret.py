@@ -15,7 +15,7 @@ __all__ = ["regret_share"]
 _NAMED = 3
 
 
-def regret_share(contenders: Sequence[Contender], pick: int) -> tuple[Interval, str]:
+def regret_share(contenders: Sequence[Contender], pick: int, *, of_scores: bool = False) -> tuple[Interval, str]:
     """Return the regret of a pick as a share of the best's cost with its 95 % interval, and why there is none.
 
     The regret is the largest of the pick's shares over all others. Its upper limit is the largest of their upper
@@ -29,12 +29,15 @@ def regret_share(contenders: Sequence[Contender], pick: int) -> tuple[Interval, 
     Args:
         contenders: All, one more than the pick at least without a failure on the hardware.
         pick: Index of the simulation's pick.
+        of_scores: Whether costs are the negatives of scores; the share is that of the best score which is lost.
     """
     chosen = contenders[pick]
     if not math.isfinite(chosen.cost("hw")):
         return Interval(math.inf, math.inf, math.inf), ""
     others = [one for i, one in enumerate(contenders) if i != pick and math.isfinite(one.cost("hw"))]
     own, least = chosen.cost("hw"), min(one.cost("hw") for one in others)
+    if of_scores:
+        return _lost_share(chosen, others)
     if own <= 0.0:
         # Runs scatter by shares: of nothing there is none. One run is one run all the same.
         end = 0.0 if len(chosen.hw) > 1 else math.nan
@@ -50,6 +53,27 @@ def regret_share(contenders: Sequence[Contender], pick: int) -> tuple[Interval, 
     return Interval(value, float(min(low, value)), float(max(high, value))), ""
 
 
+def _lost_share(chosen: Contender, others: Sequence[Contender]) -> tuple[Interval, str]:
+    """Return which share of the best score a pick loses, with the limits of :func:`regret_share`."""
+    own, best = -chosen.cost("hw"), max(-one.cost("hw") for one in others)
+    if best <= max(own, 0.0) and own <= 0.0:
+        return Interval(math.nan, math.nan, math.nan), "no controller has a score above 0 on the hardware"
+    value = max(0.0, 1.0 - own / best) if best > 0.0 else 0.0
+    if len(chosen.hw) < 2 and all(len(one.hw) < 2 for one in others):
+        return Interval(value, math.nan, math.nan), _ran_once(chosen, others)
+    if own <= 0.0:
+        return Interval(1.0, 1.0, 1.0), ""
+    rivals = [one for one in others if one.cost("hw") < 0.0]
+    limits = np.array([_limits(one, chosen, len(rivals), of_scores=True) for one in rivals])
+    if not rivals:
+        return Interval(0.0, 0.0, 0.0), ""
+    if np.isnan(limits).any():
+        return Interval(value, math.nan, math.nan), _ran_once(chosen, others)
+    # By the logarithm of the rival's score per the pick's.
+    low, high = np.maximum(-np.expm1(-limits.max(axis=0)), 0.0)
+    return Interval(value, float(min(low, value)), float(max(high, value))), ""
+
+
 def _ran_once(chosen: Contender, others: Sequence[Contender]) -> str:
     once = [one.name for one in others if len(one.hw) == 1]
     if len(once) == len(others):
@@ -58,15 +82,18 @@ def _ran_once(chosen: Contender, others: Sequence[Contender]) -> str:
     return f"{chosen.name}, the pick, ran once on the hardware, and so did {named}"
 
 
-def _limits(chosen: Contender, another: Contender, comparisons: int) -> tuple[float, float]:
+def _limits(chosen: Contender, another: Contender, comparisons: int, *, of_scores: bool = False) -> tuple[float, float]:
     """Return the limits of the logarithm of two mean costs' ratio, the lower corrected for comparisons; NaN of one run.
 
     The logarithm of the ratio of means is taken as linear in the deviations of the runs from them: runs scatter by
     shares.
     """
     own, other, paired = compared_runs(chosen, another)
+    if of_scores:
+        own, other = -own, -other
     if paired and not (own.mean() > 0.0 and other.mean() > 0.0):
-        own, other, paired = chosen.hw.sum(axis=1), another.hw.sum(axis=1), False
+        sign = -1.0 if of_scores else 1.0
+        own, other, paired = sign * chosen.hw.sum(axis=1), sign * another.hw.sum(axis=1), False
     ratio = float(np.log(own.mean() / other.mean()))
     own, other = own / own.mean(), other / other.mean()
     repeated = [one for one in (own, other) if one.size > 1]

@@ -36,6 +36,8 @@ SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".mat", ".h5", ".hdf5", ".npz", ".np
 """Files that are recordings, beside bags and LeRobot datasets."""
 _TEXT = (".csv", ".txt", ".tsv", ".dat")
 _BAGS = (".mcap", ".db3", ".bag", ".zstd")
+_EACH = 4
+"""Recordings up to which each has rows of its own in the table of guesses."""
 GUESS = "guess"
 """Mapping that guesses even where the columns have the names of the built-in mapping."""
 _TIMEOUT = 300.0
@@ -159,6 +161,11 @@ class Reading:
         if "motion" not in self._cache:
             self._cache["motion"] = apply_rules(self.columns, self.rules)
         return self._cache["motion"]
+
+    def forget(self) -> None:
+        """Free the columns and the motion; mapping and guesses stay."""
+        for key in ("columns", "motion"):
+            self._cache.pop(key, None)
 
     def _open(self) -> Columns:
         source, part = part_of(self.path)
@@ -291,7 +298,13 @@ def write_mapping(path: Path, readings: Sequence[Reading]) -> None:
 
     from pendulum_msgs_py.whole_file import write_whole
 
-    each = {reading.name: reading.rules.to_yaml() for reading in readings}
+    each: dict[str, Any] = {}
+    for reading in readings:
+        rules = reading.rules.to_yaml()
+        if each.setdefault(reading.name, rules) != rules:
+            raise DataError(
+                f"two recordings are called {reading.name}, and their mappings differ; expected other names"
+            )
     contents = list(each.values())
     content: dict[str, Any] = contents[0]
     if any(other != contents[0] for other in contents):
@@ -305,15 +318,19 @@ def print_guesses(console: Console, readings: Sequence[Reading]) -> None:
     """Print what was guessed of some recordings, in one table."""
     from pendulum_msgs_py.programs.terminal import WholeTable
 
-    rows = [(reading, guess) for reading in readings for guess in reading.guesses]
+    alike: dict[str, list[Reading]] = {}
+    for reading in readings:
+        if reading.guesses:
+            key = json.dumps(reading.rules.to_yaml()) if len(readings) > _EACH else str(reading)
+            alike.setdefault(key, []).append(reading)
+    rows = [(same, guess) for same in alike.values() for guess in same[0].guesses]
     if not rows:
         return
     table = WholeTable("recording", "quantity", "column", "unit", "how", title="Guessed from names, tested by the data")
     last = None
-    for reading, guess in rows:
+    for same, guess in rows:
         style = "yellow" if guess.assumed else None
-        table.add_row(
-            "" if reading is last else reading.name, guess.quantity, guess.column, guess.unit, guess.how, style=style
-        )
-        last = reading
+        name = same[0].name + (f" and {len(same) - 1} mapped alike" if len(same) > 1 else "")
+        table.add_row("" if same is last else name, guess.quantity, guess.column, guess.unit, guess.how, style=style)
+        last = same
     console.print(table)

@@ -1,8 +1,8 @@
-"""Finding every bag below a folder."""
+"""Finding every bag, or every recording, below a folder."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from pendulum_rosbag.reader.open_source import is_bag_folder
@@ -10,8 +10,13 @@ from pendulum_rosbag.reader.open_source import is_bag_folder
 __all__ = ["bags_below"]
 
 
-def bags_below(folder: Path) -> Iterator[Path]:
-    """Yield bags: folders with storage files, and storage files that were given themselves."""
+def bags_below(folder: Path, suffixes: Collection[str] = ()) -> Iterator[Path]:
+    """Yield bags: folders with storage files, and storage files that were given themselves.
+
+    Args:
+        folder: Where to look, or a bag.
+        suffixes: Of files that are recordings too.
+    """
     if folder.is_file():
         yield folder
         return
@@ -21,4 +26,6 @@ def bags_below(folder: Path) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
         # Links may lead round in a circle, hidden folders are somebody's scratch.
         if path.is_dir() and not path.is_symlink() and not path.name.startswith("."):
-            yield from bags_below(path)
+            yield from bags_below(path, suffixes)
+        elif path.suffix.lower() in suffixes:
+            yield path

@@ -487,7 +487,7 @@ class _Run:
         self.found.deadline.require(_SIMULATING)
         plant.ranking, case = rank_folders(plant.folder / RANKING, self.folder / RANKING)
         write_json(plant.folder / "ranking.json", plant.ranking.to_json())
-        words = Words(plant.more(f"--seeds {4 * self.order.seeds}"), "")
+        words = Words(f"record more seeds: {plant.more(f'--seeds {4 * self.order.seeds}')}", "")
         if isinstance(plant.settings, JointSettings):
             words = replace(words, cost=COST)
         plant.add(same_choice(plant.ranking, words, case=case))

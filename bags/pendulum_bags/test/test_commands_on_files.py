@@ -1,0 +1,159 @@
+"""The commands of docs/recordings.md on files of others: tables of trials, two recordings, one joint and several."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.io
+
+from pendulum_bags.commands.ranking_cli import main as ranking_main
+from pendulum_testing.synthetic_runs import regulate
+
+TIMES = {"stiff": 1.0, "mid": 1.2, "soft": 1.5, "slack": 2.0}
+"""By what the motion of each controller is larger than that of the first."""
+
+
+def upright(path: Path, *, seed: int = 1, hardware: bool = False, duration: float = 3.0, size: float = 1.0) -> Path:
+    """Write a run that stays upright as CSV or MATLAB file, in names of nobody's contract."""
+    run = regulate(rate=200, seed=seed, duration=duration, hardware=hardware)
+    columns = {
+        "t": run["t"],
+        "theta": np.pi + size * (run["position"] - np.pi),
+        "omega": size * run["velocity"],
+        "tau": run["applied"],
+        "noise": run["disturbance"],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".mat":
+        scipy.io.savemat(path, {name: values[:, None] for name, values in columns.items()})
+    else:
+        table = np.stack(list(columns.values()), axis=1)
+        np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
+    return path
+
+
+def trials(folder: Path, runs: int = 2) -> list[dict[str, str]]:
+    """Write trials of four controllers on both sides; soft and mid are the other way round on the hardware."""
+    rows = []
+    for side in ("simulation", "hardware"):
+        for name in TIMES:
+            other = {"mid": "soft", "soft": "mid"}.get(name, name) if side == "hardware" else name
+            for run in range(runs):
+                path = folder / side / name / f"{run}{'.mat' if run else '.csv'}"
+                upright(path, seed=10 * run + (side == "hardware"), hardware=side == "hardware", size=TIMES[other])
+                rows.append({"controller": name, "side": side, "file": str(path.relative_to(folder))})
+    return rows
+
+
+def table(path: Path, rows: list[dict[str, Any]]) -> Path:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+# -- ranking -------------------------------------------------------------------------------------------------------
+
+
+def ranked(capsys: Any, *words: str | Path, code: int = 0) -> Any:
+    assert ranking_main([*map(str, words), "--json"]) == code
+    said = capsys.readouterr()
+    return json.loads(said.out) if code == 0 else " ".join(said.err.split())
+
+
+def test_folders_options_and_tables_of_trials_give_one_ranking(
+    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = trials(tmp_path / "trials")
+    found = ranked(capsys, tmp_path / "trials")
+    assert found["names"] == ["stiff", "soft", "mid", "slack"]
+    assert found["pick"] == "stiff"
+    assert [(pair["picked"], pair["better"]) for pair in found["wrong"]] == [("mid", "soft")]
+    assert found["regret"]["value"] == 0.0
+    assert found["spearman"] == pytest.approx(0.8)
+    assert all(mean["low"] < mean["value"] < mean["high"] for mean in found["means"])
+    assert "4 controllers are few: by chance the best of them is picked in 1 of 4 cases" in found["layer"]["sentence"]
+    # The cost of one run by its definition, from the file.
+    run = np.loadtxt(tmp_path / "trials" / "hardware" / "slack" / "0.csv", delimiter=",", skiprows=1)
+    t, angle, speed, torque = run[:, 0], run[:, 1] - np.pi, run[:, 2], run[:, 3]
+    first = scipy.integrate.trapezoid(100.0 * angle**2 + 0.1 * torque**2, t) / t[-1] + 0.01 * np.mean(speed**2)
+    once = ranked(capsys, *(f"--trial={row['controller']},{row['side']},{tmp_path / 'trials' / row['file']}"
+                            for row in rows if row["file"].endswith("0.csv")))  # fmt: skip
+    assert once["hw"][once["names"].index("slack")] == pytest.approx(first, rel=1e-6)
+    assert once["no_interval"] == "each controller ran once on the hardware"
+    named = ranked(capsys, table(tmp_path / "trials" / "trials.csv", rows))
+    assert (named["hw"], named["mmrv"]["value"]) == (found["hw"], found["mmrv"]["value"])
+    written = tmp_path / "columns.yaml"
+    assert ranking_main([str(tmp_path / "trials"), "--write-mapping", str(written), "--out", str(tmp_path / "o")]) == 0
+    assert "mapped alike" in capsys.readouterr().out
+    assert ranked(capsys, tmp_path / "trials", "--mapping", written)["hw"] == found["hw"]
+    assert "soft" in (tmp_path / "o" / "ranking.html").read_text(encoding="utf-8")
+
+
+def test_a_table_of_scores_is_ranked_by_its_numbers(tmp_path: Path, capsys: Any) -> None:
+    scores = {"ar": (0.97, 0.616), "hs": (0.90, 0.50), "mpc": (0.80, 0.755), "vi": (0.70, 0.40)}
+    rows: list[dict[str, Any]] = [
+        {"controller": name, "side": side, "score": score}
+        for name, pair in scores.items()
+        for side, score in zip(("simulation", "machine"), pair, strict=True)
+    ]
+    found = ranked(capsys, table(tmp_path / "scores.csv", rows))
+    assert (found["pick"], found["best"]) == ("ar", "mpc")
+    assert found["names"] == ["mpc", "ar", "hs", "vi"]
+    assert found["hw"] == [0.755, 0.616, 0.5, 0.4]
+    assert found["regret"]["value"] == pytest.approx(0.755 - 0.616)
+    assert found["regret_share"]["value"] == pytest.approx(1.0 - 0.616 / 0.755)
+    # mpc is better than ar and hs on the machine, by 0.139 and 0.255, and worse in simulation.
+    assert found["mmrv"]["value"] == pytest.approx((0.139 + 0.255 + 0.255 + 0.0) / 4)
+    assert found["spearman"] == pytest.approx(0.4)
+    text = "trials:\n" + "".join(
+        f"- {{controller: {r['controller']}, side: {r['side']}, score: {r['score']}}}\n" for r in rows
+    )
+    (tmp_path / "scores.yaml").write_text(text, encoding="utf-8")
+    assert ranked(capsys, tmp_path / "scores.yaml")["hw"] == found["hw"]
+    repeated = [{**row, "score": row["score"] + d} for row in rows for d in (-0.01, 0.0, 0.01)]
+    again = ranked(capsys, table(tmp_path / "scores.csv", repeated))
+    share = again["regret_share"]
+    assert 0.1 < share["low"] < share["value"] < share["high"] < 0.3
+    assert again["spearman_ends"] == [pytest.approx(0.4), pytest.approx(0.4)]
+    failed = [*repeated, {"controller": "ar", "side": "machine", "score": ""}]
+    assert (
+        "fails on the hardware in 1 of 4 runs" in ranked(capsys, table(tmp_path / "s.csv", failed))["layer"]["sentence"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([{"controller": "a", "side": "left", "score": 1}], "row 1 of TABLE: side is 'left'; expected simulation or"),
+        ([{"controller": "a", "side": "sim", "score": "x"}], "row 1 of TABLE: score is 'x'; expected a finite number"),
+        (
+            [{"controller": "a", "side": "sim"}],
+            "row 1 of TABLE has controller, side; expected controller, side, one of",
+        ),
+        ([{"name": "a", "side": "sim", "cost": 1}], "TABLE has the columns name, side, cost; expected a folder, or a"),
+        ([{"controller": "a", "side": "sim", "file": "no.csv"}], "no.csv does not exist"),
+    ],
+)
+def test_a_row_that_is_no_trial_is_refused(tmp_path: Path, capsys: Any, rows: Any, words: str) -> None:
+    path = table(tmp_path / "t.csv", rows)
+    assert words.replace("TABLE", str(path)) in ranked(capsys, path, code=2)
+
+
+def test_a_trial_that_cannot_be_ranked_is_named(tmp_path: Path, capsys: Any) -> None:
+    rows = trials(tmp_path, runs=1)
+    run = np.loadtxt(tmp_path / rows[0]["file"], delimiter=",", skiprows=1)
+    (tmp_path / rows[0]["file"]).write_text("t,theta,omega\n", encoding="utf-8")
+    with (tmp_path / rows[0]["file"]).open("a", encoding="utf-8") as file:
+        np.savetxt(file, run[:, :3], delimiter=",")
+    said = ranked(capsys, tmp_path, code=2)
+    assert "1 of 8 recordings cannot be ranked" in said
+    assert "0.csv has no input; expected the torque, or --weights with a third of 0" in said
+    assert ranked(capsys, tmp_path, "--weights", "100", "0.01", "0")["pick"] == "stiff"
