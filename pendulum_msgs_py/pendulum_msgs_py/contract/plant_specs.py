@@ -36,11 +36,7 @@ REALTIME_PRIORITY = ParameterSpec(
 """Of all programs that run, or reply, at a plant's rate."""
 
 COMPILED = ParameterSpec(
-    "compiled",
-    True,
-    "",
-    "Use the compiled loop if available; diagnostics report which one runs.",
-    read_only=True,
+    "compiled", True, "", "Use the compiled loop if available; diagnostics report which one runs.", read_only=True
 )
 """Likewise."""
 

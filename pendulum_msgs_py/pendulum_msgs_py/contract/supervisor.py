@@ -403,14 +403,7 @@ class PlantSupervisor:
         self._last_decision_ns = now_ns
         self.reason = self.commanded_by(command.source)
         return Drive(
-            DriveKind.EFFORT,
-            effort,
-            self._nothing,
-            self._nothing,
-            command.effort,
-            disturbance,
-            push,
-            saturated,
+            DriveKind.EFFORT, effort, self._nothing, self._nothing, command.effort, disturbance, push, saturated
         )
 
     def _begin_refusal(self, command: JointCommand, now_ns: int) -> str:

@@ -4,11 +4,6 @@ Simulator, actuator emulator and identification call these very functions, inter
 there is no second copy of an equation anywhere. They use ``math`` only and never allocate.
 """
 
-from pendulum_msgs_py.dynamics.rigid import (
-    friction_magnitude,
-    gravity_torque,
-    rigid_acceleration,
-    rigid_energy,
-)
+from pendulum_msgs_py.dynamics.rigid import friction_magnitude, gravity_torque, rigid_acceleration, rigid_energy
 
 __all__ = ["friction_magnitude", "gravity_torque", "rigid_acceleration", "rigid_energy"]

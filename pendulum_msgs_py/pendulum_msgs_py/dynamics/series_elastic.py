@@ -205,13 +205,7 @@ def dry_friction_step(velocity: float, friction: float, inertia: float, dt: floa
 
 
 def link_acceleration(
-    position: float,
-    velocity: float,
-    spring: float,
-    disturbance: float,
-    inertia: float,
-    damping: float,
-    gravity: float,
+    position: float, velocity: float, spring: float, disturbance: float, inertia: float, damping: float, gravity: float
 ) -> float:
     """Return q'' = (tau_s + d - b_l q' - G sin q) / M [rad/s^2].
 

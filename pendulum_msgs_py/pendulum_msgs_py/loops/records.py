@@ -42,10 +42,7 @@ slices, done at once, delayed the reply by half a millisecond.
 TIME = np.dtype([("now", "i8", (2,)), ("until", "i8", (2,)), ("poll", "i4", (6,))], align=True)
 """Times that the C library writes and reads, in seconds and nanoseconds; three times ``struct pollfd``."""
 
-MESSAGE = np.dtype(
-    [("buffer", "u8"), ("length", "u8"), ("capacity", "u8"), ("allocator", "u8", (5,))],
-    align=True,
-)
+MESSAGE = np.dtype([("buffer", "u8"), ("length", "u8"), ("capacity", "u8"), ("allocator", "u8", (5,))], align=True)
 """``rcutils_uint8_array_t``: a serialised message."""
 
 INPUT = np.dtype(

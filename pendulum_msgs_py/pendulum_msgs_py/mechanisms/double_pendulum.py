@@ -62,11 +62,7 @@ def chain(q: Any, p: Any) -> tuple[Point, ...]:
     """Return shoulder, elbow and tip [m]."""
     l_1, l_2 = p[1], p[5]
     x, z = l_1 * math.sin(q[0]), -l_1 * math.cos(q[0])
-    return (
-        (0.0, 0.0, 0.0),
-        (x, 0.0, z),
-        (x + l_2 * math.sin(q[0] + q[1]), 0.0, z - l_2 * math.cos(q[0] + q[1])),
-    )
+    return ((0.0, 0.0, 0.0), (x, 0.0, z), (x + l_2 * math.sin(q[0] + q[1]), 0.0, z - l_2 * math.cos(q[0] + q[1])))
 
 
 def bodies(p: Any) -> tuple[Body, ...]:

@@ -75,11 +75,7 @@ PENDULUM = Mechanism(
     parameters=(
         positive("inertia", 0.055, "kg m^2", "Inertia about the joint, M_c."),
         ParameterSpec(
-            "gravity",
-            1.678,
-            "N m",
-            "Gravity coefficient, G_c = m g l_c; 0 for a pendulum that lies flat.",
-            minimum=0.0,
+            "gravity", 1.678, "N m", "Gravity coefficient, G_c = m g l_c; 0 for a pendulum that lies flat.", minimum=0.0
         ),
     ),
     forward=forward,

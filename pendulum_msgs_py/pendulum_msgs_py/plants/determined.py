@@ -7,10 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import (
-    PlantParameters,
-    load_plant_file,
-)
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant_file
 
 __all__ = ["SPAN", "require_determined", "undetermined"]
 

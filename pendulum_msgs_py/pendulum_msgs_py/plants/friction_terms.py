@@ -58,7 +58,7 @@ def _load(speed: float, weight: float, load_friction: float) -> float:  # noqa: 
 FRICTION_TERMS: Mapping[str, FrictionTerm] = {
     "load": FrictionTerm(
         _load, {"load_friction": (0.0, Quantity("-", "Dry friction per torque of gravity carried, added to tau_C."))}
-    ),
+    )
 }
 """All terms, by name."""
 

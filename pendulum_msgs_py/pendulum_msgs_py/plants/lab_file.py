@@ -114,9 +114,7 @@ LAB_ENTRIES: Mapping[str, Mapping[str, LabEntry]] = {
         "stop_time": LabEntry("stop_time", "s", float, left_out="at once"),
         "e_stop_input_timeout": LabEntry("e_stop_input_timeout", "s", float, left_out="no such input"),
     },
-    "supply": {
-        "voltage_window": LabEntry("voltage_window", "V", list),
-    },
+    "supply": {"voltage_window": LabEntry("voltage_window", "V", list)},
 }
 """The entries of a lab file, by section."""
 

@@ -42,14 +42,7 @@ from pendulum_msgs_py.contract.joints import Coordinates, Joint, Vector
 from pendulum_msgs_py.dynamics.joint_steps import FAR, JointTable
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
-from pendulum_msgs_py.parameters import (
-    ParameterSpec,
-    dump_yaml,
-    load_yaml,
-    reject_unknown,
-    require_mapping,
-    suggestion,
-)
+from pendulum_msgs_py.parameters import ParameterSpec, dump_yaml, load_yaml, reject_unknown, require_mapping, suggestion
 from pendulum_msgs_py.plants.friction_terms import STRENGTHS, TERM_PARAMETERS
 from pendulum_msgs_py.plants.joint_parameters import (
     DRIVETRAIN_SPECS,

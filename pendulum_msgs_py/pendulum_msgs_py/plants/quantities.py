@@ -113,9 +113,7 @@ def _check_interval(interval: object, where: str, unit: str) -> list[float]:
 
 
 def write_quantities(
-    values: Mapping[str, Any],
-    specs: Sequence[ParameterSpec],
-    intervals: Mapping[str, Sequence[float]],
+    values: Mapping[str, Any], specs: Sequence[ParameterSpec], intervals: Mapping[str, Sequence[float]]
 ) -> dict[str, dict[str, Any]]:
     """Return what :func:`read_quantities` reads.
 

@@ -27,11 +27,7 @@ __all__ = ["load_plant_to_run", "seal_plant"]
 def seal_plant(parameters: PlantParameters) -> str:
     """Return the text of a sealed plant file."""
     packed = zlib.compress(json.dumps(plant_document(parameters)).encode(), 9)
-    document = {
-        "format": SEALED_FORMAT,
-        "name": parameters.name,
-        "sealed": base64.b64encode(packed).decode("ascii"),
-    }
+    document = {"format": SEALED_FORMAT, "name": parameters.name, "sealed": base64.b64encode(packed).decode("ascii")}
     return dump_yaml(document, "sealed plant file")
 
 

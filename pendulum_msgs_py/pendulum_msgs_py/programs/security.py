@@ -40,13 +40,7 @@ _LOGGER = ("~/get_logger_levels", "~/set_logger_levels")
 _SILENT_PUBLISHER = ("/parameter_events",)
 _EVERY_PUBLISHER = (*_SILENT_PUBLISHER, "/rosout")
 _EVERY_SUBSCRIPTION = (names.CLOCK, "/parameter_events")
-_PLANT_SUBSCRIPTIONS = (
-    names.EFFORT_COMMAND,
-    names.DISTURBANCE,
-    names.PUSH,
-    names.JOINT_TRAJECTORY,
-    names.ENABLE_INPUT,
-)
+_PLANT_SUBSCRIPTIONS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH, names.JOINT_TRAJECTORY, names.ENABLE_INPUT)
 _PLANT_PUBLISHERS = (names.JOINT_STATES, names.APPLIED_EFFORT, names.EVENTS, names.DIAGNOSTICS)
 _PLANT_SERVICES = (names.ARM, names.E_STOP_RESET)
 
@@ -186,10 +180,7 @@ BESIDE_PLANTS = {"conductor": "/conductor", "console": "/console", "recorder": "
 _SIDE_NODES = ("controller", "effort_controller", "disturbance", "recorder", "viewer", "markers")
 _IN_PROCESS = {"simulator_e_stop": "simulator", "bridge_e_stop": "bridge", "bridge_e_stop_input": "bridge"}
 """Nodes that run in the process of another, and share its enclave; they have no log of their own."""
-_WITH_PLANT = {
-    "simulator": ("simulator_e_stop",),
-    "bridge": ("procedure", "bridge_e_stop", "bridge_e_stop_input"),
-}
+_WITH_PLANT = {"simulator": ("simulator_e_stop",), "bridge": ("procedure", "bridge_e_stop", "bridge_e_stop_input")}
 _WITHOUT_PARAMETERS = {"conductor", *_IN_PROCESS}
 
 

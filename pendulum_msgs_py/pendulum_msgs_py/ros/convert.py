@@ -187,9 +187,7 @@ def trajectory_to_message(trajectory: Trajectory, stamp_ns: int = 0) -> JointTra
     message.header.stamp = stamp_to_message(stamp_ns)
     message.points = [
         JointTrajectoryPoint(
-            positions=[point.position],
-            velocities=[point.velocity],
-            time_from_start=seconds_to_duration(point.time),
+            positions=[point.position], velocities=[point.velocity], time_from_start=seconds_to_duration(point.time)
         )
         for point in trajectory.points
     ]

@@ -33,11 +33,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.arrivals import ArrivalSignal
 from pendulum_msgs_py.ros.commander_watch import CommanderWatch
-from pendulum_msgs_py.ros.convert import (
-    command_from_bytes,
-    event_message,
-    problem_of_command,
-)
+from pendulum_msgs_py.ros.convert import command_from_bytes, event_message, problem_of_command
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.e_stop import PRESSED, EStopServer
 from pendulum_msgs_py.ros.leaving import wait_until_heard

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-__all__ = [
-    "CLOCK",
-    "COMMAND",
-    "COMMAND_INPUT",
-    "DIAGNOSTICS",
-    "EVENTS",
-    "NEWEST_STATE",
-    "STATE",
-    "TRAJECTORY",
-]
+__all__ = ["CLOCK", "COMMAND", "COMMAND_INPUT", "DIAGNOSTICS", "EVENTS", "NEWEST_STATE", "STATE", "TRAJECTORY"]
 
 
 def _profile(

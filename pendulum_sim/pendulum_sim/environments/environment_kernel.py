@@ -31,13 +31,7 @@ ROWS = ("x", "v", "torque", "disturbance", "amplitude", "limit", "q_1", "q_2", "
 
 
 def lane_table(
-    parameters: PlantParameters,
-    method: str,
-    h: float,
-    lanes: int,
-    amplitude: float,
-    q: tuple[float, ...],
-    r: float,
+    parameters: PlantParameters, method: str, h: float, lanes: int, amplitude: float, q: tuple[float, ...], r: float
 ) -> NDArray[np.float64]:
     """Return the rows for a number of equal pendulums, at rest hanging down, shape (rows, lanes).
 
@@ -47,11 +41,7 @@ def lane_table(
     integrator = get_integrator(method)
     check_stability(integrator, parameters, h, 1, h)
     coefficients = integrator.coefficients(parameters.damping / parameters.inertia, h)
-    values = (
-        *(0.0, 0.0, 0.0, 0.0, amplitude, parameters.effort_limit, *q, r),
-        *pack(parameters),
-        *coefficients,
-    )
+    values = (*(0.0, 0.0, 0.0, 0.0, amplitude, parameters.effort_limit, *q, r), *pack(parameters), *coefficients)
     return np.repeat(np.array(values)[:, np.newaxis], lanes, axis=1)
 
 

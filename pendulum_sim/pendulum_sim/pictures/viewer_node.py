@@ -54,20 +54,10 @@ SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("trail", 60, "-", "Positions that the trail shows.", minimum=1, maximum=1000, read_only=True),
     ParameterSpec("png", "", "", "File for a picture at the end and on ~/snapshot; empty for none.", read_only=True),
     ParameterSpec(
-        "gif",
-        "",
-        "",
-        "File for an animation of the last seconds, at the end; empty for none.",
-        read_only=True,
+        "gif", "", "", "File for an animation of the last seconds, at the end; empty for none.", read_only=True
     ),
     ParameterSpec(
-        "gif_fps",
-        12.5,
-        "Hz",
-        "Pictures per second of the animation.",
-        minimum=1.0,
-        maximum=50.0,
-        read_only=True,
+        "gif_fps", 12.5, "Hz", "Pictures per second of the animation.", minimum=1.0, maximum=50.0, read_only=True
     ),
     ParameterSpec("gif_duration", 8.0, "s", "Length of the animation.", minimum=0.1, maximum=60.0, read_only=True),
     ParameterSpec("duration", 0.0, "s", "Time after which to end; 0 for never.", minimum=0.0, read_only=True),

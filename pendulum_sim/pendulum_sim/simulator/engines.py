@@ -11,11 +11,7 @@ from typing import Any, NamedTuple
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import (
-    MECHANISM_PRESETS,
-    PLANT_SPECS,
-    PRESET_NAMES,
-)
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PLANT_SPECS, PRESET_NAMES
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_sim.foreign.equation_check import EquationCheck, Switches, check_equation
 from pendulum_sim.foreign.guarded_plant import GuardedPlant, in_one_sentence
@@ -183,12 +179,7 @@ OWN = Engine(
         ),
         _RATE,
         ParameterSpec(
-            "substeps",
-            0,
-            "-",
-            "Integration steps in a period; 0 chooses by the plant.",
-            minimum=0,
-            read_only=True,
+            "substeps", 0, "-", "Integration steps in a period; 0 chooses by the plant.", minimum=0, read_only=True
         ),
     ),
     make=_make_own,

@@ -24,15 +24,7 @@ from pendulum_msgs_py.plants.friction_terms import STRENGTHS, added_friction
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 from pendulum_sim.stepping.integrators import Acceleration, Coefficients, PlantTuple, Step
 
-__all__ = [
-    "DRY",
-    "LAG",
-    "PACKED",
-    "acceleration_with_friction",
-    "advance_dry",
-    "is_dry",
-    "static_friction_balance",
-]
+__all__ = ["DRY", "LAG", "PACKED", "acceleration_with_friction", "advance_dry", "is_dry", "static_friction_balance"]
 
 PACKED = tuple(spec.name for spec in PLANT_SPECS if spec.name not in {"effort_limit", "transport_delay"})
 """Order of the values in a ``PlantTuple``: that of plant files."""

@@ -33,8 +33,7 @@ Coefficients = tuple[float, ...]
 Acceleration = Callable[[float, float, float, float, PlantTuple], float]
 """a(theta, theta_dot, torque, direction, plant) [rad/s^2]."""
 Step = Callable[
-    [Acceleration, float, float, float, float, float, float, float, Coefficients, PlantTuple],
-    tuple[float, float],
+    [Acceleration, float, float, float, float, float, float, float, Coefficients, PlantTuple], tuple[float, float]
 ]
 
 
@@ -148,10 +147,7 @@ def rk4_step(
     v_4 = theta_dot + h * a_3
     a_4 = acceleration(theta + h * v_3, v_4, torque_1, direction, plant)
     sixth = h / 6.0
-    return (
-        theta + sixth * (theta_dot + 2.0 * (v_2 + v_3) + v_4),
-        theta_dot + sixth * (a_1 + 2.0 * (a_2 + a_3) + a_4),
-    )
+    return (theta + sixth * (theta_dot + 2.0 * (v_2 + v_3) + v_4), theta_dot + sixth * (a_1 + 2.0 * (a_2 + a_3) + a_4))
 
 
 def etd2_coefficients(damping_rate: float, h: float) -> Coefficients:

@@ -20,13 +20,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_delay, pack_joints
 from pendulum_sim.stepping.plant import DelayLine, check_step, period_segments
 
-__all__ = [
-    "MechanismPlant",
-    "MechanismState",
-    "check_decay",
-    "check_stable_step",
-    "is_smooth",
-]
+__all__ = ["MechanismPlant", "MechanismState", "check_decay", "check_stable_step", "is_smooth"]
 
 _RK4_STABLE = 2.78
 """Largest damping rate times step at which Runge-Kutta of order four decays."""

@@ -25,10 +25,7 @@ def make_plant(parameters: PlantParameters, dt: float, *, method: str = "auto", 
     """
     if parameters.drivetrain is None:
         return RigidPlant(
-            parameters,
-            dt,
-            method="etd4" if method == "auto" else method,
-            substeps=1 if substeps is None else substeps,
+            parameters, dt, method="etd4" if method == "auto" else method, substeps=1 if substeps is None else substeps
         )
     if method not in {"auto", "semi_implicit"}:
         raise ParameterError(

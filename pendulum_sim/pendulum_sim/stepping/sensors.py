@@ -61,12 +61,7 @@ class Sensors:
         self._channels = [
             channel if any(channel[:3]) else None
             for channel in (
-                (
-                    self.parameters[f"{name}_bias"],
-                    self.parameters[f"{name}_noise"],
-                    self.parameters[f"{name}_step"],
-                    g,
-                )
+                (self.parameters[f"{name}_bias"], self.parameters[f"{name}_noise"], self.parameters[f"{name}_step"], g)
                 for (name, _), g in zip(_QUANTITIES, noise, strict=True)
             )
         ]

@@ -32,13 +32,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.stepping.plant import DelayLine, PlantState, check_start, check_step, command_within, period_segments
 from pendulum_sim.stepping.stability import MOST_GROWTH, growth_of_map
 
-__all__ = [
-    "MAX_SUBSTEP",
-    "SeriesElasticPlant",
-    "SeriesElasticTuple",
-    "pack_series_elastic",
-    "series_elastic_step",
-]
+__all__ = ["MAX_SUBSTEP", "SeriesElasticPlant", "SeriesElasticTuple", "pack_series_elastic", "series_elastic_step"]
 
 MAX_SUBSTEP = 2.5e-4
 """Longest step at which the semi-implicit scheme is trusted with springs up to 1000 N m/rad [s]."""
@@ -103,10 +97,7 @@ def series_elastic_step(
         current, v_m, spring, torque_constant, gear_ratio, motor_damping, motor_inertia
     )
     v_m = dry_friction_step(
-        v_m_free,
-        friction_magnitude(v_m, motor_coulomb, motor_static, motor_stribeck_velocity),
-        motor_inertia,
-        h,
+        v_m_free, friction_magnitude(v_m, motor_coulomb, motor_static, motor_stribeck_velocity), motor_inertia, h
     )
     v_free = v + h * link_acceleration(q - angle_offset, v, spring, disturbance, inertia, damping, gravity)
     added = _added_friction(abs(v), abs(gravity_torque(q - angle_offset, gravity)), plant)
