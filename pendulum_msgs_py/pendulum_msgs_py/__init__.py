@@ -1,6 +1,6 @@
-"""The vocabulary that every pendulum package shares: values, names, units, angles, errors and plant rules.
+"""Names, values, units, angles, errors and plant rules shared by all packages.
 
-Nothing outside the ``ros`` subpackage imports ROS, so that the same words serve a node, a notebook and a test.
+Only the ``ros`` subpackage imports ROS: nodes, notebooks and tests use the same definitions.
 """
 
 __version__ = "0.1.0"

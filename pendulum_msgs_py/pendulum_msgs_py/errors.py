@@ -6,7 +6,7 @@ __all__ = ["BagError", "DataError", "FaultError", "ParameterError", "PendulumErr
 
 
 class PendulumError(Exception):
-    """Root of all errors that a user of the project may meet and mend."""
+    """Root of all errors that a user may meet."""
 
 
 class ParameterError(PendulumError, ValueError):
@@ -14,7 +14,7 @@ class ParameterError(PendulumError, ValueError):
 
 
 class DataError(PendulumError, ValueError):
-    """Recorded data (a CSV file, a log, the content of a bag) is not what it claims to be."""
+    """Recorded data (a CSV file, a log, the content of a bag) is malformed."""
 
 
 class BagError(PendulumError, OSError):
@@ -22,17 +22,11 @@ class BagError(PendulumError, OSError):
 
 
 class FaultError(PendulumError, RuntimeError):
-    """A plant, a node or a process is in a state in which it cannot do what was asked."""
+    """A plant, node or process cannot do what was requested in its present state."""
 
 
 class PlantStoppedError(FaultError):
-    """A plant gave up torque by itself: a fault, an e-stop, or no command for long.
-
-    Args:
-        namespace: Of the plant.
-        mode: In which it is: ``fault``, ``e_stop`` or ``disarmed``.
-        reason: Why, in its own words; a fault of the bridge begins with its name.
-    """
+    """A plant stopped torque by itself: ``mode`` is ``fault``, ``e_stop`` or ``disarmed`` (starvation)."""
 
     def __init__(self, namespace: str, mode: str, reason: str) -> None:
         super().__init__(f"{namespace} went to {mode}: {reason}")

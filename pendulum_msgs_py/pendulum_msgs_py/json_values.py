@@ -11,16 +11,12 @@ __all__ = ["json_text", "without_nan"]
 
 
 def json_text(content: Any) -> str:
-    """Return a result as a text of standard JSON, which every reader takes: ``null`` for NaN and infinity.
-
-    Numbers and arrays of numpy are written as those of Python, and what JSON has no type for, such as a path, as its
-    text.
-    """
+    """Return standard JSON: ``null`` for NaN and infinity, numpy values as Python's, other types as text."""
     return json.dumps(without_nan(content), indent=2, allow_nan=False, default=_plain)
 
 
 def without_nan(value: Any) -> Any:
-    """Return a value, or what it holds, with None for the numbers that JSON lacks: NaN and infinity."""
+    """Return a value with None for NaN and infinity, also in containers."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
@@ -31,7 +27,6 @@ def without_nan(value: Any) -> Any:
 
 
 def _key(key: Any) -> Any:
-    """Return a key as JSON takes it; those of other kinds, and NaN, as their text."""
     return (
         key
         if isinstance(key, str | int) or key is None or (isinstance(key, float) and math.isfinite(key))
@@ -41,5 +36,5 @@ def _key(key: Any) -> Any:
 
 def _plain(value: Any) -> Any:
     plain = value.tolist() if hasattr(value, "tolist") else None
-    # Of a number with more digits than Python's, numpy makes itself.
+    # For a number with more digits than Python's, tolist() returns numpy's type.
     return str(value) if plain is None or type(plain) is type(value) else without_nan(plain)

@@ -1,7 +1,6 @@
-"""Typed tables of parameters: one row gives a parameter its name, default, unit, domain and meaning.
+"""Typed tables of parameters: name, default, unit, domain and meaning.
 
-The same table declares ROS parameters (with descriptor and range), checks YAML files and writes the table in
-a package's README.
+One table declares ROS parameters, checks YAML files and generates the reference pages.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ __all__ = [
 ParameterValue: TypeAlias = bool | int | float | str | list[float] | list[str]
 
 TYPE_NAMES = {bool: "true or false", int: "an integer", float: "a number", str: "text", list: "a list"}
-"""What a parameter of a type must be, as text."""
+"""Types in messages."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +47,12 @@ class ParameterSpec:
     """One parameter.
 
     Attributes:
-        name: Name, as in YAML and on the ROS side.
-        default: Default; its type is the parameter's type. A list's elements are of its first element's type.
-        unit: SI unit, ``-`` where it has none, empty for text.
-        description: What it means, one sentence.
-        minimum: Smallest value allowed (of each element for a list).
-        maximum: Largest value allowed.
+        name: Name, in YAML and in ROS.
+        default: Default, which defines the type; a list's elements have the type of its first.
+        unit: SI unit, ``-`` for none, empty for text.
+        description: Meaning, one sentence.
+        minimum: Smallest value (of each element for a list).
+        maximum: Largest value.
         exclusive_minimum: The minimum itself is not allowed.
         choices: Values allowed, for text.
         read_only: Cannot change while the node runs.
@@ -71,7 +70,7 @@ class ParameterSpec:
 
     @property
     def domain(self) -> str:
-        """The values allowed, as text: ``> 0``, ``0 to 1``, ``one of a, b``, or empty for any."""
+        """The allowed values as text: ``> 0``, ``0 to 1``, ``one of a, b``, or empty for any."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         above = ">" if self.exclusive_minimum else ">="
@@ -86,11 +85,7 @@ class ParameterSpec:
         return ""
 
     def check(self, value: object, *, where: str = "") -> Any:
-        """Return the value in the parameter's own type.
-
-        Args:
-            value: What the user gave.
-            where: Prefix of the message, such as ``plant.yaml:12``.
+        """Return the value in the parameter's type; ``where`` (such as ``plant.yaml:12``) begins the message.
 
         Raises:
             ParameterError: The value has another type, is not finite, or lies outside the domain.
@@ -142,7 +137,7 @@ class ParameterSpec:
 
 
 def validate(specs: Iterable[ParameterSpec], values: Mapping[str, object], *, where: str = "") -> dict[str, Any]:
-    """Return all parameters of a table, given values checked, others at their default.
+    """Return all parameters of a table: given values checked, others at their default.
 
     Raises:
         ParameterError: A name is unknown, or a value is refused.
@@ -155,7 +150,7 @@ def validate(specs: Iterable[ParameterSpec], values: Mapping[str, object], *, wh
 
 
 def reject_unknown(values: Mapping[str, object], known: Iterable[str], *, where: str = "") -> None:
-    """Raise a ParameterError that names the first unknown key and the nearest known one."""
+    """Raise a ParameterError with the first unknown key and the nearest known one."""
     known = list(known)
     for name in values:
         if name not in known:
@@ -164,14 +159,14 @@ def reject_unknown(values: Mapping[str, object], known: Iterable[str], *, where:
 
 
 def suggestion(name: object, known: Iterable[str]) -> str:
-    """Return the nearest known name to an unknown one, or else all, for the end of a message."""
+    """Return the nearest known name, or else all, for the end of a message."""
     known = list(known)
     near = get_close_matches(str(name), known, n=1)
     return f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
 
 
 def require_mapping(value: object, what: str) -> dict[str, Any]:
-    """Return the value if it is a mapping with text keys, else raise a ParameterError that names it."""
+    """Return the value if it is a mapping with text keys, else raise a ParameterError."""
     if not isinstance(value, dict):
         kind = "empty" if value is None else f"a {type(value).__name__}"
         raise ParameterError(f"{what} is {kind}; expected a mapping of names to values")
@@ -192,7 +187,7 @@ _NUMBERS = (
 
 
 def _read_numbers_as_yaml_1_2(kind: type[Any]) -> type[Any]:
-    """Let a loader or dumper see numbers as YAML 1.2 does: ``1e-5`` is one, ``1:30`` and ``1_0`` are text.
+    """Make a loader or dumper read numbers as in YAML 1.2.
 
     YAML 1.1 reads 1:30 as 90, 010 as 8 and 1e-5 as text, none of which is meant in a parameter file.
     """
@@ -208,13 +203,13 @@ def _read_numbers_as_yaml_1_2(kind: type[Any]) -> type[Any]:
 
 @_read_numbers_as_yaml_1_2
 class _StrictDumper(yaml.SafeDumper):
-    """Safe YAML that quotes what the loader would take for a number, and writes everything in full."""
+    """Safe YAML that quotes text that looks like a number, without aliases."""
 
     def ignore_aliases(self, _data: Any) -> bool:
         return True
 
     def represent_text(self, text: str) -> Any:
-        # Plain or single-quoted, PyYAML writes these three line breaks as they are and reads them as spaces.
+        # Plain or single-quoted, PyYAML would read these line breaks back as spaces.
         style = '"' if any(character in text for character in "\x85\u2028\u2029") else None
         return self.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 
@@ -224,7 +219,7 @@ _StrictDumper.add_representer(str, _StrictDumper.represent_text)
 
 @_read_numbers_as_yaml_1_2
 class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML that refuses what YAML allows silently: keys given twice, aliases and nesting without bound."""
+    """Safe YAML that refuses duplicate keys, aliases, tags and deep nesting."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -271,13 +266,7 @@ _MAX_YAML_DEPTH = 40
 
 
 def read_text(path: str | Path, what: str, *, limit: int = _MAX_YAML_BYTES) -> str:
-    """Return the text of a file, or raise a ParameterError with the reason why it cannot be read.
-
-    Args:
-        path: The file.
-        what: What the file should be, such as ``plant file``.
-        limit: Largest size accepted [bytes]; parameters written by hand stay far below it.
-    """
+    """Return the text of a file of at most ``limit`` bytes; a ParameterError starts with ``what`` and says why not."""
     path = Path(path)
     try:
         status = path.stat()
@@ -302,14 +291,10 @@ def read_text(path: str | Path, what: str, *, limit: int = _MAX_YAML_BYTES) -> s
 
 
 def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
-    """Return the mapping that a YAML file holds.
-
-    Args:
-        path: The file.
-        what: What it should be, for messages.
+    """Return the mapping in a YAML file.
 
     Raises:
-        ParameterError: The file is missing, not text, not YAML (with line and column), or holds no mapping.
+        ParameterError: The file is missing, not text, not YAML (with line and column), or no mapping.
     """
     text = read_text(path, what)
     if text.lstrip().startswith(("<?xml", "<!--", "<robot", "<mujoco")):
@@ -329,7 +314,7 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
 
 
 def xacro_hint(path: str | Path, text: str) -> str:
-    """Return how a source for xacro becomes a model that ``--simulation`` takes; nothing for another text."""
+    """Return how to convert a xacro source for ``--simulation``; empty for other text."""
     name = Path(path).name
     if "xmlns:xacro" not in text and not name.endswith(".xacro"):
         return ""
@@ -339,7 +324,7 @@ def xacro_hint(path: str | Path, text: str) -> str:
 
 @lru_cache(maxsize=32)
 def _parse_yaml(text: str) -> Any:
-    """Return the parsed text, not to be changed; parsing takes ten times as long as reading and copying."""
+    """Return the parsed text, which must not be changed; parsing takes ten times as long as copying."""
     loader = _StrictLoader(text)
     try:
         return loader.get_single_data()
@@ -348,7 +333,7 @@ def _parse_yaml(text: str) -> Any:
 
 
 def parameter_sections(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield the sections of a ROS parameter file: node name or pattern, and parameters; namespaces may be nested."""
+    """Yield the sections of a ROS parameter file: node name or pattern, with namespaces, and parameters."""
     for key, value in content.items():
         if key == "ros__parameters":
             if isinstance(value, Mapping):
@@ -358,14 +343,10 @@ def parameter_sections(content: Mapping[str, Any], prefix: str = "") -> Iterator
 
 
 def dump_yaml(document: Mapping[str, Any], what: str = "file") -> str:
-    """Return the text that :func:`load_yaml` reads back to the same mapping.
-
-    Args:
-        document: Plain values: mappings, lists, text, numbers, truth values, dates.
-        what: What it is, for messages.
+    """Return the text of a mapping of plain values, which :func:`load_yaml` reads back.
 
     Raises:
-        ParameterError: A value is of a type that YAML has no word for.
+        ParameterError: YAML cannot represent a value.
     """
     try:
         return str(
@@ -384,7 +365,7 @@ def dump_yaml(document: Mapping[str, Any], what: str = "file") -> str:
 
 
 def markdown_table(specs: Iterable[ParameterSpec]) -> str:
-    """Return a table of parameters for a page: name, starred if read-only; default with unit and domain; meaning."""
+    """Return a table of parameters: name, starred if read-only; default with unit and domain; meaning."""
     rows = ["| parameter | default; allowed | meaning |", "|---|---|---|"]
     for spec in specs:
         default = str(spec.default).lower() if isinstance(spec.default, bool) else f"{spec.default}" or '""'

@@ -1,4 +1,4 @@
-"""Atomic writing of files, and the error message where it fails."""
+"""Atomic writing of files, and its errors."""
 
 from __future__ import annotations
 
@@ -15,28 +15,24 @@ from pendulum_msgs_py.errors import PendulumError
 __all__ = ["write_whole", "writing"]
 
 _NOT_REPLACED = {errno.EACCES, errno.EPERM, errno.EBUSY, errno.EROFS, errno.EINVAL}
-"""Errors of replacing a file that may be written: no right to its folder or owner, or it is a mount."""
+"""Errors of replacing a writable file: no right to its folder or owner, or it is a mount."""
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file atomically, with the folders above it.
+    """Write bytes, or text as UTF-8, to a file atomically, with the folders above it.
 
-    No temporary file remains if the disk is full or Ctrl-C interrupts. Links stay links; a file keeps its owner and
-    mode. What must not be replaced is overwritten: devices and pipes, a file of several names or with attributes of its
-    own, one in another user's folder, the own standard output.
-
-    Args:
-        path: Where to write.
-        content: Bytes, or text to be written as UTF-8.
+    No temporary file remains after a full disk or Ctrl-C. Links stay links; a file keeps owner and mode. What must not
+    be replaced is overwritten: devices and pipes, files with several names or extended attributes, files in another
+    user's folder, the process's standard output.
 
     Raises:
-        OSError: The file cannot be written, or the path or the text cannot be one.
+        OSError: The file cannot be written, or path or text are invalid.
     """
     try:
         data = content.encode() if isinstance(content, str) else content
         if b"\0" in os.fsencode(path):
             raise ValueError("embedded null character")
-        # No other path is resolved: the folders above may not be readable.
+        # Links only: the folders above may not be readable.
         target = path.resolve() if path.is_symlink() else path
     except ValueError as error:
         raise OSError(errno.EINVAL, str(error), str(path)) from error
@@ -65,7 +61,7 @@ def _may_be_replaced(target: Path, status: os.stat_result) -> bool:
         with suppress(OSError):
             if os.path.samestat(status, os.fstat(descriptor)):
                 return False
-    # A file that is not writable must not be replaced, even if its folder allows that: overwriting it raises.
+    # A read-only file must not be replaced, even if its folder allows that: overwriting it raises.
     if not os.access(target, os.W_OK):
         return False
     attributes: list[str] = []
@@ -98,15 +94,7 @@ def _circle(path: Path) -> OSError:
 
 @contextmanager
 def writing(what: str, failure: type[PendulumError]) -> Iterator[None]:
-    """Turn an ``OSError`` of writing within this context into one sentence.
-
-    Args:
-        what: The thing, with its path.
-        failure: Class of the error to raise.
-
-    Raises:
-        PendulumError: Of that class, where an ``OSError`` ended the writing; a PendulumError is passed on.
-    """
+    """Turn an ``OSError`` of writing into ``failure`` with one sentence on ``what``, the thing with its path."""
     try:
         yield
     except PendulumError:

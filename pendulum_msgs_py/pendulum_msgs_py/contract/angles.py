@@ -21,13 +21,7 @@ def wrap(angle: float) -> float: ...
 @overload
 def wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]: ...
 def wrap(angle: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
-    """Return the equivalent angle in [-pi, pi); NaN where it is not finite.
-
-    Angles that already lie there come back bit for bit, so that wrapping never adds rounding noise to a loop.
-
-    Args:
-        angle: Angle or array of angles [rad].
-    """
+    """Return the equivalent angle in [-pi, pi) [rad], NaN if not finite; angles in range stay the same bit for bit."""
     if isinstance(angle, np.ndarray):
         with np.errstate(invalid="ignore"):
             turned = (angle + math.pi) % _TWO_PI - math.pi
@@ -38,7 +32,7 @@ def wrap(angle: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
 
 
 def wrap_angle(angle: float) -> float:
-    """Return what :func:`wrap` does of one angle [rad], for loops that run compiled, too."""
+    """Return :func:`wrap` of one angle [rad], also in compiled loops."""
     if -math.pi <= angle < math.pi:
         return angle
     if math.isinf(angle):
@@ -48,7 +42,7 @@ def wrap_angle(angle: float) -> float:
 
 
 def deviation_from_upright(theta: float) -> float:
-    """Return what :func:`from_upright` does of one angle [rad], likewise."""
+    """Return :func:`from_upright` of one angle [rad], also in compiled loops."""
     return wrap_angle(theta - UPRIGHT)
 
 
@@ -57,9 +51,5 @@ def from_upright(theta: float) -> float: ...
 @overload
 def from_upright(theta: NDArray[np.float64]) -> NDArray[np.float64]: ...
 def from_upright(theta: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
-    """Return the deviation from upright, wrap(theta - pi) [rad], which is what controllers see.
-
-    Args:
-        theta: Joint angle or array of joint angles [rad].
-    """
+    """Return the deviation from upright that controllers use, wrap(theta - pi) [rad]."""
     return wrap(theta - UPRIGHT)

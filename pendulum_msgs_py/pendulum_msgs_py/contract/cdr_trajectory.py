@@ -1,7 +1,7 @@
 """JointTrajectory from CDR bytes in plain Python, so that other threads run meanwhile.
 
-rclpy takes 45 ms for a message of 1600 points (a move of the thesis) and holds the GIL throughout, which would block
-the thread that runs the actuator and the e-stop. This parser takes 5 to 10 us a point and lets other threads run.
+rclpy holds the GIL for 45 ms to read 1600 points (a move of the thesis), which would block the threads of actuator and
+e-stop. This parser takes 5 to 10 us a point.
 
 Layout (XCDR1, little endian)::
 
@@ -31,13 +31,10 @@ _SEQUENCES = ("positions", "velocities", "accelerations", "effort")
 
 
 def decode_joint_trajectory(data: bytes) -> tuple[int, Trajectory]:
-    """Return stamp [ns] and trajectory of the pendulum's joint.
-
-    Args:
-        data: A serialised message, encapsulation header included.
+    """Return stamp [ns] and trajectory of a serialised message, encapsulation header included.
 
     Raises:
-        ParameterError: It is not understood, for another joint, too long, or a point lacks its position.
+        ParameterError: It is malformed, for another joint, too long, or a point lacks its position.
     """
     try:
         return _decode(memoryview(data))

@@ -1,8 +1,7 @@
-"""Which commands a plant accepts: one gate per input, the same on simulator and hardware.
+"""Command gates: one per input of a plant, with the same rules on simulator and hardware.
 
-A command that is not finite, not of as many joints as the plant has, for other joints or for the same in another
-order, stale, from the future, a second reply to one state, or from a second commander is refused and counted; the
-plant acts on the newest one that passed.
+A gate refuses and counts commands that are not finite, for other joints, stale, from the future, duplicate, out of
+order or from a second commander. The plant acts on the newest accepted command.
 """
 
 from __future__ import annotations
@@ -20,10 +19,9 @@ __all__ = ["CommandGate", "Refusal"]
 
 
 class Refusal(str, Enum):
-    """Why a command was not applied; the value is the key in diagnostics.
+    """Why a command was refused; the value is the key in diagnostics.
 
-    ``not_one_joint`` is a message without one value for each joint of the input, ``other_joint`` one that
-    names other joints, or the same in another order.
+    ``not_one_joint``: not one value for each joint of the input. ``other_joint``: other names, or another order.
     """
 
     NOT_ONE_JOINT = "not_one_joint"
@@ -46,17 +44,17 @@ _REFUSALS = {
 
 
 class CommandGate:
-    """Checks the commands of one input and stores the newest that passed.
+    """Checks the commands of one input and stores the newest accepted one.
 
     Args:
-        timeout: Age beyond which a command is ignored [s], > 0.
-        joints: The joints that commands must be for, in this order; an empty list of names means the only one.
-        partial: Whether a command may be for some of the joints, in their order; the others get nothing.
+        timeout: Age at which a command expires [s], > 0.
+        joints: Joints that commands must name, in this order; no names mean the only joint.
+        partial: Whether a command may name some of the joints; the others get zero.
         unit: Unit of the efforts, for messages.
 
     Attributes:
-        refused: How many were refused, by reason.
-        problems: Of each reason's newest refusal, the field of the message, its value and what was expected.
+        refused: Number of refusals by reason.
+        problems: For each reason the newest refused field, its value and the expectation.
     """
 
     def __init__(
@@ -76,18 +74,13 @@ class CommandGate:
         self._expired = False
 
     def refuse_malformed(self, problem: str = "") -> Refusal:
-        """Count a message that was no command for joints at all, and keep what was wrong with it."""
+        """Count a message that is no command for joints."""
         self.refused[Refusal.NOT_ONE_JOINT] += 1
         self.problems[Refusal.NOT_ONE_JOINT] = problem
         return Refusal.NOT_ONE_JOINT
 
     def offer(self, command: JointCommand, now_ns: int) -> Refusal | None:
-        """Take a command if it passes every rule; return why it does not, or None.
-
-        Args:
-            command: The command.
-            now_ns: The plant's clock [ns].
-        """
+        """Accept a command at a time of the plant's clock [ns], or return why it is refused."""
         refusal = self._judge(command, now_ns)
         if refusal is None:
             last = self._newest is not None and rules.is_last(command.stamp_ns, self._newest.stamp_ns)
@@ -104,22 +97,22 @@ class CommandGate:
         return refusal
 
     def fresh(self, now_ns: int) -> JointCommand | None:
-        """Return the newest command if it is still young enough to act on, else None."""
+        """Return the newest accepted command unless it has expired."""
         newest = self._newest
         if newest is None:
             return None
-        # An expired command stays expired, whatever the clock does: torque does not return without a command.
+        # An expired command stays expired when the clock steps back: torque does not return without a command.
         self._expired = self._expired or has_expired(newest.stamp_ns, self._heard_ns, now_ns, self.timeout_ns)
         return None if self._expired or is_ahead(newest.stamp_ns, now_ns) else newest
 
     @property
     def newest(self) -> JointCommand | None:
-        """The newest accepted command, however old, or None before the first."""
+        """The newest accepted command, expired or not; None before the first."""
         return self._newest
 
     @property
     def newest_stamp_ns(self) -> int | None:
-        """Stamp of the newest accepted command [ns], or None before the first."""
+        """Its stamp [ns], or None."""
         return None if self._newest is None else self._newest.stamp_ns
 
     @property
@@ -128,7 +121,7 @@ class CommandGate:
         return self._holder
 
     def reset(self) -> None:
-        """Forget the last command and its commander (the plant was reset or re-armed); counters stay."""
+        """Forget command and commander; counters stay."""
         self._newest = None
         self._holder = ""
 
@@ -153,7 +146,6 @@ class CommandGate:
             return Refusal.OTHER_JOINT if joints and len(joints) == len(self.joints) else Refusal.NOT_ONE_JOINT
         if not joints:
             return Refusal.NOT_ONE_JOINT
-        # Each of them, in the plant's order, once.
         return None if joints == tuple(name for name in self.joints if name in joints) else Refusal.OTHER_JOINT
 
     def _filled(self, command: JointCommand) -> JointCommand:

@@ -1,4 +1,4 @@
-"""The words of a plant's decisions: modes, inputs, limits, and what to do until the next decision."""
+"""Modes, inputs and limits of a plant, and the drive that it applies until the next decision."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Input(str, Enum):
 
 
 class DriveKind(str, Enum):
-    """What the plant has to do until the next decision."""
+    """What the plant applies until the next decision."""
 
     OFF = "off"
     EFFORT = "effort"
@@ -47,19 +47,19 @@ class DriveKind(str, Enum):
 
 
 class Drive(NamedTuple):
-    """One decision, for the m driven ones of n joints; the defaults are those of one joint.
+    """One decision, for the m driven joints of n; the defaults are those of one joint.
 
     Attributes:
         kind: Off (zero effort, drive released), effort, or position control.
-        effort: m efforts to apply; under position control the feed-forward of the hand-over [N m or N].
-        position: m positions to hold or follow [rad or m], for ``POSITION``.
+        effort: m efforts; under position control the feed-forward of the handover [N m or N].
+        position: m set points [rad or m], for ``POSITION``.
         velocity: Their velocities.
         controller: The controller's share of the efforts, before limits.
         disturbance: The disturbance's share.
-        push: n efforts on the joints themselves; applied whatever the kind, as a hand would.
+        push: n efforts on the joints themselves, applied in every mode.
         saturated: A sum was clamped.
-        starved: Armed for effort, but without a fresh command of the commander: zero torque.
-        handover: Under position control, the share of the hand-over from effort that is still to go, 1 to 0 [-].
+        starved: Armed for effort without a fresh command: zero torque.
+        handover: Under position control, the remaining share of the handover from effort, 1 to 0 [-].
     """
 
     kind: DriveKind
@@ -76,27 +76,27 @@ class Drive(NamedTuple):
 
 @dataclass(frozen=True)
 class PlantLimits:
-    """Limits that a plant enforces; those that are one number hold for each joint, in its own unit.
+    """Limits that a plant enforces; a scalar holds for each joint, in its own unit.
 
     Attributes:
         effort: Largest effort of each driven joint, after the sum of controller and disturbance [N m or N].
         command_timeout: Age at which a command is ignored [s].
         feedback_timeout: Age of the measurement at which an armed plant faults [s].
         velocity: Speed at which an armed plant faults, and largest of a trajectory [rad/s].
-        position_min: Lower end of each joint's position window; ``(-inf,)`` for no window at any [rad or m].
+        position_min: Lower end of each joint's position window; ``(-inf,)`` for none [rad or m].
         position_max: Upper ends; ``(inf,)`` for none.
-        slew: Largest rate at which a torque rises, away from zero; it falls at once [N m/s].
-        handover_time: Time over which torque passes from position to effort control and back [s].
+        slew: Largest rate of a rising torque; it falls at once [N m/s].
+        handover_time: Time over which torque passes between position and effort control [s].
         tracking_error: Distance from the trajectory at which the plant faults [rad].
-        arm_effort: Largest command that may be waiting when the plant is armed [N m].
-        handover_effort: Largest distance of a command from the torque that holds, for it to take over [N m].
-        handover_sum: The same for the sum with a disturbance that waits [N m].
-        start_effort: Largest torque with which a commander may start where there is none [N m].
-        start_sum: The same for the sum with a disturbance that waits [N m].
-        stop_time: Time over which torque fades at an e-stop and at disarming, stop category 1; 0 for category 0 [s].
-        starvation: Time without a command after which a plant that is armed for effort disarms [s].
-        enable_timeout: Silence of the hold-to-run switch that disarms; infinity for no such switch [s].
-        coordinates: Joints whose units messages have.
+        arm_effort: Largest command that may wait when the plant is armed [N m].
+        handover_effort: Largest distance between the holding torque and a command that takes over [N m].
+        handover_sum: The same for its sum with a waiting disturbance [N m].
+        start_effort: Largest first torque of a commander [N m].
+        start_sum: The same for its sum with a waiting disturbance [N m].
+        stop_time: Time over which torque fades at e-stop and disarm, stop category 1; 0 for category 0 [s].
+        starvation: Time without a command after which a plant armed for effort disarms [s].
+        enable_timeout: Silence of the hold-to-run switch that disarms; infinity for no switch [s].
+        coordinates: Joints that give the messages their units.
     """
 
     effort: Vector
@@ -119,7 +119,6 @@ class PlantLimits:
     coordinates: Coordinates = field(default=ONE_JOINT, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse limits that limit nothing or everything; NaN, which compares false, would do the first."""
         of_position, of_velocity, _ = self.coordinates.units
         of_effort = self.coordinates.drive_unit
         for effort in self.effort:
@@ -138,7 +137,7 @@ class PlantLimits:
             ("starvation", "s"),
             ("enable_timeout", "s"),
         ):
-            if not getattr(self, name) > 0.0:
+            if not getattr(self, name) > 0.0:  # negated: NaN compares false
                 raise ParameterError(f"{name} is {getattr(self, name)} {unit}; expected > 0")
         for name, unit in (("handover_time", "s"), ("stop_time", "s"), ("arm_effort", of_effort)):
             if not getattr(self, name) >= 0.0:
@@ -152,11 +151,7 @@ class PlantLimits:
                 raise ParameterError(f"position window is [{low}, {high}] {of_position}; expected min < max")
 
     def for_joints(self, joints: int, driven: int) -> PlantLimits:
-        """Return the limits with one window for each of a number of joints.
-
-        Raises:
-            ParameterError: They are limits for another number of joints.
-        """
+        """Return the limits with one position window per joint; raise a ParameterError for another number of joints."""
         if len(self.effort) != driven:
             raise ParameterError(f"there are {len(self.effort)} effort limits; expected {driven}, one per driven joint")
         if len(self.position_min) == joints:

@@ -1,4 +1,4 @@
-"""Joints and the coordinates that they make: what wraps, where upright is, and which joints have a motor."""
+"""Joints and coordinates: which joints wrap, where upright is, and which joints are driven."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Joint:
     """One joint of a mechanism.
 
     Attributes:
-        name: Its name, in messages too.
-        unit: Unit of its position: ``rad``, or ``m`` for one that slides.
-        turns: Whether a whole turn leads back to the same place, so that deviations wrap.
-        goal: Its position where the mechanism is upright [rad or m].
+        name: Name, also in messages.
+        unit: Unit of its position: ``rad``, or ``m`` for a sliding joint.
+        turns: Whether positions a whole turn apart are the same, so that deviations wrap.
+        goal: Position where the mechanism is upright [rad or m].
     """
 
     name: str
@@ -30,7 +30,6 @@ class Joint:
     goal: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a unit that no joint has, and one that slides and turns."""
         if self.unit not in {"rad", "m"} or (self.unit == "m" and self.turns):
             raise ParameterError(
                 f"joint {self.name!r} has the unit {self.unit!r}, turns {self.turns}; expected rad, or m without turns"
@@ -43,7 +42,7 @@ class Joint:
 
     @property
     def effort_unit(self) -> str:
-        """Unit of what a motor or friction gives there: a torque, or a force."""
+        """Unit of its torque or force."""
         return "N m" if self.unit == "rad" else "N"
 
     @property
@@ -57,8 +56,8 @@ class Coordinates:
     """Joints in the model's order, and which of them are driven.
 
     Attributes:
-        joints: All joints, n of them.
-        driven: Indices of those with an actuator, ascending, m of them.
+        joints: All n joints.
+        driven: Indices of the m joints with an actuator, ascending.
     """
 
     joints: tuple[Joint, ...]
@@ -71,7 +70,7 @@ class Coordinates:
 
     @property
     def with_units(self) -> str:
-        """Names of all joints, each with the unit of its position, for messages."""
+        """Names of all joints with the units of their positions, for messages."""
         return ", ".join(f"{joint.name} [{joint.unit}]" for joint in self.joints)
 
     @property
@@ -88,12 +87,12 @@ class Coordinates:
 
     @property
     def drive_unit(self) -> str:
-        """Unit of what the motors give, for messages."""
+        """Unit of the actuators' efforts, for messages."""
         return " or ".join(dict.fromkeys(self.joints[index].effort_unit for index in self.driven))
 
     @property
     def slew_unit(self) -> str:
-        """Unit of how fast the motors' efforts change, for messages."""
+        """Unit of the rate of these efforts, for messages."""
         return " or ".join(f"{unit}/s" for unit in self.drive_unit.split(" or "))
 
     @property
@@ -102,23 +101,14 @@ class Coordinates:
         return tuple(joint.goal for joint in self.joints)
 
     def deviation(self, position: Sequence[float], goal: Sequence[float] | None = None) -> Vector:
-        """Return position minus goal; only what turns is wrapped, to [-pi, pi) [rad or m].
-
-        Args:
-            position: n positions [rad or m].
-            goal: n positions; None for upright.
-        """
+        """Return n positions minus the goal (None for upright) [rad or m]; turning joints wrap to [-pi, pi)."""
         wanted = self.goal if goal is None else goal
         return tuple(
             wrap(q - g) if joint.turns else q - g for joint, q, g in zip(self.joints, position, wanted, strict=True)
         )
 
     def for_each(self, name: str, values: Sequence[float]) -> Vector:
-        """Return a value for each joint of a parameter that has n, or one for all.
-
-        Raises:
-            ParameterError: It has another number of them.
-        """
+        """Return n values of a parameter that has n or one for all; another number is a ParameterError."""
         n = len(self.joints)
         if len(values) not in {1, n}:
             raise ParameterError(
@@ -127,11 +117,7 @@ class Coordinates:
         return tuple(values) if len(values) == n else (values[0],) * n
 
     def spread(self, effort: Sequence[float]) -> Vector:
-        """Return m efforts of the driven joints as n, zero at passive joints [N m or N].
-
-        Raises:
-            ParameterError: There are more or fewer than m.
-        """
+        """Return m efforts of the driven joints as n, zero at passive joints [N m or N]; another number is an error."""
         if len(effort) != len(self.driven):
             raise ParameterError(
                 f"effort has {len(effort)} values; expected {len(self.driven)}, for {', '.join(self.driven_names)}"

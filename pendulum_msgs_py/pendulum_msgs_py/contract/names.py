@@ -39,12 +39,12 @@ JOINT_TRAJECTORY = "joint_trajectory"
 PUSH = "push"
 APPLIED_EFFORT = "applied_effort"
 SIGNALS = (JOINT_STATES, EFFORT_COMMAND, DISTURBANCE, APPLIED_EFFORT)
-"""What goes round the loop, in order: without one of them a recording of a run is of no use."""
+"""The signals of the control loop, in order; a recording needs all of them."""
 EVENTS = "events"
 E_STOP_INPUT = "e_stop_input"
-"""``std_msgs/Bool``: true is pressed, false is released; has to be published continuously."""
+"""``std_msgs/Bool``, published continuously: true is pressed."""
 ENABLE_INPUT = "enable_input"
-"""``std_msgs/Bool``: true is held, false is released; has to be published continuously."""
+"""``std_msgs/Bool``, published continuously: true is held."""
 
 # Absolute names, by ROS convention.
 DIAGNOSTICS = "/diagnostics"
@@ -57,12 +57,12 @@ E_STOP_RESET = "~/e_stop_reset"
 
 
 def full_name(namespace: str, node: str) -> str:
-    """Return the full name of a node, such as ``/sim/controller``; ``/`` is the namespace of none."""
+    """Return the full name of a node, such as ``/sim/controller``."""
     return f"{namespace.rstrip('/')}/{node}"
 
 
 class Event:
-    """Names of the events on ``events``; the README has their details."""
+    """Names of the events on ``events``, explained in the README."""
 
     PLANT_MODE = "plant_mode"
     TRAJECTORY_REFUSED = "trajectory_refused"

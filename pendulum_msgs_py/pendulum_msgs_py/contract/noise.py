@@ -1,16 +1,14 @@
-"""Noise as a pure function of (seed, index): any run can make sample i without the samples before it.
+"""Noise as a pure function of (seed, index): sample i needs no earlier sample.
 
-The only definition of the random torques: the disturbance node, the batch engine of the simulator and
-the replay of a recorded run call these functions. SplitMix64 in counter form: the generator's state after
-``index`` steps is ``key + index * gamma``, its output that state scrambled, so no step depends on another::
+This is the only definition of the random torques, for the disturbance node, the batch engine and replay::
 
     uniform(seed, index, a) = a (2 U - 1),  U = (scramble(scramble(seed, 1), index) >> 11) / 2^53
 
-The integer functions are leaves in arithmetic modulo 2^64: they give the same bits for Python integers, for
-arrays of ``uint64`` and, compiled by numba, for scalars of ``uint64``.
+The integer functions work modulo 2^64 and give the same bits for Python integers, ``uint64`` arrays and compiled
+scalars.
 
-Source: Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014, with the finaliser
-that Stafford calls variant 13.
+Source: SplitMix64 in counter form: Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014,
+with Stafford's variant 13 as finaliser.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ _TWO_TO_MINUS_52 = 2.0**-52
 
 
 def scramble(key: int, index: int) -> int:
-    """Return 64 random-looking bits for a key and an index, both 0 to ``MAX_SEED``."""
+    """Return 64 pseudorandom bits for a key and an index, both 0 to ``MAX_SEED``."""
     z = (key + index * _GAMMA) & _MASK
     z = ((z ^ (z >> 30)) * _MIX_1) & _MASK
     z = ((z ^ (z >> 27)) * _MIX_2) & _MASK
@@ -43,34 +41,22 @@ def scramble(key: int, index: int) -> int:
 
 
 def unit_interval(bits: int) -> float:
-    """Return the number in [-1, 1) that 64 bits stand for, in steps of 2^-52."""
+    """Return 64 bits as a number in [-1, 1), in steps of 2^-52."""
     return (bits >> 11) * _TWO_TO_MINUS_52 - 1.0
 
 
 def stream_key(seed: int) -> int:
-    """Return where a seed's stream starts; neighbouring seeds start far apart.
-
-    Args:
-        seed: 0 to ``MAX_SEED``.
-
-    Raises:
-        ParameterError: The seed is outside that range.
-    """
+    """Return the key of a seed's stream; raise a ParameterError for a seed outside 0 to ``MAX_SEED``."""
     if not 0 <= seed <= MAX_SEED:
         raise ParameterError(f"seed is {seed}; expected an integer from 0 to 2^64 - 1")
     return scramble(int(seed), 1)
 
 
 def uniform(seed: int, index: int, amplitude: float) -> float:
-    """Return sample ``index`` of the uniform noise of a seed, in [-amplitude, amplitude).
-
-    Args:
-        seed: 0 to ``MAX_SEED``.
-        index: Sample number, >= 0.
-        amplitude: Half width of the distribution, for a torque [N m].
+    """Return sample ``index`` of a seed's uniform noise, in [-amplitude, amplitude), in the unit of the amplitude.
 
     Raises:
-        ParameterError: The seed or the index is outside its range.
+        ParameterError: Seed or index is outside 0 to ``MAX_SEED``.
     """
     if not 0 <= index <= MAX_SEED:
         raise ParameterError(f"noise index is {index}; expected an integer from 0 to 2^64 - 1")
@@ -78,19 +64,10 @@ def uniform(seed: int, index: int, amplitude: float) -> float:
 
 
 def uniform_array(seed: int, start: int, count: int, amplitude: float) -> NDArray[np.float64]:
-    """Return samples ``start`` to ``start + count - 1``, equal to :func:`uniform` bit for bit.
-
-    Args:
-        seed: 0 to ``MAX_SEED``.
-        start: First sample number, >= 0.
-        count: How many, >= 0.
-        amplitude: Half width of the distribution, finite, for a torque [N m].
-
-    Returns:
-        Array of shape (count,), in the unit of the amplitude.
+    """Return samples ``start`` to ``start + count - 1``, shape (count,), equal to :func:`uniform` bit for bit.
 
     Raises:
-        ParameterError: An argument is outside its range.
+        ParameterError: Seed or indices are outside 0 to ``MAX_SEED``, or the amplitude is not finite.
     """
     if start < 0 or count < 0 or start + count > MAX_SEED:
         raise ParameterError(f"noise samples {start} to {start + count}; expected 0 to 2^64 - 1")

@@ -1,7 +1,7 @@
 """The supervisor's state in nominal periods as numbers, for the compiled loop.
 
-A period is nominal if one driven joint is armed for effort and the commander has not changed, without trajectory,
-hand-over, push or conflict. The loop borrows the numbers and returns them; all else, texts included, stays here.
+A period is nominal if one driven joint is armed for effort, without change of commander, trajectory, handover, push or
+conflict. Texts and everything else stay in Python.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ GATE = np.dtype(
     ],
     align=True,
 )
-"""A gate's newest command."""
+"""State of a gate."""
 
 ORDINARY = np.dtype(
     [
@@ -49,15 +49,13 @@ ORDINARY = np.dtype(
     ],
     align=True,
 )
-"""What an ordinary decision depends on and changes."""
+"""State that a nominal decision reads and changes."""
 
 
 def lend(supervisor: PlantSupervisor, record: Any) -> bool:
-    """Write the state of a supervisor into a record; return whether its next period may be a nominal one.
+    """Write a supervisor's state into a record of :data:`ORDINARY`; return whether its next period may be nominal.
 
-    Args:
-        supervisor: Not to be used until :func:`take_back`.
-        record: Of :data:`ORDINARY`, its fields by attribute.
+    The supervisor must not be used until :func:`take_back`.
     """
     commands, disturbances = supervisor.gates[Input.EFFORT_COMMAND], supervisor.gates[Input.DISTURBANCE]
     ordinary = (
@@ -89,7 +87,7 @@ def lend(supervisor: PlantSupervisor, record: Any) -> bool:
 
 
 def take_back(supervisor: PlantSupervisor, record: Any) -> None:
-    """Take over what the periods since it was lent have changed."""
+    """Write the record back into the supervisor."""
     _take_gate_back(supervisor.gates[Input.EFFORT_COMMAND], record.command)
     _take_gate_back(supervisor.gates[Input.DISTURBANCE], record.disturbance)
     if not record.decisions:
@@ -102,7 +100,6 @@ def take_back(supervisor: PlantSupervisor, record: Any) -> None:
 
 
 def _may_act(gate: CommandGate) -> bool:
-    """Return whether a gate has a command that has not expired."""
     return gate._newest is not None and not gate._expired
 
 
@@ -117,7 +114,7 @@ def _lend_gate(gate: CommandGate, record: Any) -> None:
 
 
 def _take_gate_back(gate: CommandGate, record: Any) -> None:
-    # It may have grown old without a new one.
+    # It may have expired without a new one.
     gate._expired = bool(record.expired)
     if not record.accepted:
         return

@@ -1,4 +1,4 @@
-"""Parameters that every plant has, whatever it is: the limits that it enforces, and how its loop runs."""
+"""Parameters of every plant: the limits that it enforces, and how its loop runs."""
 
 from __future__ import annotations
 
@@ -33,12 +33,11 @@ REALTIME_PRIORITY = ParameterSpec(
     maximum=99,
     read_only=True,
 )
-"""Of all programs that run, or reply, at a plant's rate."""
+"""Of all programs that run at a plant's rate."""
 
 COMPILED = ParameterSpec(
     "compiled", True, "", "Use the compiled loop if available; diagnostics report which one runs.", read_only=True
 )
-"""Likewise."""
 
 LOOP_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
@@ -183,12 +182,7 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
 
 
 def in_units_of(specs: Iterable[ParameterSpec], coordinates: Coordinates) -> tuple[ParameterSpec, ...]:
-    """Return a table of parameters, of ``LIMIT_SPECS`` among others, with the limits in the units of a plant's joints.
-
-    Args:
-        specs: The parameters, with the units of a pendulum.
-        coordinates: Joints of the plant.
-    """
+    """Return specs with those of ``LIMIT_SPECS`` in the units of a plant's joints."""
     limits = {spec.name for spec in LIMIT_SPECS}
     of_position, of_velocity, _ = coordinates.units
     units = {"rad": of_position, "rad/s": of_velocity, "N m": coordinates.drive_unit, "N m/s": coordinates.slew_unit}
@@ -208,15 +202,15 @@ def limits_from_parameters(
 
     Args:
         values: Parameter values by name.
-        plant_effort_limits: Effort limit of each driven joint in the plant file [N m or N]; the parameter can only
-            lower them.
+        plant_effort_limits: Effort limits of the driven joints in the plant file [N m or N]; parameters only lower
+            them.
         coordinates: Joints of the plant.
-        lockstep: Whether time is simulated: there noise starts with the controller, and its sum is not limited.
+        lockstep: Simulated time, in which noise starts with the controller: their sum is not limited.
         feedback_timeout: Age of a measurement that faults an armed plant [s].
-        least_command_timeout: The shortest that the plant's own period allows; a shorter one is raised to it [s].
+        least_command_timeout: A shorter command timeout is raised to this [s].
 
     Raises:
-        ParameterError: They contradict each other or the plant.
+        ParameterError: The values contradict each other or the plant.
     """
 
     def number(name: str) -> float:

@@ -1,7 +1,6 @@
 """The rules of a plant as functions of numbers, for one command or one joint at a time.
 
-Gates and supervisor call them; compiled loops compile these very functions. The caller names, counts and reports what
-they decide.
+Gates, supervisor and compiled loops run these very functions; the caller names, counts and reports the results.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ COMMANDER_HOLD = 1.0
 FUTURE_TOLERANCE_NS = 5_000_000
 """How far ahead of the plant's clock a stamp may lie [ns]."""
 NEVER = -(2**63)
-"""In place of a missing stamp."""
+"""Stands for a missing stamp."""
 
 ACCEPTED, TOO_OLD, FROM_FUTURE, SECOND_COMMANDER, DUPLICATE, OUT_OF_ORDER = range(6)
 """Results of :func:`judge_stamp`."""
@@ -44,21 +43,21 @@ _HOLD_NS = round(COMMANDER_HOLD * NANOSECONDS)
 
 
 def judge_stamp(stamp_ns: int, now_ns: int, timeout_ns: int, newest_ns: int, heard_ns: int, other: bool) -> int:
-    """Return whether a command's stamp and sender let it pass, or the first reason why not.
+    """Return ``ACCEPTED`` or the first reason to refuse a command.
 
     Args:
         stamp_ns: Stamp of the command [ns].
         now_ns: The plant's clock [ns].
         timeout_ns: Age at which a command is ignored [ns].
-        newest_ns: Stamp of the newest command that passed [ns], or ``NEVER``.
-        heard_ns: When that one passed, on the plant's clock [ns].
-        other: Whether it comes from another sender.
+        newest_ns: Stamp of the newest accepted command [ns], or ``NEVER``.
+        heard_ns: Its arrival on the plant's clock [ns].
+        other: Whether this one comes from another sender.
     """
     if now_ns - stamp_ns > timeout_ns:
         return TOO_OLD
     if is_ahead(stamp_ns, now_ns):
         return FROM_FUTURE
-    # A clock that jumped back leaves a last command "from the future": it no longer orders anything.
+    # After a clock stepped back, the last command lies in the future: it no longer defines an order.
     if newest_ns == NEVER or is_ahead(newest_ns, now_ns):
         return ACCEPTED
     if other and 0 <= now_ns - heard_ns <= _HOLD_NS:
@@ -69,29 +68,28 @@ def judge_stamp(stamp_ns: int, now_ns: int, timeout_ns: int, newest_ns: int, hea
 
 
 def is_ahead(stamp_ns: int, now_ns: int) -> bool:
-    """Return whether a stamp lies further ahead of the plant's clock than clocks may differ."""
+    """Return whether a stamp lies further ahead of the plant's clock than ``FUTURE_TOLERANCE_NS``."""
     return stamp_ns - now_ns > FUTURE_TOLERANCE_NS
 
 
 def has_expired(stamp_ns: int, heard_ns: int, now_ns: int, timeout_ns: int) -> bool:
-    """Return whether a command is too old to act on.
+    """Return whether a command is too old to act on, by its stamp or by its arrival [ns].
 
-    Measured from the stamp and from the arrival, so that a clock that jumps either way only shortens it. An arrival
-    slightly "later than now" does not imply such a jump: a plant that catches up on missed periods decides as of each
-    of them.
+    Both, so that a clock step can only shorten its life. An arrival after ``now_ns`` is no such step: a plant that
+    catches up decides as of each missed period.
     """
     return now_ns - stamp_ns > timeout_ns or abs(now_ns - heard_ns) > timeout_ns
 
 
 def has_lapsed(commanded_ns: int, now_ns: int) -> bool:
-    """Return whether the commander has timed out, so that the next command starts a new one."""
+    """Return whether the commander has timed out, so that the next command begins a new one."""
     return now_ns - commanded_ns > _HOLD_NS
 
 
 def is_last(stamp_ns: int, newest_ns: int) -> bool:
-    """Return whether an effort of zero ends what its commander commands: it replies to no state, but follows the reply.
+    """Return whether a zero effort ends its commander's commands: it is stamped 1 ns after the last reply.
 
-    Ended at once, a motor is released; an effort of zero would drive its torque loop until it is too old.
+    The motor is then released at once; otherwise the zero would keep its torque loop active until it expires.
     """
     return stamp_ns == newest_ns + 1
 
@@ -102,12 +100,12 @@ def age_of(stamp_ns: int, now_ns: int) -> float:
 
 
 def is_inside(low: float, position: float, high: float, velocity: float, fastest: float) -> bool:
-    """Return whether a joint is inside its window and below the speed limit; False for NaN."""
+    """Return whether a joint is inside its window and speed limit; False for NaN."""
     return low <= position <= high and -fastest <= velocity <= fastest
 
 
 def within(value: float, limit: float) -> float:
-    """Return a value within a limit either way, and nothing for what is no number."""
+    """Return a value clamped to +-limit; 0 for NaN."""
     if -limit <= value <= limit:
         return value
     if math.isnan(value):
@@ -116,8 +114,5 @@ def within(value: float, limit: float) -> float:
 
 
 def rise_within(last: float, wanted: float, step: float) -> float:
-    """Return an effort that rises from the last one by a step at most.
-
-    Away from zero only: torque that is no longer commanded must drop at once.
-    """
+    """Return the wanted effort, rising away from zero by at most a step; it falls at once."""
     return min(max(last, 0.0) + step, max(min(last, 0.0) - step, wanted))

@@ -1,4 +1,4 @@
-"""The supervisor, used from several threads: messages arrive in one, the e-stop and an actuator's cycle in others."""
+"""The supervisor behind a lock: messages, e-stop and the actuator's cycle run in different threads."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from pendulum_msgs_py.contract.values import JointCommand, JointSample, Vector
 __all__ = ["SharedSupervisor"]
 
 _LONGEST_COURTESY = 0.005
-"""Longest time that :meth:`alone` yields to waiting threads [s]."""
+"""Longest yield of :meth:`alone` to waiting threads [s]."""
 
 
 class SharedSupervisor(PlantSupervisor):
-    """A plant supervisor whose every step is taken under one lock, and that has the drive prepared before arming.
+    """A plant supervisor that takes each step under one lock, and prepares the drive before arming.
 
     Args:
-        limits: The limits to keep.
-        prepare: Makes the plant ready to be armed, such as the drive's strategy set and confirmed; returns why it could
-            not, or an empty string. Called outside the lock, because it may wait for another thread.
-        withdraw: Called where the plant was prepared but then not armed.
-        measure: Returns the time [ns] and the newest measurement once the plant is prepared, for preparing takes its
-            time; None where it takes none.
+        limits: The limits.
+        prepare: Prepares the drive (strategy set and confirmed); returns why it could not, or an empty string. Called
+            outside the lock, because it may wait for another thread.
+        withdraw: Called if the plant was prepared but not armed.
+        measure: Returns time [ns] and newest measurement after the preparation, which may take long; None if it does
+            not.
         coordinates: The plant's joints, and which of them are driven.
         follows: Whether the plant can follow trajectories.
     """
@@ -58,15 +58,11 @@ class SharedSupervisor(PlantSupervisor):
 
     @property
     def waiting_at(self) -> int:
-        """Address of an ``int64`` that counts threads that wait for :meth:`alone` to end; polled by compiled code."""
+        """Address of an ``int64`` that counts the threads waiting for :meth:`alone`; compiled code polls it."""
         return ctypes.addressof(self._waiting)
 
     def watch_for_presses(self, look: Callable[[], tuple[int, str] | None]) -> None:
-        """Poll for an e-stop before each decision and each request.
-
-        Args:
-            look: Returns time [ns] and reason of a press that :meth:`e_stop` has not been called for, or None.
-        """
+        """Poll before each step for an e-stop that did not call :meth:`e_stop`: its time [ns] and reason, or None."""
         self._look_for_press = look
 
     def _look_then_carry_out(self) -> bool:
@@ -76,10 +72,7 @@ class SharedSupervisor(PlantSupervisor):
         return self._carry_out_presses()
 
     def _carry_out_presses(self) -> bool:
-        """Latch what e-stops were pressed before, at the beginning of each step; return whether there were any.
-
-        On a busy machine the thread that pressed one may not have run since.
-        """
+        """Latch pending e-stops, whose own threads may not have run yet; return whether there were any."""
         pressed = bool(self._presses)
         while self._presses:
             super().e_stop(*self._presses[0])
@@ -89,7 +82,7 @@ class SharedSupervisor(PlantSupervisor):
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
-        """Hold the supervisor exclusively; other threads are counted, wait, and run next."""
+        """Hold the supervisor exclusively; waiting threads run next."""
         with self._lock:
             self._look_then_carry_out()
             yield
@@ -100,10 +93,7 @@ class SharedSupervisor(PlantSupervisor):
 
     @contextlib.contextmanager
     def _in_turn(self) -> Iterator[bool]:
-        """Take the lock, and signal to compiled code that holds it that a thread is waiting.
-
-        Yields whether there were e-stop requests that had not been carried out yet.
-        """
+        """Take the lock, and signal the wait to compiled code that holds it; yield whether e-stops were pending."""
         with self._counting:
             self._waiting.value += 1
         try:
@@ -121,12 +111,12 @@ class SharedSupervisor(PlantSupervisor):
             return super().offer(kind, command, now_ns, problem)
 
     def set_commander_conflict(self, conflict: str) -> None:
-        """Report several publishers behind one name."""
+        """Set or clear a conflict between publishers."""
         with self._in_turn():
             super().set_commander_conflict(conflict)
 
     def receive_enable(self, now_ns: int, *, held: bool) -> None:
-        """Take note of a message of the hold-to-run switch."""
+        """Record a message of the hold-to-run switch."""
         with self._in_turn():
             super().receive_enable(now_ns, held=held)
 
@@ -138,7 +128,7 @@ class SharedSupervisor(PlantSupervisor):
             return super().accept_trajectory(trajectory, now_ns, sample)
 
     def arm(self, now_ns: int, sample: JointSample | None) -> str:
-        """Have the strategy set and confirmed, then arm."""
+        """Prepare the drive, then arm."""
         if self.mode is not Mode.DISARMED:
             with self._in_turn():
                 return super().arm(now_ns, sample)
@@ -159,14 +149,14 @@ class SharedSupervisor(PlantSupervisor):
             super().disarm(now_ns, reason)
 
     def e_stop(self, now_ns: int, reason: str = "e-stop pressed") -> None:
-        """Latch the e-stop: each decision from now on respects it, even before this thread has the lock."""
+        """Latch the e-stop; every decision respects it from here on, even before this thread has the lock."""
         self._newest_press = press = (now_ns, reason)
         self._presses.append(press)
         with self._in_turn():
             pass  # it is carried out on the way in, unless another thread did so first
 
     def e_stop_reset(self, now_ns: int) -> str:
-        """Leave the e-stop for disarmed, unless a press arrived after the reset was requested."""
+        """Leave the e-stop for disarmed, unless it was requested again meanwhile."""
         known = self._newest_press
         with self._in_turn() as pressed:
             if pressed or self._newest_press is not known:
@@ -179,18 +169,18 @@ class SharedSupervisor(PlantSupervisor):
             super().fault(reason, now_ns)
 
     def end_stop(self) -> None:
-        """Let nothing fade any more."""
+        """End the fade of a stop."""
         with self._in_turn():
             super().end_stop()
 
     def decide(self, now_ns: int, sample: JointSample | None) -> Drive:
-        """Return what the plant has to do now."""
+        """Return the drive until the next decision."""
         with self._lock:
             self._look_then_carry_out()
             return super().decide(now_ns, sample)
 
     def report_applied(self, effort: Vector) -> None:
-        """Record the efforts that were really applied."""
+        """Record the applied efforts."""
         with self._lock:
             self._carry_out_presses()
             super().report_applied(effort)

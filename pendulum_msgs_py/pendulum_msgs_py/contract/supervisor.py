@@ -1,4 +1,4 @@
-"""What a plant does at each instant: one state machine and one set of rules for simulator and hardware.
+"""The plant supervisor: one state machine and one set of rules for simulator and hardware.
 
 ::
 
@@ -6,7 +6,7 @@
     any armed state --fault--> FAULT --disarm--> DISARMED
     any state --e-stop--> E_STOP --reset--> DISARMED        (a reset never re-arms)
 
-Pure: time, measurements and messages are arguments, the decision is a value. The plants only carry it out.
+It is pure: time, measurements and messages are arguments, the decision is a value that the plant carries out.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSam
 __all__ = ["PUSH_LIMIT_FACTOR", "Drive", "DriveKind", "Input", "Mode", "PlantLimits", "PlantSupervisor"]
 
 PUSH_LIMIT_FACTOR = 10.0
-"""A push on the link is clamped to this multiple of the effort limit: 1e308 N m is finite, but no hand."""
+"""A push is clamped to this multiple of the effort limit: 1e308 N m is finite too."""
 
 _KEPT_TRANSITIONS = 50
 _LONGEST_STEP_NS = NANOSECONDS // 10
-"""Largest step in time by which one decision moves a trajectory or a fade on [ns]."""
+"""Longest step of a trajectory or a fade in one decision [ns]."""
 
 
 @dataclass
 class PlantSupervisor:
-    """State machine, command gates, trajectory and hand-over of one plant.
+    """State machine, command gates, trajectory and handover of one plant.
 
     Args:
-        limits: The limits to keep.
+        limits: The limits.
         preflight: Called on arming; returns why the plant is not ready, or an empty string.
         coordinates: The plant's joints, and which of them are driven.
-        follows: Whether the plant can follow trajectories; one of several joints cannot.
+        follows: Whether the plant can follow trajectories; with several joints it cannot.
 
     Raises:
         ParameterError: The limits are for another number of joints.
@@ -59,7 +59,6 @@ class PlantSupervisor:
     transitions: list[tuple[int, Mode, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        """Make one gate per input."""
         joints, driven, unit = self.coordinates.names, self.coordinates.driven_names, self.coordinates.drive_unit
         self.limits = self.limits.for_joints(len(joints), len(driven))
         self.follows = self.follows and len(joints) == 1
@@ -72,11 +71,11 @@ class PlantSupervisor:
         self._joints = len(joints)
         self._nothing = (0.0,) * len(driven)
         self._no_push = (0.0,) * len(joints)
-        # A passive joint takes a push of the size that the strongest motor could give.
+        # A passive joint has the push limit of the strongest motor.
         largest = max(self.limits.effort, default=1.0)
         own = dict(zip(driven, self.limits.effort, strict=True))
         self._push_limits = tuple(PUSH_LIMIT_FACTOR * own.get(name, largest) for name in joints)
-        # By name as well: enum hashes its members in Python, which a lookup would pay for at each decision.
+        # Attributes, because enum hashes its members in Python: slow in each decision.
         self._commands = self.gates[Input.EFFORT_COMMAND]
         self._disturbances = self.gates[Input.DISTURBANCE]
         self._pushes = self.gates[Input.PUSH]
@@ -98,25 +97,21 @@ class PlantSupervisor:
     # --- messages ------------------------------------------------------------------------------------------
 
     def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
-        """Offer a message of an input; None stands for no command at all, with its problem."""
+        """Offer a message of an input; None for a message that is no command, with its problem."""
         gate = self.gates[kind]
         return gate.refuse_malformed(problem) if command is None else gate.offer(command, now_ns)
 
     def set_commander_conflict(self, conflict: str) -> None:
-        """Report that several publishers stand behind one name on ``effort_command``, or that they no longer do.
-
-        Commanders with names of their own are told apart message by message; twins are not, and while there are
-        twins nobody's torque is applied.
-        """
+        """Set or clear a conflict: publishers of one name cannot be distinguished, so no torque is applied."""
         self.commander_conflict = conflict
 
     def receive_enable(self, now_ns: int, *, held: bool) -> None:
-        """Take note of a message of the hold-to-run switch; its release disarms at once."""
+        """Record a message of the hold-to-run switch; its release disarms at once."""
         self._held_ns = now_ns if held else None
         self._keep_enabled(now_ns)
 
     def accept_trajectory(self, trajectory: Trajectory, now_ns: int, sample: JointSample) -> str:
-        """Start to follow a trajectory; return why it is refused, or an empty string."""
+        """Follow a trajectory; return why it is refused, or an empty string."""
         limits = self.limits
         if not self.follows:
             return f"{self.no_trajectories}; expected effort_command"
@@ -133,7 +128,7 @@ class PlantSupervisor:
                 f"trajectory starts at {trajectory.start:.4f} rad, the pendulum is at {place:.4f} rad; "
                 f"expected at most {limits.tracking_error} rad between them"
             )
-        # The gap is closed while the trajectory already runs, no faster than a ramp would.
+        # The gap closes while the trajectory runs, no faster than a ramp.
         offset_time = max(limits.handover_time, abs(gap) / MAX_RAMP_VELOCITY)
         speed = trajectory.max_speed
         if offset_time > 0.0:
@@ -157,7 +152,7 @@ class PlantSupervisor:
     # --- transitions ---------------------------------------------------------------------------------------
 
     def arm(self, now_ns: int, sample: JointSample | None) -> str:
-        """Arm for effort at zero torque; return why not, or an empty string. Arming twice changes nothing."""
+        """Arm for effort at zero torque; return why not, or an empty string."""
         if self.mode.armed:
             return ""
         refusal = self._arm_refusal(now_ns, sample)
@@ -174,7 +169,7 @@ class PlantSupervisor:
         return ""
 
     def disarm(self, now_ns: int, reason: str = "disarmed on request") -> None:
-        """Stop the drive; also acknowledges a fault, but never an e-stop."""
+        """Stop the drive; also acknowledges a fault, never an e-stop."""
         if self.mode is not Mode.E_STOP:
             self._stop_drive(Mode.DISARMED, reason, now_ns)
 
@@ -190,24 +185,19 @@ class PlantSupervisor:
         return ""
 
     def fault(self, reason: str, now_ns: int) -> None:
-        """Release the drive and stay so until somebody disarms; an e-stop outranks a fault."""
+        """Release the drive until a disarm; an e-stop outranks a fault."""
         self._stop = None
         if self.mode not in {Mode.E_STOP, Mode.FAULT}:
             self._release(Mode.FAULT, reason, now_ns)
 
     def end_stop(self) -> None:
-        """Let nothing fade any more: a drive that is prepared for arming must not go on with it."""
+        """End the fade of a stop: a drive prepared for arming must not continue it."""
         self._stop = None
 
     # --- decision ------------------------------------------------------------------------------------------
 
     def decide(self, now_ns: int, sample: JointSample | None) -> Drive:
-        """Return what the plant has to do now.
-
-        Args:
-            now_ns: The plant's clock [ns].
-            sample: Newest measurement, or None before the first.
-        """
+        """Return the drive for a time of the plant's clock [ns] and the newest measurement, None before the first."""
         self._keep_pace(now_ns)
         self._keep_enabled(now_ns)
         push_command = self._pushes.fresh(now_ns)
@@ -227,7 +217,7 @@ class PlantSupervisor:
         return self._decide_effort(now_ns, push)
 
     def report_applied(self, effort: Vector) -> None:
-        """Tell what efforts the plant really applied, so that the next hand-over starts from there [N m or N]."""
+        """Record the applied efforts [N m or N], from which the next handover starts."""
         self._applied = _clamp(effort, self.limits.effort)
 
     @property
@@ -245,7 +235,7 @@ class PlantSupervisor:
 
     @staticmethod
     def commanded_by(source: str) -> str:
-        """Return the reason of a plant that does what somebody commands."""
+        """Return the reason of a commanded plant."""
         return f"commanded by {source or 'an unnamed node'}"
 
     # --- inside --------------------------------------------------------------------------------------------
@@ -255,23 +245,20 @@ class PlantSupervisor:
             self.disarm(now_ns, f"disarmed: {refusal}")
 
     def _enable_refusal(self, now_ns: int) -> str:
-        """Return why the hold-to-run switch does not let the plant be armed, or an empty string."""
+        """Return why the hold-to-run switch forbids arming, or an empty string."""
         timeout = self.limits.enable_timeout
         if math.isinf(timeout):
             return ""
         if self._held_ns is None:
             return "enable switch is not held; expected true on enable_input, all the time"
-        # Either way: a clock that steps back must not keep a switch held.
+        # abs: a clock that steps back must not keep a switch held.
         silence = abs(now_ns - self._held_ns) / NANOSECONDS
         if silence > timeout:
             return f"enable switch is silent for {1e3 * silence:.0f} ms; expected a message within {timeout:g} s"
         return ""
 
     def _keep_pace(self, now_ns: int) -> None:
-        """Let trajectory and fades wait where the plant itself did not run, or where its clock stepped.
-
-        A process that was stopped for half a second must not find its setpoint half a second further on.
-        """
+        """Shift trajectory and fades by the time in which the process was stopped or the clock stepped."""
         last_ns, self._last_time_ns = self._last_time_ns, now_ns
         if last_ns is None:
             return
@@ -282,7 +269,7 @@ class PlantSupervisor:
             if self._handover is not None:
                 self._handover.start_ns += lost
             if self._stop is not None and elapsed < 0:
-                # A stop waits for nothing, but a clock that steps back must not give it its torque back.
+                # A stop never waits, but a clock that steps back must not restore its torque.
                 self._stop.start_ns += elapsed
 
     def _decide_position(self, now_ns: int, sample: JointSample, push: Vector) -> Drive | None:
@@ -294,7 +281,7 @@ class PlantSupervisor:
         remaining = handover.remaining(now_ns, self.limits.handover_time) if handover else 0.0
         offset = handover.remaining_offset(now_ns) if handover else 0.0
         position += offset
-        # Negated, so that a setpoint that is not a number is a fault too.
+        # Negated, so that NaN is a fault too.
         if not abs(sample.position[0] - position) <= self.limits.tracking_error:
             self.fault(
                 f"pendulum is at {sample.position[0]:.3f} rad, the trajectory at {position:.3f} rad; "
@@ -324,10 +311,9 @@ class PlantSupervisor:
 
     def _take_over_refusal(self, command: JointCommand, now_ns: int) -> str:
         """Return why a command may not take over from position control, or an empty string."""
-        # What it asks for, not what the limit leaves of it: with a low limit all would look near.
+        # Before the limit: with a low limit every command would look near.
         unit = self.coordinates.drive_unit
         largest, asked = self.limits.handover_effort, f"{command.effort[0]:.2f} {unit}"
-        # A controller for another place: awake at the bottom, one for upright asks for all it has.
         jump = abs(command.effort[0] - self._applied[0])
         waiting = self._disturbances.fresh(now_ns)
         if jump <= largest and waiting is not None:
@@ -351,23 +337,23 @@ class PlantSupervisor:
         return Drive(DriveKind.OFF, self._nothing, self._nothing, self._nothing, self._nothing, self._nothing, push)
 
     def _stop_drive(self, mode: Mode, reason: str, now_ns: int) -> None:
-        """Release the drive, or with stop category 1 let the torque that acts fade to zero first; one fade alone."""
+        """Release the drive; with stop category 1 the acting torque fades first, in one fade."""
         stop, applied = self._stop, self._applied
         if self.mode.armed:
-            # Where no torque acts there is none to fade, and a torque of zero would wake the torque loop of a module.
+            # Without torque nothing fades: a zero torque would wake the torque loop of a module.
             starved = self.mode is Mode.EFFORT and self._gap_from is not None
             stop = None if starved else Handover(now_ns, ())
         self._release(mode, reason, now_ns)
         self._stop, self._applied = stop, applied
 
     def _decide_stop(self, now_ns: int, sample: JointSample | None, push: Vector) -> Drive:
-        """Return what a plant does that is not armed: nothing, or what is left of a stop of category 1."""
+        """Return the drive of a plant that is not armed: off, or the rest of a category 1 stop."""
         stop = self._stop
         if stop is None:
             return self._off(push)
-        # Taken here: a request may come while a torque that was decided before it is not reported as applied yet.
+        # Read here: at the request, the torque decided before it may not have been reported yet.
         stop.effort = stop.effort or self._applied
-        # A plant that catches up decides as of before the request, and a clock may be set back behind it.
+        # A plant that catches up, or whose clock stepped back, decides as of before the request.
         stop.start_ns = min(stop.start_ns, now_ns)
         remaining = stop.remaining(now_ns, self.limits.stop_time)
         if remaining == 0.0 or not any(stop.effort) or self._measurement_fault(now_ns, sample):
@@ -407,10 +393,9 @@ class PlantSupervisor:
         )
 
     def _begin_refusal(self, command: JointCommand, now_ns: int) -> str:
-        """Return why a commander may not begin, or an empty string; one that commands already may ask for anything.
+        """Return why a commander may not begin, or an empty string; an active commander may ask for anything.
 
-        After a gap a commander goes on if it asks for what it asked for before; one that was deactivated or restarted
-        meanwhile ended with zero torque, or is at another state.
+        After a gap it goes on near its last effort; one that was deactivated ended with zero torque.
         """
         largest, who, unit = self.limits.start_effort, command.source or "a controller", self.coordinates.drive_unit
         if self._commanding == command.source and not has_lapsed(self._commanded_ns, now_ns):
@@ -425,7 +410,7 @@ class PlantSupervisor:
                 f"expected at most {largest} {unit} to begin: bring the plant to where it asks for less, "
                 "or let its torque rise (a controller's start_time)"
             )
-        # With its first command a disturbance that waits would act at once, however large.
+        # The first command would let a waiting disturbance act at once, however large.
         largest = self.limits.start_sum
         waiting = self._disturbances.fresh(now_ns)
         if waiting is not None and not _largest(tuple(map(add, command.effort, waiting.effort))) <= largest:
@@ -470,7 +455,7 @@ class PlantSupervisor:
             )
         age = age_of(sample.stamp_ns, now_ns)
         if age < -limits.feedback_timeout:
-            # It would look fresh for as long, even if no other ever came.
+            # It would look fresh too long if no other followed.
             return f"measurement is stamped {-age * 1e3:.0f} ms ahead of the plant's clock"
         if age > limits.feedback_timeout:
             return (
@@ -479,7 +464,7 @@ class PlantSupervisor:
             )
         _, positions, velocities, _ = sample
         fastest = limits.velocity
-        # As many as there are joints: seen above, so that the look at them may be the fastest there is.
+        # Lengths were checked above: strict would cost time.
         for low, position, high, velocity in zip(  # noqa: B905
             limits.position_min, positions, limits.position_max, velocities
         ):
@@ -553,7 +538,7 @@ def _largest(values: Vector) -> float:
 
 
 def _clamp(values: Vector, limits: Vector) -> Vector:
-    """Return values within limits either way, nothing for what is no number; the very same tuple where all are."""
+    """Return values within +-limits, 0 for NaN; the same tuple if all are inside."""
     for value, limit in zip(values, limits):  # noqa: B905  # a third faster, and the rare case below compares lengths
         if not -limit <= value <= limit:
             break

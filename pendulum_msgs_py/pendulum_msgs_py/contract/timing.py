@@ -1,4 +1,4 @@
-"""Loop statistics and clocks, pure: the time of each event is an argument."""
+"""Loop statistics and clocks; the time of each event is an argument."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ __all__ = ["LoopStatistics", "RingOfTimes", "SteadyWallClock", "Throttle"]
 
 
 class SteadyWallClock:
-    """Wall-clock time that only ever moves forward, at the pace of the monotonic clock [ns].
+    """Wall-clock time that moves only forward, at the pace of the monotonic clock [ns].
 
-    A step of the system clock (NTP, a user) must not make a command look fresh or a loop miss a thousand
-    deadlines, so the wall clock is read once, and the monotonic clock counts from there.
+    The wall clock is read once: a step of it (NTP, a user) must not make a command look fresh or a loop miss deadlines.
     """
 
     def __init__(
@@ -25,7 +24,7 @@ class SteadyWallClock:
     ) -> None:
         self._monotonic = monotonic
         self.ahead_ns = wall() - monotonic()
-        """How far this clock is ahead of the monotonic one [ns]."""
+        """Lead over the monotonic clock [ns]."""
 
     def __call__(self) -> int:
         """Return the time [ns]."""
@@ -33,7 +32,7 @@ class SteadyWallClock:
 
 
 class RingOfTimes:
-    """The last N durations, kept without allocation; percentiles are computed on request."""
+    """The last N durations, stored without allocation."""
 
     def __init__(self, size: int = 4096) -> None:
         # Not numpy's: an item is written several times a period, and read twice a second.
@@ -42,12 +41,12 @@ class RingOfTimes:
         self._count = 0
 
     def add(self, duration_ns: int) -> None:
-        """Keep one duration [ns]."""
+        """Add one duration [ns]."""
         self._values[self._count % self._size] = duration_ns
         self._count += 1
 
     def extend(self, durations_ns: Sequence[int]) -> None:
-        """Keep several durations, the oldest first [ns]."""
+        """Add several durations, the oldest first [ns]."""
         kept = durations_ns[-self._size :]
         begin = (self._count + len(durations_ns) - len(kept)) % self._size
         until_end = min(len(kept), self._size - begin)
@@ -57,11 +56,11 @@ class RingOfTimes:
 
     @property
     def count(self) -> int:
-        """How many durations were ever added."""
+        """Number of durations ever added."""
         return self._count
 
     def percentiles_us(self, *percents: float) -> list[float]:
-        """Return percentiles of the stored durations, each the nearest in rank [us]; NaN before the first."""
+        """Return percentiles by nearest rank [us]; NaN before the first duration."""
         kept = np.frombuffer(self._values, dtype=np.int64)[: min(self._count, self._size)]
         if kept.size == 0:
             return [float("nan")] * len(percents)
@@ -72,11 +71,7 @@ class RingOfTimes:
 
 
 class Throttle:
-    """Lets one of many lines through in a time, and counts those that it left out.
-
-    Args:
-        interval: Least time between two lines [s].
-    """
+    """Passes at most one line per interval [s], and counts the suppressed ones."""
 
     def __init__(self, interval: float) -> None:
         self._interval = interval
@@ -84,12 +79,7 @@ class Throttle:
         self._left_out = 0
 
     def ask(self, now: float, *, urgent: bool = False) -> int | None:
-        """Return how many lines were left out before this one, or None where it is left out too.
-
-        Args:
-            now: Time on a steady clock [s].
-            urgent: Let it through regardless of the last line.
-        """
+        """Return how many lines were suppressed before this one at a time [s], or None to suppress it too."""
         if now - self._last < self._interval and not urgent:
             self._left_out += 1
             return None
@@ -98,16 +88,12 @@ class Throttle:
         return left_out
 
     def flush(self, now: float) -> int:
-        """Return how many lines were left out once their time is over, so that the last state can be logged; else 0."""
+        """Return how many lines were suppressed once the interval is over, to log the last state; else 0."""
         return 0 if not self._left_out or now - self._last < self._interval else self.ask(now) or 0
 
 
 class LoopStatistics:
-    """Rate, jitter, overruns and command latency of a periodic loop.
-
-    Args:
-        period_ns: Nominal period [ns].
-    """
+    """Rate, jitter, overruns and command latency of a loop with this period [ns]."""
 
     def __init__(self, period_ns: int) -> None:
         self.period_ns = period_ns
@@ -120,7 +106,7 @@ class LoopStatistics:
         self._window_cycles = 0
 
     def cycle(self, now_ns: int, deadline_ns: int) -> None:
-        """Record one cycle: when it ran and when it should have run [ns]. Late by a whole period is an overrun."""
+        """Record a cycle: when it ran and when it was due [ns]; late by a period is an overrun."""
         late = now_ns - deadline_ns
         self.jitter.add(abs(late))
         if late >= self.period_ns:
@@ -131,7 +117,7 @@ class LoopStatistics:
         self._window_cycles += 1
 
     def punctual_cycles(self, late_ns: Sequence[int], first_ns: int) -> None:
-        """Record cycles of which none was late by a period: how late each was, and when the first ran [ns]."""
+        """Record cycles without overrun: lateness of each, and when the first ran [ns]."""
         self.jitter.extend(late_ns)
         if self.cycles == 0:
             self._window_start_ns = first_ns
@@ -139,15 +125,15 @@ class LoopStatistics:
         self._window_cycles += len(late_ns)
 
     def round_trip(self, duration_ns: int) -> None:
-        """Record the time from the publication of a state until the command in reply to it arrives [ns]."""
+        """Record the time from publishing a state until its command arrives [ns]."""
         self.latency.add(duration_ns)
 
     def act_on_age(self, age_ns: int) -> None:
-        """Record how old a measurement is when the command in reply to it is taken: the loop's delay [ns]."""
+        """Record the age of a measurement when its command is taken: the loop's delay [ns]."""
         self.answered_age.add(age_ns)
 
     def summary(self, now_ns: int) -> Mapping[str, float]:
-        """Return the figures for diagnostics; the rate is that since the last summary."""
+        """Return the figures for diagnostics, with the rate since the last summary."""
         elapsed = (now_ns - self._window_start_ns) / NANOSECONDS
         rate = self._window_cycles / elapsed if elapsed > 0 and self.cycles else float("nan")
         self._window_start_ns = now_ns

@@ -1,4 +1,4 @@
-"""Position trajectories: the thesis's smooth ramp, and sampling of any trajectory between its points."""
+"""Position trajectories: the thesis's smooth ramp, and interpolation between points."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ RAMP_PERIOD = 0.01
 MAX_RAMP_VELOCITY = 0.3
 """Amplitude of the half-sine of commanded velocity [rad/s]."""
 MAX_POSITION = 1e6
-"""Largest position of a trajectory [rad]; beyond it, differences of positions lose their meaning."""
+"""Largest position [rad]: differences of larger ones lose precision."""
 MAX_RAMP_STEPS = 1_000_000
-"""Longest ramp: 2.8 h at 100 Hz. A slip in a unit should not fill the memory."""
+"""Longest ramp, 2.8 h at 100 Hz: a wrong unit must not fill the memory."""
 MAX_TRAJECTORY_POINTS = 20_000
-"""Most points that a plant takes in one message: 200 s at 100 Hz. Reading more would keep it from better things."""
+"""Most points in one message, 200 s at 100 Hz: reading more would block the plant."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +45,10 @@ class TrajectoryPoint:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Points at increasing times; between them position and velocity are interpolated linearly.
+    """Points at increasing times, with linear interpolation of position and velocity.
 
-    Linear, not cubic, because the thesis commands position and velocity as two separate curves (a linear ramp and
-    a half sine that is no derivative of it) and a spline through both would be neither.
+    Linear, not cubic: the thesis commands a linear ramp and a half sine that is not its derivative, and a spline
+    through both would be neither.
 
     Attributes:
         points: The points.
@@ -63,7 +63,6 @@ class Trajectory:
     max_speed: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Refuse what no position controller should follow; precompute what a plant needs at once."""
         if not self.points:
             raise ParameterError("trajectory has 0 points; expected at least one")
         previous = -math.inf
@@ -101,15 +100,10 @@ class Trajectory:
         return self.points[-1].position
 
     def from_position(self, position: float) -> Trajectory:
-        """Return the trajectory that leads there from where the joint is, if its first point lies ahead in time.
+        """Return the trajectory from a joint position [rad] to a first point that lies ahead in time.
 
-        That is how ``joint_trajectory_controller`` of ros2_control reads a goal of one point. A single point at rest
-        is reached on half a cosine, so that velocity neither jumps at its start nor at its end; the first of several
-        points, linearly. A trajectory that starts at time 0 is complete; one that starts later uses all of that time,
-        however near the first point is.
-
-        Args:
-            position: Where the joint is [rad].
+        So does ``joint_trajectory_controller`` of ros2_control. A single point at rest is reached on half a cosine,
+        whose velocity does not jump; the first of several points linearly.
         """
         first = self.points[0]
         if first.time == 0.0:
@@ -154,14 +148,14 @@ def thesis_ramp(
     period: float = RAMP_PERIOD,
     max_velocity: float = MAX_RAMP_VELOCITY,
 ) -> Trajectory:
-    """Return the thesis's smooth move: positions in steps of 0.002 rad at 100 Hz, velocity half a cycle of a sine.
+    """Return the thesis's smooth move: positions in steps of 0.002 rad at 100 Hz, velocity half a sine.
 
     Args:
         start: First position [rad].
         goal: Last position [rad].
         increment: Position step [rad], > 0.
         period: Time between two steps [s], > 0.
-        max_velocity: Amplitude of the half sine [rad/s], >= 0. A short move gets a smaller one.
+        max_velocity: Amplitude of the half sine [rad/s], >= 0; smaller for a short move.
 
     Raises:
         ParameterError: A value is outside its domain, or the ramp has more than ``MAX_RAMP_STEPS`` steps.
@@ -189,7 +183,7 @@ def thesis_ramp(
             f"expected fewer than {MAX_RAMP_STEPS} steps"
         )
     steps = max(1, math.ceil(abs(distance) / increment - 1e-9))
-    # The average of a half sine is 2/pi of its peak: it never has to promise more speed than the move needs.
+    # The mean of a half sine is 2/pi of its peak: no more speed than the move needs.
     peak = min(max_velocity, 0.5 * math.pi * abs(distance) / (steps * period))
     direction = math.copysign(1.0, distance) if distance else 0.0
     return Trajectory(

@@ -1,4 +1,4 @@
-"""Typed values that travel between plant, controller and recorder: tuples in the order of the joints, also for one."""
+"""Values exchanged by plant, controller and recorder: tuples in the order of the joints, also for one joint."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import NamedTuple
 __all__ = ["NANOSECONDS", "JointCommand", "JointSample", "Vector", "written"]
 
 NANOSECONDS = 1_000_000_000
-"""Nanoseconds in a second; stamps are integers of nanoseconds so that no time is ever rounded."""
+"""Nanoseconds in a second; stamps are integers, so that no time is rounded."""
 
 Vector = tuple[float, ...]
 """One number per joint, in the order of the model."""
 
 
 class JointSample(NamedTuple):
-    """State of all n joints at one instant.
+    """State of n joints at one instant.
 
     Attributes:
         stamp_ns: Time of the measurement [ns].
-        position: n positions; of the pendulum theta, 0 hanging down, pi upright [rad or m].
+        position: n positions; theta is 0 hanging down, pi upright [rad or m].
         velocity: n velocities [rad/s or m/s].
-        effort: n measured efforts; NaN where none is measured [N m or N].
+        effort: n measured efforts, NaN if not measured [N m or N].
     """
 
     stamp_ns: int
@@ -35,7 +35,7 @@ class JointSample(NamedTuple):
         return cls(stamp_ns, (position,), (velocity,), (effort,))
 
     def is_finite(self) -> bool:
-        """Return whether positions and velocities are finite numbers, and efforts too where they are measured."""
+        """Return whether positions and velocities are finite, and efforts finite or NaN."""
         finite = math.isfinite
         for value in self.position + self.velocity:  # twice as fast as all()
             if not finite(value):
@@ -47,13 +47,13 @@ class JointSample(NamedTuple):
 
 
 class JointCommand(NamedTuple):
-    """Commanded efforts, in reply to one state.
+    """Commanded efforts in reply to one state.
 
     Attributes:
-        stamp_ns: Stamp of the state that this command replies to [ns].
-        effort: One effort for each joint that it names [N m or N].
+        stamp_ns: Stamp of that state [ns].
+        effort: One effort for each named joint [N m or N].
         source: The commander (``header.frame_id``).
-        joints: Joint names that the message carried; empty means "the only joint".
+        joints: Joint names in the message; empty for the only joint.
     """
 
     stamp_ns: int
@@ -68,11 +68,6 @@ class JointCommand(NamedTuple):
 
 
 def written(values: Vector, digits: str = "") -> str:
-    """Return numbers as a message has them: one alone, several in brackets.
-
-    Args:
-        values: The numbers.
-        digits: Format of each, such as ``.3f``; empty for all digits.
-    """
+    """Return numbers as text: one alone, several in brackets, in a format such as ``.3f``."""
     texts = [format(value, digits) if digits else str(value) for value in values]
     return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"

@@ -1,7 +1,7 @@
-"""The scalar equations in another arithmetic: complex numbers, arrays, symbols.
+"""The scalar equations in another arithmetic.
 
-The equations of this package use ``math`` and the four operations alone. With ``cmath`` in place of ``math`` they
-give exact derivatives (complex step), with ``numpy`` they take whole grids, with ``casadi`` they become expressions.
+With ``cmath`` in place of ``math`` they give exact derivatives (complex step), with ``numpy`` they take arrays, with
+``casadi`` they become expressions.
 """
 
 from __future__ import annotations
@@ -16,17 +16,12 @@ __all__ = ["complex_step", "in_arithmetic"]
 
 _EQUATIONS = ("pendulum_msgs_py.dynamics", "pendulum_msgs_py.mechanisms", "pendulum_msgs_py.plants.friction_terms")
 _STEP = 2.0**-64
-"""Imaginary step; its square is lost in any sum, and a power of two scales without rounding."""
+"""Imaginary step: its square vanishes in any sum, and a power of two scales without rounding."""
 
 
 @lru_cache(maxsize=64)
 def in_arithmetic(function: Callable[..., Any], arithmetic: ModuleType) -> Callable[..., Any]:
-    """Return an equation of this package, and what it calls, with another module in place of ``math``.
-
-    Args:
-        function: A plain function of :mod:`pendulum_msgs_py.dynamics` or :mod:`pendulum_msgs_py.mechanisms`.
-        arithmetic: ``cmath``, ``numpy``, ``casadi``, or another module with ``sin``, ``cos`` and ``exp``.
-    """
+    """Return a function of ``dynamics`` or ``mechanisms``, and all that it calls, with another module for ``math``."""
     assert isinstance(function, FunctionType)
     scope = dict(function.__globals__)
     for name in function.__code__.co_names:
@@ -39,11 +34,7 @@ def in_arithmetic(function: Callable[..., Any], arithmetic: ModuleType) -> Calla
 
 
 def complex_step(function: Callable[..., Any], at: tuple[float, ...]) -> list[list[float]]:
-    """Return the Jacobian of a function at a point, exact to rounding: row i, column j is d f_i / d x_j.
-
-    Args:
-        function: Takes n numbers, complex ones too, and returns a tuple of m.
-        at: The point, n values.
+    """Return the Jacobian of a function of n numbers at a point, exact to rounding: row i, column j is d f_i / d x_j.
 
     Source:
         Squire and Trapp, Using complex variables to estimate derivatives of real functions, SIAM Review 40(1), 1998.

@@ -1,12 +1,9 @@
 """Steps of a mechanism with true stiction and end stops: pure functions on tuples, interpreted or compiled by numba.
 
-Between events each joint slides in one direction, is held, or is free, and the equations are smooth: Runge-Kutta of
-order four keeps its order. A velocity that crosses zero and a position that reaches an end stop are located inside the
-step. A resting joint is held while the effort that holds it lies within its dry friction (and, at an end stop, whatever
-presses it there); it is then exactly at rest, and the other joints move as if it were welded. A stop takes the whole
-velocity of its joint (a plastic impact), and the others get their share of the impulse through the mass matrix.
-
-It is the one-joint plant's rule (:mod:`pendulum_sim.stepping.dry_friction`) for several joints.
+Between events each joint slides one way, is held, or is free: the equations are smooth and Runge-Kutta keeps order
+four. Zero crossings of velocity and end stops are located inside the step. A joint at rest is held, exactly, while the
+effort that holds it is within its dry friction; the others move as if it were welded. A stop is a plastic impact, whose
+impulse reaches the other joints through the mass matrix. For one joint: :mod:`pendulum_sim.stepping.dry_friction`.
 
 Sources: D. Karnopp, "Computer simulation of stick-slip friction in mechanical dynamic systems", 1985, events located;
 F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, section 8 (impacts).
@@ -38,7 +35,7 @@ __all__ = [
 ]
 
 JOINT_ROWS = ("coulomb_friction", "static_friction", "stribeck_velocity", "lower_stop", "upper_stop", "time_constant")
-"""What a row of a ``JointTable`` holds, by the names of plant files."""
+"""Rows of a ``JointTable``, by the names of plant files."""
 COULOMB, STATIC, STRIBECK, LOWER, UPPER, LAG = range(len(JOINT_ROWS))
 JointTable = tuple[tuple[float, ...], ...]
 """Rows of one number per joint, in the order of ``JOINT_ROWS``."""
@@ -46,26 +43,26 @@ JointTable = tuple[tuple[float, ...], ...]
 _MAX_EVENTS = 12
 _MAX_ROOT_STEPS = 60
 FAR = 1e300
-"""End stop that nothing reaches [rad or m]."""
+"""End stop out of reach [rad or m]."""
 
 
 def put_1(_values: Any, _index: int, value: Any) -> Any:
-    """Return values with one of them replaced, of one joint."""
+    """Return the values of one joint with one replaced."""
     return (value,)
 
 
 def put_2(values: Any, index: int, value: Any) -> Any:
-    """Return values with one of them replaced, of two joints."""
+    """Return the values of two joints with one replaced."""
     return (value, values[1]) if index == 0 else (values[0], value)
 
 
 def lag_1(torque: Any, command: Any, elapsed: float, constants: Any) -> Any:
-    """Return the effort of a lagging actuator after some time, of one joint."""
+    """Return the effort of one lagging actuator after some time."""
     return (actuator_torque(torque[0], command[0], elapsed, constants[0]),)
 
 
 def lag_2(torque: Any, command: Any, elapsed: float, constants: Any) -> Any:
-    """Return the efforts of lagging actuators after some time, of two joints."""
+    """Return the efforts of two lagging actuators after some time."""
     return (
         actuator_torque(torque[0], command[0], elapsed, constants[0]),
         actuator_torque(torque[1], command[1], elapsed, constants[1]),
@@ -77,18 +74,14 @@ _LAG_FUNCTIONS = {1: lag_1, 2: lag_2}
 
 
 def joint_functions(count: int) -> tuple[Callable[..., Any], ...]:
-    """Return (along, put, lag) for a number of joints: what loops over tuples would do, written out to be compiled.
-
-    Raises:
-        ParameterError: There are none for so many joints.
-    """
+    """Return (along, put, lag) for 1 or 2 joints, written out for the compiler; else raise a ParameterError."""
     if count not in _PUT:
         raise ParameterError(f"a mechanism of {count} joints is not stepped yet; expected 1 or 2")
     return along_functions(count), _PUT[count], _LAG_FUNCTIONS[count]
 
 
 def _loaded(put: Any, v: Any, torque: Any, direction: Any, table: Any) -> Any:
-    """Return the efforts less the dry friction of what slides."""
+    """Return the efforts less the dry friction of sliding joints."""
     for i in range(len(torque)):
         if direction[i] != 0.0:
             friction = friction_magnitude(v[i], table[COULOMB][i], table[STATIC][i], table[STRIBECK][i])
@@ -99,7 +92,7 @@ def _loaded(put: Any, v: Any, torque: Any, direction: Any, table: Any) -> Any:
 def _constrained(
     forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any, direction: Any, held: Any, p: Any, table: Any
 ) -> Any:
-    """Return q'' with friction against ``direction``, and exactly 0 at held joints."""
+    """Return q'' with friction against ``direction``, exactly 0 at held joints."""
     tau = _loaded(put, v, torque, direction, table)
     a = forward(q, v, tau, p)
     count = 0
@@ -111,7 +104,7 @@ def _constrained(
     if count == len(a):
         return along(a, -1.0, a)
     if count == 1:
-        # The acceleration is affine in the effort: one more point of it gives the effort that holds.
+        # The acceleration is affine in the effort: a second point gives the holding effort.
         more = forward(q, v, put(tau, last, tau[last] + 1.0), p)
         column = along(more, -1.0, a)
         a = put(along(a, -a[last] / column[last], column), last, 0.0)
@@ -122,7 +115,7 @@ def _step(
     forward: Any, along: Any, put: Any, lag: Any, q: Any, v: Any, torque: Any, command: Any, push: Any, begin: float,
     h: float, direction: Any, held: Any, p: Any, table: Any,
 ) -> Any:  # fmt: skip
-    """Return (q, v) after h with the joints in one mode; ``begin`` is the time since the effort was ``torque``."""
+    """Return (q, v) after h in one mode; ``begin`` is the time since the effort was ``torque``."""
     half = 0.5 * h
     constants = table[LAG]
     t_0 = along(lag(torque, command, begin, constants), 1.0, push)
@@ -143,7 +136,7 @@ def _step(
 
 
 def joint_modes(forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any, p: Any, table: Any) -> Any:
-    """Return (direction, held) of each joint: which way friction acts on it, and 1 where it is held at rest."""
+    """Return (direction, held) of each joint: the direction of sliding, and 1 if held at rest."""
     n = len(q)
     direction = along(v, -1.0, v)
     held = direction
@@ -155,14 +148,14 @@ def joint_modes(forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any,
         elif table[STATIC][i] > 0.0 or q[i] <= table[LOWER][i] or q[i] >= table[UPPER][i]:
             held = put(held, i, 1.0)
             rest += 1
-    # Release the joints that cannot be held, one at a time, the one pulled hardest beyond its friction first.
+    # Release the joints that cannot be held, one at a time, the largest excess over friction first.
     for _ in range(n):
         if rest == 0:
             break
         worst, excess, way = -1, 0.0, 0.0
         for i in range(n):
             if held[i] > 0.0:
-                # What holds joint i, given that the other held joints stay: the effort that takes its acceleration.
+                # The effort that holds joint i while the other held joints stay.
                 free = put(held, i, 0.0)
                 loose = _constrained(forward, along, put, q, v, torque, direction, free, p, table)
                 pulled = _constrained(
@@ -185,7 +178,7 @@ def joint_modes(forward: Any, along: Any, put: Any, q: Any, v: Any, torque: Any,
 
 
 def _passed(kind: int, i: int, q: Any, v: Any, direction: Any, table: Any) -> float:
-    """Return an event's function, > 0 before it: 0 velocity crosses zero, 1 and 2 lower and upper stop."""
+    """Return an event function, > 0 before the event: 0 velocity crosses zero, 1 lower stop, 2 upper stop."""
     if kind == 0:
         return float(v[i] * direction[i])
     if kind == 1:
@@ -197,21 +190,21 @@ def advance_joints(
     forward: Any, along: Any, put: Any, lag: Any, q: Any, v: Any, torque: Any, command: Any, push: Any, h: float,
     p: Any, table: Any,
 ) -> Any:  # fmt: skip
-    """Return (q, v) after h, sticking, slipping and hitting stops as often as that takes.
+    """Return (q, v) after h [s], with as many events as occur.
 
     Args:
-        forward: The mechanism's equation.
-        along: Of :func:`joint_functions`.
-        put: Of the same.
-        lag: Of the same.
+        forward: The mechanism's equation, of parameters ``p``.
+        along: As ``put`` and ``lag`` from :func:`joint_functions`.
+        put: Likewise.
+        lag: Likewise.
         q: Positions [rad or m].
-        v: Velocities.
-        torque: Efforts of the actuators at the start, 0 at passive joints [N m or N].
-        command: Commanded efforts during the step.
+        v: Velocities [rad/s or m/s].
+        torque: Actuator efforts at the start, 0 at passive joints [N m or N].
+        command: Commanded efforts.
         push: Efforts on the joints themselves.
         h: Step [s].
         p: The mechanism's parameters.
-        table: What the joints have, of :func:`pendulum_msgs_py.plants.plant_parameters.pack_joints`.
+        table: From :func:`pendulum_msgs_py.plants.plant_parameters.pack_joints`.
     """
     left = h
     n = len(q)
@@ -222,7 +215,7 @@ def advance_joints(
         q_1, v_1 = _step(forward, along, put, lag, q, v, torque, command, push, begin, left, direction, held, p, table)
         for i in range(n):
             if v[i] == 0.0 and direction[i] != 0.0 and v_1[i] * direction[i] < 0.0:
-                # It broke away and came back within the step: keep it where it is.
+                # It broke away and came back within the step: hold it.
                 held = put(held, i, 1.0)
                 direction = put(direction, i, 0.0)
                 q_1, v_1 = _step(
@@ -256,12 +249,12 @@ def advance_joints(
         if joint < 0:
             return q_1, v_1
         q, v = _step(forward, along, put, lag, q, v, torque, command, push, begin, first, direction, held, p, table)
-        # A joint that turned round within the step may have been at a stop before: it is no further than that.
+        # A joint that reversed within the step may have started at a stop.
         q = put(q, joint, min(max(q[joint], table[LOWER][joint]), table[UPPER][joint]))
         if which > 0:
             q = put(q, joint, table[LOWER][joint] if which == 1 else table[UPPER][joint])
-            # A plastic impact: the impulse that takes this joint's velocity moves the others too. Dry friction holds
-            # no joint against it, for it is a finite effort in no time; an end stop does.
+            # A plastic impact: its impulse moves the other joints too. Dry friction, a finite effort, cannot resist an
+            # impulse; an end stop can.
             for i in range(n):
                 if table[LOWER][i] < q[i] < table[UPPER][i]:
                     held = put(held, i, 0.0)

@@ -1,4 +1,4 @@
-"""One step of the smooth equations of a mechanism, on tuples: interpreted, or compiled by numba."""
+"""One step of a mechanism's smooth equations, on tuples: interpreted, or compiled by numba."""
 
 from __future__ import annotations
 
@@ -19,25 +19,17 @@ def along_2(q: Any, h: Any, v: Any) -> Any:
 
 
 def along_functions(count: int) -> Callable[..., Any]:
-    """Return :func:`along_1` or :func:`along_2`, by the number of joints."""
+    """Return the function for this number of joints."""
     return {1: along_1, 2: along_2}[count]
 
 
 def rk4_joints(
     forward: Any, along: Any, q: Any, v: Any, torque_0: Any, torque_mid: Any, torque_1: Any, h: float, p: Any
 ) -> Any:
-    """Return (q, v) after a step h of the smooth equations, by the classical Runge-Kutta method of order four.
+    """Return (q, v) after a step h [s] of the classical Runge-Kutta method of order four.
 
-    Args:
-        forward: The mechanism's equation.
-        along: :func:`along_1` or :func:`along_2`.
-        q: Positions [rad or m].
-        v: Velocities.
-        torque_0: Efforts at the start of the step, of all joints [N m or N].
-        torque_mid: In its middle.
-        torque_1: At its end.
-        h: Step [s].
-        p: The mechanism's parameters.
+    ``forward`` is the mechanism's equation with parameters ``p``; q in rad or m; the efforts of all joints at start,
+    middle and end of the step in N m or N.
     """
     half = 0.5 * h
     a_1 = forward(q, v, torque_0, p)

@@ -1,4 +1,4 @@
-"""The compiled loop that replies to each message of an input, for the compiler's process alone."""
+"""The compiled loop that replies to each message of an input; imported by the compiler's process alone."""
 
 from __future__ import annotations
 
@@ -24,13 +24,12 @@ __all__ = ["answer_loop", "count_answer"]
 
 
 def answer_loop(own: np.dtype[Any], answer: Any) -> Any:
-    """Return the loop, compiled.
+    """Return the compiled loop.
 
     Args:
-        own: Layout of what replies depend on and change.
-        answer: Compiled function ``answer(s, arrived_ns)`` that replies to the message which was taken and counts the
-            reply, or returns False before it has changed anything: Python then handles the message. The time is that of
-            the monotonic clock [ns].
+        own: Layout of the node's own state.
+        answer: Compiled ``answer(s, arrived_ns)``, at a time of the monotonic clock [ns]: replies to the message and
+            counts the reply, or returns False before any change, so that Python handles the message.
     """
 
     @entry(answer_record(own))
@@ -58,7 +57,7 @@ def answer_loop(own: np.dtype[Any], answer: Any) -> Any:
 
 @compiled
 def count_answer(s: Any, stamp_ns: Any, age_ns: Any, compute_ns: Any) -> None:
-    """Count a reply that was published, with its times [ns]."""
+    """Record the times of a published reply [ns]."""
     s.stamp_ns[s.answers] = stamp_ns
     s.age_ns[s.answers] = age_ns
     s.compute_ns[s.answers] = compute_ns

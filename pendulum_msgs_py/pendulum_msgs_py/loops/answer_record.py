@@ -1,4 +1,4 @@
-"""The record of a loop that replies to each message of an input by one of an output."""
+"""The record of a loop that replies to each message of an input."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from pendulum_msgs_py.loops.records import INPUT, OUTPUT, TIME
 __all__ = ["ENDED", "FAILED", "LEFT", "MOST_ANSWERS", "Answerer", "LoopKind", "answer_record"]
 
 MOST_ANSWERS = 1024
-"""Largest number of replies in one slice; each of their times is stored."""
+"""Most replies in one slice; their times are stored."""
 ENDED, LEFT, FAILED = range(3)
-"""Why a slice ended: its time is over or a call is pending, a message is left to Python, or rcl failed to take one."""
+"""Why a slice ended: its time is over or a call is pending, a message is left to Python, or rcl failed."""
 
 
 @dataclass(frozen=True)
 class LoopKind:
-    """The loop that replies.
+    """A replying loop.
 
     Attributes:
-        own: Layout of what its replies depend on and change.
-        builder: Builds it, ``module:function``.
-        choice: Which variant of it.
+        own: Layout of its own state.
+        builder: Its builder, ``module:function``.
+        choice: Arguments of the builder.
     """
 
     own: np.dtype[Any]
@@ -33,34 +33,30 @@ class LoopKind:
 
 
 class Answerer(Protocol):
-    """A node's logic that replies, and lends a loop the numbers for it.
+    """Logic of a node that lends its state to a replying loop.
 
     Attributes:
-        kind: The loop; None where there is none.
-        refusal: Why it cannot reply at present; empty where it can.
+        kind: The loop, or None.
+        refusal: Why it cannot run at present, or empty.
     """
 
     kind: LoopKind | None
     refusal: str
 
     def lend(self, own: Any) -> bool:
-        """Write what replies depend on into a record; return False where Python has to handle the next message."""
+        """Write the state into a record; return False if Python has to handle the next message."""
 
     def take_back(self, record: Any) -> None:
-        """Take over the changes by one or more replies; the record is the loop's whole one."""
+        """Read the state back from the loop's whole record after one or more replies."""
 
 
 def answer_record(own: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the layout of a loop that replies.
-
-    Args:
-        own: Layout of what its replies depend on and change.
-    """
+    """Return the layout of a replying loop, with the node's own state."""
     return np.dtype(
         [
             ("time", TIME),
             ("counter", "i4"),
-            # Event counters of what ends a slice, -1 for none.
+            # Event counters that end a slice, -1 for none.
             ("calls", "i4", (2,)),
             ("wall_ahead_ns", "i8"),
             ("end_ns", "i8"),

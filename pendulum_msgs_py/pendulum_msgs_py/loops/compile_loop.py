@@ -1,6 +1,6 @@
 """The compiler's process: ``python -m pendulum_msgs_py.loops.compile_loop FILE MODULE:BUILDER [CHOICE ...]``.
 
-Without arguments it caches the loops that experiments run, so that no program has to wait for them.
+Without arguments it caches the loops of the thesis's experiment, so that no program has to wait for them.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ COMMON = (
     ("pendulum_lqr.disturbances.disturbance_kernel:uniform_loop",),
     ("pendulum_hw_bridge.emulation.kernel_loop:actuator_loop",),
 )
-"""Those of the thesis's experiment: the plant by the default integrator and by the thesis's, its controller, its
-noise, and the emulated actuator."""
+"""Plant (default and thesis's integrator), controller, noise and emulated actuator of the thesis's experiment."""
 
 
 def _keep_common() -> None:

@@ -1,8 +1,7 @@
-"""Machine code of loops: compiled once by numba in a process of its own, cached on disk, loaded without numba.
+"""Machine code of loops: compiled once by numba in its own process, cached on disk, loaded without numba.
 
-Importing numba costs a program half a second of processor time and 60 MB; loading what it has compiled costs neither.
-A loop is one function of one record of numbers (:mod:`numpy.dtype`), which holds all that it reads and writes, and of
-symbols that its caller names.
+Importing numba costs a program 0.5 s of CPU and 60 MB. A loop is a function of one record of numbers
+(:class:`numpy.dtype`), which holds all its data, and of symbols named by its caller.
 """
 
 from __future__ import annotations
@@ -33,28 +32,28 @@ from pendulum_msgs_py.whole_file import write_whole
 __all__ = ["Loop", "NoMachineCodeError", "compile_loop", "keep_loop", "load_loop"]
 
 Loop = Callable[[NDArray[Any]], int]
-"""Runs on one record, an array of shape (1,); returns what the loop returns."""
+"""Runs on one record, an array of shape (1,)."""
 
 _LIBRARIES = {
     "libm.so.6": ("sin", "cos", "sincos", "tan", "exp", "expm1", "log", "sqrt", "tanh", "pow", "fmod", "floor"),
     "libc.so.6": ("memcpy", "memmove", "memset", "clock_gettime", "clock_nanosleep", "ppoll", "read"),
 }
-"""What every loop may call in addition to what its caller names."""
+"""What every loop may call in addition to the caller's symbols."""
 _PATIENCE = 120.0
-"""Longest time that a compiler may take on a busy machine [s]."""
+"""Timeout of the compiler on a busy machine [s]."""
 _COMPILER = "pendulum_msgs_py.loops.compile_loop"
 
 
 class NoMachineCodeError(PendulumError):
-    """A loop cannot be compiled; the message has the reason, and the caller runs interpreted."""
+    """A loop cannot be compiled, for the reason in the message; the caller runs interpreted."""
 
 
 def load_loop(builder: str, *choice: str, symbols: Mapping[str, int]) -> Loop:
-    """Return a loop; the first time on this computer, or after a change of its source, it is compiled for seconds.
+    """Return a loop; the first time on a computer, or after a change of its source, compiling takes seconds.
 
     Args:
         builder: ``module:function``; called with the choice, it returns the loop compiled by numba for one record.
-        choice: Which variant of it, such as a method.
+        choice: Arguments of the builder, such as a method.
         symbols: Addresses of the functions that it calls, by name.
 
     Raises:
@@ -74,9 +73,7 @@ def _load(builder: str, choice: tuple[str, ...], symbols: tuple[tuple[str, int],
 
 
 def keep_loop(builder: str, *choice: str) -> tuple[dict[str, Any], bytes]:
-    """Return the cached head and code of a loop; it is compiled first if not cached, or if its source has changed.
-
-    Args: as in :func:`load_loop`.
+    """Return head and code of a loop from the cache; compile first if missing or if its source has changed.
 
     Raises:
         NoMachineCodeError: It cannot be compiled here.
@@ -92,13 +89,7 @@ def keep_loop(builder: str, *choice: str) -> tuple[dict[str, Any], bytes]:
 
 
 class _LoadedLoop:
-    """Machine code in this process.
-
-    Args:
-        name: Of its function.
-        code: Object file.
-        symbols: Addresses of what it calls.
-    """
+    """Machine code in this process, and the addresses of what it calls."""
 
     def __init__(self, name: str, code: bytes, symbols: Mapping[str, int]) -> None:
         known = {**_addresses(), **symbols}
@@ -141,7 +132,7 @@ def _addresses() -> dict[str, int]:
 
 
 def _path(builder: str, choice: tuple[str, ...]) -> Path:
-    """Return the cache file of a loop's code: one for each choice, compiler and kind of processor."""
+    """Return the cache file: one for each choice, compiler and processor."""
     module, _, function = builder.partition(":")
     try:
         versions = [importlib.metadata.version(each) for each in ("numba", "llvmlite", "numpy")]
@@ -161,7 +152,7 @@ def _path(builder: str, choice: tuple[str, ...]) -> Path:
 
 @cache
 def _processor() -> str:
-    """Return the model and the instruction sets of the first processor, on which machine code depends."""
+    """Return model and instruction sets of the first processor."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").partition("\n\n")[0].splitlines()
         return "\n".join(line for line in lines if line.startswith(("model name", "flags")))
@@ -169,8 +160,8 @@ def _processor() -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes] | None:
-    """Return the head of the code and the code itself; None where it is damaged, of other source, or missing."""
-    # A file of another program is ignored, whatever it holds.
+    """Return head and code; None if missing, damaged, or of other source."""
+    # Another program's file is ignored.
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
         line, _, code = path.read_bytes().partition(b"\n")
         head = json.loads(line)
@@ -184,7 +175,7 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes] | None:
 
 
 def _source(name: str) -> Path:
-    """Return a source file of the imported packages, also for code that was compiled from another copy."""
+    # Relative to the imported package, also for code compiled from another copy.
     package, _, rest = name.partition("/")
     return _folder(package) / rest
 
@@ -198,11 +189,11 @@ def _folder(package: str) -> Path:
 
 
 def _compile_apart(path: Path, builder: str, choice: tuple[str, ...]) -> None:
-    """Compile a loop in a process of its own; of several programs that need it one compiles, the others wait."""
+    """Compile in another process; one of several waiting programs compiles."""
     with _alone(path):
         if _read(path) is not None:
             return
-        # The message shows that the first start, which takes seconds, does not hang.
+        # The first start takes seconds and must not seem to hang.
         print(f"compiling {builder} {' '.join(choice)}: ten seconds or so, this once", file=sys.stderr, flush=True)
         command = [sys.executable, "-m", _COMPILER, str(path), builder, *choice]
         try:
@@ -234,13 +225,7 @@ def _alone(path: Path) -> Iterator[None]:
 
 
 def compile_loop(path: Path, builder: str, *choice: str) -> None:
-    """Compile a loop and keep it.
-
-    Args:
-        path: Where.
-        builder: As in :func:`load_loop`.
-        choice: Likewise.
-    """
+    """Compile a loop of :func:`load_loop` into a file."""
     module, _, function = builder.partition(":")
     dispatcher = getattr(importlib.import_module(module), function)(*choice)
     (signature,) = dispatcher.signatures
@@ -249,14 +234,13 @@ def compile_loop(path: Path, builder: str, *choice: str) -> None:
     head = {
         "name": compiled.fndesc.llvm_func_name,
         "digest": _digest(code),
-        # All that was imported to build it: nothing else can have changed it.
+        # All imported modules: nothing else can have changed the loop.
         "sources": {name: _digest(_source(name).read_bytes()) for name in _own_sources()},
     }
     write_whole(path, json.dumps(head).encode() + b"\n" + code)
 
 
 def _own_sources() -> list[str]:
-    """Return the files of the project's modules in use, each from its package on: a copy elsewhere has its own."""
     found = []
     for name, module in sorted(sys.modules.items()):
         package = name.partition(".")[0]

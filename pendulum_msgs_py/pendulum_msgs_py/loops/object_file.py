@@ -1,7 +1,7 @@
-"""Object files of LLVM's large code model put into memory: what a compiled loop needs of a linker.
+"""A minimal linker: loads object files of LLVM's large code model.
 
-llvmlite can do this too, for 50 MB and a tenth of a second in each program. The code that numba makes names whatever it
-uses by whole addresses, so that one kind of relocation is all there is, and anything else is refused.
+llvmlite can do this too, for 50 MB and 0.1 s in each program. Numba's code refers to everything by whole addresses, so
+one kind of relocation suffices; any other is refused.
 
 Source: System V ABI, chapters 4 and 5; its AMD64 supplement, table 4.9 (``R_X86_64_64``: S + A).
 """
@@ -18,7 +18,7 @@ from typing import NamedTuple
 __all__ = ["LinkedCode", "link", "undefined_symbols"]
 
 _MAGIC = b"\x7fELF\x02\x01"
-"""An object file of 64 bits, little endian."""
+"""ELF, 64 bits, little endian."""
 _X86_64, _AT_MACHINE = 62, 18
 _HEADER = struct.Struct("<40xQ10xHHH")
 _SECTION = struct.Struct("<IIQQQQIIQQ")
@@ -53,11 +53,7 @@ class _Symbol(NamedTuple):
 
 
 class LinkedCode:
-    """Code in memory that can be executed and not written; it stays there as long as this object.
-
-    Attributes:
-        addresses: Where its symbols are.
-    """
+    """Executable, read-only code in memory as long as this object lives, with the addresses of its symbols."""
 
     def __init__(self, memory: mmap.mmap, addresses: Mapping[str, int]) -> None:
         self._memory = memory
@@ -65,28 +61,20 @@ class LinkedCode:
 
 
 def undefined_symbols(code: bytes) -> set[str]:
-    """Return the names that an object file leaves to its loader.
-
-    Raises:
-        ValueError: It is no such file.
-    """
-    with _damage_is_told():
+    """Return the undefined symbols of an object file; raise a ValueError if it is none."""
+    with _damage_as_value_error():
         sections = _sections(code)
         return {symbol.name for symbol in _symbols(code, sections) if symbol.section == _UNDEFINED and symbol.name}
 
 
 def link(code: bytes, known: Mapping[str, int]) -> LinkedCode:
-    """Put an object file into memory.
-
-    Args:
-        code: The file.
-        known: Addresses of the symbols that it does not define.
+    """Load an object file, given the addresses of its undefined symbols.
 
     Raises:
-        ValueError: It is not of this kind, or something that it needs is not known.
-        OSError: This system lets no program make code.
+        ValueError: It is of another kind, or a symbol is unknown.
+        OSError: This system forbids programs to make code.
     """
-    with _damage_is_told():
+    with _damage_as_value_error():
         return _link(code, known)
 
 
@@ -111,8 +99,7 @@ def _link(code: bytes, known: Mapping[str, int]) -> LinkedCode:
 
 
 @contextlib.contextmanager
-def _damage_is_told() -> Iterator[None]:
-    """Turn any error of a truncated or damaged file into a ``ValueError``."""
+def _damage_as_value_error() -> Iterator[None]:
     try:
         yield
     except (struct.error, LookupError, OverflowError, MemoryError) as error:
@@ -145,17 +132,14 @@ def _symbols(code: bytes, sections: list[_Section]) -> list[_Symbol]:
 
 
 def _places(sections: list[_Section], symbols: list[_Symbol]) -> tuple[dict[int | str, int], int, int]:
-    """Return where each section that is loaded comes, and each common symbol by its name.
-
-    Pages with code come first, and the size of these; then those with what code may write, and the size of all.
-    """
+    """Return the offset of each loaded section and common symbol, the size of the code pages, and the size of all."""
     places: dict[int | str, int] = {}
 
     def place(key: int | str, size: int, alignment: int, end: int) -> int:
         places[key] = end + -end % max(1, alignment)
         return places[key] + size
 
-    # Nothing is ever thrown through a loop, so how to unwind its stack may be left out.
+    # No exception passes through a loop: unwind tables are not needed.
     loaded = [
         (index, section)
         for index, section in enumerate(sections)

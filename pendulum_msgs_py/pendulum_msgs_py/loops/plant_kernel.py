@@ -1,7 +1,6 @@
-"""Nominal periods of a plant of one joint, for compiled code: take torques, decide, step, publish.
+"""Nominal periods of a plant of one joint, compiled: take torques, decide, step, publish.
 
-Every check comes before the first change: a period or a message that is not nominal ends the loop untouched, and
-Python handles it by the same rules.
+Every check comes before the first change: any other period or message ends the loop untouched, and Python handles it.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ def _somebody_waits(s: Any) -> Any:
 
 @compiled
 def _is_answer(s: Any, stamp_ns: Any) -> Any:
-    """Return whether a stamp is that of an own state, newest first since it nearly always is that one."""
+    """Return whether a stamp is that of an own state; nearly always the newest."""
     for back in range(OWN_STAMPS):  # noqa: SIM110  (compiled code has no any())
         if s.own_stamp_ns[(s.own_newest - back) % OWN_STAMPS] == stamp_ns:
             return True
@@ -67,7 +66,7 @@ def _time_ns(s: Any) -> Any:
 
 @compiled
 def _take_inputs(s: Any) -> Any:
-    """Take the torques that have come; return the input at which a message waits for Python, or ``_IS_READ``."""
+    """Take new torques; return the input whose message is left to Python, or ``_IS_READ``."""
     for index in range(INPUTS):
         source = s.inputs[index]
         for _ in range(source.most):
@@ -79,7 +78,7 @@ def _take_inputs(s: Any) -> Any:
             if index == EFFORT:
                 if not _is_answer(s, source.stamp_ns) or not _accept(source, s.rules.command, _time_ns(s)):
                     return index
-                # Like those of the interpreted loop: system time, as DDS notes arrivals in.
+                # System time, as in DDS's arrival stamps and the interpreted loop.
                 if not s.lockstep and source.stamp_ns == s.sample_ns and s.latencies < MOST_PERIODS:
                     s.latency_ns[s.latencies] = source.info[1] - s.published_ns
                     s.latencies += 1
@@ -94,19 +93,18 @@ def _take_inputs(s: Any) -> Any:
 
 
 def plant_loop(layout: Any, step: Any) -> Any:
-    """Return the loop for a kind of plant, compiled.
+    """Return the compiled loop for a kind of plant.
 
     Args:
         layout: Of the plant's part of the record.
-        step: Compiled ``step(plant, effort)``: goes on for one period under an effort, sets ``theta``, ``theta_dot``
-            and ``torque`` of its record.
+        step: Compiled ``step(plant, effort)``: advances one period and sets ``theta``, ``theta_dot`` and ``torque``.
     """
 
     @compiled
     def advance(s: Any) -> Any:
-        """Do one period from a decision to its publication; return whether it was done, and its state is out."""
+        """Run one period from decision to publication; return whether the state was published."""
         until_ns = s.now_ns + s.period_ns
-        # In lockstep a decision is as of the state that was replied to, in real time as of the deadline.
+        # In lockstep a decision is as of the answered state, in real time as of the deadline.
         if not _decide(s, s.now_ns if s.lockstep else until_ns):
             return False
         before_ns = s.sample_ns
@@ -158,7 +156,7 @@ def plant_loop(layout: Any, step: Any) -> Any:
             if waits != _IS_READ:
                 return MESSAGE_WAITS + waits
             if s.answered & s.expected == s.expected:
-                # Python does the last step, which publishes that it was.
+                # Python does the last step, which also publishes the end.
                 if s.now_ns + s.period_ns >= s.last_ns or not advance(s):
                     return UNUSUAL
                 continue

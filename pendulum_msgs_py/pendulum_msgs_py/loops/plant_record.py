@@ -1,4 +1,4 @@
-"""The record of a plant's compiled periods: clock, rules, inputs and outputs; the plant itself is its last part."""
+"""The record of a plant's compiled periods: clock, rules, inputs, outputs, and last the plant itself."""
 
 from __future__ import annotations
 
@@ -22,29 +22,21 @@ __all__ = [
 ]  # fmt: skip
 
 MOST_PERIODS = 256
-"""Largest number of periods in one slice in real time; each of their figures is stored."""
+"""Most periods in one slice in real time; their figures are stored."""
 OWN_STAMPS = 128
-"""Number of own stamps among which a command's stamp is searched."""
+"""Own stamps among which a command's stamp is searched."""
 EFFORT, DISTURBANCE, PUSH = range(3)
-"""Index of each input."""
 INPUTS = 3
 ENDED, UNUSUAL, MESSAGE_WAITS = range(3)
-"""Why a slice ended: its time is over, the next period is not nominal, or a message is Python's to read.
-
-With the last, the number of the input is added.
-"""
+"""Why a slice ended: its time is over, the next period is not nominal, or (plus the input) a message is Python's."""
 
 
 def plant_record(plant: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the layout of a loop's record for a kind of plant.
-
-    Args:
-        plant: Layout of the plant's own part.
-    """
+    """Return the layout of a loop's record, given the plant's own part."""
     return np.dtype(
         [
             ("time", TIME),
-            # Address of the i8 that counts threads waiting for the supervisor, for which the loop ends.
+            # Address of the count of threads waiting for the supervisor, which end the loop.
             ("waiting_at", "u8"),
             ("waiting", "i8", (1,)),
             ("counter", "i4"),

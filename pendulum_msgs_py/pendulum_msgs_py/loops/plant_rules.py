@@ -1,7 +1,7 @@
-"""Nominal decisions of a plant of one joint on the numbers of a record: the supervisor's rules, one after the other.
+"""Nominal decisions of a plant of one joint: the supervisor's rules on the numbers of a record.
 
-Plain functions, which loops compile and tests run unchanged. Each checks everything before it changes anything: where
-a case is not nominal it returns so, and Python decides by the same rules.
+Plain functions, compiled by loops and run unchanged by tests. Each checks everything before it changes anything and
+returns False for any other case, which Python decides.
 """
 
 from __future__ import annotations
@@ -28,13 +28,7 @@ __all__ = ["accept", "decide"]
 
 
 def accept(source: Any, gate: Any, now_ns: int) -> bool:
-    """Take an expected message's torque where it passes every rule; return whether it does.
-
-    Args:
-        source: Record of ``INPUT``, just read.
-        gate: Record of ``GATE``.
-        now_ns: The plant's clock [ns].
-    """
+    """Accept a message's torque (``INPUT``) into a gate (``GATE``) at a time [ns]; return whether it passed."""
     if not math.isfinite(source.value[0]) or gate.newest_ns == NEVER:
         return False
     verdict = judge_stamp(source.stamp_ns, now_ns, gate.timeout_ns, gate.newest_ns, gate.heard_ns, False)
@@ -49,12 +43,7 @@ def accept(source: Any, gate: Any, now_ns: int) -> bool:
 
 
 def decide(s: Any, now_ns: int) -> bool:
-    """Decide as the supervisor does; return whether this is an ordinary decision: if not, nothing was changed.
-
-    Args:
-        s: Record of a plant: ``rules`` (of ``ORDINARY``) and the newest sample.
-        now_ns: The plant's clock [ns].
-    """
+    """Decide as the supervisor does, on a plant's record at a time [ns]; return False, unchanged, if not nominal."""
     r = s.rules
     age = age_of(s.sample_ns, now_ns)
     if age < -r.feedback_timeout or age > r.feedback_timeout:

@@ -1,7 +1,7 @@
-"""What compiled loops are made of: time, waiting, messages. Imported by the compiler's process alone.
+"""Primitives of compiled loops: time, waiting, messages. Imported by the compiler's process alone.
 
-The functions of rcl are called as ``pendulum_rcl_...``: the loader passes their addresses, so that they are those of
-the library that rclpy has loaded (:mod:`pendulum_msgs_py.ros.direct`).
+Functions of rcl are called as ``pendulum_rcl_...``; the loader passes their addresses in the library that rclpy has
+loaded (:mod:`pendulum_msgs_py.ros.direct`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = [
     "wall_ns",
 ]
 
-# Simulator and control, which compile, install them; this package and the recorder run without.
+# Installed by the packages that compile, simulator and control; not a dependency of this one.
 numba = importlib.import_module("numba")
 llvm = importlib.import_module("llvmlite.binding")
 types = numba.types
@@ -45,7 +45,7 @@ _get_time = types.ExternalFunction("clock_gettime", _int(_int, _address))
 _sleep = types.ExternalFunction("clock_nanosleep", _int(_int, _int, _address, _address))
 _poll = types.ExternalFunction("ppoll", _int(_address, types.uint64, _address, _address))
 _read = types.ExternalFunction("read", types.int64(_int, _address, _address))
-# Compiled here, called elsewhere: the linker in between only needs them to have an address.
+# Called in another process: here the linker only needs some address.
 for _symbol in ("pendulum_rcl_take", "pendulum_rcl_publish", "pendulum_rcl_count"):
     llvm.add_symbol(_symbol, 1)
 
@@ -53,18 +53,18 @@ _WALL, _STEADY, _ABSOLUTE, _READABLE = 0, 1, 1, 1
 """``CLOCK_REALTIME``, ``CLOCK_MONOTONIC``, ``TIMER_ABSTIME``, ``POLLIN``."""
 _STAMP_AT, _HEADER = 4, 4
 NOTHING, ORDINARY, OTHER, FAILED = range(4)
-"""What :func:`take_one` found: no message, one as expected, one that Python has to handle, or an error of rcl."""
+"""Results of :func:`take_one`: no message, an expected one, one for Python, or an error of rcl."""
 _TAKE_FAILED = 401
-"""``RCL_RET_SUBSCRIPTION_TAKE_FAILED``: there is none."""
+"""``RCL_RET_SUBSCRIPTION_TAKE_FAILED``: no message."""
 
 
 def compiled(function: Any) -> Any:
-    """Return a function, for compiled ones to call, that runs as in Python: no operation fused or reordered."""
+    """Compile a function for compiled callers, with Python's results: no operation fused or reordered."""
     return numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
 
 
 def entry(layout: np.dtype[Any]) -> Any:
-    """Return a decorator for the function of a loop, of one record."""
+    """Return a decorator that compiles a loop's function of one record."""
     signature = types.int64(numba.from_dtype(layout))
     return numba.njit(signature, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
@@ -91,7 +91,7 @@ def wall_ns(time: Any) -> Any:
 
 @compiled
 def sleep_until(time: Any, steady: Any) -> None:
-    """Sleep until a time of the monotonic clock [ns], or a signal."""
+    """Sleep until a time of the monotonic clock [ns] or a signal."""
     time.until[0] = steady // NANOSECONDS
     time.until[1] = steady % NANOSECONDS
     _sleep(_STEADY, _ABSOLUTE, time.until.ctypes.data, 0)
@@ -99,7 +99,7 @@ def sleep_until(time: Any, steady: Any) -> None:
 
 @compiled
 def is_called(time: Any, calls: Any) -> Any:
-    """Return whether one of two event counters has been incremented; it neither waits nor resets them."""
+    """Return whether one of two event counters was incremented, without waiting or resetting."""
     time.poll[0], time.poll[2] = calls[0], calls[1]
     time.poll[1] = time.poll[3] = _READABLE
     time.until[0] = time.until[1] = 0
@@ -108,26 +108,18 @@ def is_called(time: Any, calls: Any) -> Any:
 
 @compiled
 def wait_for_any(time: Any, counter: Any, calls: Any, longest: Any) -> None:
-    """Wait until one of three event counters has been added to, and empty the first.
-
-    Args:
-        time: Record of ``TIME``.
-        counter: Descriptor of the first, which does not block.
-        calls: Those of the others.
-        longest: Longest wait [ns].
-    """
+    """Wait at most a time [ns] for one of three event counters, and reset the first, which does not block."""
     time.poll[0], time.poll[2], time.poll[4] = counter, calls[0], calls[1]
     time.poll[1] = time.poll[3] = time.poll[5] = _READABLE
     time.until[0] = longest // NANOSECONDS
     time.until[1] = longest % NANOSECONDS
     if longest > 0 and _poll(time.poll.ctypes.data, 3, time.until.ctypes.data, 0) > 0:
-        # What it counted does not matter, nor whether it was this one.
         _read(counter, time.until.ctypes.data, 8)
 
 
 @compiled
 def matches(source: Any) -> Any:
-    """Read what was taken where it is as expected: stamp and numbers; return whether it is."""
+    """Read stamp and numbers of the taken message if it has the expected layout; return whether it has."""
     size = source.size
     if size == 0 or source.message[1] != size:
         return False
@@ -140,7 +132,6 @@ def matches(source: Any) -> Any:
     _memcpy(source.stamp.ctypes.data, source.data.ctypes.data + np.uintp(_STAMP_AT), 8)
     if source.stamp[1] >= NANOSECONDS:
         return False
-    # The seconds are signed.
     seconds = np.int64(source.stamp[0])
     if seconds >= 2**31:
         return False
@@ -155,7 +146,7 @@ def matches(source: Any) -> Any:
 
 @compiled
 def take_one(source: Any) -> Any:
-    """Take the oldest message of an input; return ``NOTHING``, ``ORDINARY``, ``OTHER`` or ``FAILED``."""
+    """Take the oldest message of an input; return what it is."""
     message, info = source.message.ctypes.data, source.info.ctypes.data
     code = _take(source.subscription, message, info, 0)
     if code == _TAKE_FAILED:
@@ -167,7 +158,7 @@ def take_one(source: Any) -> Any:
 
 @compiled
 def publish(output: Any, stamp_ns: Any) -> Any:
-    """Publish the numbers of an output under a stamp [ns]; return whether the middleware took them."""
+    """Publish an output's numbers under a stamp [ns]; return whether the middleware accepted them."""
     output.stamp[0] = np.uint32(stamp_ns // NANOSECONDS)
     output.stamp[1] = np.uint32(stamp_ns % NANOSECONDS)
     data = output.data.ctypes.data
@@ -180,5 +171,5 @@ def publish(output: Any, stamp_ns: Any) -> Any:
 
 @compiled
 def has_listeners(output: Any) -> Any:
-    """Return whether a subscriber is matched with an output."""
+    """Return whether an output has a matched subscriber."""
     return _count(output.publisher, output.matched.ctypes.data) == 0 and output.matched[0] > 0

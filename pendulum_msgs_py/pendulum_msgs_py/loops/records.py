@@ -1,7 +1,7 @@
-"""What a compiled loop reads and writes: records with names, of numbers and of the bytes of messages.
+"""Records that a compiled loop reads and writes: numbers, and messages as bytes.
 
-The layouts are numpy's, so that Python and compiled code see one memory. Messages have a fixed layout: a template that
-the bytes must equal but for stamp and numbers (:func:`pendulum_msgs_py.contract.cdr.template_of`).
+Their numpy layouts give Python and compiled code the same memory. Messages match a template except in stamp and numbers
+(:func:`pendulum_msgs_py.contract.cdr.template_of`).
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ __all__ = [
 ]
 
 MOST_BYTES = 512
-"""Longest message that a loop reads or writes itself [bytes]; longer ones are Python's."""
+"""Longest message of a loop [bytes]; Python handles longer ones."""
 MOST_VALUES = 3
-"""Numbers in a message: position, velocity and effort of one joint."""
+"""Position, velocity and effort of one joint."""
 HAND_OVER_NS = 250_000
-"""Time that the receiver of the newest message has before Python is next [ns].
+"""Time for the receiver of the newest message before Python runs [ns].
 
-Linux wakes a receiver on the sender's core and does not preempt the sender: the work that Python does between two
-slices, done at once, delayed the reply by half a millisecond.
+Linux wakes a receiver on the sender's core without preempting the sender: Python's work between two slices, done at
+once, delayed the reply by 0.5 ms.
 """
 
 TIME = np.dtype([("now", "i8", (2,)), ("until", "i8", (2,)), ("poll", "i4", (6,))], align=True)
-"""Times that the C library writes and reads, in seconds and nanoseconds; three times ``struct pollfd``."""
+"""``timespec`` now and until, and three ``struct pollfd``."""
 
 MESSAGE = np.dtype([("buffer", "u8"), ("length", "u8"), ("capacity", "u8"), ("allocator", "u8", (5,))], align=True)
 """``rcutils_uint8_array_t``: a serialised message."""
@@ -49,7 +49,7 @@ INPUT = np.dtype(
     [
         ("subscription", "u8"),
         ("message", "u8", (MESSAGE.itemsize // 8,)),
-        # rmw_message_info_t: when it was sent and when it arrived [ns], and more that is not used.
+        # rmw_message_info_t: times of sending and arrival [ns], and unused fields.
         ("info", "i8", (16,)),
         ("size", "i8"),
         ("template", "u1", (MOST_BYTES,)),
@@ -63,9 +63,9 @@ INPUT = np.dtype(
     ],
     align=True,
 )
-"""A subscription, the message that is expected there, and the newest one's content.
+"""A subscription, its expected message, and the newest content.
 
-``size`` is 0 where none is expected: Python handles every message. ``most`` bounds the messages of one poll.
+``size`` 0 leaves every message to Python; ``most`` bounds the messages of one poll.
 """
 
 OUTPUT = np.dtype(
@@ -82,7 +82,7 @@ OUTPUT = np.dtype(
     ],
     align=True,
 )
-"""A publisher, and the message that goes out there."""
+"""A publisher and its message."""
 
 
 _NUMBERS = {
@@ -97,7 +97,7 @@ _NUMBERS = {
 
 @cache
 def structure_of(layout: np.dtype[Any]) -> type[ctypes.Structure]:
-    """Return the structure of a layout: Python reads and writes its fields by attribute, in a third of numpy's time."""
+    """Return a layout as a ctypes structure, whose fields Python accesses in a third of numpy's time."""
 
     def kind_of(field: np.dtype[Any]) -> Any:
         base, shape = field.base, field.shape
@@ -118,14 +118,9 @@ def structure_of(layout: np.dtype[Any]) -> type[ctypes.Structure]:
 
 
 def expect_template(source: NDArray[Any], template: MessageTemplate | None) -> None:
-    """Set the message that is expected of an input.
-
-    Args:
-        source: Record of :data:`INPUT`.
-        template: None where Python handles every message.
-    """
+    """Set the expected message of an :data:`INPUT`; None leaves every message to Python."""
     source["size"] = 0
-    # What a message lacks reads as zero, not as the value of the message before.
+    # Missing values read as zero, not as those of an earlier message.
     source["value_at"], source["value"] = 0, 0.0
     if template is None or len(template.data) > MOST_BYTES or len(template.value_at) > MOST_VALUES:
         return
@@ -137,12 +132,7 @@ def expect_template(source: NDArray[Any], template: MessageTemplate | None) -> N
 
 
 def set_template(output: NDArray[Any], template: MessageTemplate) -> None:
-    """Set the message that is published.
-
-    Args:
-        output: Record of :data:`OUTPUT`; its own message points at the bytes in it.
-        template: Of the message.
-    """
+    """Set the message of an :data:`OUTPUT`, which points at its own bytes."""
     size = len(template.data)
     output["data"][:size] = np.frombuffer(template.data, dtype=np.uint8)
     output["value_at"][: len(template.value_at)] = template.value_at

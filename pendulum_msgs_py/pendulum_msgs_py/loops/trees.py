@@ -1,8 +1,4 @@
-"""Compiles the project's scalar functions with numba, from the very code that is also interpreted.
-
-Equations and rules stand once, in plain Python with ``math``. :func:`compile_tree` takes such a function with
-everything it calls and returns it compiled; on request with another module in place of one that it uses.
-"""
+"""Compiles the project's scalar functions with numba, from the code that is also interpreted."""
 
 from __future__ import annotations
 
@@ -16,13 +12,13 @@ from pendulum_msgs_py.programs.kernel_cache import name_symbols_apart
 
 __all__ = ["WITHIN", "compile_by_type", "compile_tree", "tuple_loader"]
 
-# Simulator and control, which compile, install it; this package needs it nowhere else.
+# Installed by the packages that compile, simulator and control.
 numba = importlib.import_module("numba")
 # What is compiled here becomes part of cached kernels.
 name_symbols_apart()
 
 WITHIN = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-"""Options for ``numba.njit`` of a function that compiled ones alone call: wrappers for others take time to compile."""
+"""``numba.njit`` options of functions called by compiled ones only: wrappers take time to compile."""
 _OWN = "pendulum_"
 _NO_SUBSTITUTES: Mapping[ModuleType, ModuleType] = {}
 _cache: dict[tuple[Any, ...], Any] = {}
@@ -36,14 +32,14 @@ def compile_tree(
     substitutes: Mapping[ModuleType, ModuleType] = _NO_SUBSTITUTES,
     within: bool = False,
 ) -> Any:
-    """Return a function, and those it calls, compiled.
+    """Return a plain function of scalars, tuples and ``math``, and all that it calls, compiled.
 
     Args:
-        function: A plain function of this project that uses scalars, tuples and ``math``.
-        exact: Give the very bits that Python gives; else a fused multiply-add may change the last one.
+        function: A function of this project.
+        exact: Give the bits that Python gives; else a fused multiply-add may change the last one.
         inline: Inline each function: machine code without function arguments can be cached on disk.
-        substitutes: Modules that are found in place of those that the functions name.
-        within: Compiled functions alone call it, as they do what it calls.
+        substitutes: Replacements of modules that the functions use.
+        within: Only compiled functions call it.
     """
     key = (function, exact, inline, within, *substitutes.items())
     if key not in _cache:
@@ -56,10 +52,8 @@ def compile_tree(
             elif isinstance(value, ModuleType) and value in substitutes:
                 scope[name] = substitutes[value]
         copy = FunctionType(function.__code__, scope, function.__name__, function.__defaults__, function.__closure__)
-        # Of fastmath nothing but contraction is allowed. C code calls none of these: a wrapper for it would only cost
-        # time to compile.
         allowed = False if exact else {"contract"}
-        # Loops borrow their arrays; without the option numba would count references in a law with a loop.
+        # Loops borrow their arrays: no reference counting (_nrt). C wrappers, never called, would take time to compile.
         wrappers = WITHIN if within else {"no_cfunc_wrapper": True}
         options = {"fastmath": allowed, "error_model": "numpy", "forceinline": inline, "_nrt": not exact}
         _cache[key] = numba.njit(copy, **wrappers, **options)
@@ -67,10 +61,10 @@ def compile_tree(
 
 
 def compile_by_type(function: Callable[..., Any]) -> Any:
-    """Return a function, compiled by :func:`compile_tree`, for compiled functions to call or to take as an argument.
+    """Return a compiled function that compiled code passes by its type.
 
-    Numba passes a compiled function by its address in this process, and machine code with addresses cannot be cached on
-    disk unless each function that takes one is inlined: much to compile. What this returns is passed by its type alone.
+    Numba passes a function by its address, and machine code with addresses cannot be cached on disk unless each
+    function that takes one is inlined.
     """
     compiled = compile_tree(function)
 
@@ -84,25 +78,20 @@ def compile_by_type(function: Callable[..., Any]) -> Any:
 
 @cache
 def tuple_loader(length: int, stride: int) -> Any:
-    """Return a compiled function (array, start) -> (array[start], array[start + stride], ...).
-
-    Args:
-        length: Values to load, >= 1; a constant of the compiled code.
-        stride: Distance between two of them.
-    """
+    """Return compiled (array, start) -> (array[start], array[start + stride], ...), of ``length`` >= 1 values."""
     if length == 1:
 
         def load(array: Any, start: int) -> Any:
             return (array[start],)
 
     else:
-        # By halves: each length that comes is a function to compile, and so they are few.
+        # By halves: few lengths, and each is a function to compile.
         half = length // 2
         first, second = tuple_loader(half, stride), tuple_loader(length - half, stride)
         offset = half * stride
 
         def load(array: Any, start: int) -> Any:
-            # Not (*first, *second): compilers of Python 3.10 to 3.12 spell that differently, and numba follows late.
+            # Not (*first, *second): its bytecode differs between Python 3.10 and 3.12, and numba follows late.
             return first(array, start) + second(array, start + offset)
 
     return numba.njit(load, forceinline=True, **WITHIN)

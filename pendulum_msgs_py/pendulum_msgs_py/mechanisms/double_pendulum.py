@@ -9,8 +9,8 @@
     c    = (-h sin q_2 (2 v_1 v_2 + v_2^2),  h sin q_2 v_1^2)
     g    = (g (m_1 r_1 + m_2 l_1) sin q_1 + m_2 g r_2 sin(q_1 + q_2),  m_2 g r_2 sin(q_1 + q_2))
 
-I_i are about the link's own joint. Each joint has a motor of rotor inertia J_r behind gears N; that of the elbow is
-carried by the first link. With a motor at the elbow alone it is the acrobot, with one at the shoulder the pendubot.
+I_i are about the link's own joint. Each joint has a motor of rotor inertia J_r behind gears N; the first link carries
+the elbow's. With a motor at the elbow alone it is the acrobot, at the shoulder alone the pendubot.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def mass(q: Any, p: Any) -> Any:
 
 
 def potential(q: Any, p: Any) -> Any:
-    """Return the energy of the two weights, 0 hanging down [J]."""
+    """Return the potential energy, 0 hanging down [J]."""
     m_1, l_1, r_1, _, m_2, _, r_2, _, g, _, _, _, _ = p
     first = (m_1 * r_1 + m_2 * l_1) * (1.0 - math.cos(q[0]))
     return g * (first + m_2 * r_2 * (1.0 - math.cos(q[0] + q[1])))
@@ -81,7 +81,7 @@ def bodies(p: Any) -> tuple[Body, ...]:
 
 
 def rotors(p: Any) -> tuple[Rotor, ...]:
-    """Return the rotors: that of the shoulder turns N times as fast, that of the elbow N times backwards on link 1."""
+    """Return the rotors: the shoulder's turns N times as fast, the elbow's, on link 1, N times backwards."""
     rotor, gear = p[9], p[10]
     return (Rotor(rotor, (gear, 0.0)), Rotor(rotor, (1.0, -gear)))
 

@@ -6,7 +6,7 @@
     M_11 q_1'' + M_12 q_2'' + 2 J_2 sin q_2 cos q_2 v_1 v_2 - m L c sin q_2 v_2^2 + b_1 v_1 = torque_1
     M_12 q_1'' + M_22 q_2'' - J_2 sin q_2 cos q_2 v_1^2     + m g c sin q_2       + b_2 v_2 = torque_2
 
-Counter-clockwise from above turns the arm forward; a positive angle lifts the pendulum towards where the arm then goes.
+Counter-clockwise from above is positive; a positive pendulum angle leans in the direction of a positive arm velocity.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pendulum_msgs_py.parameters import ParameterSpec
 __all__ = ["FURUTA"]
 
 _SLENDER = 1e-9
-"""Share of a slender rod's inertia that file formats require about its own axis."""
+"""Share of a slender rod's inertia about its own axis, required by file formats."""
 
 
 def forward(q: Any, v: Any, torque: Any, p: Any) -> Any:
@@ -65,7 +65,7 @@ def chain(q: Any, p: Any) -> tuple[Point, ...]:
 
 
 def bodies(p: Any) -> tuple[Body, ...]:
-    """Return arm and pendulum; the arm's inertia is all about its axis, its mass is unknown and has no effect."""
+    """Return arm and pendulum; the arm's whole inertia is about its axis, its unknown mass has no effect."""
     arm_inertia, arm, m, length, centre, inertia, _, _, _ = p
     about_centre = inertia - m * centre * centre
     return (

@@ -1,4 +1,4 @@
-"""What a mechanism is: joints, parameters, equations of motion, and bodies to draw and export."""
+"""Definition of a mechanism: joints, parameters, equations of motion, and bodies to draw and export."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from pendulum_msgs_py.parameters import ParameterSpec
 __all__ = ["STANDARD_GRAVITY", "Body", "Mechanism", "Point", "Rotor", "gravity_spec", "positive"]
 
 STANDARD_GRAVITY = 9.81
-"""Acceleration of gravity where a plant file gives none [m/s^2]."""
+"""Default of the acceleration of gravity [m/s^2]."""
 
 Point = tuple[float, float, float]
 """x to the right, y away from the viewer, z up [m]."""
 
 
 def positive(name: str, default: float, unit: str, description: str) -> ParameterSpec:
-    """Return a parameter that must be above zero, as a mass or a length."""
+    """Return the spec of a parameter > 0, such as a mass or a length."""
     return ParameterSpec(name, default, unit, description, minimum=0.0, exclusive_minimum=True)
 
 
 def gravity_spec() -> ParameterSpec:
-    """Return the parameter that every mechanism with masses has: the acceleration of gravity; 0 lies flat."""
+    """Return the spec of the acceleration of gravity."""
     return ParameterSpec("gravity", STANDARD_GRAVITY, "m/s^2", "Acceleration of gravity, g; 0 lies flat.", minimum=0.0)
 
 
 class Body(NamedTuple):
-    """One rigid body, moved by one joint against the body before it.
+    """One rigid body, moved by one joint relative to the body before it.
 
     Attributes:
-        name: Its name in files.
-        origin: Where its joint sits, in the frame of the body before [m].
+        name: Name in files.
+        origin: Position of its joint in the frame of the body before [m].
         axis: Axis of the joint: of rotation by the right-hand rule, or of sliding.
         mass: [kg].
-        centre: Centre of mass in the body's own frame, at joint position 0 [m].
+        centre: Centre of mass in its own frame, at joint position 0 [m].
         inertia: Principal moments about the centre of mass, along x, y, z [kg m^2].
-        tip: End of the rod that is drawn, in the body's own frame [m].
+        tip: End of the drawn rod in its own frame [m].
     """
 
     name: str
@@ -51,12 +51,7 @@ class Body(NamedTuple):
 
 
 class Rotor(NamedTuple):
-    """A rotor that turns with a sum of joint velocities, sum_i c_i q'_i, and adds J/2 times its square to the energy.
-
-    Attributes:
-        inertia: J [kg m^2].
-        rates: c_i, one per joint [-].
-    """
+    """A rotor of inertia J [kg m^2] and energy J/2 (sum_i c_i q'_i)^2, with one rate c_i per joint."""
 
     inertia: float
     rates: tuple[float, ...]
@@ -70,26 +65,24 @@ def _no_rotors(_p: Any) -> tuple[Rotor, ...]:
 class Mechanism:
     """Equations and joints, without numbers.
 
-    The functions take tuples, use ``+ - * /`` and ``math.sin`` and ``math.cos`` alone, and have no branches: they run
-    with floats, and by :func:`~pendulum_msgs_py.dynamics.arithmetic.in_arithmetic` with complex numbers, arrays and
-    casadi's symbols; numba compiles them too. ``p`` holds the values of ``parameters`` in their order, then the viscous
-    damping of each joint.
+    The functions take tuples, use ``+ - * /``, ``math.sin`` and ``math.cos`` alone, and have no branches: they run with
+    floats, compiled by numba, and by :func:`~pendulum_msgs_py.dynamics.arithmetic.in_arithmetic` with complex numbers,
+    arrays and symbols. ``p`` holds the values of ``parameters`` in order, then the viscous damping of each joint.
 
     Attributes:
-        name: Its name in plant files (``model:``).
-        title: What it is, one sentence.
+        name: Name in plant files (``model:``).
+        title: One sentence.
         joints: n joints, in the order of messages.
         parameters: Table of its own parameters.
-        forward: ``forward(q, v, torque, p) -> q''``; M(q) q'' + c(q, v) + g(q) + D v = torque, solved for q''. Smooth:
-            dry friction is part of ``torque`` [rad/s^2 or m/s^2].
-        mass: ``mass(q, p)``, the rows of the mass matrix M(q), n tuples of n.
+        forward: ``forward(q, v, torque, p) -> q''`` [rad/s^2 or m/s^2], M(q) q'' + c(q, v) + g(q) + D v = torque solved
+            for q''; dry friction is part of ``torque``.
+        mass: ``mass(q, p)``, rows of the mass matrix M(q), n tuples of n.
         potential: ``potential(q, p)`` [J].
-        chain: ``chain(q, p)``, points from the base to the tip, to draw [m].
+        chain: ``chain(q, p)``, drawn points from base to tip [m].
         bodies: ``bodies(p)``, one :class:`Body` per joint, for URDF and MJCF.
-        weights: Diagonal of Q [deviation of each joint, then velocity of each] and of R, where a design has none.
-        source: Where the equations are published.
-        rotors: ``rotors(p)``, what turns with more than one joint, or faster than its own; none where a motor's inertia
-            is part of its link's.
+        weights: Default diagonal of Q (deviations, then velocities) and of R.
+        source: Publication of the equations.
+        rotors: ``rotors(p)``, unless each motor's inertia is part of its link's.
     """
 
     name: str
@@ -106,11 +99,10 @@ class Mechanism:
     rotors: Callable[[Any], tuple[Rotor, ...]] = _no_rotors
 
     def __hash__(self) -> int:
-        """Return a hash that is quick: tables of mechanisms are looked up for each plant."""
-        return hash(self.name)
+        return hash(self.name)  # quick: mechanisms are looked up for each plant
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the entries of ``p``: the parameters, then ``JOINT.damping`` of each joint, of one ``damping``."""
+        """Names of the entries of ``p``; the damping is ``JOINT.damping``, of a single joint ``damping``."""
         damping = [f"{joint.name}.damping" for joint in self.joints] if len(self.joints) > 1 else ["damping"]
         return (*(spec.name for spec in self.parameters), *damping)

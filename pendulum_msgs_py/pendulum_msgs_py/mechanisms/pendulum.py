@@ -1,9 +1,4 @@
-"""The pendulum as a mechanism of one joint; its equation is :func:`~pendulum_msgs_py.dynamics.rigid_acceleration`.
-
-::
-
-    M q'' + b q' + G sin(q) = torque
-"""
+"""The pendulum as a mechanism of one joint, M q'' + b q' + G sin(q) = torque."""
 
 from __future__ import annotations
 
@@ -39,7 +34,7 @@ def potential(q: Any, p: Any) -> Any:
 
 
 def _shape(p: Any) -> tuple[float, float]:
-    """Return mass and length of a bob with nine tenths of the inertia: the file has M and G only."""
+    """Return mass and length of a bob with nine tenths of the inertia, as the file has M and G only."""
     at_bob = _BOB_SHARE * p[0]
     length = at_bob * STANDARD_GRAVITY / p[1] if p[1] > 0.0 else _FLAT_LENGTH
     return at_bob / length**2, length

@@ -12,28 +12,24 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 __all__ = ["SPAN", "require_determined", "undetermined"]
 
 SPAN = 10.0
-"""Upper end over estimate, or over lower end of a size, from which on an interval determines no more than an order."""
+"""Ratio of upper end to estimate, or to lower end, from which on an interval is too wide."""
 
 _LONGEST = 1.0
-"""Width of the interval of a time from which on it does not determine a drive [s]."""
+"""Width from which on the interval of a time is too wide [s]."""
 
 _NONE = 0.02
-"""Share of the largest torque up to which a gravity of 0 may be more: that of a pendulum that lies flat."""
+"""Share of the largest torque below which a gravity of 0 counts as a pendulum that lies flat."""
 
 _OVERDAMPED = 2.0
-"""Damping ratio beyond which the inertia of a pendulum is a fast lag behind its damping, which decides instead."""
+"""Damping ratio above which the inertia is a fast lag, and the damping decides instead."""
 
 
 def undetermined(plant: PlantParameters, intervals: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
-    """Return the intervals that leave open what a design needs, by name.
+    """Return those 95 % intervals, by names of a plant file, that leave open what a design needs.
 
-    A size (inertia, gravity, mass, centre of mass) has to be positive and known to an order of magnitude; only the
-    inertia of a strongly overdamped pendulum may be anything from 0 up. A friction may be 0, but not more than ten
-    times the estimate, or than what stops the pendulum; a time has to be known to a second.
-
-    Args:
-        plant: The estimates.
-        intervals: 95 % intervals by the names of a plant file.
+    Sizes (inertia, gravity, mass, centre) must be positive and known to a factor of ten; only the inertia of a strongly
+    overdamped pendulum may include 0. A friction may be 0, but not exceed ten times the estimate or what stops the
+    pendulum; a time must be known to a second.
     """
     values = plant.numbers
     sizes = {spec.name for spec in plant.mechanism.parameters}
@@ -61,7 +57,7 @@ def undetermined(plant: PlantParameters, intervals: Mapping[str, Sequence[float]
         elif kind in {"damping", "coulomb_friction", "static_friction"}:
             lost = high > SPAN * max(value, critical if kind == "damping" else largest)
         else:
-            # What gives a friction its form matters no more than that friction.
+            # The shape of a friction matters no more than that friction.
             lost = False
         if lost:
             found[name] = (low, high)
@@ -69,11 +65,7 @@ def undetermined(plant: PlantParameters, intervals: Mapping[str, Sequence[float]
 
 
 def require_determined(preset_or_path: str | Path) -> None:
-    """Refuse a plant file whose own intervals do not determine the plant.
-
-    Raises:
-        ParameterError: An interval holds 0 or spans orders of magnitude where that matters; or as ``load_plant``.
-    """
+    """Raise a ParameterError for a plant file whose intervals do not determine the plant, or as ``load_plant``."""
     plant, provenance = load_plant_file(preset_or_path)
     for name, (low, high) in undetermined(plant, provenance["intervals"]).items():
         raise ParameterError(

@@ -1,4 +1,7 @@
-"""Where a plant can stay, what holds it there, and how it creeps: offsets, motor and gears included."""
+"""Equilibria of a plant, holding torques and slow motion, with offsets, motor and gears.
+
+Angles theta are measured ones, 0 hanging down [rad]; torques are commands unless noted [N m].
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ __all__ = [
 
 
 class RigidPlant(Protocol):
-    """The least that a plant has to have; what ``PlantParameters`` adds to it is used where present."""
+    """The minimum of a plant; further values of ``PlantParameters`` are used where present."""
 
     @property
     def inertia(self) -> float:
@@ -58,13 +61,12 @@ class RigidPlant(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FixedPoint:
-    """Angle at which the pendulum rests under a constant torque.
+    """Rest under a constant commanded torque.
 
     Attributes:
-        theta: Measured angle, 0 hanging down, in [-pi, pi) [rad].
-        effort: The constant torque, as commanded [N m].
-        stable: Whether the pendulum returns to it after a small push; False at a tip of the torque curve too, where
-            what comes from one side is held and from the other passes.
+        theta: Angle in [-pi, pi) [rad].
+        effort: The torque [N m].
+        stable: Whether the pendulum returns after a small push; False also where both fixed points meet.
     """
 
     theta: float
@@ -73,24 +75,24 @@ class FixedPoint:
 
 
 def drivetrain_of(plant: RigidPlant) -> SeriesElasticParameters | None:
-    """Return motor, gears and spring of a plant that has them."""
+    """Return motor, gears and spring of a plant, or None."""
     return getattr(plant, "drivetrain", None)
 
 
 def offset_of(plant: RigidPlant, name: str) -> float:
-    """Return a value that only whole plant parameters have; 0 for a bare rigid plant."""
+    """Return a value of full plant parameters; 0 for a bare rigid plant."""
     return float(getattr(plant, name, 0.0))
 
 
 def resistance_of(drive: SeriesElasticParameters) -> float:
-    """Return the resistance of the winding at its temperature [ohm]."""
+    """Return the resistance at the winding's temperature [ohm]."""
     return winding_resistance_at(
         drive.winding_temperature, drive.winding_resistance, drive.resistance_temperature_coefficient
     )
 
 
 def command_pwm(torque: Any, drive: SeriesElasticParameters) -> Any:
-    """Return the duty for a torque command [N m], a number, also a complex one, or an array [-]."""
+    """Return the duty for a torque command: a number, also complex, or an array [-]."""
     return feedforward_pwm(
         torque,
         drive.supply_voltage,
@@ -104,11 +106,8 @@ def command_pwm(torque: Any, drive: SeriesElasticParameters) -> Any:
 def torque_gain(plant: RigidPlant) -> float:
     """Return the torque at the link per commanded torque, at rest [-]; 1 for a rigid plant.
 
-    A series-elastic actuator without an effort loop applies R(20 degC) / (R(T) eta) times the commanded torque: the
-    command is divided by the efficiency, and the simulated gears lose their share as friction and not by it.
-
-    Args:
-        plant: Plant parameters.
+    A series-elastic actuator without an effort loop applies R(20 degC) / (R(T) eta) times the command: the command is
+    divided by the efficiency, but the simulated gears lose torque as friction.
     """
     drive = drivetrain_of(plant)
     if drive is None:
@@ -125,11 +124,7 @@ def torque_gain(plant: RigidPlant) -> float:
 
 
 def total_damping(plant: RigidPlant) -> float:
-    """Return all viscous damping at the link in slow motion: its own, the motor's and that of the back EMF [N m s/rad].
-
-    Args:
-        plant: Plant parameters.
-    """
+    """Return the viscous damping at the link in slow motion: link, motor and back EMF [N m s/rad]."""
     drive = drivetrain_of(plant)
     if drive is None:
         return plant.damping
@@ -140,23 +135,14 @@ def total_damping(plant: RigidPlant) -> float:
 
 
 def is_overdamped(plant: RigidPlant) -> bool:
-    """Return whether a plant creeps to rest without swinging past it: b^2 > 4 M G, motor included.
-
-    Args:
-        plant: Plant parameters.
-    """
+    """Return whether a plant comes to rest without overshoot: b^2 > 4 M G, motor included."""
     drive = drivetrain_of(plant)
     inertia = plant.inertia + (drive.reflected_inertia if drive is not None else 0.0)
     return total_damping(plant) ** 2 > 4.0 * inertia * plant.gravity
 
 
 def held_torque(plant: RigidPlant, theta: float) -> float:
-    """Return the torque of the actuator on the link that holds it at an angle, G_c sin(theta - theta_0) - tau_0 [N m].
-
-    Args:
-        plant: Plant parameters.
-        theta: Measured angle, 0 hanging down [rad].
-    """
+    """Return the actuator's torque on the link that holds it, G_c sin(theta - theta_0) - tau_0 [N m]."""
     # sin(math.pi) is 1.2e-16, not 0: upright must not need a torque.
     angle = theta - offset_of(plant, "angle_offset")
     weight = 0.0 if angle == UPRIGHT else gravity_torque(angle, plant.gravity)
@@ -164,22 +150,12 @@ def held_torque(plant: RigidPlant, theta: float) -> float:
 
 
 def equilibrium_effort(plant: RigidPlant, theta: float) -> float:
-    """Return the command that holds the pendulum at an angle [N m].
-
-    Args:
-        plant: Plant parameters.
-        theta: Measured angle, 0 hanging down [rad].
-    """
+    """Return the command that holds the pendulum [N m]."""
     return held_torque(plant, theta) / torque_gain(plant)
 
 
 def friction_effort(plant: PlantParameters, theta: float) -> float:
-    """Return the command that sliding dry friction takes at an angle, of link and motor together [N m].
-
-    Args:
-        plant: Plant parameters.
-        theta: Measured angle, 0 hanging down [rad].
-    """
+    """Return the command that overcomes sliding dry friction of link and motor [N m]."""
     drive = plant.drivetrain
     weight = abs(plant.gravity * math.sin(theta - plant.angle_offset))
     link = plant.coulomb_friction + friction_of_terms(plant, weight)
@@ -187,13 +163,7 @@ def friction_effort(plant: PlantParameters, theta: float) -> float:
 
 
 def fixed_points(plant: RigidPlant, effort: float = 0.0) -> tuple[FixedPoint, ...]:
-    """Return the fixed points under a constant torque: the stable one first, one at the tip of the curve, or none.
-
-    They solve G_c sin(theta - angle_offset) = gain effort + torque_offset.
-
-    Args:
-        plant: Plant parameters.
-        effort: Constant commanded torque [N m].
+    """Return the solutions of G_c sin(theta - angle_offset) = gain effort + torque_offset, the stable one first.
 
     Raises:
         ParameterError: The torque is not finite.
@@ -215,15 +185,10 @@ def fixed_points(plant: RigidPlant, effort: float = 0.0) -> tuple[FixedPoint, ..
 
 
 def overdamped_velocity(plant: RigidPlant, theta: NDArray[np.float64], effort: float = 0.0) -> NDArray[np.float64]:
-    """Return x' = (gain u_0 + tau_0 - G_c sin(x - theta_0)) / b, the velocity where damping outweighs inertia [rad/s].
-
-    Args:
-        plant: Plant parameters; damping > 0, of link and motor together.
-        theta: Measured angles, any shape [rad].
-        effort: Constant commanded torque u_0 [N m].
+    """Return x' = (gain u_0 + tau_0 - G_c sin(x - theta_0)) / b, the limit of negligible inertia [rad/s].
 
     Raises:
-        ParameterError: The plant has no damping, so that the limit does not exist.
+        ParameterError: The plant has no damping.
     """
     damping = total_damping(plant)
     if not damping > 0.0:

@@ -1,13 +1,12 @@
-"""Friction of the link beyond viscous, Coulomb and Stribeck friction: one function and one line for each term.
+"""Friction of the link beyond viscous, Coulomb and Stribeck friction: one function and one table entry for each term.
 
 ::
 
     F(v) = (tau_C + a) + (tau_S - tau_C) exp(-(v / v_s)^2),   a = sum of the magnitudes of the terms at |v|
     F    = tau_S + a(0)                                       at rest
 
-A line of ``FRICTION_TERMS`` defines a plant's parameters, with unit and default, in plant files, tables and help. The
-simulators, single and in batches, the emulated actuator, the designs' friction and ``identify`` all call
-:func:`added_friction` for the sum of them.
+An entry of ``FRICTION_TERMS`` defines parameters of plant files, tables and help. Simulators, emulator, designs and
+identification all call :func:`added_friction`.
 """
 
 from __future__ import annotations
@@ -39,11 +38,10 @@ class FrictionTerm(NamedTuple):
     """One term.
 
     Attributes:
-        magnitude: ``magnitude(speed, weight, *parameters)``, the torque against the motion, >= 0 [N m], at a speed
-            |v| >= 0 [rad/s] and a torque of gravity that is carried, |G_c sin| >= 0 [N m]. A plain function of scalars
-            and ``math``: it is interpreted, compiled and differentiated.
-        parameters: Default and meaning of each, by its name in plant files. The first is the term's strength: 0, its
-            default, leaves the term out.
+        magnitude: ``magnitude(speed, weight, *parameters)``, torque against the motion, >= 0 [N m], at |v| [rad/s] and
+            a carried torque of gravity |G_c sin| [N m]. A plain function of scalars and ``math``, also compiled.
+        parameters: Default and meaning by name in plant files. The first is the strength; 0, its default, omits the
+            term.
     """
 
     magnitude: Callable[..., float]
@@ -51,7 +49,7 @@ class FrictionTerm(NamedTuple):
 
 
 def _load(speed: float, weight: float, load_friction: float) -> float:  # noqa: ARG001
-    """Return what gears add that carry a load, l |G_c sin(theta)| [N m]."""
+    """Return the friction of loaded gears, l |G_c sin(theta)| [N m]."""
     return load_friction * weight
 
 
@@ -63,13 +61,13 @@ FRICTION_TERMS: Mapping[str, FrictionTerm] = {
 """All terms, by name."""
 
 TERM_PARAMETERS = tuple(name for term in FRICTION_TERMS.values() for name in term.parameters)
-"""Names of their parameters, in the order in which their sum takes them."""
+"""Names of all parameters, in the order of their sum's arguments."""
 STRENGTHS = tuple(TERM_PARAMETERS.index(next(iter(term.parameters))) for term in FRICTION_TERMS.values())
-"""Which of these are strengths: where all are 0, there is no term."""
+"""Indices of the strengths."""
 
 
 def term_fields() -> type[Any]:
-    """Return a frozen dataclass with the parameters of all terms, for a plant's parameters to begin with."""
+    """Return a frozen dataclass with the parameters of all terms, the base of a joint's parameters."""
     found = [
         (name, Annotated[float, quantity], field(default=default, kw_only=True))
         for term in FRICTION_TERMS.values()
@@ -82,13 +80,10 @@ def term_fields() -> type[Any]:
 def added_friction(
     names: tuple[str, ...], each: Callable[[Callable[..., float]], Any] = lambda magnitude: magnitude
 ) -> Callable[[float, float, Any], float]:
-    """Return ``added(speed, weight, values)``, what the terms add to dry friction [N m], as one plain function.
+    """Return ``added(speed, weight, values)``, the sum of the terms [N m], as one plain function without table or loop.
 
-    It is written out, so that compilers see neither table nor loop.
-
-    Args:
-        names: What the values will be, in their order; a term whose parameters are not among them is left out.
-        each: Made of each term's magnitude before it is called, such as ``numba.njit``.
+    ``names`` are those of the values, in order; terms with other parameters are omitted. ``each`` is applied to each
+    term's magnitude, such as ``numba.njit``.
     """
     scope: dict[str, Any] = {"__name__": __name__}
     calls = []
@@ -97,7 +92,7 @@ def added_friction(
             continue
         scope[f"term_{number}"] = each(term.magnitude)
         values = [f"values[{names.index(name)}]" for name in term.parameters]
-        # One that is absent is not called: interpreted plants would wait for it.
+        # An omitted term is not called, which saves time where interpreted.
         calls.append(f"(term_{number}({', '.join(('speed', 'weight', *values))}) if {values[0]} != 0.0 else 0.0)")
     text = f"def added(speed, weight, values):\n    return {' + '.join(calls) or '0.0'}\n"
     exec(compile(text, __file__, "exec"), scope)  # noqa: S102  (own text: names and numbers of the table above)
@@ -106,25 +101,20 @@ def added_friction(
 
 
 def friction_of_terms(plant: object, weight: float) -> float:
-    """Return what the terms add to the dry friction of a plant that begins to slide [N m].
-
-    Args:
-        plant: Its parameters; terms that it has not are absent.
-        weight: Torque of gravity that is carried, >= 0 [N m].
-    """
+    """Return the sum of a plant's terms at breakaway, under a carried torque of gravity [N m]."""
     return added_friction(TERM_PARAMETERS)(0.0, weight, terms_of(plant))
 
 
 def terms_of(plant: object) -> tuple[float, ...]:
-    """Return the values of ``TERM_PARAMETERS`` of a plant; what it has not is absent, 0."""
+    """Return a plant's values of ``TERM_PARAMETERS``, 0 for missing ones."""
     return tuple(float(getattr(plant, name, 0.0)) for name in TERM_PARAMETERS)
 
 
 def without_terms() -> dict[str, float]:
-    """Return the changes of a plant's parameters that leave every term out."""
+    """Return the changes of a plant's parameters that omit every term."""
     return {TERM_PARAMETERS[index]: 0.0 for index in STRENGTHS}
 
 
 def modules() -> list[ModuleType]:
-    """Return the modules of the terms; caches of machine code compare their age."""
+    """Return the modules of the terms, for caches of machine code."""
     return [sys.modules[name] for name in {__name__, *(term.magnitude.__module__ for term in FRICTION_TERMS.values())}]

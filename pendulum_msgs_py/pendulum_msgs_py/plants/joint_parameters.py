@@ -1,4 +1,4 @@
-"""What each joint of a plant has: friction, offsets, ends of travel, and an actuator with or without a drivetrain."""
+"""Parameters of one joint: friction, offsets, end stops, and an actuator with or without a drivetrain."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ __all__ = [
 
 
 _LARGEST_EFFORT = 1e4
-"""More than any joint's drive gives, those of the largest robots included [N m or N]: beyond it a unit is wrong."""
+"""More than any robot's joint gives [N m or N]: beyond it the unit is wrong."""
 OF_A_PENDULUM = ("torque_offset", "angle_offset", *TERM_PARAMETERS)
-"""Quantities of a joint that only a pendulum's equation has."""
+"""Quantities that only the pendulum's equation has."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ class SeriesElasticParameters:
     ] = 2e-4
 
     def __post_init__(self) -> None:
-        """Check every value; a static friction below the sliding one would feed energy in."""
         check_fields(self, DRIVETRAIN_SPECS)
+        # A static friction below the sliding one would feed energy in.
         if self.motor_static_friction < self.motor_coulomb_friction:
             raise ParameterError(
                 f"motor_static_friction is {self.motor_static_friction} N m; "
@@ -104,8 +104,6 @@ if TYPE_CHECKING:
 
     @dataclass(frozen=True, kw_only=True)
     class _FrictionTerms:
-        """What type checkers see of the terms' parameters: those of the table of terms."""
-
         load_friction: float = 0.0
 
 else:
@@ -114,10 +112,10 @@ else:
 
 @dataclass(frozen=True)
 class JointParameters(_FrictionTerms):
-    """Friction, offsets, ends of travel and actuator of one joint; units such as ``effort_unit`` are the joint's.
+    """Friction, offsets, end stops and actuator of one joint; units such as ``effort_unit`` are the joint's.
 
-    Where ``static_friction`` is None it is the Coulomb friction; a stop, an actuator or a drivetrain that is None is
-    not there. ``OF_A_PENDULUM`` and the drivetrain are a pendulum's.
+    A static friction of None equals the Coulomb friction; other None are absent. ``OF_A_PENDULUM`` and the drivetrain
+    are a pendulum's only.
     """
 
     damping: Annotated[float, Quantity("damping_unit", "Viscous friction, b_c.")] = 0.0
@@ -145,13 +143,13 @@ class JointParameters(_FrictionTerms):
 
 @cache
 def joint_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
-    """Return the table of a joint's quantities, in its units."""
+    """Return the table of a joint's quantities in its units."""
     return _in_units_of(joint, JointParameters)
 
 
 @cache
 def actuator_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
-    """Return the table of an actuator's quantities, in its joint's units."""
+    """Return the table of its actuator's quantities in its units."""
     return _in_units_of(joint, Actuator)
 
 

@@ -1,7 +1,6 @@
-"""The lab file: which actuator stands in a lab and how it is mounted, limited, driven and fed, stated once.
+"""The lab file: which actuator stands in a lab, and how it is mounted, limited, driven and supplied.
 
-Bridge, checklist, scan, guided procedures, launch files and experiments read the same file. Each value stands with its
-unit, and an unknown entry is refused::
+All programs read the same file; values carry units, and unknown entries are refused::
 
     format: pendulum_lab/1
     module: {backend: hebi, family: Lab, name: Pendulum, serial: X5-9-00123, type: X5-9}
@@ -12,9 +11,8 @@ unit, and an unknown entry is refused::
       effort: {value: 5.0, unit: N m}
     proofs: {...}          # written by the guided procedures
 
-An entry is a parameter of the bridge under a descriptive name; the bridge's own table has the allowed values. To the
-bridge, 0 (or a window with equal ends) often stands for no limit or a default, which is not what such an entry
-suggests: a lab file leaves it out. Text that is a path is relative to the file's folder.
+An entry is a parameter of the bridge, whose table has the allowed values. A bridge's 0 (or window with equal ends) that
+means no limit or a default is refused here: the entry is omitted. Relative paths start at the file's folder.
 """
 
 from __future__ import annotations
@@ -43,10 +41,9 @@ __all__ = [
 
 FORMAT = "pendulum_lab/1"
 EMULATED_BACKENDS = frozenset({"emulator", "emulator_process"})
-"""Backends of the bridge behind which a pendulum is emulated: it may be pushed, and restarted without a prompt.
-Any other name is a machine, since what is taken for an emulator by mistake moves by itself."""
+"""Backends that emulate a pendulum, which may be pushed and restarted without a prompt; any other is a machine."""
 EMULATED_NETWORK = "emulator:"
-"""What ``interface`` begins with where backend ``hebi`` finds emulators in place of modules: ``emulator:HOST:PORT``."""
+"""Prefix of ``interface`` for emulators behind backend ``hebi``: ``emulator:HOST:PORT``."""
 _HEADER = """\
 # Lab file: read by bridge, check, scan, lab, launch files and `experiment --hardware hebi --lab FILE`.
 # The guided procedures of `python -m pendulum_hw_bridge lab` rewrite it; remarks of your own go under `notes`.
@@ -58,11 +55,11 @@ class LabEntry:
     """One entry of the lab file.
 
     Attributes:
-        parameter: Parameter of the bridge that it sets.
+        parameter: Parameter of the bridge.
         unit: SI unit; with one, the entry is written ``{value: ..., unit: ...}``.
-        kind: Type of the value: ``float``, ``int``, ``str``, or ``list`` of numbers.
+        kind: ``float``, ``int``, ``str``, or ``list`` of numbers.
         path: Whether the text may be a path, relative to the lab file's folder.
-        left_out: Meaning of a missing entry, which the bridge's parameter codes as 0; 0 and less are then refused.
+        left_out: Meaning of a missing entry, the bridge's 0; values <= 0 are then refused.
     """
 
     parameter: str
@@ -127,11 +124,11 @@ class LabFile:
     """The content of a lab file.
 
     Attributes:
-        values: Value by parameter of the bridge; what the file leaves out is not in it.
+        values: Given values by parameter of the bridge.
         name: Name of the bench.
         notes: Free text.
-        proofs: What the guided procedures have shown, by procedure: date and result as text.
-        folder: Where relative paths start; the folder of the file.
+        proofs: Date and result of each guided procedure, by its name.
+        folder: Folder of the file, where relative paths start.
     """
 
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -141,15 +138,10 @@ class LabFile:
     folder: Path = Path()
 
     def __post_init__(self) -> None:
-        """Keep what was given from changes."""
         object.__setattr__(self, "values", MappingProxyType(dict(self.values)))
 
     def changed(self, **values: Any) -> LabFile:
-        """Return the lab with other values of parameters.
-
-        Raises:
-            ParameterError: A parameter has no place in a lab file.
-        """
+        """Return the lab with changed values; raise a ParameterError for a parameter without an entry."""
         reject_unknown(values, _parameters(), where="lab file")
         return replace(self, values={**self.values, **values})
 
@@ -163,13 +155,13 @@ class LabFile:
 
     @property
     def emulated(self) -> bool:
-        """Whether a pendulum is emulated behind it: an emulator, or HEBI's network with emulators on it."""
+        """Whether a pendulum is emulated behind it."""
         backend = self.values.get("backend", "hebi")
         on_network = backend == "hebi" and str(self.values.get("interface", "")).startswith(EMULATED_NETWORK)
         return on_network or backend in EMULATED_BACKENDS
 
     def describe(self) -> str:
-        """Return which actuator it is, in a few words, for a question to the operator."""
+        """Return the actuator in a few words, for a question to the operator."""
         values = self.values
         who = f"{values.get('family') or '*'}/{values.get('name') or '*'}"
         marks = [str(values[key]) for key in ("serial", "mac_address") if values.get(key)]
@@ -180,8 +172,8 @@ def load_lab(path: str | Path) -> LabFile:
     """Return the content of a lab file.
 
     Raises:
-        ParameterError: No such file, not YAML, an unknown section or entry (with the nearest known one), a value of
-            another type, not finite, without its unit, or a limit of nothing; the message names the place.
+        ParameterError: The file is missing or not YAML, a name is unknown, or a value has the wrong type, no unit, or
+            limits nothing; the message names the place.
     """
     document = load_yaml(path, "lab file")
     where = str(path)
@@ -210,11 +202,7 @@ def load_lab(path: str | Path) -> LabFile:
 
 
 def write_lab(path: str | Path, lab: LabFile) -> Path:
-    """Write a lab file that :func:`load_lab` reads back to the same; at once, so that no half of one is ever there.
-
-    Raises:
-        ParameterError: It cannot be written, or a limit of nothing is in it.
-    """
+    """Write a lab file atomically; raise a ParameterError if that fails or a limit limits nothing."""
     path = Path(path)
     document: dict[str, Any] = {"format": FORMAT}
     if lab.name:
@@ -269,7 +257,7 @@ def _number(value: object, where: str) -> float:
 
 
 def _limiting(value: Any, entry: LabEntry, where: str) -> Any:
-    """Return a value that does not stand for no limit or a default."""
+    """Return a value, unless it means no limit or a default."""
     if entry.left_out:
         good, expected = (value[0] < value[1], "low < high") if entry.kind is list else (value > 0.0, "> 0")
         if not good:
@@ -287,7 +275,7 @@ def _written(value: Any, entry: LabEntry, folder: Path, where: str) -> Any:
 
 
 def _absolute(text: str, folder: Path) -> str:
-    """Return a path as one that does not depend on where a program is started; names of presets stay."""
+    """Return a path as absolute; names of presets stay."""
     is_path = "/" in text or Path(text).suffix != ""
     return str((folder / Path(text).expanduser()).resolve()) if text and is_path else text
 

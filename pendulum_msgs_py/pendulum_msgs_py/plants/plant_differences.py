@@ -29,21 +29,14 @@ __all__ = [
 ]
 
 PLANT_PARAMETERS = "plant_parameters"
-"""Key of a plant's description in its diagnostics."""
+"""Key of a plant's descriptions in its diagnostics."""
 _SAME = 1e-3
-"""Relative difference of a value up to which it is the same, written with fewer digits."""
+"""Relative difference due to fewer printed digits."""
 
 
 @dataclass(frozen=True)
 class PlantDifference:
-    """One parameter in which two plants differ.
-
-    Attributes:
-        name: The parameter; ``drivetrain`` where one plant has a motor and a spring and the other has not.
-        designed: Its value in the plant designed for.
-        running: Its value in the plant that runs.
-        unit: Unit of both; empty for ``drivetrain``.
-    """
+    """One parameter in which two plants differ, with its unit; ``drivetrain`` where only one plant has one."""
 
     name: str
     designed: float | str
@@ -60,10 +53,9 @@ class PlantDifference:
 
 
 def plant_differences(designed: PlantParameters, running: PlantParameters) -> tuple[PlantDifference, ...]:
-    """Return the parameters in which two plants differ, in the order of the plant file.
+    """Return the parameters that differ by more than 0.1 %, in the order of the plant file.
 
-    Values within 0.1 % of each other count as the same. Of a rigid plant and a series-elastic one the link is compared,
-    and the drivetrain named once.
+    If only one plant has a drivetrain, the links are compared and the drivetrain is named once.
     """
     first, second = (plant.mechanism.name for plant in (designed, running))
     if first != second:
@@ -90,12 +82,10 @@ def plant_differences(designed: PlantParameters, running: PlantParameters) -> tu
 
 
 def plant_mismatch(designed: PlantParameters, running: Sequence[PlantParameters]) -> str:
-    """Return as text how the running plant differs from the one designed for; empty where it does not.
+    """Return how the running plant differs from the one designed for, or an empty string.
 
-    Args:
-        designed: The plant designed for.
-        running: Descriptions of the one plant that runs, such as a machine with its drivetrain and the rigid plant
-            that experiments on it give; one match is enough, else the closest is reported. Empty: nothing is known.
+    ``running`` holds alternative descriptions of one plant, such as a machine with its drivetrain and its rigid
+    equivalent: one match suffices, else the closest is reported. Empty means unknown.
     """
     if not running:
         return ""
@@ -110,16 +100,12 @@ def plant_mismatch(designed: PlantParameters, running: Sequence[PlantParameters]
 
 
 def describe_plants(plants: Sequence[PlantParameters]) -> str:
-    """Return a plant's descriptions, one or several, as text for its diagnostics."""
+    """Return descriptions of a plant as text for its diagnostics."""
     return json.dumps([_as_mapping(plant) for plant in plants], separators=(",", ":"))
 
 
 def read_plants(text: str) -> tuple[PlantParameters, ...]:
-    """Return the plants of a text that :func:`describe_plants` wrote.
-
-    Raises:
-        ParameterError: The text is something else, or a value is outside of its domain.
-    """
+    """Return the plants of :func:`describe_plants`; raise a ParameterError for other text or values."""
     try:
         return tuple(_from_mapping(entry) for entry in json.loads(text))
     except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:

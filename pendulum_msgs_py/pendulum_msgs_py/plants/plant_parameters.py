@@ -1,8 +1,7 @@
-"""Physical parameters of a plant: one type, one YAML format, shared by plant, design and identification.
+"""Physical parameters of a plant: one type, one YAML format, shared by simulation, design and identification.
 
-A plant is a mechanism with its values, and what each of its joints has. A file gives each value with its unit, so that
-a file in other units is refused rather than misread. The format ``pendulum_plant/2`` names the mechanism and its
-joints; an ``actuator:`` block makes a joint driven::
+Each value carries its unit; other units are refused. ``pendulum_plant/2`` names a mechanism and its joints, of which
+those with an ``actuator:`` are driven::
 
     format: pendulum_plant/2
     name: acrobot
@@ -15,7 +14,7 @@ joints; an ``actuator:`` block makes a joint driven::
         coulomb_friction: {value: 0.12, unit: N m}
         actuator: {effort_limit: {value: 6.0, unit: N m}}
 
-The format ``pendulum_plant/1`` has the numbers of a pendulum, one driven hinge, in one list::
+``pendulum_plant/1`` lists the numbers of one driven hinge::
 
     format: pendulum_plant/1
     name: thesis
@@ -89,7 +88,7 @@ __all__ = [
 FORMAT = "pendulum_plant/1"
 MECHANISM_FORMAT = "pendulum_plant/2"
 SEALED_FORMAT = "pendulum_plant_sealed/1"
-"""Format of a plant file that only simulators read; see :mod:`pendulum_msgs_py.plants.sealed_plant`."""
+"""See :mod:`pendulum_msgs_py.plants.sealed_plant`."""
 _PRESET_FOLDER = Path(str(resources.files("pendulum_msgs_py.plants") / "presets"))
 _PRESET_TEXTS = {
     file.stem: file.read_text(encoding="utf-8")
@@ -98,32 +97,30 @@ _PRESET_TEXTS = {
 MECHANISM_PRESETS = tuple(
     name for name, text in _PRESET_TEXTS.items() if f"\nformat: {MECHANISM_FORMAT}" in f"\n{text}"
 )
-"""Names of the plant files of several joints that come with the package."""
+"""Presets of several joints."""
 PRESETS = tuple(name for name in _PRESET_TEXTS if name not in MECHANISM_PRESETS)
-"""Names of the plant files of one joint; a file in their folder is a preset, the default comes first."""
+"""Presets of one joint: the files of the folder, the default first."""
 PRESET_NAMES = ", ".join(PRESETS)
-"""The same for help texts."""
 SERIES_ELASTIC_PRESETS = tuple(name for name in PRESETS if "\ndrivetrain:" in _PRESET_TEXTS[name])
-"""Those of them that have motor, gears and spring."""
+"""Presets with a drivetrain."""
 
 _PENDULUM = MECHANISMS["pendulum"]
 _REQUIRED = ("inertia", "damping", "gravity")
-"""What a file of a pendulum must give."""
+"""Required in a file of a pendulum."""
 _EXAMPLES = {"damping": 11.77, "effort_limit": 13.0}
-"""Defaults of one joint where those of a joint among others differ; its effort has no largest value: a foreign
-simulation may have any."""
+"""Defaults of a single joint where they differ; a foreign simulation's effort may be of any size."""
 _ANGLES = 16
-"""Angles of each turning joint at which the mass matrix must be positive definite."""
+"""Angles of each turning joint at which the mass matrix is checked."""
 
 
 class _Place(NamedTuple):
-    """Where a plant has one of its numbers.
+    """Place of a number in a plant.
 
     Attributes:
-        spec: What it is.
+        spec: Its spec.
         part: ``values``, ``joint`` or ``actuator``.
-        number: Of the value, or of the joint.
-        key: Name of the joint's or the actuator's field.
+        number: Index of the value or of the joint.
+        key: Field of the joint or the actuator.
         where: Prefix of messages.
     """
 
@@ -136,7 +133,7 @@ class _Place(NamedTuple):
 
 @cache
 def _places(mechanism: Mechanism) -> dict[str, _Place]:
-    """Return where the numbers of a mechanism's plants are, by name: ``elbow.damping``, or of one joint ``damping``."""
+    """Return the places of a mechanism's numbers by name: ``elbow.damping``, or of one joint ``damping``."""
     found = {spec.name: _Place(spec, "values", index, spec.name, "") for index, spec in enumerate(mechanism.parameters)}
     several = len(mechanism.joints) > 1
     for index, joint in enumerate(mechanism.joints):
@@ -153,31 +150,30 @@ def _places(mechanism: Mechanism) -> dict[str, _Place]:
                 found[name] = _Place(shown, part, index, spec.name, where)
     if several:
         return found
-    # As in files: what a file must give first, and friction terms last.
+    # As in files: required ones first, friction terms last.
     order = {name: rank for rank, name in enumerate(_REQUIRED, -len(_REQUIRED))}
     return dict(sorted(found.items(), key=lambda each: order.get(each[0], each[0] in TERM_PARAMETERS)))
 
 
 def _name(mechanism: Mechanism, joint: Joint, key: str) -> str:
-    """Return the name of a joint's or an actuator's quantity."""
     if len(mechanism.joints) > 1:
         return f"{joint.name}.{key}"
     return "actuator_time_constant" if key == "time_constant" else key
 
 
 def _format_2(joint: Joint) -> tuple[ParameterSpec, ...]:
-    """Return what a joint may have in format 2."""
+    """Return a joint's quantities in format 2."""
     return tuple(spec for spec in joint_specs(joint) if spec.name not in OF_A_PENDULUM)
 
 
 PLANT_SPECS = tuple(
     place.spec for name, place in _places(_PENDULUM).items() if name not in {"lower_stop", "upper_stop"}
 )
-"""Quantities of a pendulum, in the order of a plant file's section ``parameters``."""
+"""Quantities of a pendulum, in the order of a plant file."""
 
 
 class _Pendulum:
-    """Numbers that a pendulum, ``is_pendulum``, has as attributes, too; of others :meth:`PlantParameters.value` takes.
+    """Attributes of a plant with ``is_pendulum``; other plants have :meth:`PlantParameters.value` only.
 
     ::
 
@@ -200,16 +196,16 @@ class _Pendulum:
 
 @dataclass(frozen=True)
 class PlantParameters(_Pendulum):
-    """A plant of n joints: a mechanism, its numbers, and what each joint has.
+    """A plant of n joints: a mechanism with numbers.
 
     Attributes:
         mechanism: Equations and joints.
-        values: Values of ``mechanism.parameters``, in their order.
-        joints: One entry per joint, in the order of the model.
+        values: Values of ``mechanism.parameters``, in order.
+        joints: Parameters of each joint, in order.
         name: Name of the plant.
 
     Raises:
-        ParameterError: A value is outside its domain, or the masses give no positive inertia at some position.
+        ParameterError: A value is outside its domain, or the mass matrix is not positive definite at some position.
     """
 
     mechanism: Mechanism
@@ -218,7 +214,6 @@ class PlantParameters(_Pendulum):
     name: str = field(default="unnamed", compare=False)
 
     def __post_init__(self) -> None:
-        """Check every value, and keep it as the number that it is."""
         specs = self.mechanism.parameters
         if len(self.values) != len(specs) or len(self.joints) != len(self.mechanism.joints):
             raise ParameterError(
@@ -231,7 +226,7 @@ class PlantParameters(_Pendulum):
             if value is not None and (checked := place.spec.check(value, where=place.where)) is not value:
                 changes[place] = checked
             if place.key == "static_friction" and value == self.joints[place.number].coulomb_friction:
-                # It follows the Coulomb friction: otherwise a change of that would add stiction.
+                # None follows later changes of the Coulomb friction, which would otherwise add stiction.
                 changes[place] = None
         if changes:
             for name, part in zip(("values", "joints"), self._changed(changes), strict=True):
@@ -271,7 +266,7 @@ class PlantParameters(_Pendulum):
 
     @cached_property
     def is_pendulum(self) -> bool:
-        """Whether it is one driven hinge without end stops, which the equations of a single pendulum describe."""
+        """Whether it is one driven hinge without end stops."""
         own = self.joints[0]
         return (
             self.mechanism.name == _PENDULUM.name
@@ -281,7 +276,7 @@ class PlantParameters(_Pendulum):
 
     @property
     def drivetrain(self) -> SeriesElasticParameters | None:
-        """Motor, gears and spring, of a pendulum that has them."""
+        """Motor, gears and spring of a series-elastic pendulum."""
         return self.joints[0].drivetrain
 
     @cached_property
@@ -292,12 +287,12 @@ class PlantParameters(_Pendulum):
 
     @cached_property
     def packed(self) -> Vector:
-        """The ``p`` of the mechanism's functions: values, then the damping of each joint."""
+        """The mechanism's ``p``: values, then the damping of each joint."""
         return (*self.values, *(joint.damping for joint in self.joints))
 
     @property
     def actuators(self) -> tuple[Actuator, ...]:
-        """Actuators of the driven joints, in the model's order."""
+        """Actuators of the driven joints, in order."""
         return tuple(joint.actuator for joint in self.joints if joint.actuator is not None)
 
     @property
@@ -307,7 +302,7 @@ class PlantParameters(_Pendulum):
 
     @property
     def stops(self) -> tuple[tuple[float, float], ...]:
-        """Lowest and highest position of each joint, infinite where nothing stops it [rad or m]."""
+        """Lowest and highest position of each joint, infinite without a stop [rad or m]."""
         return tuple(
             (
                 -math.inf if joint.lower_stop is None else joint.lower_stop,
@@ -318,7 +313,7 @@ class PlantParameters(_Pendulum):
 
     @property
     def has_dry_friction(self) -> bool:
-        """Whether any joint has dry friction, by Coulomb or by a further term."""
+        """Whether any joint has dry friction."""
         strengths = [TERM_PARAMETERS[index] for index in STRENGTHS]
         return any(own.breakaway > 0.0 or any(getattr(own, name) for name in strengths) for own in self.joints)
 
@@ -351,33 +346,27 @@ class PlantParameters(_Pendulum):
 
     @property
     def specs(self) -> dict[str, ParameterSpec]:
-        """Table of what :meth:`with_values` takes, by name."""
+        """Table of the names that :meth:`with_values` takes."""
         return {name: place.spec for name, place in self._places.items()}
 
     @cached_property
     def numbers(self) -> dict[str, float]:
-        """All values that are given, by the names of :attr:`specs`; of a pendulum all that a file may give."""
+        """All given values by the names of :attr:`specs`, of a pendulum all that a file may give."""
         found = {name: self._at(place) for name, place in self._places.items()}
         if self.is_pendulum:
             found["static_friction"] = self.joints[0].breakaway
         return {name: value for name, value in found.items() if value is not None}
 
     def value(self, name: str) -> float:
-        """Return a parameter by the name that :meth:`with_values` takes.
-
-        Raises:
-            ParameterError: There is none of that name, or it is not given.
-        """
+        """Return a value by a name of :attr:`specs`; raise a ParameterError if it is unknown or not given."""
         if (key := self._plain(name)) not in self.numbers:
             raise ParameterError(f"{name!r} is not given for plant {self.name!r}; expected {self._expected_names()}")
         return self.numbers[key]
 
     def with_values(self, changes: Mapping[str, Any] | None = None, /, **more: Any) -> PlantParameters:
-        """Return a copy with some values changed, checked again.
+        """Return a checked copy with changed values: ``mass_1``, ``elbow.damping``, ``elbow.effort_limit``.
 
-        Args:
-            changes: Values by name: ``mass_1``, ``elbow.damping``, ``elbow.effort_limit``; of one joint ``damping``.
-            more: The same; ``name`` and, of a pendulum, ``drivetrain``, too.
+        ``name`` and, of a pendulum, ``drivetrain`` change too.
 
         Raises:
             ParameterError: A name is unknown, a joint is passive, or a value is outside its domain.
@@ -393,10 +382,10 @@ class PlantParameters(_Pendulum):
         return PlantParameters(self.mechanism, values, joints, name)
 
     def check_start(self, position: Sequence[float]) -> Vector:
-        """Return a start position as numbers.
+        """Return n start positions as floats [rad or m].
 
         Raises:
-            ParameterError: It has another length, is not finite, or lies beyond an end stop.
+            ParameterError: Their number is wrong, or one is not finite or beyond an end stop.
         """
         values = tuple(float(value) for value in position)
         if len(values) != len(self.joints) or not all(map(math.isfinite, values)):
@@ -412,13 +401,7 @@ class PlantParameters(_Pendulum):
         return values
 
     def acceleration(self, position: Vector, velocity: Vector, torque: Vector) -> Vector:
-        """Return q'' under generalised forces at all n joints, dry friction apart [rad/s^2 or m/s^2].
-
-        Args:
-            position: q, n values [rad or m].
-            velocity: q', n values.
-            torque: n values [N m or N]; ``coordinates.spread`` makes them of those of the driven joints.
-        """
+        """Return q'' for n positions, velocities and forces of all joints, without dry friction [rad/s^2 or m/s^2]."""
         result: Vector = self.mechanism.forward(position, velocity, torque, self.packed)
         return result
 
@@ -452,16 +435,9 @@ def pendulum_plant(
     name: str = "unnamed",
     **numbers: float | None,
 ) -> PlantParameters:
-    """Return a pendulum.
+    """Return a pendulum of M_c [kg m^2], b_c [N m s/rad] and G_c = m g l_c [N m].
 
-    Args:
-        inertia: About the joint, M_c [kg m^2].
-        damping: b_c [N m s/rad].
-        gravity: G_c = m g l_c [N m].
-        drivetrain: Motor, gears and spring; None for a rigid one.
-        name: Name of the plant.
-        numbers: Others of ``PLANT_SPECS``; those left out have their defaults, and the static friction is then the
-            Coulomb friction.
+    ``numbers`` are others of ``PLANT_SPECS``, else at their defaults; the static friction is then the Coulomb friction.
 
     Raises:
         ParameterError: A name is unknown, or a value is outside its domain.
@@ -479,20 +455,16 @@ def pendulum_plant(
 
 
 def load_mechanism(preset_or_path: str | Path) -> PlantParameters:
-    """Return the plant of a preset or of a plant file, of one joint or more.
+    """Return the plant of a preset or a plant file.
 
     Raises:
-        ParameterError: No such preset or file, or the file is refused; the message names file and entry.
+        ParameterError: It does not exist, or is refused; the message names file and entry.
     """
     return load_plant_file(preset_or_path)[0]
 
 
 def load_plant_file(preset_or_path: str | Path) -> tuple[PlantParameters, dict[str, Any]]:
-    """Return the plant and the file's provenance (intervals included under ``intervals``).
-
-    Raises:
-        ParameterError: as :func:`load_mechanism`.
-    """
+    """Return the plant and its provenance, with ``intervals``; errors as :func:`load_mechanism`."""
     path = resolve_plant(preset_or_path)
     document = load_yaml(path, "plant file")
     if document.get("format") == SEALED_FORMAT:
@@ -504,11 +476,7 @@ def load_plant_file(preset_or_path: str | Path) -> tuple[PlantParameters, dict[s
 
 
 def load_plant(preset_or_path: str | Path) -> PlantParameters:
-    """Return the pendulum of a preset (one of ``PRESETS``) or of a plant file.
-
-    Raises:
-        ParameterError: as :func:`load_mechanism`, or it is another mechanism.
-    """
+    """Return the pendulum of a preset (one of ``PRESETS``) or a plant file; another mechanism is a ParameterError."""
     parameters = load_mechanism(preset_or_path)
     if not parameters.is_pendulum:
         raise ParameterError(
@@ -519,17 +487,8 @@ def load_plant(preset_or_path: str | Path) -> PlantParameters:
 
 
 def read_plant_document(document: Mapping[str, Any], path: Path) -> tuple[PlantParameters, dict[str, Any]]:
-    """Return the plant and the provenance of the content of a plant file.
-
-    Args:
-        document: The content.
-        path: The file, for messages and as a name.
-
-    Raises:
-        ParameterError: as :func:`load_mechanism`.
-    """
+    """Return plant and provenance of a plant file's content; errors as :func:`load_mechanism`."""
     where = str(path)
-    # What the other names may be depends on the format.
     if document.get("format") not in (FORMAT, MECHANISM_FORMAT):
         raise ParameterError(
             f"{where}: format is {document.get('format')!r}; expected {FORMAT!r} or {MECHANISM_FORMAT!r}"
@@ -561,7 +520,7 @@ def _read_pendulum(document: Mapping[str, Any], where: str) -> _Parts:
 def _read_mechanism(document: Mapping[str, Any], where: str) -> _Parts:
     reject_unknown(document, ("format", "name", "model", "parameters", "joints", "provenance"), where=where)
     model = document.get("model")
-    # Lists and mappings are neither names nor hashable.
+    # Lists and mappings are not hashable.
     if not isinstance(model, str) or model not in MECHANISMS:
         given = "missing" if model is None else repr(model)
         raise ParameterError(f"{where}: model is {given}; {suggestion(model, MECHANISMS)}")
@@ -569,7 +528,7 @@ def _read_mechanism(document: Mapping[str, Any], where: str) -> _Parts:
     given_values, intervals = read_quantities(
         document.get("parameters") or {}, mechanism.parameters, f"{where}: parameters"
     )
-    # Those that have a natural value may be left out; a mass or a length has none.
+    # Only these have natural defaults.
     natural = {"gravity", "rotor_inertia", "gear_ratio"}
     _require_values(given_values, [spec for spec in mechanism.parameters if spec.name not in natural], where)
     defaults: dict[str, Any] = {spec.name: spec.default for spec in mechanism.parameters}
@@ -629,13 +588,7 @@ def write_plant(
     provenance: Mapping[str, Any] | None = None,
     intervals: Mapping[str, Sequence[float]] | None = None,
 ) -> Path:
-    """Write a plant file that :func:`load_mechanism` reads back to the same values; it appears whole or not at all.
-
-    Args:
-        path: Where to write.
-        parameters: The plant.
-        provenance: Data, method, date: plain YAML values.
-        intervals: 95 % interval by name, as ``mass_1``, ``elbow.damping`` or ``damping``, in the parameter's unit.
+    """Write a plant file atomically, with plain provenance and 95 % intervals by name (``elbow.damping``).
 
     Raises:
         ParameterError: The file cannot be written.
@@ -651,7 +604,7 @@ def write_plant(
 def plant_document(
     parameters: PlantParameters, intervals: Mapping[str, Sequence[float]] | None = None
 ) -> dict[str, Any]:
-    """Return the content of a plant file, each value with its unit and, where given, its interval."""
+    """Return the content of a plant file, each value with its unit and, if given, its interval."""
     known = intervals or {}
     mechanism, drive = parameters.mechanism, parameters.drivetrain
     document: dict[str, Any] = {"format": FORMAT, "name": parameters.name}
@@ -675,7 +628,7 @@ def plant_document(
 
 
 def resolve_plant(preset_or_path: str | Path) -> Path:
-    """Return the file of a preset, or the path itself; a word that is neither is refused."""
+    """Return the file of a preset, or the path itself; raise a ParameterError for an unknown name."""
     text = str(preset_or_path)
     if text in PRESETS or text in MECHANISM_PRESETS:
         return _PRESET_FOLDER / f"{text}.yaml"
@@ -689,26 +642,14 @@ def resolve_plant(preset_or_path: str | Path) -> Path:
 
 
 def is_mechanism(preset_or_path: str | Path) -> bool:
-    """Return whether a preset or plant file is no pendulum; a sealed one is.
-
-    Raises:
-        ParameterError: No such preset or file.
-    """
+    """Return whether a preset or plant file is no pendulum; a sealed one is a pendulum."""
     path = resolve_plant(preset_or_path)
     document = load_yaml(path, "plant file")
     return document.get("format") == MECHANISM_FORMAT and not read_plant_document(document, path)[0].is_pendulum
 
 
 def require_one_joint(preset_or_path: str | Path, instead: str) -> None:
-    """Refuse a plant of several joints.
-
-    Args:
-        preset_or_path: Preset or plant file.
-        instead: What does something like it for several joints, for the message.
-
-    Raises:
-        ParameterError: It is one, or there is no such preset or file.
-    """
+    """Raise a ParameterError for a plant of several joints; the message says what to use instead."""
     if is_mechanism(preset_or_path):
         raise ParameterError(
             f"plant is {preset_or_path}, which has several joints; expected one of one joint, or {instead}"
@@ -716,7 +657,7 @@ def require_one_joint(preset_or_path: str | Path, instead: str) -> None:
 
 
 def _positive_definite(rows: Sequence[Sequence[float]]) -> bool:
-    """Return whether a small symmetric matrix is positive definite, by the pivots of Gauss's elimination."""
+    """Return whether a small symmetric matrix is positive definite, by Gaussian elimination."""
     matrix = [list(row) for row in rows]
     for k, pivot_row in enumerate(matrix):
         pivot = pivot_row[k]
@@ -730,10 +671,11 @@ def _positive_definite(rows: Sequence[Sequence[float]]) -> bool:
 
 
 def pack_joints(parameters: PlantParameters) -> JointTable:
-    """Return friction, stops and lags of the joints, as the dynamics take them: in the order of ``JOINT_ROWS``.
+    """Return friction, stops and lags of the joints in the order of ``JOINT_ROWS``.
 
     Raises:
-        ParameterError: The plant has what these dynamics have not: a drivetrain, an offset, a further friction term.
+        ParameterError: The plant has a drivetrain, an offset or a further friction term, which the steps do not
+            support.
     """
     _require_rigid(parameters)
     joints = parameters.joints
@@ -748,11 +690,7 @@ def pack_joints(parameters: PlantParameters) -> JointTable:
 
 
 def common_delay(parameters: PlantParameters) -> float:
-    """Return the transport delay of all actuators [s].
-
-    Raises:
-        ParameterError: They differ.
-    """
+    """Return the common transport delay of all actuators [s]; raise a ParameterError if they differ."""
     delays = {actuator.transport_delay for actuator in parameters.actuators}
     if len(delays) > 1:
         raise ParameterError(

@@ -1,4 +1,4 @@
-"""Physical quantities in plant files, ``{value: NUMBER, unit: UNIT, interval: [LOW, HIGH]}`` each, read and written."""
+"""Physical quantities in plant files, read and written: ``{value: NUMBER, unit: UNIT, interval: [LOW, HIGH]}``."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ __all__ = [
 
 
 class Quantity(NamedTuple):
-    """What a physical parameter is; it annotates the field that holds one, whose default is that of plant files too.
+    """Annotation of a dataclass field that is a physical parameter.
 
     Attributes:
-        unit: SI unit, ``-`` where it has none.
-        description: What it means, one sentence.
+        unit: SI unit, ``-`` for none.
+        description: Meaning, one sentence.
         positive: Zero is refused.
-        signed: Below zero is allowed.
-        example: Shown as the default where a value must be given.
-        largest: What no such thing exceeds; None for any.
+        signed: Negative values are allowed.
+        example: Shown as the default of a required value.
+        largest: Plausible maximum, or None.
     """
 
     unit: str
@@ -44,10 +44,10 @@ class Quantity(NamedTuple):
 
 
 def specs_of(kind: type[Any]) -> tuple[ParameterSpec, ...]:
-    """Return the table of a dataclass's quantities: name and default are the field's, the rest its annotation's."""
+    """Return the table of a dataclass's quantities; names and defaults are the fields'."""
     found = []
     hints = get_type_hints(kind, include_extras=True)
-    # What is given by name alone, such as a friction term, comes last.
+    # Keyword-only fields, such as friction terms, come last.
     for entry in sorted(fields(kind), key=lambda entry: bool(entry.kw_only)):
         for quantity in getattr(hints[entry.name], "__metadata__", ()):
             default = entry.default if isinstance(entry.default, float) else quantity.example
@@ -69,15 +69,10 @@ def specs_of(kind: type[Any]) -> tuple[ParameterSpec, ...]:
 def read_quantities(
     entries: object, specs: Sequence[ParameterSpec], where: str
 ) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Return values and intervals by name of entries written ``{value: NUMBER, unit: UNIT}``, as in a plant file.
-
-    Args:
-        entries: What a YAML file holds.
-        specs: The quantities that there may be.
-        where: Prefix of messages.
+    """Return values and intervals by name.
 
     Raises:
-        ParameterError: An entry is unknown, without its unit, or refused.
+        ParameterError: An entry is unknown, without its unit, or refused; the message begins with ``where``.
     """
     mapping = require_mapping(entries, where)
     table = {spec.name: spec for spec in specs}
@@ -115,13 +110,7 @@ def _check_interval(interval: object, where: str, unit: str) -> list[float]:
 def write_quantities(
     values: Mapping[str, Any], specs: Sequence[ParameterSpec], intervals: Mapping[str, Sequence[float]]
 ) -> dict[str, dict[str, Any]]:
-    """Return what :func:`read_quantities` reads.
-
-    Args:
-        values: By name; None is left out.
-        specs: The quantities to write.
-        intervals: By name.
-    """
+    """Return the entries of values that are not None, with their intervals."""
     quantities: dict[str, dict[str, Any]] = {}
     for spec in specs:
         if values[spec.name] is None:
@@ -133,7 +122,7 @@ def write_quantities(
 
 
 def build_plant(kind: Callable[..., Any], parts: Mapping[str, Any], where: str) -> Any:
-    """Return what a file describes; an error names the file."""
+    """Return ``kind(**parts)``; a ParameterError names the file."""
     try:
         return kind(**parts)
     except ParameterError as error:
@@ -141,13 +130,13 @@ def build_plant(kind: Callable[..., Any], parts: Mapping[str, Any], where: str) 
 
 
 def check_fields(instance: object, specs: Sequence[ParameterSpec]) -> None:
-    """Check every value of a frozen dataclass, and keep it as the number that it is."""
+    """Check the values of a frozen dataclass, and convert them to their types."""
     for spec in specs:
         object.__setattr__(instance, spec.name, spec.check(getattr(instance, spec.name)))
 
 
 def read_name(document: Mapping[str, Any], path: Path) -> str:
-    """Return the name of the plant of a file: by default the file's."""
+    """Return the plant's name, by default the file's."""
     name = document.get("name", path.stem)
     if not isinstance(name, str):
         raise ParameterError(f"{path}: name is {name!r}; expected text")
@@ -155,5 +144,5 @@ def read_name(document: Mapping[str, Any], path: Path) -> str:
 
 
 def read_provenance(document: Mapping[str, Any], where: str, intervals: Mapping[str, list[float]]) -> dict[str, Any]:
-    """Return the provenance of a plant file, with the intervals of its entries under ``intervals``."""
+    """Return the provenance of a plant file, with ``intervals``."""
     return {**require_mapping(document.get("provenance") or {}, f"{where}: provenance"), "intervals": intervals}

@@ -1,6 +1,6 @@
-"""A plant file for an exercise: simulators run it, and its parameters are not readable at a glance.
+"""A plant file for an exercise: simulators run it, but its parameters are not readable.
 
-The seal is packing, not encryption. It prevents a student from seeing the solution by accident.
+The seal is packing, not encryption: it prevents a student from seeing the solution by accident.
 """
 
 from __future__ import annotations
@@ -32,13 +32,10 @@ def seal_plant(parameters: PlantParameters) -> str:
 
 
 def load_plant_to_run(preset_or_path: str | Path) -> tuple[PlantParameters, bool]:
-    """Return the parameters for a simulator, and whether they are sealed, so that they must not be shown.
-
-    Args:
-        preset_or_path: A preset, a plant file or a sealed plant file.
+    """Return the plant of a preset or file, and whether it is sealed, so that its values must not be shown.
 
     Raises:
-        ParameterError: No such preset or file, the file is refused, or its seal is damaged.
+        ParameterError: It does not exist, is refused, or its seal is damaged.
     """
     path = resolve_plant(preset_or_path)
     document = load_yaml(path, "plant file")

@@ -1,8 +1,7 @@
 """Completion of command lines in bash and zsh: ``source <(python -m pendulum_bags --completion bash)``.
 
-Programs are started as ``python -m PACKAGE EXECUTABLE``, which no library for command lines completes: the shell sees a
-program named python. The printed script therefore passes the typed words to the program itself, marked by an
-environment variable, and the program prints what may follow instead of running.
+No completion library handles ``python -m PACKAGE EXECUTABLE``, whose program is named python. The printed script passes
+the words to the program itself, marked by an environment variable; it prints the candidates instead of running.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["SHELLS", "VARIABLE", "asked", "of_command", "of_node", "of_package", "script"]
 
 VARIABLE = "_PENDULUM_COMPLETE"
-"""Set by the shell where what was typed is to be completed, not run; its last word is incomplete."""
+"""Set by the shell if the words are to be completed, not run; the last one is incomplete."""
 
 _SCRIPT = r"""
 _pendulum_complete() {{
@@ -71,14 +70,7 @@ def asked() -> bool:
 
 
 def script(shell: str) -> str:
-    """Return what a shell is to source.
-
-    Args:
-        shell: One of :data:`SHELLS`.
-
-    Raises:
-        ParameterError: Another shell.
-    """
+    """Return the script for one of :data:`SHELLS` to source; raise a ParameterError for another shell."""
     if shell not in SHELLS:
         raise ParameterError(f"shell is {shell!r}; expected one of {', '.join(SHELLS)}")
     # Imported late: every program imports this module, and few print a script.
@@ -95,26 +87,13 @@ def script(shell: str) -> str:
 
 
 def of_package(table: Iterable[str], words: Sequence[str]) -> list[str]:
-    """Return which executables of a package what was typed may become.
-
-    Args:
-        table: Their names.
-        words: What was typed behind the package.
-    """
+    """Return the executables (names in ``table``) that complete the words behind a package."""
     incomplete = words[-1] if words else ""
     return _beginning(["--completion", "--help"] if incomplete.startswith("-") else sorted(table), incomplete)
 
 
 def of_command(command: Any, words: Sequence[str]) -> list[str]:
-    """Return what may follow on the command line of a typer application.
-
-    Args:
-        command: Its command, or group of commands.
-        words: What was typed behind the program; the last word is incomplete.
-
-    Returns:
-        Commands, options, or the choices of an option; nothing where a file or a free value belongs.
-    """
+    """Return completions of a typer command: commands, options, or choices; none for a file or a free value."""
     *before, incomplete = words or [""]
     while before and (command_below := getattr(command, "commands", {}).get(before[0])) is not None:
         command, before = command_below, before[1:]
@@ -132,12 +111,7 @@ def of_command(command: Any, words: Sequence[str]) -> list[str]:
 
 
 def of_node(specs: Iterable[ParameterSpec], words: Sequence[str]) -> list[str]:
-    """Return what may follow on the command line of a node.
-
-    Args:
-        specs: Its parameters.
-        words: What was typed behind the program; the last word is incomplete.
-    """
+    """Return completions of a node's command line, given its parameters."""
     *before, incomplete = words or [""]
     if "--ros-args" not in before:
         return _beginning(["--help", "--ros-args"], incomplete)

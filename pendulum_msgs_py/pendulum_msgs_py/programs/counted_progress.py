@@ -1,4 +1,4 @@
-"""Progress of work that is counted in pieces, in the terminal."""
+"""Progress bars of work that is counted in pieces."""
 
 from __future__ import annotations
 
@@ -21,12 +21,7 @@ _Result = TypeVar("_Result")
 
 
 def counting_bar(console: Console, *columns: ProgressColumn) -> Progress:
-    """Return a bar that counts pieces and leaves nothing behind; in a file or a pipe it draws nothing.
-
-    Args:
-        console: Where to draw.
-        columns: Columns at its right end.
-    """
+    """Return a bar with further columns at its end, removed when done; in a file or a pipe it draws nothing."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=None),
@@ -41,16 +36,10 @@ def counting_bar(console: Console, *columns: ProgressColumn) -> Progress:
 def results_at_once(
     console: Console, unit: str, jobs: Sequence[Callable[[], _Result]], workers: int = 0
 ) -> list[_Result]:
-    """Return what each job returns, run in processes of their own, with a progress bar.
-
-    Args:
-        console: Where to draw.
-        unit: What is counted, as a plural.
-        jobs: What to run; each can be pickled.
-        workers: Jobs at once; 0 for one a core.
+    """Return the results of picklable jobs, run in ``workers`` processes (0: one per core), with a progress bar.
 
     Raises:
-        typer.Exit: The user interrupted; nothing of the results is left.
+        typer.Exit: The user interrupted; no results are left.
     """
     pool = ProcessPoolExecutor(min(len(jobs), workers or os.cpu_count() or 1))
     results = []
@@ -74,11 +63,7 @@ def _call(job: Callable[[], _Result]) -> _Result:
 
 @contextmanager
 def resumable(console: Console, folder: Path) -> Iterator[None]:
-    """Turn Ctrl-C into a sentence on how to resume the work in a folder.
-
-    Raises:
-        typer.Exit: The user interrupted, after the sentence.
-    """
+    """Turn Ctrl-C into ``typer.Exit``, after a sentence on how to resume the work in a folder."""
     try:
         yield
     except KeyboardInterrupt:
@@ -88,19 +73,10 @@ def resumable(console: Console, folder: Path) -> Iterator[None]:
 
 @contextmanager
 def counted_progress(console: Console, unit: str, total: int, folder: Path) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar with the remaining time during resumable work.
-
-    Args:
-        console: Where to draw.
-        unit: What is counted, as a plural.
-        total: How many there are.
-        folder: Where the work stores its results.
+    """Show a bar with the remaining time during :func:`resumable` work on ``total`` pieces; ``unit`` is a plural.
 
     Yields:
-        What the work calls with pieces done and in all.
-
-    Raises:
-        typer.Exit: The user interrupted.
+        A function of the pieces done and in all.
     """
     with resumable(console, folder), counting_bar(console, TimeRemainingColumn()) as bar:
         task = bar.add_task(unit, total=total)

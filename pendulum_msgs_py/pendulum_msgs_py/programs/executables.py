@@ -1,8 +1,7 @@
-"""One way to start every program of the project: ``ros2 run PKG EXE``, ``python -m PKG EXE`` and ``install/``.
+"""Starts every program of the project: ``ros2 run PKG EXE``, ``python -m PKG EXE`` and ``install/``.
 
-Each package has a table ``EXECUTABLES`` (name -> ``module:function``) in its ``executables`` module. The console
-scripts of ``setup.py`` and ``python -m`` both read it. What would hide a program of the system is in a second table,
-``COMMANDS``, for ``python -m`` alone.
+The table ``EXECUTABLES`` (name -> ``module:function``) of each package is read by ``setup.py`` and ``python -m``. Names
+that would hide a program of the system are in ``COMMANDS``, for ``python -m`` alone.
 """
 
 from __future__ import annotations
@@ -46,24 +45,19 @@ __all__ = [
 ]
 
 EXIT_USAGE = 2
-"""Exit code of a program whose arguments or request are invalid."""
+"""Exit code for invalid arguments or requests."""
 
 
 class _Reported(int):
-    """An exit code of a program that has printed the reason itself."""
+    """Exit code of a program that has printed the reason itself."""
 
 
 EXIT_INTERRUPTED = _Reported(130)
-"""Exit code after Ctrl-C, by the shell's convention of 128 + SIGINT; printed already, with what is left."""
+"""Exit code after Ctrl-C (128 + SIGINT), reported already."""
 
 
 def run_package(package: str, argv: Sequence[str] | None = None) -> int:
-    """Run ``python -m package EXE ARGS`` and return the exit code.
-
-    Args:
-        package: Import name of the package.
-        argv: Executable name and its arguments; by default those of the process.
-    """
+    """Run ``python -m package EXE ARGS`` and return the exit code; ``argv`` defaults to the process's."""
     importlib.import_module("pendulum_msgs_py.programs.one_thread")
     arguments = list(sys.argv[1:] if argv is None else argv)
     table = tables_of(package)
@@ -79,16 +73,10 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
 def answer_of_dispatcher(
     arguments: Sequence[str], names: Collection[str], *, usage: Callable[[], str], unknown: Callable[[str], str]
 ) -> int | None:
-    """Handle what a dispatching command does itself: completion, help, an unknown name.
+    """Handle completion, help and unknown names of a command that starts programs.
 
-    Args:
-        arguments: All of the command's.
-        names: Programs that it starts.
-        usage: Returns its help.
-        unknown: Returns the message for a name that is none of these.
-
-    Returns:
-        The exit code; None where the first argument is the name of a program to start.
+    ``usage`` returns the help, ``unknown`` the message for an unknown name. Returns the exit code, or None if the first
+    argument is the name of a program to start.
     """
     if completion.asked() and len(arguments) < 2:
         print_text("\n".join(completion.of_package(names, arguments)))
@@ -113,12 +101,9 @@ def tables_of(package: str) -> dict[str, str]:
 
 
 def run_program(target: str, arguments: Sequence[str], *, called_as: str = "") -> int:
-    """Import a program, run it and return its exit code.
+    """Run a program by its entry point ``module:function`` and return its exit code.
 
-    Args:
-        target: Its entry point, ``module:function``.
-        arguments: Its own.
-        called_as: How it was started, for its help; empty for ``python -m``.
+    ``called_as`` is its name in help texts; empty for ``python -m``.
     """
     keep_interrupts()
     importlib.import_module("pendulum_msgs_py.programs.one_thread")
@@ -128,7 +113,7 @@ def run_program(target: str, arguments: Sequence[str], *, called_as: str = "") -
         main = getattr(importlib.import_module(module_name), function_name)
         return int(main(list(arguments)) or 0)
     except KeyboardInterrupt:
-        # Ctrl-C while the modules are still loading: no command runs yet that could report it.
+        # Ctrl-C while modules load: no command can report it yet.
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except Exception as error:
@@ -138,11 +123,11 @@ def run_program(target: str, arguments: Sequence[str], *, called_as: str = "") -
 
 
 _called_as: list[str] = []
-"""How the running program was started; a help text names it."""
+"""Name of the running program in its help text."""
 
 
 def print_completion(arguments: Sequence[str]) -> int:
-    """Print the script of ``--completion [SHELL]`` for a shell to source; return the exit code."""
+    """Print the script of ``--completion [SHELL]``; return the exit code."""
     try:
         print_text(completion.script(arguments[0] if arguments else "bash"))
     except PendulumError as error:
@@ -151,7 +136,7 @@ def print_completion(arguments: Sequence[str]) -> int:
 
 
 def split_ros_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a program's own arguments, and those of ROS: from ``--ros-args`` on."""
+    """Return a program's own arguments, and those from ``--ros-args`` on."""
     split = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
     return list(arguments[:split]), list(arguments[split:])
 
@@ -161,18 +146,15 @@ def cli_main(
 ) -> int:
     """Run a typer application and return its exit code; a PendulumError ends as one sentence.
 
-    Args:
-        app: The application.
-        argv: Arguments; by default those of the process.
-        name: Program name for the help text, such as ``python -m pendulum_lqr design``.
-        takes_ros_arguments: Arguments from ``--ros-args`` on belong to ROS; the command finds them in ``context.obj``.
+    ``name`` is shown in the help, such as ``python -m pendulum_lqr design``. With ``takes_ros_arguments``,
+    ``context.obj`` holds the arguments from ``--ros-args`` on.
     """
     # Once more: a console script calls this function only.
     keep_interrupts()
-    # Imported late: a node that has no command line should not pay for typer and rich.
+    # Imported late: nodes without a command line do not need typer and rich.
     import typer.main
 
-    # typer brings a click of its own, which is no other click's: its errors are found through what it exports.
+    # typer vendors click: its error class is reachable only through typer's exports.
     usage_error: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
     command: Any = typer.main.get_command(app)
     command.context_settings["token_normalize_func"] = _one_name
@@ -224,10 +206,7 @@ def cli_main(
 
 
 def _refuse_repeats(command: Any) -> None:
-    """Let a command and its subcommands refuse an option that is given twice but counts once.
-
-    Click silently takes the last one, so that an overlooked first one would have no effect.
-    """
+    """Make a command and its subcommands refuse repeated options, of which click silently takes the last."""
     for one in getattr(command, "commands", {}).values():
         _refuse_repeats(one)
     make_parser = command.make_parser
@@ -253,7 +232,7 @@ def _refuse_repeats(command: Any) -> None:
 
 
 def _complete_help(command: Any) -> None:
-    """Let help show commands that the shell finds, and summaries of subcommands whole: click cuts them to one line."""
+    """Show runnable commands and whole summaries of subcommands in help: click cuts them to one line."""
     for one in getattr(command, "commands", {}).values():
         _complete_help(one)
         one.short_help = one.short_help or " ".join((one.help or "").partition("\n\n")[0].split()).removesuffix(".")
@@ -261,12 +240,12 @@ def _complete_help(command: Any) -> None:
 
 
 def _one_name(name: str) -> str:
-    """Return the option's name here: ``--output``, as in ROS 2's own tools, is ``--out``; helps omit the alias."""
+    """Accept ``--output``, as in ROS 2's own tools, for ``--out``."""
     return "out" if name == "output" else name
 
 
 def print_text(text: str) -> None:
-    """Print a text; a reader that has gone (``| head``) is no error."""
+    """Print a text; a closed pipe (``| head``) is no error."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
@@ -274,18 +253,13 @@ def print_text(text: str) -> None:
 
 
 def _discard_output() -> None:
-    """Send what is still buffered nowhere: the reader of the output has gone."""
+    """Redirect buffered output: its reader has gone."""
     with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 def typed_options(context: typer.Context, names: Collection[str]) -> list[str]:
-    """Return those of a command's options that were typed, as ``--effort-limit``, in alphabetical order.
-
-    Args:
-        context: Of the command.
-        names: Names of the options' variables, such as ``effort_limit``.
-    """
+    """Return the options of these variables that were typed, as ``--effort-limit``, in alphabetical order."""
     typed = {name for name in names if str(context.get_parameter_source(name)).endswith("COMMANDLINE")}
     return sorted(
         max(option.secondary_opts if context.params[option.name] is False else option.opts, key=len)
@@ -301,14 +275,14 @@ def report_error(error: BaseException) -> int:
 
 
 def is_exhaustion(error: BaseException) -> bool:
-    """Return whether an error of any library means that memory is exhausted."""
+    """Return whether an error, of any library, means that memory is exhausted."""
     return isinstance(error, MemoryError) or any(sign in str(error) for sign in _SIGNS_OF_EXHAUSTION)
 
 
 def report_exhaustion(error: BaseException) -> int:
-    """Print that a limit of the process's memory was met, and return exit code 1; 0 for other errors.
+    """Print that memory is exhausted and return exit code 1; 0 for other errors.
 
-    Under a limit the error comes from Python, the loader of a library, or a library that starts a thread.
+    Python, the loader of a library, or a library that starts a thread may raise it.
     """
     if not is_exhaustion(error):
         return 0
@@ -324,22 +298,8 @@ def report_missing(error: BaseException) -> int:
     return report_error(ParameterError(text)) if text else 0
 
 
-_OF_A_PATH = frozenset(
-    {
-        errno.ENOENT,
-        errno.EEXIST,
-        errno.ENOTDIR,
-        errno.EISDIR,
-        errno.EACCES,
-        errno.EPERM,
-        errno.EROFS,
-        errno.ENOSPC,
-        errno.EDQUOT,
-        errno.ENAMETOOLONG,
-        errno.ELOOP,
-    }
-)
-"""Error numbers of the file system for a path that it cannot serve."""
+_OF_A_PATH = (errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS,
+              errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG, errno.ELOOP)  # fmt: skip
 _SIGNS_OF_EXHAUSTION = (
     "failed to map segment",
     "annot allocate memory",
@@ -357,12 +317,10 @@ _DOCSTRING = re.compile(r'(?:\s*#.*\n)*\s*"""(.*?)(?:"""|\n)')
 def summary(name: str, target: str) -> str:
     """Return a program's summary: the first line of its module's docstring, read without importing the module.
 
-    Args:
-        name: The program; where the line covers several (```one``: this; ``other``: that``), its part is returned.
-        target: Its entry point, ``module:function``.
+    Of a line that covers several programs (```one``: this; ``other``: that``), its part is returned.
     """
     top, *rest = target.partition(":")[0].split(".")
-    # By its file: finding the module would import its packages.
+    # By file: finding the module would import its packages.
     spec = importlib.util.find_spec(top)
     folders = [] if spec is None else list(spec.submodule_search_locations or [])
     files = [path for folder in folders if (path := Path(folder, *rest).with_suffix(".py")).is_file()]

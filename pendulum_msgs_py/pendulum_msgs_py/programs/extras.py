@@ -1,4 +1,4 @@
-"""What to install where a library is missing: the extra of a package that installs it, in a sentence."""
+"""Which extra of a package installs a missing library."""
 
 from __future__ import annotations
 
@@ -16,20 +16,13 @@ _PACKAGES = (
     "pendulum_bags",
 )
 _DISTRIBUTIONS = {"foxglove": "foxglove-sdk", "hebi": "hebi-py", "PIL": "pillow", "dask": "distributed"}
-"""Module -> what pip calls it, where the names differ."""
+"""Distributions whose name differs from the module's."""
 _REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)[^;]*(?:;.*extra\s*==\s*[\"']([\w-]+)[\"'])?")
 
 
 def extra_of(module: str) -> str:
-    """Return the extra that brings a module, as ``pendulum_bags[console]``; the package alone where it always does.
-
-    Args:
-        module: What is imported; of ``a.b`` only ``a`` counts.
-
-    Returns:
-        Empty where no installed package of this project needs it.
-    """
-    # Each program's start would pay for it, and few lack a library.
+    """Return the extra that installs a module, as ``pendulum_bags[console]``, its package, or an empty string."""
+    # Imported late: few programs lack a library.
     from importlib.metadata import PackageNotFoundError, requires
 
     top = module.partition(".")[0]
@@ -47,17 +40,10 @@ def extra_of(module: str) -> str:
 
 
 def how_to_install(error: ImportError) -> str:
-    """Return a sentence with the missing library and how to install it, or the new place of an own module.
-
-    Args:
-        error: What an import of it raised.
-
-    Returns:
-        Empty where no package of this project names the library.
-    """
+    """Return a sentence on how to install the missing library, or where an own module moved to; empty for others."""
     module = error.name if isinstance(error, ModuleNotFoundError) else None
     if module and (package := module.partition(".")[0]) in _PACKAGES and (place := _place_of(package)) is not None:
-        # The package is installed; the import uses a module's name of an earlier version.
+        # The import uses a module's name of an earlier version.
         now = sorted(
             f"{package}.{path.parent.name}.{path.stem}" for path in place.glob(f"*/{module.split('.')[-1]}.py")
         )

@@ -1,4 +1,4 @@
-"""The graph of a run: which programs, under which names and parameters. Experiments and launch files read it."""
+"""The graph of a run: programs with names and parameters, for experiments and launch files."""
 
 from __future__ import annotations
 
@@ -16,16 +16,7 @@ ParameterArgument: TypeAlias = bool | int | float | str | list[str] | list[float
 
 @dataclass(frozen=True)
 class NodeProgram:
-    """One node as a program.
-
-    Attributes:
-        package: ROS package.
-        executable: Its executable.
-        namespace: Namespace that makes a plant's relative names unique, such as ``/sim``.
-        name: Node name.
-        parameters: ROS parameters.
-        remappings: Names to remap.
-    """
+    """One node as a program; ``namespace`` makes a plant's relative names unique, such as ``/sim``."""
 
     package: str
     executable: str
@@ -36,7 +27,7 @@ class NodeProgram:
 
     @property
     def node_name(self) -> str:
-        """Name of the node; that of the executable unless given."""
+        """Name of the node, by default the executable's."""
         return self.name or self.executable
 
     @property
@@ -45,7 +36,7 @@ class NodeProgram:
         return full_name(self.namespace, self.node_name)
 
     def ros_arguments(self) -> list[str]:
-        """Return what follows the executable on a command line."""
+        """Return the arguments behind the executable."""
         arguments = ["--ros-args", "-r", f"__ns:={self.namespace}", "-r", f"__node:={self.node_name}"]
         for source, target in self.remappings.items():
             arguments += ["-r", f"{source}:={target}"]
@@ -54,7 +45,7 @@ class NodeProgram:
         return arguments
 
     def command(self) -> list[str]:
-        """Return the command that starts it with this interpreter."""
+        """Return the command line with this interpreter."""
         return [sys.executable, "-m", self.package, self.executable, *self.ros_arguments()]
 
 
@@ -79,12 +70,12 @@ def disturbance(namespace: str, **parameters: ParameterArgument) -> NodeProgram:
 
 
 def parameter_text(value: ParameterArgument) -> str:
-    """Write a value so that ROS reads back the same type: text quoted, floats with a point."""
+    """Return a value as text of the same type in ROS: text quoted, floats with a point."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
         text = repr(value)
-        # YAML 1.1 takes 1e-05 for text.
+        # YAML 1.1 reads 1e-05 as text.
         return text if "." in text or "e" not in text else text.replace("e", ".0e")
     if isinstance(value, list):
         return "[" + ", ".join(parameter_text(element) for element in value) + "]"

@@ -1,4 +1,4 @@
-"""Ends a process whose libraries hang for good: a watchdog that needs neither the interpreter nor its lock."""
+"""A watchdog that ends a process whose libraries hang, without the interpreter or its lock."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from functools import cache
 __all__ = ["guard_exit", "hang_guard"]
 
 _LONGEST = 15.0
-"""Time that what is guarded may take, also on a busy computer [s]."""
+"""Timeout, also on a busy computer [s]."""
 _STANDARD_ERROR = 2
-"""Its descriptor: what stands for it in Python may have none, as in a notebook."""
+"""Its descriptor: ``sys.stderr`` may have none, as in a notebook."""
 _lock = threading.Lock()
 _under_way = 0
 
 
 @contextmanager
 def hang_guard() -> Iterator[None]:
-    """End the process with exit code 1 and print its stacks if this context is not left within 15 s.
+    """End the process with exit code 1 and print its stacks if this context takes more than 15 s.
 
-    No signal does that while a library holds the GIL. Make the plant safe and write files before.
+    No signal does that while a library holds the GIL. Make the plant safe and write files first.
     """
     global _under_way  # noqa: PLW0603  # the watchdog is one for the process
     _watch()
@@ -38,8 +38,8 @@ def hang_guard() -> Iterator[None]:
 
 @cache
 def guard_exit() -> None:
-    """Let what was imported until now, and hangs while the interpreter ends, not keep the process."""
-    # What is registered last is called first.
+    """Guard the interpreter's exit against the libraries imported so far."""
+    # Registered last, called first.
     atexit.register(_watch)
 
 

@@ -1,4 +1,4 @@
-"""Every request to end a program interrupts it as Ctrl-C does, and none is lost."""
+"""Every request to end a program raises KeyboardInterrupt, and none is lost."""
 
 from __future__ import annotations
 
@@ -16,17 +16,15 @@ from pendulum_msgs_py.programs.starter import end_with_starter, stops
 __all__ = ["defer_interrupts", "keep_interrupts"]
 
 _MOMENT = 0.01
-"""Time after which it is raised again [s]: by then the destructor has most probably returned; if not, once more."""
+"""Delay after which it is raised again, probably outside the destructor [s]; if not, once more."""
 
 
 def keep_interrupts() -> None:
     """Raise KeyboardInterrupt on SIGINT, SIGTERM, SIGHUP and the end of the starter, again where Python drops it.
 
-    A program that dies of a closed terminal leaves plants armed and bags open; one that ``nohup`` started ignores it.
-
-    Without job control, as in a script, a shell starts what it puts into the background with SIGINT ignored. Python
-    leaves that as it is, and passes it on to its children. An experiment would then run on, plants armed, whatever
-    requests its end, and so would a child that is interrupted before it has a handler of its own.
+    A closed terminal must not leave plants armed and bags open; ``nohup`` still protects a program from it. Without job
+    control a shell starts background programs with SIGINT ignored, which Python keeps and its children inherit: their
+    experiment could not be stopped.
     """
     in_main = threading.current_thread() is threading.main_thread()
     if in_main:
@@ -45,7 +43,7 @@ def keep_interrupts() -> None:
         if not issubclass(unraisable.exc_type, KeyboardInterrupt):
             before(unraisable)
             return
-        # Raised here it would be dropped, too: this runs within what drops it.
+        # Raised here it would be dropped too.
         again = threading.Timer(_MOMENT, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
         again.daemon = True
         again.start()
@@ -56,9 +54,9 @@ def keep_interrupts() -> None:
 
 @contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Handle requests to end after the block: what it starts is on record before anything is raised.
+    """Handle requests to end after the block, so that what it starts is on record first.
 
-    Masks of signals do not do this, since another thread takes the signal then.
+    Signal masks do not do this: another thread would take the signal.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -78,7 +76,7 @@ def defer_interrupts() -> Iterator[None]:
 
 
 _interrupted: set[int] = set()
-"""This process; a forked worker, which is another one, dies of these signals as usual."""
+"""This process; a forked worker dies of these signals as usual."""
 
 
 def _interrupt(number: int, _frame: FrameType | None) -> None:

@@ -1,8 +1,8 @@
-"""A cache on disk of what numba compiles, so that a restarted program need not compile for seconds.
+"""A disk cache of numba kernels, so that a restarted program need not compile for seconds.
 
-Numba's own ``cache=True`` identifies a function by its file alone. Kernels here are made of functions from several
-files, for a method or a mechanism: their key is that choice, the modules of all functions that they reach, and the
-values that those functions find in their globals and closures.
+Numba's own ``cache=True`` identifies a function by its file alone. These kernels combine functions of several files for
+one method or mechanism: their key is that choice, the modules of all functions that they reach, and the values of those
+functions' globals and closures.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pendulum_msgs_py.whole_file import write_whole
 __all__ = ["KernelStore", "drop_stale_code", "keep_kernel", "name_symbols_apart"]
 
 _COUNTED = re.compile(rb"B\dv\d{1,8}B")
-"""Part of a symbol that bears a number of numba's own count."""
+"""Part of a symbol with a number of numba's own count."""
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 _COMPILERS = ("pendulum_msgs_py.loops.trees", __name__)
 """Modules that decide how kernels are compiled."""
@@ -34,42 +34,29 @@ _COMPILERS = ("pendulum_msgs_py.loops.trees", __name__)
 def name_symbols_apart() -> None:
     """Number what numba compiles at random from here on.
 
-    Numba numbers functions of one name from 1 in each process: those made again for each method or mechanism. Two
-    processes may cache different functions under one symbol; a process that loads both is linked to the first for all,
-    and gets wrong numbers or invalid writes (numba, issue 10486). A child by ``fork`` would continue its parent's
-    numbers.
+    Numba numbers functions of one name from 1 in each process. Two processes may cache different functions under one
+    symbol; a process that loads both is linked to the first for all, with wrong numbers or invalid writes (numba, issue
+    10486). A forked child would continue its parent's numbers.
     """
     identity = sys.modules["numba.core.bytecode"].FunctionIdentity
     identity._unique_ids = iter(partial(secrets.randbits, 64), None)
 
 
 def keep_kernel(dispatcher: Any, name: str, *choice: object) -> Any:
-    """Return a compiled function that loads its machine code from disk, or stores it there.
+    """Return a function compiled by ``numba.njit`` that loads its machine code from disk, or stores it there.
 
-    Args:
-        dispatcher: What ``numba.njit`` returned.
-        name: The kernel's name, unique in its package.
-        choice: All that the function was made for: functions that it calls, by their code, the rest by ``repr``.
+    ``name`` is unique in the package; ``choice`` is all that it was made for: functions by their code, the rest by
+    ``repr``.
     """
-    with contextlib.suppress(RuntimeError):  # there is no folder to write to: it compiles each time
+    with contextlib.suppress(RuntimeError):  # no writable folder: it compiles each time
         dispatcher._cache = KernelStore(dispatcher.py_func, name, choice)
     return dispatcher
 
 
 class KernelStore:
-    """The machine code of one kernel on disk, a file for each type of arguments and kind of processor.
-
-    Args:
-        function: The kernel in Python.
-        name: What it is called.
-        choice: What it was made for.
-
-    Raises:
-        RuntimeError: No folder can be written.
-    """
+    """The cache of one kernel: a file per argument types and processor; a RuntimeError if no folder is writable."""
 
     def __init__(self, function: Any, name: str, choice: tuple[object, ...]) -> None:
-        # A program that compiles has numba installed; this package needs none otherwise.
         self._numba = sys.modules["numba.core"]
         name_symbols_apart()
         self._folder = Path(self._numba.caching.CompileResultCacheImpl(function).locator.get_cache_path())
@@ -84,25 +71,23 @@ class KernelStore:
         return str(self._folder)
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """Return the kernel for these types of arguments; None where none is cached, or it is damaged."""
+        """Return the kernel for these types of arguments; None if missing or damaged."""
         target.refresh()
-        # A damaged file is replaced by compiling again.
         with contextlib.suppress(OSError, ValueError, EOFError, pickle.UnpicklingError):
             head, _, content = self._path(signature, target.codegen()).read_bytes().partition(b"\n")
-            # Of other source it is not even read: what it names may be gone.
+            # Code of other source is not unpickled: its names may be gone.
             if head == self._head(content):
                 payload = pickle.loads(content)  # noqa: S301  (our own, as the compiled modules next to it)
                 return self._numba.compiler.CompileResult._rebuild(target, *payload)
         return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Keep a kernel, unless its code has addresses of this process, or symbols that another may have as well."""
+        """Store a kernel, unless its code has addresses of this process or ambiguous symbols."""
         if compiled.library.has_dynamic_globals or compiled.lifted:
             return
         content = self._numba.serialize.dumps(compiled._reduce())
         if _COUNTED.search(content):
             return
-        # Whole or not at all: others may compile the same at this moment.
         with contextlib.suppress(OSError):
             write_whole(self._path(signature, compiled.library.codegen), self._head(content) + b"\n" + content)
 
@@ -113,7 +98,7 @@ class KernelStore:
         """Do nothing: a store is always on."""
 
     def flush(self) -> None:
-        """Do nothing: what is old is not taken, and written over."""
+        """Do nothing: stale entries are overwritten."""
 
     def _head(self, content: bytes) -> bytes:
         return self._source + b" " + _digest(content)
@@ -137,7 +122,7 @@ def _digest(content: bytes) -> bytes:
 
 
 def _made_of(values: Iterable[Any]) -> set[str]:
-    """Return the source of all modules that functions reach by name, and what else they find there."""
+    """Return the source of all modules that functions reach by name, and the values they use."""
     found, waiting, seen = set[str](), [*values, *map(sys.modules.get, _COMPILERS)], dict[int, Any]()
     while waiting:
         value = waiting.pop()
@@ -165,7 +150,7 @@ def _made_of(values: Iterable[Any]) -> set[str]:
 
 
 def _reached(function: FunctionType) -> list[Any]:
-    """Return what the code of a function, and of those inside it, may find by the names in it."""
+    """Return what the code of a function and its inner functions may find by name."""
     codes, names = [function.__code__], set[str]()
     for code in codes:
         names |= set(code.co_names)
@@ -180,32 +165,27 @@ def _reached(function: FunctionType) -> list[Any]:
 
 
 def _ours(module: str) -> bool:
-    """Return whether a module's source counts: not that of Python and of what has its version in the key."""
+    """Return whether a module's source counts: Python's and that of versions in the key do not."""
     return module.partition(".")[0] not in {*sys.stdlib_module_names, "numba", "numpy", "llvmlite"}
 
 
 @cache
 def _source_of(name: str) -> str:
-    """Return what identifies the source of a module."""
     file = getattr(sys.modules.get(name), "__file__", None)
     return f"{name} {_digest(Path(file).read_bytes()).decode() if file else ''}"
 
 
 def drop_stale_code(kernel: Any, modules: Iterable[ModuleType]) -> None:
-    """Delete numba's own cache of a kernel where it is older than what the kernel calls.
+    """Delete numba's own cache of a kernel if older than the modules that it was compiled from.
 
     Numba checks the kernel's own file only; an edited equation would be ignored silently.
-
-    Args:
-        kernel: The compiled function.
-        modules: Those whose functions and tables it was compiled from, besides its own.
     """
     folder = getattr(getattr(kernel, "_cache", None), "cache_path", None)
     if folder is None or not Path(folder).is_dir():
         return
     newest = max(Path(str(module.__file__)).stat().st_mtime for module in modules)
     for file in Path(folder).glob(f"{Path(kernel.py_func.__code__.co_filename).stem}.*.nb[ic]"):
-        # Another process was faster, or the folder is read-only: numba copes with both.
+        # Another process was faster, or the folder is read-only; numba handles both.
         with contextlib.suppress(OSError):
             if file.stat().st_mtime < newest:
                 file.unlink()

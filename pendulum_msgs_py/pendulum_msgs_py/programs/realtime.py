@@ -1,4 +1,4 @@
-"""Real-time priority, for programs that keep a plant's time on a computer that has other work too.
+"""Real-time priority, for programs that run at a plant's rate on a computer with other work.
 
 Memory is not locked: Python with its libraries maps 290 MB and uses 78.
 """
@@ -26,25 +26,23 @@ __all__ = [
 
 _TASKS = Path("/proc/self/task")
 _AHEAD = 50
-"""Real-time priority that is taken without being given: that of a plant in an experiment."""
+"""Default real-time priority: that of a plant in an experiment."""
 NO_REALTIME = "PENDULUM_NO_REALTIME"
-"""Variable of the environment with which no real-time priority is taken that is not given."""
+"""Environment variable that forbids a default real-time priority."""
 
 
 def run_in_real_time(priority: int) -> None:
-    """Give all threads of this process, and those that they will start, real-time priority (``SCHED_FIFO``).
+    """Give all threads of this process, present and future, real-time priority (``SCHED_FIFO``).
 
-    The calling thread gets one less than the others: equals do not preempt each other, and on a single core an e-stop's
-    thread would wait for a busy loop to end.
-
-    The middleware's threads too, since a torque that waits for them is late too. Start child
-    processes :func:`as_ordinary`, else they inherit it. (``SCHED_RESET_ON_FORK`` would take it from new threads too.)
+    The middleware's threads too, since a torque waits for them. The calling thread gets one less: equals do not preempt
+    each other, and on a single core an e-stop's thread would wait for a busy loop. Start children :func:`as_ordinary`,
+    else they inherit it (``SCHED_RESET_ON_FORK`` would take it from new threads too).
 
     Args:
-        priority: 1 to 99, a higher one goes first; 0 changes nothing; -1 is 50 where this user may have it.
+        priority: 1 to 99, higher first; 0 changes nothing; -1 is 50 if this user may have it.
 
     Raises:
-        ParameterError: This user may not have it, or this system has no such priority.
+        ParameterError: The user or the system may not have it.
     """
     if priority < 0:
         priority = 0 if os.environ.get(NO_REALTIME) or not may_run_in_real_time(_AHEAD) else _AHEAD
@@ -62,16 +60,12 @@ def run_in_real_time(priority: int) -> None:
 
 
 def thread_numbers() -> set[int]:
-    """Return the kernel's numbers of this process's threads; empty where it has no list of them."""
+    """Return the kernel's numbers of this process's threads, empty if unknown."""
     return {int(task.name) for task in _TASKS.iterdir()} if _is_known() else set()
 
 
 def run_ahead(threads: Iterable[int]) -> None:
-    """Run threads that hardly compute before every ordinary one, where this user may; else they stay as they are.
-
-    Args:
-        threads: The kernel's numbers of threads of this process.
-    """
+    """Run threads (kernel numbers) that hardly compute before all ordinary ones, if this user may."""
     for thread in () if os.environ.get(NO_REALTIME) or not _is_known() else threads:
         with contextlib.suppress(ParameterError):
             _promote(thread, _AHEAD)
@@ -82,13 +76,12 @@ def may_run_in_real_time(priority: int) -> bool:
     allowed: list[bool] = []
 
     def try_it() -> None:
-        # No right, a C library or a kernel without it (musl: ENOSYS), a group of processes that gets no time for it.
+        # No permission, no support (musl: ENOSYS), or a cgroup without real-time budget.
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
             allowed.append(True)
 
     if _is_known():
-        # By a thread that ends with it.
         trial = threading.Thread(target=try_it)
         trial.start()
         trial.join()
@@ -97,10 +90,10 @@ def may_run_in_real_time(priority: int) -> bool:
 
 @contextlib.contextmanager
 def as_ordinary() -> Iterator[None]:
-    """Run this thread, and the processes that it starts, at normal priority meanwhile: for lengthy work.
+    """Run this thread and processes started by it at normal priority meanwhile, for lengthy work.
 
-    A thread that computes in real time for a second blocks all normal programs of its core until the kernel gives them
-    50 ms, which a plant on that core then misses.
+    A thread that computes in real time for a second blocks its core, and the kernel's 50 ms break then delays a plant
+    there.
     """
     with priority_kept():
         if _is_known() and os.sched_getparam(0).sched_priority:
@@ -110,7 +103,7 @@ def as_ordinary() -> Iterator[None]:
 
 @contextlib.contextmanager
 def priority_kept() -> Iterator[None]:
-    """Restore this thread's scheduling on exit: the code that follows has not requested real time."""
+    """Restore this thread's scheduling on exit."""
     if not _is_known():
         yield
         return
@@ -119,13 +112,13 @@ def priority_kept() -> Iterator[None]:
         yield
     finally:
         if (os.sched_getscheduler(0), os.sched_getparam(0)) != before:
-            # A process that has lost the right meanwhile continues without.
+            # The permission may have been lost meanwhile.
             with contextlib.suppress(OSError):
                 os.sched_setscheduler(0, *before)
 
 
 def _is_known() -> bool:
-    """Return whether this system has such priorities, and lists a process's threads."""
+    """Return whether this system has real-time priorities and lists threads."""
     return hasattr(os, "sched_setscheduler") and _TASKS.is_dir()
 
 

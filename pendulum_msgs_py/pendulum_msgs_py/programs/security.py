@@ -1,10 +1,8 @@
-"""Who may say and hear what: least permissions of each node, and the SROS 2 policy that grants them.
+"""Least permissions of each node, and the SROS 2 policy that grants them.
 
 ``python -m pendulum_msgs_py.programs.security > policy.xml`` writes the policy of both plants for ``ros2 security``
-(https://design.ros2.org/articles/ros2_access_control_policies.html). What a node needs is stated here once, from the
-names that the nodes themselves use; a test compares it with what the nodes do on a running graph.
-
-The player of recordings has no permissions: it republishes all of a bag, and belongs on a domain without plants.
+(https://design.ros2.org/articles/ros2_access_control_policies.html). A test compares it with a running graph. The
+player has no permissions: it republishes all of a bag, and belongs on a domain without plants.
 """
 
 from __future__ import annotations
@@ -46,31 +44,25 @@ _PLANT_SERVICES = (names.ARM, names.E_STOP_RESET)
 
 
 _PLANT = "{plant}/"
-"""Before the name of a service: that of the plant on each side."""
+"""Prefix of a service of the plant on each side."""
 _SIDE = "{side}/"
-"""Before a name: on each side."""
+"""Prefix of a name on each side."""
 _PROCEDURE = "{procedure}/"
-"""Before the name of a service: that of the procedure, on each side that has one."""
+"""Prefix of a service of the procedure on each side that has one."""
 _ANY = "{any}/"
-"""Before the name of a service: that of every node that has parameters."""
+"""Prefix of a service of every node with parameters."""
 _RECORDED = "{recorded}"
-"""Every topic that nodes of a side publish there."""
+"""All topics that a side's nodes publish there."""
 _READ_PARAMETERS = (_ANY + "list_parameters", _ANY + "get_parameters")
 _WATCHED = (names.APPLIED_EFFORT, names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH)
 
 
 @dataclass(frozen=True)
 class Permissions:
-    """The topics and services that one node may use.
+    """Topics that a node may publish and subscribe to, services that it may offer (``reply``) and call (``request``).
 
-    In :data:`NODES` names are as the node writes them: relative, private (``~/``) or absolute, and with placeholders
-    where a node connects to several others; :func:`granted` writes them out.
-
-    Attributes:
-        publish: Topics that it may publish.
-        subscribe: Topics that it may subscribe to.
-        reply: Services that it may offer.
-        request: Services that it may call.
+    In :data:`NODES` names are relative, private (``~/``) or absolute, with placeholders for other nodes;
+    :func:`granted` resolves them.
     """
 
     publish: tuple[str, ...] = ()
@@ -169,23 +161,23 @@ NODES: dict[str, Permissions] = {
         ),
     ),
 }
-"""Permissions of the nodes, beyond those of every node (parameters, log, clock)."""
+"""Permissions beyond those of every node (parameters, log, clock)."""
 
 PLANTS = {"/sim": "simulator", "/hw": "bridge"}
 """Namespace of each side, and its plant."""
 
 BESIDE_PLANTS = {"conductor": "/conductor", "console": "/console", "recorder": "/recorder"}
-"""Nodes that have to do with all sides, in the root namespace, and the enclave of each: that of its process."""
+"""Nodes for all sides, in the root namespace, and the enclaves of their processes."""
 
 _SIDE_NODES = ("controller", "effort_controller", "disturbance", "recorder", "viewer", "markers")
 _IN_PROCESS = {"simulator_e_stop": "simulator", "bridge_e_stop": "bridge", "bridge_e_stop_input": "bridge"}
-"""Nodes that run in the process of another, and share its enclave; they have no log of their own."""
+"""Nodes in the process and enclave of another; they have no log."""
 _WITH_PLANT = {"simulator": ("simulator_e_stop",), "bridge": ("procedure", "bridge_e_stop", "bridge_e_stop_input")}
 _WITHOUT_PARAMETERS = {"conductor", *_IN_PROCESS}
 
 
 def _resolve(name: str, node: str, namespace: str) -> str:
-    """Return a name in full: ``~/arm`` of ``simulator`` in ``/sim`` is ``/sim/simulator/arm``."""
+    """Return a full name: ``~/arm`` of ``simulator`` in ``/sim`` is ``/sim/simulator/arm``."""
     if name.startswith("/"):
         return name
     base = namespace.rstrip("/")
@@ -193,10 +185,7 @@ def _resolve(name: str, node: str, namespace: str) -> str:
 
 
 def granted(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[str, Permissions]:
-    """Return what each node may do, in full names: full name of the node -> permissions.
-
-    Args:
-        plants: Namespace and node of each plant.
+    """Return the permissions of each node, in full names, for plants given by namespace and node.
 
     Raises:
         ParameterError: A node is no plant.
@@ -210,7 +199,7 @@ def granted(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[s
     with_parameters = [_resolve(node, "", side) for side, node in nodes if node not in _WITHOUT_PARAMETERS]
     with_parameters += [f"/{node}" for node in BESIDE_PLANTS if node not in _WITHOUT_PARAMETERS]
 
-    spoken: set[str] = set()  # filled with what the nodes publish, before anybody may record it
+    spoken: set[str] = set()  # the recordable topics, filled below
 
     def written_out(name: str, node: str, here: str) -> set[str]:
         around = [here] if here != "/" else list(sides)
@@ -252,7 +241,7 @@ def granted(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[s
 
 
 def enclaves(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[str, dict[str, Permissions]]:
-    """Return the enclaves of all nodes, one for each process: path -> full name of the node -> permissions."""
+    """Return the enclaves, one for each process: path -> full name of the node -> permissions."""
     answer: dict[str, dict[str, Permissions]] = {}
     for full, allowed in granted(plants).items():
         space, _, node = full.rpartition("/")
@@ -262,11 +251,7 @@ def enclaves(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[
 
 
 def policy(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> str:
-    """Return the SROS 2 policy of plants and of all that has to do with them.
-
-    Args:
-        plants: Namespace and node of each plant.
-    """
+    """Return the SROS 2 policy for plants given by namespace and node."""
     root = ElementTree.Element("policy", version="0.2.0")
     listed = ElementTree.SubElement(root, "enclaves")
     for path, nodes in enclaves(plants).items():

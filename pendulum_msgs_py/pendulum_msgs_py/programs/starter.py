@@ -1,4 +1,4 @@
-"""A program ends with the process that started it, whatever ends that one."""
+"""A program ends with the process that started it, even if that is killed."""
 
 from __future__ import annotations
 
@@ -11,29 +11,26 @@ from collections.abc import Mapping
 __all__ = ["bound_environment", "end_with_starter", "stops"]
 
 stops: list[int] = []
-"""Signals by which this process was asked to end; the end of its starter asks nothing more of one that ends already."""
+"""Signals that asked this process to end; the end of its starter then adds none."""
 
 _STARTER = "PENDULUM_STARTER"
-"""Environment variable with the process id of the starter."""
+"""Environment variable with the starter's process id."""
 _PATIENCE = 30.0
-"""Time from the end of the starter until a program that still runs is killed [s].
-
-Longer than an experiment takes to end its own programs, in two waves.
-"""
+"""Time from the starter's end until this program is killed [s]; an experiment ends its programs in two waves."""
 
 
 def bound_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return an environment in which a program of ours ends when this process does."""
+    """Return an environment for programs that end with this process."""
     return {**environment, _STARTER: str(os.getpid())}
 
 
 def end_with_starter() -> None:
-    """Interrupt this process, as Ctrl-C does, once the process that started it has ended; kill it if that is no use.
+    """Interrupt this process once its starter has ended; kill it if it continues.
 
-    A descriptor of the starter is watched, not a pipe, which forked workers would keep open, nor the kernel's signal to
-    children, which comes at the end of the starting thread and is lost before there is a handler.
+    A descriptor of the starter is watched: a pipe would be kept open by forked workers, and the kernel's signal to
+    children comes at the end of the starting thread and may precede the handler.
     """
-    # Removed, so that what this process starts in turn is bound to this process alone.
+    # Removed, so that children are bound to this process alone.
     if starter := os.environ.pop(_STARTER, ""):
         threading.Thread(target=_watch, args=(int(starter),), daemon=True).start()
 
@@ -45,9 +42,8 @@ def _watch(starter: int) -> None:
         pass  # ended while this program was loading
     else:
         select.select([descriptor], [], [])
-    # A second one would be a wish to leave at once, a recorder's last messages or an experiment's plants left behind.
+    # A second signal would end the process at once, with a recorder's last messages or armed plants left behind.
     if not stops:
         os.kill(os.getpid(), signal.SIGINT)
-    # Nothing arrives here: a pause that needs no clock.
     threading.Event().wait(_PATIENCE)
     os.kill(os.getpid(), signal.SIGKILL)

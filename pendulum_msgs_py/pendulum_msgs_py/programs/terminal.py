@@ -1,7 +1,7 @@
 """Tables whose figures are never cut, on a terminal of any width and in a file.
 
-Rich shortens a cell that does not fit to an ellipsis, and takes a pipe for a terminal of 80 columns. ``11.7…`` is no
-figure, so every program prints through :func:`make_console` and :class:`WholeTable`.
+Rich shortens cells to an ellipsis (``11.7…``) and treats a pipe as a terminal of 80 columns, so every program prints
+through :func:`make_console` and :class:`WholeTable`.
 """
 
 from __future__ import annotations
@@ -16,18 +16,11 @@ from rich.table import Column, Table
 __all__ = ["WholeTable", "make_console"]
 
 _NO_BOUND = 10_000
-"""Width of what is no terminal [columns]: a file takes lines as long as they are."""
+"""Width of a file or pipe [columns]."""
 
 
 def make_console(*, stderr: bool = False, highlight: bool = True) -> Console:
-    """Return a console with the terminal's width, or without bound where the output is no terminal.
-
-    The variable ``COLUMNS`` chooses the width in either case.
-
-    Args:
-        stderr: Write to standard error, where standard output is JSON.
-        highlight: Colour numbers and paths in plain text.
-    """
+    """Return a console of the terminal's width, or unbounded if the output is no terminal; ``COLUMNS`` overrides it."""
     console = Console(stderr=stderr, highlight=highlight)
     if not console.is_terminal and not os.environ.get("COLUMNS", "").isdigit():
         console.width = _NO_BOUND
@@ -35,24 +28,23 @@ def make_console(*, stderr: bool = False, highlight: bool = True) -> Console:
 
 
 class WholeTable(Table):
-    """A table that breaks its cells at spaces only, and continues below with its first column if it is too wide.
+    """A table that breaks cells at spaces only, and continues below with its first column if it is too wide.
 
-    A single word that is wider than the console is folded; nothing is ever left out.
+    A single word that is wider than the console is folded.
     """
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield one table that fits, or several, one below the other."""
         if not self.columns:
             return
         sizes = [_measure(column, console, options) for column in self.columns]
-        # A column costs its padding of one on each side and a border; the table one border more.
+        # A column needs padding of one on each side and a border; the table one more border.
         room = options.max_width - 1
         for number, block in enumerate(_blocks([size.minimum + 3 for size in sizes], room)):
             widths = _widths([sizes[index] for index in block], room - 3 * len(block))
             yield self._part(block, widths, with_title=number == 0)
 
     def _part(self, block: Sequence[int], widths: Sequence[int], *, with_title: bool) -> Table:
-        """Return a table of some of the columns, with these widths of their content."""
+        """Return a table of some columns with these widths."""
         part = Table(
             title=self.title if with_title else None,
             box=self.box,
@@ -71,7 +63,7 @@ class WholeTable(Table):
 
 
 def _measure(column: Column, console: Console, options: ConsoleOptions) -> Measurement:
-    """Return the longest word and the longest line of a column [columns]."""
+    """Return the longest word and line of a column [columns]."""
     free = options.update(max_width=_NO_BOUND)
     found = [Measurement.get(console, free, cell) for cell in (column.header, *column.cells)]
     longest = max(size.maximum for size in found)
@@ -79,7 +71,7 @@ def _measure(column: Column, console: Console, options: ConsoleOptions) -> Measu
 
 
 def _blocks(least: Sequence[int], room: int) -> list[list[int]]:
-    """Return which columns stand side by side: the first with as many of the others as fit."""
+    """Return which columns stand side by side: the first, and as many others as fit."""
     blocks = [[0]]
     for index in range(1, len(least)):
         if len(blocks[-1]) > 1 and sum(least[other] for other in blocks[-1]) + least[index] > room:
@@ -89,9 +81,9 @@ def _blocks(least: Sequence[int], room: int) -> list[list[int]]:
 
 
 def _widths(sizes: Sequence[Measurement], room: int) -> list[int]:
-    """Return widths between longest word and longest line; what is to spare goes to the narrowest first.
+    """Return widths between longest word and longest line, the narrowest growing first.
 
-    Only where not even the longest words fit, the widest columns get less, and their words are folded.
+    If not even the longest words fit, the widest columns shrink.
     """
     widths = [size.minimum for size in sizes]
     while sum(widths) > room and max(widths) > 1:

@@ -1,4 +1,4 @@
-"""Commands in printed texts as the user's shell finds them."""
+"""Printed commands as the user's shell finds them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _COMMAND = re.compile(r"(?<![\w/.-])python(?= -m pendulum_)")
 
 
 def as_typed(text: str) -> str:
-    """Return a text in which ``python -m pendulum_...`` starts with the interpreter that runs this process.
+    """Return a text whose ``python -m pendulum_...`` start with a path of this interpreter.
 
-    ``python`` stays where the shell's ``python`` is this interpreter, as in an activated virtual environment. Elsewhere
-    its path is printed, relative to the working folder if it lies below it, so that a copied command runs.
+    ``python`` stays if the shell finds this interpreter by it, as in an activated virtual environment; the path is
+    relative if it lies below the working folder.
     """
     return _COMMAND.sub(lambda _: _interpreter(os.environ.get("PATH", ""), Path.cwd()), text)
 

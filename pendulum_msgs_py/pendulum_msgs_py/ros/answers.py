@@ -1,9 +1,8 @@
-"""Answers of services that neither wait for a client that has gone nor end the process that serves it.
+"""Service responses that neither wait for an absent client nor end the process.
 
-Where the client's half of a service is not there, rmw_fastrtps waits 100 ms for it before each answer, and rclpy holds
-Python's lock all the while: no thread of the process runs, neither an actuator's nor an e-stop's. A client that ended
-with a thousand requests unread stopped a plant for 100 s. What rclpy's own services do not understand, such as a
-parameter of no known type, leaves their callbacks as an exception, and would end the node of a plant with its e-stop.
+If the client's half of a service is missing, rmw_fastrtps waits 100 ms before each response while rclpy holds the GIL:
+no thread runs, neither an actuator's nor an e-stop's. A client that ended with a thousand unread requests stopped a
+plant for 100 s. Exceptions of rclpy's own services, as for a parameter of unknown type, would end the node.
 """
 
 from __future__ import annotations
@@ -25,22 +24,22 @@ from pendulum_msgs_py.ros.requests import send_response
 __all__ = ["answer_who_listens"]
 
 _PATIENCE = 1.0
-"""Time for which an answer is kept for a client that discovery has not told of yet [s]."""
+"""Time for which a response waits for a client that discovery has not reported yet [s]."""
 _LOOK_AGAIN = 0.005
-"""Time between two looks for such clients [s]."""
+"""Poll period for such clients [s]."""
 _MOST_KEPT = 100
-"""Answers kept for clients at once, for each service."""
+"""Most waiting responses of a service."""
 _WAITED = 0.09
-"""Time from which on the middleware has waited for a client in vain [s]."""
+"""Duration from which on the middleware has waited for a client in vain [s]."""
 _FARTHEST = 100
-"""Largest distance of the numbers of two requests that are taken for one client's."""
+"""Largest distance between numbers of two requests of one client."""
 
 
 def answer_who_listens(node: Node) -> None:
-    """Let each service of a node send its answers to clients that are there; call it once all services are made.
+    """Make each service of a node respond to present clients only; call it once all services exist.
 
-    An exception of a service that rclpy makes itself is logged and answered with nothing; one of a node's own service
-    is a fault, and ends it as any other.
+    An exception of rclpy's own services is logged and answered with an empty response; one of a node's own service ends
+    it.
     """
     for service in node.services:
         service.send_response = _Answers(node, service).send
@@ -52,7 +51,6 @@ def _answer_or_nothing(node: Node, service: Service, answer: Callable[[Any, Any]
     def guarded(request: Any, response: Any) -> Any:
         try:
             return answer(request, response)
-        # Of any kind: rclpy converts what it was sent before it looks at it.
         except Exception as error:  # noqa: BLE001
             node.get_logger().error(
                 f"request to {service.srv_name} is answered empty: {type(error).__name__}: {error}",
@@ -64,13 +62,6 @@ def _answer_or_nothing(node: Node, service: Service, answer: Callable[[Any, Any]
 
 
 class _Answers:
-    """What a service sends.
-
-    Args:
-        node: Its node.
-        service: The service.
-    """
-
     def __init__(self, node: Node, service: Service) -> None:
         self._name = name = service.handle.name
         self._count: Callable[[], int] = lambda: node.count_clients(name)
@@ -82,7 +73,7 @@ class _Answers:
         self._gone_guid = b""
 
     def send(self, response: Any, header: Any) -> None:
-        """Send an answer, keep it for a while where no client is known yet, or drop it where the client has gone."""
+        """Send a response, hold it while no client is known, or drop it if the client has gone."""
         if self._count():
             self._send_now(response, header)
             return
@@ -97,7 +88,6 @@ class _Answers:
         if self._follows_gone(header):
             self._gone = header.request_id.sequence_number
             return
-        # A client that has gone asked before that; who asks later has been answered, by a thread that was kept waiting.
         began, began_ns = time.monotonic(), time.time_ns()
         gone = self._send(response, header)
         if gone is None:
@@ -107,7 +97,7 @@ class _Answers:
             self._gone_guid = _guid(header)
 
     def _follows_gone(self, header: Any) -> bool:
-        """Tell whether a request is the next of a client that has just been waited for in vain."""
+        """Return whether a request is an earlier one of a client that has just been waited for in vain."""
         if self._gone is None or header.source_timestamp > self._gone_ns or _guid(header) != self._gone_guid:
             return False
         return 0 < header.request_id.sequence_number - self._gone <= _FARTHEST
@@ -115,7 +105,7 @@ class _Answers:
     def _wait(self) -> None:
         while True:
             time.sleep(_LOOK_AGAIN)
-            # A node that is destroyed has nobody to answer any more.
+            # The node may have been destroyed.
             with contextlib.suppress(rclpy_implementation.InvalidHandle):
                 there = self._count() > 0
                 while there and self._kept:
@@ -130,5 +120,5 @@ class _Answers:
 
 
 def _guid(header: Any) -> bytes:
-    """Return who asked; empty where rclpy took the request, which does not tell."""
+    """Return the client's identity; empty for requests taken by rclpy, which hides it."""
     return bytes(getattr(header.request_id, "writer_guid", b""))

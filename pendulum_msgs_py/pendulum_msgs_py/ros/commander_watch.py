@@ -1,4 +1,4 @@
-"""Who commands a plant, as far as the graph tells: twins behind one name, and a second plant under our names."""
+"""Conflicts on the graph: several commanders of one name, and a second plant of the same names."""
 
 from __future__ import annotations
 
@@ -15,22 +15,17 @@ from pendulum_msgs_py.contract.values import JointCommand
 __all__ = ["CHECK_PERIOD_NS", "CommanderWatch"]
 
 CHECK_PERIOD_NS = 50_000_000
-"""Least time between two looks at the graph after a message gave reason for one [ns]."""
+"""Shortest time between two checks of the graph after suspect messages [ns]."""
 _HOLD_NS = 1_000_000_000
-"""Time after the last contradiction at which commands are believed again [ns]."""
+"""Time for which a contradiction or a foreign state counts [ns]."""
 _OWN_STATES = 128
-"""Stamps of own states that an answer is looked up among: those that are young enough to be answered, and more."""
+"""Own stamps among which a command's stamp is searched."""
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
-"""What discovery calls a node whose name has not arrived yet."""
+"""Discovery's name of a node whose name has not arrived yet."""
 
 
 class CommanderWatch:
-    """Tells a supervisor that several stand where one is expected, which no single message shows.
-
-    Args:
-        node: The plant's node.
-        supervisor: Told the conflict, or that there is none; while there is one, nobody's torque is applied.
-    """
+    """Reports conflicts that no single message shows to a plant's supervisor, which then applies no torque."""
 
     def __init__(self, node: Node, supervisor: PlantSupervisor) -> None:
         self._node = node
@@ -41,25 +36,21 @@ class CommanderWatch:
         self._checked_ns = 0
         self._contradicted_ns: int | None = None
         self.own_stamps: deque[int] = deque(maxlen=_OWN_STATES)
-        """Stamps of states that this plant published, the newest first [ns]."""
+        """Stamps of published states, the newest first [ns]."""
         self._foreign_ns: int | None = None
 
     def note_state(self, stamp_ns: int) -> None:
-        """Remember the stamp of a state that this plant publishes [ns]."""
+        """Record the stamp of a published state [ns]."""
         self.own_stamps.appendleft(stamp_ns)
 
     def note_states(self, newest_ns: int, period_ns: int, count: int) -> None:
-        """Remember the stamps of states that this plant published one period after the other [ns]."""
+        """Record the stamps of states published in consecutive periods [ns]."""
         self.own_stamps.extendleft(range(newest_ns - (count - 1) * period_ns, newest_ns + 1, period_ns))
 
     def suspect_twins(self, command: JointCommand, now_ns: int) -> None:
-        """Look at the graph at once when a state is answered in two ways: two commanders may share a name.
+        """Check the graph if a second command for one state differs: two commanders may share a name.
 
-        Answered alike, it is one commander that repeats itself, as in lockstep after a lost message.
-
-        Args:
-            command: The second answer.
-            now_ns: The plant's clock [ns].
+        An equal command is a repetition, as in lockstep after a lost message.
         """
         newest = self._supervisor.gates[Input.EFFORT_COMMAND].fresh(now_ns)
         if newest is None or newest.effort == command.effort:
@@ -68,17 +59,17 @@ class CommanderWatch:
         self._check_soon(self._contradicted_ns)
 
     def suspect_second_plant(self, command: JointCommand) -> None:
-        """Look at the graph when a command answers a state that is not ours: a second plant may share our names.
+        """Check the graph if a command is for a foreign state: a second plant may share our names.
 
-        A controller that stamps with the time of day is none, as long as nobody else publishes states.
+        A controller that stamps with the time of day is no conflict, while no other node publishes states.
         """
         if command.stamp_ns not in self.own_stamps:
             self._foreign_ns = time.monotonic_ns()
             self._check_soon(self._foreign_ns)
 
     def check(self) -> None:
-        """Look at the graph and tell the supervisor what is wrong, or that nothing is; in any thread."""
-        # One after the other: who has looked earlier must not tell later that nothing is wrong.
+        """Check the graph and report a conflict, or none, to the supervisor; from any thread."""
+        # Serialised: an earlier check must not clear the conflict of a later one.
         with self._looking:
             self._checked_ns = now = time.monotonic_ns()
             conflict = self._two_commanders(now) or self._two_plants(now)
@@ -92,7 +83,7 @@ class CommanderWatch:
 
     def _two_commanders(self, now: int) -> str:
         topic = self._commands
-        # Who they are takes ten times as long to ask as how many.
+        # Names take ten times as long to query as their number.
         if self._node.count_publishers(topic) < 2:
             return ""
         found = Counter(

@@ -1,7 +1,7 @@
-"""Answers by compiled code: a slice of some milliseconds is one call, and what is not ordinary is left to Python.
+"""Replies by compiled code: one call runs for some milliseconds, and Python handles all other messages.
 
-The loop waits for a message, compares it with the layout that is known, computes the answer and publishes it, without
-the interpreter. Who answers lends it what the answers depend on, and takes back what they have changed.
+The loop waits for a message, compares it with the known layout, computes and publishes the reply. The node's logic
+lends it its state and takes it back.
 """
 
 from __future__ import annotations
@@ -26,18 +26,17 @@ from pendulum_msgs_py.ros.turns import INTERPRETED_SLICE, WHILE_CALLED, Turns
 __all__ = ["AnsweredInput"]
 
 _EVENTS_AFTER_SLICE = 3
-"""Events that the executor may attend to after each slice: 15 a second at least. Who answers has a timer of 1 Hz; its
-services are attended to apart."""
+"""Executor events after each slice, at least 15 a second: a timer of 1 Hz; services are served separately."""
 
 
 class AnsweredInput:
-    """An input whose messages are answered one by one, by compiled code where it can be had.
+    """An input whose messages get replies one by one, from compiled code if available.
 
     Args:
-        source: The input; who receives its messages answers those that are Python's.
-        receive: Receives them.
-        answerer: Who answers.
-        called: Returns the event counter of what ends a slice of compiled code, such as
+        source: The input.
+        receive: Handles the messages that are left to Python.
+        answerer: The node's logic.
+        called: Returns the event counter that ends a slice, such as
             :attr:`pendulum_msgs_py.ros.polled.PollingNode.request_descriptor`; -1 for none.
     """
 
@@ -57,13 +56,13 @@ class AnsweredInput:
         self._turns = Turns(self._serve, _EVENTS_AFTER_SLICE)
 
     def compile(self, publisher: Publisher, *, sender: str, joint: str, ahead_ns: int) -> None:
-        """Have the loop that the answerer wants, if any; where it was never needed before, that takes seconds.
+        """Load the answerer's loop, if it has one; compiling it the first time takes seconds.
 
         Args:
-            publisher: Publishes the answers.
-            sender: ``frame_id`` of the answers.
-            joint: The joint of states and answers.
-            ahead_ns: How far the clock of the stamps is ahead of the monotonic one, in real time [ns].
+            publisher: Publishes the replies.
+            sender: Their ``frame_id``.
+            joint: Joint of states and replies.
+            ahead_ns: Lead of the stamps' clock over the monotonic one, in real time [ns].
         """
         kind = self._answerer.kind
         if kind is None:
@@ -75,12 +74,12 @@ class AnsweredInput:
 
     @property
     def loop(self) -> str:
-        """What answers, for diagnostics."""
+        """Which code replies, for diagnostics."""
         why = self._why or self._answerer.refusal
         return f"interpreted: {why}" if why else "compiled"
 
     def run_due(self) -> float | None:
-        """Attend to the input in its turn, as :class:`pendulum_msgs_py.ros.runner.Paced` does."""
+        """Serve the input in its turn, as :class:`pendulum_msgs_py.ros.runner.Paced` does."""
         return self._turns.run_due() if self._source.works else None
 
     def _serve(self, longest: float) -> bool:
@@ -100,18 +99,14 @@ class AnsweredInput:
             if loop.failed:
                 self._loop, self._why = None, loop.failed
             if loop.ended:
-                # Where somebody calls, it may be some time before they have their turn.
+                # A pending call may have to wait for its turn.
                 left = ends - time.monotonic()
                 return (left > 0.0 and self._source.serve(min(left, WHILE_CALLED))) or came
         return came
 
 
 class _Loop:
-    """The loop of one input and one output, each of one joint.
-
-    Raises:
-        NoMachineCodeError: It cannot be had here.
-    """
+    """The loop of one input and one output of one joint; raises a NoMachineCodeError if unavailable."""
 
     def __init__(
         self, source: WaitedInput, kind: LoopKind, publisher: Publisher, sender: str, joint: str, ahead_ns: int
@@ -134,7 +129,7 @@ class _Loop:
         self.record["wall_ahead_ns"] = ahead_ns
 
     def run(self, longest: float, called: int) -> bytes | None:
-        """Answer what comes within a time [s], or until somebody calls or a message is Python's, and return that."""
+        """Reply for a time [s], until a call is pending or a message is left to Python; return that message."""
         self.record["answers"] = 0
         self.record["calls"] = called, -1
         self.record["end_ns"] = time.monotonic_ns() + round(longest * NANOSECONDS)
@@ -146,7 +141,7 @@ class _Loop:
         return DirectTopics.message(self.record["state"]) if why == LEFT else None
 
     def expect(self, data: bytes) -> None:
-        """Expect messages of the layout of one that was Python's, where it tells the state of the one joint alone."""
+        """Expect messages of the layout of this one, if it is a state of the joint alone."""
         fields = decode_joint_state(data)
         if fields is None or fields.joints != (self._joint,):
             return

@@ -1,7 +1,7 @@
-"""Ordinary periods of a plant of one joint, run by compiled code for some milliseconds at a time.
+"""Nominal periods of a plant of one joint, run by compiled code for some milliseconds at a time.
 
-What is not ordinary (a command that is refused, silence, a transition, a service) is Python's: the loop ends before it,
-and the supervisor, the gates and the plant have the state that they would have, to the last bit.
+The loop ends before anything else (a refused command, silence, a transition, a service), which Python handles; the
+state of supervisor, gates and plant is the same to the last bit.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ _NO_END = 2**62
 
 
 class Slice(NamedTuple):
-    """What became of a slice.
+    """Result of a slice.
 
     Attributes:
         now_ns: The plant's time, that of its newest state [ns].
-        periods: How many were done.
+        periods: Number of periods.
         answered: In lockstep: inputs that have answered the newest state.
-        message: A message that was taken and is Python's to receive: its input, its bytes, when it came [ns].
-        ended: It went on until its time was over or somebody called; others have their turn.
+        message: A taken message that is left to Python: its input, its bytes, its arrival [ns].
+        ended: Its time was over or a call is pending.
     """
 
     now_ns: int
@@ -65,31 +65,31 @@ class CompiledPlant(Protocol):
 
     @property
     def builder(self) -> str:
-        """Builds its loop, ``module:function``."""
+        """Builder of its loop, ``module:function``."""
 
     @property
     def choice(self) -> tuple[str, ...]:
-        """Which variant of it."""
+        """Arguments of the builder."""
 
     @property
     def layout(self) -> np.dtype[Any]:
         """Layout of its part of the record."""
 
     def describe(self, record: Any) -> None:
-        """Write what stays as it is into its part of the record, by attribute."""
+        """Write the constants into its part of the record."""
 
     def lend(self, record: Any) -> None:
-        """Write its state."""
+        """Write the state."""
 
     def take_back(self, record: Any) -> None:
-        """Take over the state that a loop has left."""
+        """Read the state back."""
 
 
 class CompiledPeriods:
     """The loop of one plant.
 
     Args:
-        interface: The plant on the graph, its inputs polled.
+        interface: The plant on the graph, with polled inputs.
         plant: The plant.
         period_ns: Period [ns].
         clock: Wall time in real time; None in lockstep.
@@ -97,10 +97,10 @@ class CompiledPeriods:
         done: Called after periods with the stamp of the newest state [ns].
 
     Attributes:
-        periods: How many it has done.
+        periods: Number of periods so far.
 
     Raises:
-        NoMachineCodeError: The loop cannot be had here.
+        NoMachineCodeError: The loop is not available.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class CompiledPeriods:
         self.periods = 0
         self._loop = load_loop(plant.builder, *plant.choice, symbols=rcl_symbols())
         self._memory = np.zeros(1, dtype=plant_record(plant.layout))
-        # For what is written once numpy's view will do; what is written in each slice has a faster one.
+        # numpy's view for what is written once, a faster one for each slice.
         self._entries = record = self._memory[0]
         self._record: Any = structure_of(self._memory.dtype).from_buffer(self._memory.data)
         self._topics = DirectTopics()
@@ -156,14 +156,14 @@ class CompiledPeriods:
         answered: Collection[Input] = (),
         last_ns: int | None = None,
     ) -> Slice:
-        """Run ordinary periods from one on.
+        """Run nominal periods.
 
         Args:
             now_ns: The plant's time, that of its newest state [ns].
-            longest: Longest time to do so [s].
+            longest: Longest duration [s].
             expected: In lockstep: inputs that have to answer a state.
-            answered: Those that have answered the newest.
-            last_ns: In lockstep: the time at which the plant stops stepping [ns].
+            answered: In lockstep: those that have answered the newest.
+            last_ns: In lockstep: the time at which the plant stops [ns].
         """
         interface, record, supervisor = self._interface, self._record, self._interface.supervisor
         sample = interface.sample
@@ -198,7 +198,7 @@ class CompiledPeriods:
         return Slice(record.now_ns, record.periods, newest, message, why == ENDED)
 
     def _expect_messages(self) -> None:
-        """Expect the messages that Python accepted last, of each input."""
+        """Expect messages like those that Python accepted last."""
         for kind, data in self._interface.pop_accepted().items():
             fields = fields_from_bytes(data)
             template = None if fields is None else template_of(fields, len(data))

@@ -45,11 +45,7 @@ _NO_JOINT_STATE = "its bytes are no sensor_msgs/JointState"
 
 
 def class_of(name: str) -> Any:
-    """Return the class of a message or service, such as ``sensor_msgs/msg/JointState``.
-
-    Raises:
-        ImportError: It is not installed.
-    """
+    """Return the class of a name such as ``sensor_msgs/msg/JointState``; raise an ImportError if not installed."""
     package, kind, short = name.split("/")
     module = importlib.import_module(f"{package}.{kind}")
     if not hasattr(module, short):
@@ -58,18 +54,18 @@ def class_of(name: str) -> Any:
 
 
 def stamp_to_message(stamp_ns: int) -> Time:
-    """Return a ROS time from nanoseconds."""
+    """Return nanoseconds as a ROS time."""
     sec, nanosec = divmod(stamp_ns, NANOSECONDS)
     return Time(sec=sec, nanosec=nanosec)
 
 
 def stamp_from_message(stamp: Time) -> int:
-    """Return nanoseconds from a ROS time."""
+    """Return a ROS time in nanoseconds."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
 def fields_from_bytes(data: bytes) -> JointStateFields | None:
-    """Return what a serialised JointState holds, whatever its joints; None where it is none."""
+    """Return the content of a serialised JointState of any joints, or None if it is none."""
     fields = decode_joint_state(data)
     if fields is not None:
         return fields
@@ -88,7 +84,7 @@ def _fields_from_message(message: JointState) -> JointStateFields:
 
 
 def command_from_bytes(data: bytes) -> JointCommand | None:
-    """Return the command that a serialised JointState carries, or None where it has not one effort for each name."""
+    """Return the command in a serialised JointState, or None unless it has one effort per name."""
     fields = fields_from_bytes(data)
     if fields is None or _problem_of_efforts(fields):
         return None
@@ -96,19 +92,16 @@ def command_from_bytes(data: bytes) -> JointCommand | None:
 
 
 def sample_from_bytes(data: bytes, joints: tuple[str, ...] = ONE_JOINT.names) -> JointSample | None:
-    """Return the state of a plant's joints that a serialised JointState carries, or None where it carries none.
+    """Return the state of a plant's joints in a serialised JointState, or None.
 
-    Args:
-        data: The message.
-        joints: All joints of the plant. The one joint of a plant is found among others; several are expected alone and
-            in their order, so that nobody ever takes one for another.
+    A single joint may be one among others; several must be alone and in order, so that none is mistaken for another.
     """
     fields = fields_from_bytes(data)
     return None if fields is None else _sample_from_fields(fields, joints)
 
 
 def sample_from_message(message: JointState, joints: tuple[str, ...] = ONE_JOINT.names) -> JointSample | None:
-    """Return the state of a plant's joints that a message carries, as :func:`sample_from_bytes` does."""
+    """Return the state in a message, as :func:`sample_from_bytes`."""
     return _sample_from_fields(_fields_from_message(message), joints)
 
 
@@ -124,12 +117,7 @@ def _sample_from_fields(fields: JointStateFields, joints: tuple[str, ...]) -> Jo
 
 
 def stamp_of_state(data: bytes, joints: tuple[str, ...]) -> tuple[int | None, tuple[str, ...]]:
-    """Return the stamp of a serialised state that tells of some joints [ns], else None, and whose state it is.
-
-    Args:
-        data: The message.
-        joints: Joints that must be among its own, each with position and velocity, in this order.
-    """
+    """Return the stamp of a serialised state with these joints, in order [ns], or None, and all its joints."""
     fields = fields_from_bytes(data)
     if fields is None:
         return None, ()
@@ -139,12 +127,7 @@ def stamp_of_state(data: bytes, joints: tuple[str, ...]) -> tuple[int | None, tu
 
 
 def problem_of_state(data: bytes, joints: tuple[str, ...] = ONE_JOINT.names) -> str:
-    """Return which field of a serialised JointState keeps it from being a state of the joints, empty where none does.
-
-    Args:
-        data: The message.
-        joints: All joints of the plant.
-    """
+    """Return which field of a serialised JointState makes it no state of all these joints, or an empty string."""
     fields = fields_from_bytes(data)
     return _NO_JOINT_STATE if fields is None else _problem_of_positions(fields, joints)
 
@@ -171,7 +154,7 @@ def _problem_of_positions(fields: JointStateFields, joints: tuple[str, ...]) -> 
 
 
 def problem_of_command(data: bytes) -> str:
-    """Return which field of a serialised JointState keeps it from being a command, empty where none does."""
+    """Return which field of a serialised JointState makes it no command, or an empty string."""
     fields = fields_from_bytes(data)
     return _NO_JOINT_STATE if fields is None else _problem_of_efforts(fields)
 
@@ -182,7 +165,7 @@ def _problem_of_efforts(fields: JointStateFields) -> str:
 
 
 def trajectory_to_message(trajectory: Trajectory, stamp_ns: int = 0) -> JointTrajectory:
-    """Return the message for a trajectory of our joint."""
+    """Return the message of a trajectory."""
     message = JointTrajectory(joint_names=[JOINT])
     message.header.stamp = stamp_to_message(stamp_ns)
     message.points = [
@@ -201,22 +184,14 @@ def seconds_to_duration(seconds: float) -> Duration:
 
 
 def event_message(stamp_ns: int, name: str, **details: Any) -> String:
-    """Return an event for the ``events`` topic: JSON with at least ``stamp_ns`` and ``name``."""
+    """Return an event: JSON with at least ``stamp_ns`` and ``name``."""
     return String(data=json.dumps(without_nan({"stamp_ns": stamp_ns, "name": name, **details}), sort_keys=True))
 
 
 def diagnostic_status(
     name: str, level: bytes, message: str, values: Mapping[str, object], *, hardware_id: str = "none"
 ) -> DiagnosticStatus:
-    """Return a diagnostic status; numbers are written with as many digits as a reader needs.
-
-    Args:
-        name: What is told of, such as ``/sim/simulator: plant``.
-        level: A constant of the message.
-        message: How it is, in words.
-        values: Figures by name.
-        hardware_id: Which device it is about; ``none`` for a program, as diagnostic_updater says.
-    """
+    """Return a status of, for example, ``/sim/simulator: plant``; ``hardware_id`` is ``none`` for a program."""
     return DiagnosticStatus(
         name=name,
         hardware_id=hardware_id,
@@ -227,12 +202,12 @@ def diagnostic_status(
 
 
 def plant_mode(message: DiagnosticArray, namespace: str) -> str:
-    """Return the mode that the plant in a namespace tells in its diagnostics, or nothing where it is not among them."""
+    """Return the mode of the plant in a namespace, or an empty string."""
     return plant_value(message, namespace, "mode")
 
 
 def plant_value(message: DiagnosticArray, namespace: str, key: str) -> str:
-    """Return a value that the plant in a namespace tells in its diagnostics, or nothing where it is not among them."""
+    """Return a diagnostic value of the plant in a namespace, or an empty string."""
     prefix = namespace.rstrip("/") + "/"
     for status in message.status:
         name, _, what = status.name.partition(": ")

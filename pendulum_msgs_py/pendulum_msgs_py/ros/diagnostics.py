@@ -1,4 +1,4 @@
-"""What a program says of itself on ``/diagnostics``."""
+"""A node's status on ``/diagnostics``."""
 
 from __future__ import annotations
 
@@ -14,19 +14,11 @@ from pendulum_msgs_py.ros.convert import diagnostic_status, stamp_to_message
 __all__ = ["DIAGNOSTICS_PERIOD", "Diagnostics"]
 
 DIAGNOSTICS_PERIOD = 0.5
-"""Time between two diagnostics of a program [s]."""
+"""Time between two diagnostics [s]."""
 
 
 class Diagnostics:
-    """The diagnostics of one node, with one status.
-
-    Args:
-        node: The node.
-        what: What it is, such as ``plant``.
-
-    Attributes:
-        publisher: Of the messages.
-    """
+    """Diagnostics of one node with one status, such as that of a ``plant``."""
 
     def __init__(self, node: Node, what: str) -> None:
         self._name = f"{node.get_fully_qualified_name()}: {what}"
@@ -35,15 +27,7 @@ class Diagnostics:
     def publish(
         self, stamp_ns: int, level: bytes, text: str, values: Mapping[str, object], *, hardware_id: str = "none"
     ) -> None:
-        """Publish how the node is.
-
-        Args:
-            stamp_ns: The node's time [ns].
-            level: A constant of ``DiagnosticStatus``.
-            text: How it is, in words.
-            values: Figures by name.
-            hardware_id: Which device it is about; ``none`` for a program.
-        """
+        """Publish the status at the node's time [ns]; ``hardware_id`` is ``none`` for a program."""
         message = DiagnosticArray(status=[diagnostic_status(self._name, level, text, values, hardware_id=hardware_id)])
         message.header.stamp = stamp_to_message(stamp_ns)
         self.publisher.publish(message)

@@ -1,8 +1,7 @@
 """rclpy's publishers and subscriptions in the records of compiled loops: the module that knows rcl's memory.
 
-A loop that runs compiled calls ``rcl_take_serialized_message`` and ``rcl_publish_serialized_message`` of the very
-library that rclpy has loaded. What it calls them with are entities that rclpy made and keeps: while a loop runs, their
-handles are held, so that none of them can be destroyed. Bytes that rcl writes to are its own allocator's.
+A compiled loop calls ``rcl_take_serialized_message`` and ``rcl_publish_serialized_message`` of the library that rclpy
+has loaded, with rclpy's entities, whose handles are held meanwhile. rcl's own allocator owns the bytes that rcl writes.
 """
 
 from __future__ import annotations
@@ -30,18 +29,14 @@ _SYMBOLS = {
     "pendulum_rcl_count": "rcl_publisher_get_subscription_count",
 }
 _LARGEST_KEPT = 65_536
-"""What a stranger's long message may leave of an input's memory [bytes]."""
+"""Most memory that a long message leaves allocated for an input [bytes]."""
 _MIDDLEWARES = ("rmw_fastrtps_cpp",)
-"""Those with which this was tried."""
+"""Tested ones."""
 
 
 @functools.cache
 def rcl_symbols() -> dict[str, int]:
-    """Return the addresses of what loops call, by the names that they use.
-
-    Raises:
-        NoMachineCodeError: They cannot be had here.
-    """
+    """Return the addresses of the functions that loops call; raise a NoMachineCodeError if unavailable."""
     from rclpy.utilities import get_rmw_implementation_identifier
 
     middleware = get_rmw_implementation_identifier()
@@ -63,32 +58,21 @@ class DirectTopics:
         self._handles: list[Any] = []
 
     def add_input(self, record: NDArray[Any], subscription: Subscription, most: int) -> None:
-        """Put a subscription into a record.
-
-        Args:
-            record: Of :data:`pendulum_msgs_py.loops.records.INPUT`; it must live as long as this.
-            subscription: No executor attends to it.
-            most: Messages that one look takes at most.
-        """
+        """Write a subscription without executor into a record of ``INPUT``; one poll takes ``most`` messages."""
         record["subscription"] = subscription.handle.pointer
         record["most"] = most
         _allocate(_message_in(record), MOST_BYTES)
-        # The memory goes with this object; a record is only a view of it.
         weakref.finalize(self, _free, _message_in(record), record)
         self._handles.append(subscription.handle)
 
     def add_output(self, record: NDArray[Any], publisher: Publisher) -> None:
-        """Put a publisher into a record of :data:`pendulum_msgs_py.loops.records.OUTPUT`."""
+        """Write a publisher into a record of ``OUTPUT``."""
         record["publisher"] = publisher.handle.pointer
         self._handles.append(publisher.handle)
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Keep all entities from being destroyed.
-
-        Raises:
-            InvalidHandle: One of them has been destroyed already.
-        """
+        """Hold all entities; raise an ``InvalidHandle`` if one has been destroyed."""
         with contextlib.ExitStack() as stack:
             for handle in self._handles:
                 stack.enter_context(handle)
@@ -96,7 +80,7 @@ class DirectTopics:
 
     @staticmethod
     def message(record: NDArray[Any]) -> bytes:
-        """Return the message that a loop took and left to Python; memory that it asked too much of is given back."""
+        """Return the message that a loop left to Python, and shrink its memory."""
         message = _message_in(record)
         data = ctypes.string_at(message.buffer, message.length)
         if message.capacity > _LARGEST_KEPT:

@@ -1,8 +1,8 @@
-"""The e-stop of a plant on a path of its own: a node, an executor and a thread that do nothing else.
+"""The e-stop of a plant: a participant, node, executor and thread of its own.
 
-A plant's own thread steps or waits for an actuator, and reads whatever others send. The e-stop must not stand in that
-queue. A participant has one socket and one thread that empties it: behind a flood of requests or trajectories to the
-owner a press would wait there, or be lost and come again when DDS asks for it. An error in it is a press, not its end.
+The plant's thread steps or waits for an actuator, and reads what others send. A participant has one socket and one
+thread that empties it: behind a flood of requests or trajectories an e-stop would wait, or be lost and repeated by DDS.
+An error in this thread is an e-stop.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ PRESSED = "e-stop pressed"
 
 _JOIN = 2.0
 _DISCOVERY = 0.5
-"""Longest wait until all of the owner is known here, which takes 0.1 s from its beginning [s]."""
+"""Longest wait until the owner is discovered here, usually 0.1 s after its start [s]."""
 _LOOK = 0.002
 _SWITCH = 0.001
-"""Time after which a thread that computes hands Python's lock to one that waits [s]; by default it is 5 ms."""
+"""Switch interval of the GIL [s]; the default is 5 ms."""
 _PAUSE = 0.01
-"""Time after an error before the thread serves again [s]."""
+"""Pause after an error [s]."""
 
 
 class EStopThread:
-    """A node beside another one, served by a thread that does nothing else.
+    """A node alongside another one, served by its own thread.
 
     Args:
         owner: The node whose e-stop it serves.
         suffix: Of the node's and the thread's name.
-        press: Latches the e-stop, with the reason; called in the thread, must be quick and wait for nobody.
+        press: Latches the e-stop with the reason; called in the thread, must not wait.
 
     Attributes:
-        node: The node; give it what it has to serve, then :meth:`start`.
+        node: The node; create its services, then :meth:`start`.
     """
 
     def __init__(self, owner: Node, suffix: str, press: Callable[[str], None]) -> None:
@@ -58,7 +58,7 @@ class EStopThread:
         others = thread_numbers()
         # With the process's arguments, which may name a security enclave.
         rclpy.init(args=sys.argv, context=self._context, domain_id=owner.context.get_domain_id())
-        # Without the process's remaps: they were for the owner, whose names are resolved there already.
+        # Without the process's remaps: the owner's names are resolved already.
         self.node = Node(
             f"{owner.get_name()}_{suffix}",
             context=self._context,
@@ -72,26 +72,26 @@ class EStopThread:
         self._executor.add_node(self.node)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=suffix, daemon=True)
-        # An owner that could not be made is not closed, and a thread that spins ends no process cleanly.
+        # An owner whose construction failed is not closed, and a spinning thread ends no process cleanly.
         owner.context.on_shutdown(self.close)
 
     def start(self) -> None:
-        """Begin to serve."""
+        """Start to serve."""
         answer_who_listens(self.node)
         sys.setswitchinterval(min(_SWITCH, sys.getswitchinterval()))
         self._thread.start()
-        # On a busy machine an ordinary thread may wait for tens of milliseconds after a request has come.
+        # On a busy machine an ordinary thread may wait for tens of milliseconds.
         run_ahead({*self._middleware, self._thread.native_id or 0})
 
     def close(self) -> None:
-        """Stop to serve; at the latest the end of the owner's context does so."""
+        """Stop to serve, at the latest when the owner's context ends."""
         if self._closing.is_set():
             return
         self._closing.set()
         self._executor.shutdown()
         if self._thread.is_alive():
             self._thread.join(_JOIN)
-        # Where a node is ended as soon as it is made, its participant is told of the owner's entities just then.
+        # A node that ends at once: its participant is just discovering the owner's entities.
         entities, deadline = self._entities_of_owner(self._owner), time.monotonic() + _DISCOVERY
         while entities and self._entities_of_owner(self.node) != entities and time.monotonic() < deadline:
             time.sleep(_LOOK)
@@ -100,7 +100,7 @@ class EStopThread:
             rclpy.try_shutdown(context=self._context)
 
     def _entities_of_owner(self, seen_by: Node) -> list[Any]:
-        """Return what a node knows of the owner: its publishers, subscriptions and services; nothing if it cannot."""
+        """Return the owner's discovered publishers, subscriptions and services, or nothing."""
         try:
             owner = (self._owner.get_name(), self._owner.get_namespace())
             return [
@@ -108,7 +108,6 @@ class EStopThread:
                 seen_by.get_subscriber_names_and_types_by_node(*owner),
                 seen_by.get_service_names_and_types_by_node(*owner),
             ]
-        # Not discovered yet, or destroyed or shut down already.
         except (NodeNameNonExistentError, implementation.InvalidHandle, implementation.RCLError):
             return []
 
@@ -118,7 +117,7 @@ class EStopThread:
                 self._executor.spin()
             except ExternalShutdownException:
                 return
-            # An answer that cannot be sent raises as well: whoever waits for this e-stop must still find it.
+            # Also a response that cannot be sent: the e-stop must stay available.
             except Exception as error:  # noqa: BLE001
                 self._fail(error)
                 self._closing.wait(_PAUSE)
@@ -137,17 +136,17 @@ class EStopThread:
 
 
 class EStopServer:
-    """Serves ``~/e_stop`` of a node from a thread of its own.
+    """Serves ``~/e_stop`` of a node from its own thread.
 
-    The middleware's thread counts requests as they come, without Python's lock. The plant reads that counter before
-    each decision, and so stops before this thread has run.
+    The middleware's thread counts requests without the GIL. The plant reads that counter before each decision, and so
+    stops before this thread has run.
 
     Args:
         owner: The node whose service it is.
-        press: Latches the e-stop, with the reason; called in the server's thread, must be quick and wait for nobody.
+        press: Latches the e-stop with the reason; called in the server's thread, must not wait.
 
     Attributes:
-        arrivals: Counts requests that this thread has not begun to answer.
+        arrivals: Counts requests that this thread has not handled.
     """
 
     def __init__(self, owner: Node, press: Callable[[str], None]) -> None:

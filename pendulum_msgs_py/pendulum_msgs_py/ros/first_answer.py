@@ -1,4 +1,4 @@
-"""The first answer of a run in simulated time: held back until everybody who listens would get it."""
+"""The first reply of a run in simulated time, delayed until all subscribers would get it."""
 
 from __future__ import annotations
 
@@ -8,18 +8,14 @@ from rclpy.publisher import Publisher
 __all__ = ["FirstAnswer"]
 
 _TRIES = 5
-"""States that are left unanswered at most: a listener whose QoS does not match is never met."""
+"""Most unanswered states: a subscriber with incompatible QoS never matches."""
 
 
 class FirstAnswer:
-    """Tells whether an answer may go out.
+    """Whether a node may publish its first reply.
 
-    DDS tells one side of a match before the other: a recorder that knows of a publisher may not be known to it yet, and
-    a run in lockstep is over within a fraction of a second. A plant that waits repeats its state each second.
-
-    Args:
-        node: Who answers.
-        publisher: What it answers on.
+    DDS reports a match to one side before the other: a recorder may know a publisher that does not know it yet, and a
+    lockstep run is over in a fraction of a second. A waiting plant repeats its state each second.
     """
 
     def __init__(self, node: Node, publisher: Publisher) -> None:
@@ -29,11 +25,11 @@ class FirstAnswer:
 
     @property
     def gone(self) -> bool:
-        """Whether answers may go out without being asked about."""
+        """Whether replies need no further check."""
         return not self._left
 
     def may_go(self) -> bool:
-        """Ask before an answer; costs nothing once it was true."""
+        """Return whether a reply may go out."""
         if self._left:
             met = self._publisher.get_subscription_count()
             self._left = 0 if met >= self._node.count_subscribers(self._publisher.topic_name) else self._left - 1

@@ -1,4 +1,4 @@
-"""A lifecycle node that survives a transition which is not possible in its state."""
+"""A lifecycle node that survives a request for an impossible transition."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ __all__ = ["LifecycleNode"]
 
 
 class LifecycleNode(RclpyLifecycleNode):
-    """rclpy's lifecycle node, but a request for an impossible transition is refused instead of ending the process.
+    """rclpy's lifecycle node, which refuses impossible transitions.
 
-    rclpy lets the error of its C library out of the service's callback, so that a second ``activate`` kills a
-    controller that holds a pendulum. The callback is private there; this overrides it under its mangled name.
+    rclpy's C error leaves the service's callback, so that a second ``activate`` would end a controller that holds a
+    pendulum. The callback is private there; this overrides it under its mangled name.
     """
 
     def _LifecycleNodeMixin__on_change_state(  # noqa: N802

@@ -1,4 +1,4 @@
-"""What this project asks of the middleware where the user has not said otherwise."""
+"""Default settings of the middleware."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ _PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 _TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
 _SETTINGS = (_TRANSPORTS, "FASTDDS_DEFAULT_PROFILES_FILE", _PROFILES)
 _MAPPED = Path("/proc/self/maps")
-# rclpy has loaded the middleware by now. Fast DDS 3 refuses the whole profile for one element that was renamed.
+# rclpy has loaded the middleware by now. Fast DDS 3 refuses the whole profile for one renamed element.
 _IS_FAST_DDS_3 = _MAPPED.is_file() and "/libfastdds.so" in _MAPPED.read_text(encoding="utf-8", errors="replace")
 _LOOPBACK = Path(__file__).with_name("loopback_3.xml" if _IS_FAST_DDS_3 else "loopback.xml")
 _LEAST_MEMORY = 1 << 30
-"""Address space in which Fast DDS starts its threads; with less, it ends the process in ways of its own [bytes]."""
+"""Address space in which Fast DDS starts its threads; with less, it ends the process [bytes]."""
 _PORTS_OF_DOMAIN = 250
 _FIRST_PORT = 7400
 _FIRST_UNICAST = 10
-"""Offset of the port on which the first participant of a domain hears of others; each takes two (RTPS 2.3, 9.6.1.1)."""
+"""Offset of the first participant's discovery port; each participant takes two (RTPS 2.3, 9.6.1.1)."""
 
 
 def set_middleware_defaults() -> None:
-    """Stay on this host, and pass messages through sockets; to be called before ``rclpy.init``.
+    """Stay on this host, and use sockets; call it before ``rclpy.init``.
 
     A plant that the whole subnet may command is a decision, not a default.
 
     Raises:
-        FaultError: The profile is not where it was installed, or the memory of this process is limited too much.
+        FaultError: The profile is not installed, or this process's memory is limited too much.
     """
     _require_memory()
     for name, value in middleware_defaults(os.environ, get_rmw_implementation_identifier()).items():
@@ -56,23 +56,17 @@ def _require_memory() -> None:
 
 
 def middleware_defaults(environment: Mapping[str, str], middleware: str) -> dict[str, str]:
-    """Return the variables to set in an environment, and with an empty value those to take out of it.
+    """Return the variables to set in an environment; those with an empty value are to be removed.
 
-    The range ``LOCALHOST`` keeps a program of Jazzy from calling out, but its sockets listen on every interface:
-    whoever names this host as a static peer is let in. Where nothing was opened, a profile binds Fast DDS to the
-    loopback address; other middleware is left with ``LOCALHOST``.
+    With ``LOCALHOST`` Jazzy does not call out, but listens on every interface: a host with this one as a static peer
+    gets in. Unless opened, a profile therefore binds Fast DDS to the loopback address; other middleware keeps
+    ``LOCALHOST``.
 
-    Sockets, because Fast DDS passes messages between processes through shared memory otherwise, and a process that is
-    killed while it holds some leaves it locked: with a publisher of five topics at 500 Hz, after some ten kills new
-    subscribers, matched as they were, got nothing any more. The kernel closes the sockets of the dead, and round trips
-    take as long.
-
-    Args:
-        environment: What the user has set, or a program of ours that starts others.
-        middleware: Identifier of the RMW implementation.
+    Sockets instead of Fast DDS's shared memory: a process killed while it holds some leaves it locked, and after some
+    ten kills (five topics at 500 Hz) new matched subscribers got nothing. Round trips take as long.
 
     Raises:
-        FaultError: The profile is not where it was installed.
+        FaultError: The profile is not installed.
     """
     asked = environment.get(_RANGE) or "LOCALHOST"
     ours = {_PROFILES: str(_LOOPBACK), _TRANSPORTS: "UDPv4"}
@@ -84,22 +78,17 @@ def middleware_defaults(environment: Mapping[str, str], middleware: str) -> dict
     if asked != "LOCALHOST" or environment.get("ROS_STATIC_PEERS"):
         return {_RANGE: asked, _TRANSPORTS: ours[_TRANSPORTS], _PROFILES: ""}
     if not _LOOPBACK.is_file():
-        # Without it Fast DDS would listen to the whole subnet.
         raise FaultError(f"{_LOOPBACK} is missing; expected it where pendulum_msgs_py is installed")
-    # SYSTEM_DEFAULT leaves the network to the profile; the older variable of ROS would overrule it.
+    # SYSTEM_DEFAULT leaves the network to the profile; ROS_LOCALHOST_ONLY would override it.
     older = {"ROS_LOCALHOST_ONLY": "0"} if environment.get("ROS_LOCALHOST_ONLY") == "1" else {}
     return {_RANGE: "SYSTEM_DEFAULT", _PROFILES: ours[_PROFILES], **older}
 
 
 def check_closed(domain: int) -> None:
-    """Check that this process listens to this host alone, where nobody has opened it, and can be found there.
-
-    Args:
-        domain: ROS domain that the process has joined.
+    """Check that this process, unless opened, listens to this host alone and can be discovered on its ROS domain.
 
     Raises:
-        FaultError: The middleware has taken no notice of the profile, or more programs have joined the domain than
-            find each other.
+        FaultError: The middleware ignores the profile, or too many programs have joined the domain.
     """
     sockets = Path("/proc/self/net/udp")
     if os.environ.get(_PROFILES) != str(_LOOPBACK) or not sockets.is_file():
@@ -128,12 +117,7 @@ def check_closed(domain: int) -> None:
 
 
 def participant_number(ports: Iterable[int], domain: int) -> int:
-    """Return which participant of a domain has these UDP ports, counted from 1; 0 for none of its unicast ports.
-
-    Args:
-        ports: Ports that a process listens on.
-        domain: ROS domain.
-    """
+    """Return which participant of a ROS domain has these UDP ports, from 1; 0 for none of its unicast ports."""
     offsets = [port - _FIRST_PORT - _PORTS_OF_DOMAIN * domain - _FIRST_UNICAST for port in ports]
     return max((offset // 2 + 1 for offset in offsets if offset >= 0), default=0)
 
@@ -146,7 +130,7 @@ def _most_participants() -> int:
 
 
 def _open_sockets() -> set[str]:
-    """Return the numbers of the sockets of this process, as the kernel's tables tell them."""
+    """Return the inodes of this process's sockets."""
     found = set()
     for descriptor in Path("/proc/self/fd").iterdir():
         try:

@@ -22,19 +22,17 @@ _PREFIXES_OF_ROS = ("qos_overrides.",)
 
 
 class NodeParameters:
-    """The parameters of a node, as its table of specs says.
+    """The parameters of a node.
 
     Args:
-        node: The node.
+        node: The node; parameters from elsewhere must be declared before.
         specs: The table.
-        prepare: Called with all values, changed ones included, before a change is accepted; what it raises as
-            ParameterError refuses the change. It must leave everything as it is: somebody else may still refuse.
-        apply: Called once a change is accepted and in force, with what ``prepare`` has returned, or with all values
-            where there is no ``prepare``.
+        prepare: Called with all values, changed ones included, before a change is accepted; a ParameterError refuses
+            it. It must not have effects, as the change may still be refused elsewhere.
+        apply: Called once a change is in force, with the result of ``prepare``, or else with all values.
 
     Raises:
-        ParameterError: A value given at start is refused, or a parameter was given that the node does not have, unless
-            in a section of a file that is for every node. Parameters that are declared elsewhere have to be so before.
+        ParameterError: A value at start is refused, or a parameter is unknown, unless a file gives it to every node.
     """
 
     def __init__(
@@ -57,7 +55,7 @@ class NodeParameters:
         node.add_post_set_parameters_callback(self._take_over)
 
     def __getitem__(self, name: str) -> Any:
-        """Return the value in force."""
+        """Return the present value."""
         return self.values[name]
 
     @staticmethod
@@ -113,10 +111,7 @@ class NodeParameters:
 
 
 def _refuse_unknown(node: Node, specs: Mapping[str, ParameterSpec]) -> None:
-    """ROS ignores a misspelt parameter and the default stays in force; here nobody should believe it was set.
-
-    A file may serve several nodes, though: what its sections for every node give may be another's.
-    """
+    """ROS would ignore a misspelt parameter silently. What a file gives to every node may belong to others."""
     given = [
         name
         for name in node._parameter_overrides
@@ -134,12 +129,12 @@ def _refuse_unknown(node: Node, specs: Mapping[str, ParameterSpec]) -> None:
 
 
 def _plain(value: Any) -> object:
-    """Return arrays of rclpy (of module ``array``) as lists."""
+    """Return rclpy's arrays as lists."""
     return value if isinstance(value, (bool, int, float, str)) or value is None else list(value)
 
 
 def _as_decimals(spec: ParameterSpec, value: object) -> str:
-    """Return how to write whole numbers where ROS wants decimals, or nothing where that is not the trouble."""
+    """Return whole numbers as ROS wants decimals, or an empty string if that is not the problem."""
     if isinstance(spec.default, float) and isinstance(value, int) and not isinstance(value, bool):
         return str(float(value))
     if isinstance(spec.default, list) and spec.default and isinstance(spec.default[0], float):
@@ -157,8 +152,8 @@ def _descriptor(spec: ParameterSpec) -> ParameterDescriptor:
         read_only=spec.read_only,
         additional_constraints=spec.domain,
     )
-    # ROS knows ranges with two ends only; tools make sliders of them. A domain with one end stands in the constraints,
-    # and our own refusal says it better than "out of range, Max: 1.797e+308".
+    # ROS has two-ended ranges only; a one-ended domain is in the constraints, and refused better by our own check than
+    # by "out of range, Max: 1.797e+308".
     if spec.minimum is not None and spec.maximum is not None:
         if isinstance(spec.default, float):
             descriptor.floating_point_range = [

@@ -1,6 +1,6 @@
-"""What every plant offers on the graph: topics, services, command rules and diagnostics, in one place.
+"""The graph side of every plant: topics, services, command rules and diagnostics.
 
-A plant (simulator, bridge) owns its clock and its loop; it asks ``decide`` what to do and publishes what was done.
+A plant (simulator, bridge) owns clock and loop; it calls ``decide`` and publishes what was applied.
 """
 
 from __future__ import annotations
@@ -43,14 +43,13 @@ from pendulum_msgs_py.ros.timers import create_wall_timer
 __all__ = ["PlantInterface"]
 
 _LEAST_BETWEEN_LINES = 1.0
-"""Time between two lines of the log about one mode [s]."""
+"""Time between two log lines about one mode [s]."""
 _DRIFT = 0.01
-"""Largest share of the time between two messages of the hold-to-run switch by which the second is later because two
-clocks differ."""
+"""Relative drift of two clocks that is allowed between messages of the hold-to-run switch."""
 _LOOK = 0.02
-"""Time between two looks for a press or a trajectory [s]; of trajectories without pause the newest is read then."""
+"""Poll period of e-stops and trajectories [s]; only the newest trajectory is read."""
 TRAJECTORY_AGE_LIMIT = 1.0
-"""Largest distance of a trajectory's stamp from the plant's time [s]: an old wish should not move a machine."""
+"""Largest difference between a trajectory's stamp and the plant's time [s]: an old one must not move a machine."""
 
 
 class _CommandHook(Protocol):
@@ -63,23 +62,23 @@ class PlantInterface:
     Args:
         node: The plant's node.
         supervisor: Its rules and state.
-        clock: The plant's time [ns]: wall clock or simulated; asked by the thread of the e-stop too, from the start.
-        push: Whether the plant can take a torque on the link itself.
+        clock: The plant's time [ns], wall or simulated; also called by the e-stop's thread.
+        push: Whether the plant accepts a torque on the link itself.
         polled: Whether torque inputs wait for :meth:`take_inputs` instead of waking the node.
         statistics: The loop's figures, shown in diagnostics.
-        more_diagnostics: Further key-value pairs for diagnostics.
+        more_diagnostics: Further values for diagnostics.
         on_command: Called after each accepted command of any torque input.
 
     Attributes:
-        sample: Newest state that was published.
-        published_ns: System time at which it was, in which DDS notes arrivals too [ns].
-        hardware_id: Which device this is, for diagnostics.
-        arrived_ns: System time at which the message being handled reached this process, for polled inputs [ns].
-        polled: Whether torque inputs wait.
+        sample: Newest published state.
+        published_ns: Its system time, the clock of DDS's arrival stamps [ns].
+        hardware_id: The device, for diagnostics.
+        arrived_ns: Arrival of the message being handled, in system time, for polled inputs [ns].
+        polled: As above.
         inputs: Subscription of each input.
-        commander_watch: Who commands, as far as the graph tells.
+        commander_watch: Conflicts on the graph.
         state_publisher: Publishes states.
-        applied_publisher: Publishes what was applied.
+        applied_publisher: Publishes applied efforts.
     """
 
     def __init__(
@@ -111,7 +110,7 @@ class PlantInterface:
         self._more_diagnostics = more_diagnostics
         self._reported_mode: tuple[Mode, bool, bool] | None = None
         self._mode_lines = Throttle(_LEAST_BETWEEN_LINES)
-        self._told_refusals = 0
+        self._reported_refusals = 0
         self.commander_watch = CommanderWatch(node, supervisor)
         self._seconds_at_check = 0
         self._second_commander = False
@@ -143,7 +142,7 @@ class PlantInterface:
         create_wall_timer(node, _LOOK, self._on_look)
         node.create_service(SetBool, names.ARM, self._on_arm)
         node.create_service(Trigger, names.E_STOP_RESET, self._on_e_stop_reset)
-        # Steady time: it must go on where simulated time stands still, or where the system clock is set back.
+        # Steady time: it must run while simulated time stands still, or the system clock is set back.
         create_wall_timer(node, DIAGNOSTICS_PERIOD, self._on_housekeeping)
         self._pressed = threading.Event()
         self._e_stop = EStopServer(node, self.e_stop)
@@ -159,43 +158,43 @@ class PlantInterface:
     # --- the plant's loop calls these ----------------------------------------------------------------------
 
     def take_inputs(self) -> None:
-        """Take the torques that came since the last look, where inputs are polled."""
+        """Take new torques of polled inputs."""
         for source, receive in self._polled:
             source.take(receive)
 
     def watch_inputs(self) -> ArrivalSignal:
-        """Have the middleware say when a torque comes, where inputs are polled, for who waits for them."""
+        """Return the arrival signal of polled torque inputs."""
         if self._torques is None:
             self._torques = ArrivalSignal([source.subscription for source, _ in self._polled])
         return self._torques
 
     def wait_for_inputs(self, timeout: float) -> None:
-        """Take the torques that came since the last look, or wait for one [s], where inputs are watched."""
+        """Take new torques, or wait for one at most a time [s]; after :meth:`watch_inputs`."""
         assert self._torques is not None, "inputs are not watched"
         if self._torques.wait(timeout):
             self.take_inputs()
 
     @property
     def calls(self) -> tuple[int, int]:
-        """Descriptors of what ends a slice of compiled code: requests and trajectories; -1 where there is none."""
+        """Descriptors that end a slice of compiled code: requests and trajectories; -1 for none."""
         if self._called is None and self.node.request_descriptor >= 0:
-            # Readable when one of these is: an e-stop does not wait for its thread to wake the node.
+            # Readable when one of these is: an e-stop need not wait for its thread.
             self._called = select.epoll()
             for counter in {self.node.request_descriptor, self._e_stop.arrivals.descriptor} - {-1}:
                 self._called.register(counter, select.EPOLLIN)
         return -1 if self._called is None else self._called.fileno(), self._trajectories.descriptor
 
     def receive(self, kind: Input, data: bytes, arrived_ns: int) -> None:
-        """Receive a torque that somebody else has taken, where inputs are polled."""
+        """Receive a torque that compiled code has taken from a polled input."""
         self._receivers[kind](data, arrived_ns)
 
     def pop_accepted(self) -> dict[Input, bytes]:
-        """Return the newest message that was accepted at each input since this was asked last."""
+        """Return the newest accepted message of each input since the last call."""
         accepted, self._accepted = self._accepted, {}
         return accepted
 
     def publish_state(self, sample: JointSample) -> None:
-        """Publish a state and remember it as the newest."""
+        """Publish the newest state."""
         self.sample = sample
         self.commander_watch.note_state(sample.stamp_ns)
         stamp_ns, position, velocity, effort = sample
@@ -204,78 +203,78 @@ class PlantInterface:
         self.state_publisher.publish(data)
 
     def decide(self, now_ns: int | None = None) -> Drive:
-        """Return what to do now, by the supervisor's rules; says on the log when the answer changes."""
+        """Return the supervisor's decision, and log changes."""
         if self._enable is not None and self._enable.came():
             self._receive_enable()
         drive = self.supervisor.decide(self.clock() if now_ns is None else now_ns, self.sample)
         report = (self.supervisor.mode, drive.starved, self.supervisor.trajectory_finished)
         if report != self._reported_mode:
-            self._tell(drive)
+            self._report_change(drive)
             self._reported_mode = report
         return drive
 
     def publish_applied(self, stamp_ns: int, effort: Vector) -> None:
-        """Publish the efforts that were really applied from the state with this stamp on, and remember them."""
+        """Publish the efforts applied from the state with this stamp on."""
         self.supervisor.report_applied(effort)
-        # Building and publishing what nobody hears would be a tenth of the loop.
+        # Publishing without a subscriber would take a tenth of the loop.
         if self.applied_publisher.get_subscription_count():
             self.applied_publisher.publish(encode_joints(stamp_ns, "", self._driven, (), (), effort))
-        # Only the last words are waited for: a torque that was under way meanwhile is still to be ended.
+        # Wait for the last zero only: any other torque must still be ended.
         if self._stopping and not any(effort):
             wait_until_heard(self.applied_publisher)
 
     def publish_event(self, name: str, **details: object) -> None:
-        """Publish an event at the plant's time."""
+        """Publish an event."""
         self._events.publish(event_message(self.clock(), name, **details))
 
     # --- graph ---------------------------------------------------------------------------------------------
 
     @property
     def state_subscribers(self) -> int:
-        """How many subscriptions are matched with ``joint_states``."""
+        """Number of matched subscriptions to ``joint_states``."""
         return self.state_publisher.get_subscription_count()
 
     def commanders(self, kind: Input) -> int:
-        """Return how many publishers are matched with an input."""
+        """Return the number of publishers matched with an input."""
         return self.inputs[kind].get_publisher_count()
 
     def e_stop(self, reason: str) -> None:
-        """Latch the e-stop; from any thread, waiting for nobody."""
-        # Compiled code that waits for an answer has the supervisor, and sees nothing but its counters.
+        """Latch the e-stop, from any thread, without waiting."""
+        # Waiting compiled code holds the supervisor, and polls nothing but its counters.
         self.node.wake()
         self._pressed_at = time.monotonic_ns()
         self.supervisor.e_stop(self.clock(), reason)
         self._pressed.set()
 
     def _unread_press(self) -> tuple[int, str] | None:
-        """Return a press that has reached this process, though the e-stop's thread has not run since."""
+        """Return an e-stop that has reached this process but not yet the e-stop's thread."""
         if not self._e_stop.arrivals.counted():
             return None
         self._pressed_at = time.monotonic_ns()
         return self.clock(), PRESSED
 
     def _is_outdated(self) -> bool:
-        """Return whether the request being answered came before the e-stop was pressed last, and has waited since."""
+        """Return whether the request being answered arrived before the last e-stop."""
         return _came_before(self.node.request_ns, self._pressed_at)
 
     def measured(self) -> tuple[int, JointSample | None]:
-        """Return the time and the newest state after a preparation, in which the hold-to-run switch was not heard."""
+        """Return time and newest state after a preparation, during which the hold-to-run switch was not read."""
         self._receive_enable()
         return self.clock(), self.sample
 
     def safe_stop(self, reason: str) -> None:
-        """Disarm, say so in diagnostics; the plant then applies zero torque and publishes that, to be heard too."""
+        """Disarm and publish that; the plant then applies and publishes zero torque."""
         self.supervisor.disarm(self.clock(), reason)
         self.publish_diagnostics()
         wait_until_heard(self._diagnostics.publisher)
         self._stopping = True
 
     def close(self) -> None:
-        """Serve the e-stop no longer: the plant is safe."""
+        """Stop to serve the e-stop: the plant is safe."""
         self._e_stop.close()
 
     def publish_diagnostics(self) -> None:
-        """Publish the state of the plant."""
+        """Publish the plant's status."""
         supervisor = self.supervisor
         values: dict[str, object] = {
             "mode": supervisor.mode.value,
@@ -324,9 +323,9 @@ class PlantInterface:
         return receive
 
     def _note_round_trip(self, command: JointCommand) -> None:
-        """Measure until the answer reached this process; that it waits there until it is looked at costs it nothing.
+        """Measure until the reply reached this process, without its wait to be polled.
 
-        Both are system time; they differ by a fraction of a period, so a step of that clock between them is unlikely.
+        Both times are system time; a clock step within this fraction of a period is unlikely.
         """
         answers = self.sample is not None and command.stamp_ns == self.sample.stamp_ns
         if answers and self.arrived_ns and self.statistics is not None:
@@ -339,7 +338,7 @@ class PlantInterface:
         self._look_for_trajectory()
 
     def _look_for_trajectory(self) -> None:
-        """Take the newest trajectory, and leave others the time: reading one holds Python's lock, and many may come."""
+        """Take the newest trajectory, then pause: reading holds the GIL, and many may come."""
         if time.monotonic() < self._next_trajectory or not self._trajectories.came():
             return
         began = time.thread_time()
@@ -384,7 +383,7 @@ class PlantInterface:
             was_armed = self.supervisor.mode.armed
             refusal = self.supervisor.arm(self.clock(), self.sample)
             if not was_armed:
-                # Arming takes its time; what waited in the meantime was not meant for an armed plant.
+                # A trajectory that waited during arming was not meant for an armed plant.
                 self._armed_at = time.monotonic_ns()
                 self._trajectories.take(self._on_trajectory)
             response.success, response.message = not refusal, refusal or self.supervisor.mode.value
@@ -398,26 +397,26 @@ class PlantInterface:
     def _receive_enable(self) -> None:
         if self._enable is not None:
             with self.supervisor.alone():
-                # No more than it keeps: e-stop and actuator wait meanwhile, however fast others publish.
+                # Bounded, since e-stop and actuator wait meanwhile.
                 for data, info in islice(self._enable.messages(), self._enable.depth):
                     self._on_enable(data, info)
 
     def _on_enable(self, data: bytes, info: Mapping[str, int]) -> None:
-        """Hear the hold-to-run switch as of when it spoke: what waited for a process that stood still is old.
+        """Read the hold-to-run switch as of the time of its message: what waited for a stalled process is old.
 
-        A message has no stamp, and hosts have clocks of their own; but what waited is later than those before it were.
+        A message has no stamp, and hosts' clocks differ; but a message that waited is later than those before it.
         """
         assert self._enable is not None
         timeout_ns = NANOSECONDS * self.supervisor.limits.enable_timeout
         spoke_ns = info["source_timestamp"] or info["received_timestamp"]
         apart, lag = spoke_ns - self._enable_spoke_ns, time.time_ns() - spoke_ns
         later = lag - self._enable_lag - _DRIFT * min(apart, timeout_ns)
-        # Of messages that waited each is less late than the one before; where none is, a clock was set. While armed it
-        # is not assumed: a link that delays more and more would count as one in time.
+        # Of waiting messages each is less late than the one before; otherwise a clock was set. Not assumed while armed:
+        # it would excuse a link with growing delay.
         was_set = lag >= self._enable_lag and self._enable_waited > timeout_ns and not self.supervisor.mode.armed
         self._enable_spoke_ns, self._enable_lag = spoke_ns, lag
         self._enable_waited = 0.0 if was_set else max(0.0, self._enable_waited + later)
-        # Of two switches one would hide that the other is released or silent.
+        # A second switch would hide that the first is released or silent.
         alone = self._enable.subscription.get_publisher_count() == 1
         held = data[4:5] == b"\x01"
         self.supervisor.receive_enable(self.clock() - round(self._enable_waited), held=held and alone)
@@ -435,16 +434,16 @@ class PlantInterface:
         seconds = sum(gate.refused[Refusal.SECOND_COMMANDER] for gate in self.supervisor.gates.values())
         self._second_commander = seconds > self._seconds_at_check
         self._seconds_at_check = seconds
-        self._tell_refusals()
-        self._tell_mode_again()
+        self._report_refusals()
+        self._report_suppressed()
         self.publish_diagnostics()
 
-    def _tell(self, drive: Drive) -> None:
+    def _report_change(self, drive: Drive) -> None:
         supervisor = self.supervisor
         logger = self.node.get_logger()
         text = f"{supervisor.mode.value}: {supervisor.reason}"
         same_mode = self._reported_mode is not None and self._reported_mode[0] is supervisor.mode
-        # Commands that come more slowly than they age start and starve the plant with each of them.
+        # Commands slower than their timeout start and starve the plant each time.
         left_out = self._mode_lines.ask(time.monotonic(), urgent=not same_mode)
         timeout = supervisor.limits.command_timeout
         if left_out is None:
@@ -463,20 +462,19 @@ class PlantInterface:
         else:
             self.publish_event(Event.PLANT_MODE, mode=supervisor.mode.value, reason=supervisor.reason)
 
-    def _tell_refusals(self) -> None:
+    def _report_refusals(self) -> None:
         gates = {kind: self.supervisor.gates[kind] for kind in self.inputs}
         refused = sum(sum(gate.refused.values()) for gate in gates.values())
-        if refused > self._told_refusals:
+        if refused > self._reported_refusals:
             details = ", ".join(
                 f"{kind.value} {refusal.value} {count} ({gate.problems.get(refusal, '')})"
                 for kind, gate in gates.items()
                 for refusal, count in sorted(gate.refused.items())
             )
             self.node.get_logger().warning(f"commands refused so far: {details}")
-            self._told_refusals = refused
+            self._reported_refusals = refused
 
-    def _tell_mode_again(self) -> None:
-        """Say how it ended where lines were left out."""
+    def _report_suppressed(self) -> None:
         left_out = self._mode_lines.flush(time.monotonic())
         if left_out:
             supervisor = self.supervisor
@@ -494,8 +492,8 @@ class PlantInterface:
 
 
 def _came_before(arrived_ns: int, happened_at: float) -> bool:
-    """Return whether what has waited since a system time [ns], 0 if unknown, came before a steady time [ns].
+    """Return whether an arrival in system time [ns], 0 if unknown, was before a steady time [ns].
 
-    By how long ago either was: the system clock may have been set since, and a process may stand still for any time.
+    By their ages: the system clock may have been set since, and the process may have stalled.
     """
     return arrived_ns > 0 and time.time_ns() - arrived_ns > time.monotonic_ns() - happened_at

@@ -1,4 +1,4 @@
-"""The two clocks of a plant: absolute deadlines of wall time, or in lockstep with those who answer its states."""
+"""The two clocks of a plant: absolute deadlines of wall time, and lockstep with the replies to its states."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ __all__ = ["LockstepLoop", "RealtimeLoop", "Stepper"]
 
 
 class Stepper(Protocol):
-    """What a loop needs of a plant: go on for one period, until a given time, under a decision."""
+    """Steps a plant."""
 
     def __call__(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, Vector]:
-        """Return the state at the end of the period, so stamped, and the efforts that were applied on the way.
+        """Step one period until a stamp [ns] under a decision; return the state there and the applied efforts.
 
-        None stands for a measurement that was lost: nothing is published, time goes on.
+        A lost measurement is None: nothing is published, time goes on.
         """
 
 
 class RealtimeLoop:
     """Steps the plant at absolute deadlines of wall time, without drift.
 
-    Late by a period or more, the plant is stepped through the periods it missed and only the newest state is
-    published: one overrun, however many periods were missed. Its runner calls :meth:`run_due`: a timer of rclpy's would
-    cost two more threads' attention a period, and drop the periods it missed.
+    A plant that is late by a period or more is stepped through the missed periods, and only the newest state is
+    published: one overrun. The runner calls :meth:`run_due`: rclpy's timer would wake two more threads per period, and
+    skip missed ones.
 
     Args:
-        interface: The plant on the graph, its inputs polled.
+        interface: The plant on the graph, with polled inputs.
         step: Steps the plant.
-        statistics: Gets the loop's figures.
+        statistics: Receives the loop's figures.
         clock: Wall time.
 
     Attributes:
-        paused: Somebody wants the plant to wait.
-        halted: The plant has no next state; it says so itself, in a step.
-        compiled: Runs ordinary periods, or None.
+        paused: Time stands still.
+        halted: The plant, in a step, reported that it has no next state.
+        compiled: Runs nominal periods, or None.
     """
 
     def __init__(
@@ -65,11 +65,10 @@ class RealtimeLoop:
         self.compiled: CompiledPeriods | None = None
 
     def run_due(self) -> float:
-        """Do what is due; return the time until the next deadline [s]."""
+        """Run due periods; return the time until the next deadline [s]."""
         now = self._clock()
         period = self._statistics.period_ns
         if self.compiled is not None and now >= self._deadline_ns and not (self.paused or self.halted):
-            # Until the first deadline after it whatever else waits has its turn.
             done = self.compiled.run(self._deadline_ns - period)
             self._deadline_ns = done.now_ns + period
             if done.message is not None:
@@ -101,10 +100,10 @@ class RealtimeLoop:
     def _advance(self, *, publish: bool = True) -> None:
         interface = self._interface
         before = interface.sample
-        # As of the deadline: a plant that catches up must not chase a setpoint of the time at which it was noticed.
+        # As of the deadline: a plant that catches up must not follow a later set point.
         drive = interface.decide(self._deadline_ns)
         sample, applied = self._step(drive, self._deadline_ns)
-        # The state first: somebody waits to answer it.
+        # The state first: a controller waits for it.
         if publish and sample is not None:
             interface.publish_state(sample)
         if before is not None:
@@ -112,24 +111,24 @@ class RealtimeLoop:
 
 
 class LockstepLoop:
-    """Publishes a state and steps only when every expected answer stamped with it has come; runs as fast as they do.
+    """Publishes a state and steps once every expected reply to it has arrived, as fast as they come.
 
-    The plant's time is simulated, goes out on ``/clock`` and depends on nothing but the number of steps, so that two
-    runs with one seed publish the same messages.
+    The plant's time is simulated, published on ``/clock``, and depends on the number of steps alone: two runs with one
+    seed publish the same messages.
 
     Args:
         interface: The plant on the graph.
         step: Steps the plant.
         period_ns: Time between two states [ns].
-        inputs: Inputs that must answer.
-        subscribers: Subscriptions to states that must be there before the first one.
+        inputs: Inputs that must reply.
+        subscribers: Subscriptions to states required before the first one.
         duration: Simulated time after which to stop [s]; 0 for never.
         publish_clock: Whether this plant owns ``/clock``.
 
     Attributes:
-        paused: Somebody wants the plant to wait.
-        halted: The plant has no next state; it says so itself, in a step.
-        compiled: Runs ordinary steps, or None.
+        paused: Time stands still.
+        halted: The plant, in a step, reported that it has no next state.
+        compiled: Runs nominal steps, or None.
         clock_publisher: Publishes ``/clock``, or None.
     """
 
@@ -152,8 +151,8 @@ class LockstepLoop:
         self._last_ns = LOCKSTEP_EPOCH_NS + round(duration * NANOSECONDS) if duration else None
         self._answered: set[Input] = set()
         self._waiting_since = time.monotonic()
-        self._told_waiting = False
-        self._told_finished = False
+        self._reported_waiting = False
+        self._reported_finished = False
         self.now_ns = LOCKSTEP_EPOCH_NS
         self.steps = 0
         self.started = False
@@ -170,7 +169,7 @@ class LockstepLoop:
             interface.watch_inputs()
 
     def __call__(self) -> int:
-        """Return the simulated time [ns]: the loop is the plant's clock."""
+        """Return the simulated time [ns]."""
         return self.now_ns
 
     def diagnostics(self) -> Mapping[str, object]:
@@ -182,10 +181,7 @@ class LockstepLoop:
         }
 
     def run_due(self) -> float:
-        """Start, step where nobody has to answer, ask again where patience has ended; return when to look again [s].
-
-        Its runner calls this after each event; answers alone make the pace where they are waited for.
-        """
+        """Start, take steps that need no reply, or repeat an overdue state; return the time until the next call [s]."""
         interface, waits = self._interface, False
         if interface.polled:
             interface.take_inputs()
@@ -199,7 +195,7 @@ class LockstepLoop:
         return 0.0 if waits else self._next_look - now
 
     def _wait_for_answers(self, longest: float) -> bool:
-        """Take answers and step, for a time at most [s]; return whether any step was taken."""
+        """Take replies and step, at most a time [s]; return whether a step was taken."""
         before, compiled = self.steps, self.compiled
         end = time.monotonic() + (longest if compiled is not None else INTERPRETED_SLICE)
         while (left := end - time.monotonic()) > 0.0 and self._must_wait() and not self.finished:
@@ -207,7 +203,7 @@ class LockstepLoop:
                 steps = self.steps
                 done = self._run_compiled(compiled, left)
                 if done.ended:
-                    # Somebody calls, and it may be some time before they have their turn: Python waits meanwhile.
+                    # A pending call may have to wait for its turn: Python waits meanwhile.
                     compiled, end = None, min(end, time.monotonic() + WHILE_CALLED)
                     continue
                 if self.steps > steps or done.message is not None:
@@ -216,7 +212,7 @@ class LockstepLoop:
         return self.steps > before
 
     def _run_compiled(self, compiled: CompiledPeriods, longest: float) -> Slice:
-        """Take ordinary steps for a time at most [s], and let Python do what comes then."""
+        """Take nominal steps at most a time [s], and handle what ended them."""
         done = compiled.run(
             self.now_ns, longest=longest, expected=self._inputs, answered=self._answered, last_ns=self._last_ns
         )
@@ -227,12 +223,12 @@ class LockstepLoop:
         if done.message is not None:
             self._interface.receive(*done.message)
         elif self._inputs <= self._answered:
-            # All have answered, and what they make of it is not ordinary.
+            # All have answered, but the step is not nominal.
             self.advance()
         return done
 
     def answered(self, kind: Input, command: JointCommand) -> None:
-        """Take note of an accepted command; steps when it was the last one missing."""
+        """Record an accepted command, and step if it was the last one missing."""
         if self.started and command.stamp_ns == self.now_ns:
             self._answered.add(kind)
             if not self.paused and not self._must_wait():
@@ -242,7 +238,7 @@ class LockstepLoop:
         """Take one step."""
         interface = self._interface
         sample = None
-        # A measurement that was lost has nobody to answer it: the plant goes on under its last decision's rules.
+        # A lost measurement gets no reply: the plant steps on.
         while sample is None and not self.finished and not self.halted:
             before_ns = self.now_ns
             drive = interface.decide()
@@ -250,12 +246,12 @@ class LockstepLoop:
             sample, applied = self._step(drive, self.now_ns)
             self.steps += 1
             self.finished = self._last_ns is not None and self.now_ns >= self._last_ns
-            # The state first: somebody waits to answer it.
+            # The state first: a controller waits for it.
             if sample is not None:
                 self._publish(sample)
             interface.publish_applied(before_ns, applied)
-        if self.finished and not self._told_finished:
-            self._told_finished = True
+        if self.finished and not self._reported_finished:
+            self._reported_finished = True
             interface.publish_event(Event.LOCKSTEP_FINISHED, steps=self.steps)
 
     def step_once(self) -> None:
@@ -265,7 +261,7 @@ class LockstepLoop:
 
     def _note_publication(self) -> None:
         self._waiting_since = time.monotonic()
-        self._told_waiting = False
+        self._reported_waiting = False
 
     def _publish(self, sample: JointSample) -> None:
         self._answered.clear()
@@ -288,15 +284,15 @@ class LockstepLoop:
             self._repeat()
 
     def _repeat(self) -> None:
-        """Publish the state again: a match is known to one side before the other, so it may have been heard by nobody.
+        """Publish the state again: DDS may have matched too late for the first copy.
 
-        Who has answered already answers the same, and the plant refuses the second copy.
+        Repeated replies are equal, and refused as duplicates.
         """
         sample = self._interface.sample
         assert sample is not None
         self._waiting_since = time.monotonic()
-        if not self._told_waiting:
-            self._told_waiting = True
+        if not self._reported_waiting:
+            self._reported_waiting = True
             self._interface.node.get_logger().warning(
                 f"waiting for {self.diagnostics()['lockstep_waits_for']} in answer to the state at "
                 f"{self.now_ns / NANOSECONDS:.3f} s; publishing it again"
@@ -314,10 +310,10 @@ class LockstepLoop:
 
 
 _EVENTS_AFTER_SLICE = 16
-"""Events that the executor may attend to after each slice: 80 a second at least, and a plant's timers make 51."""
+"""Executor events after each slice, at least 80 a second; a plant's timers make 51."""
 _LOOK_FREE = 0.001
-"""Wall time between two steps that nobody has to answer, and between two looks for those who will [s]."""
+"""Wall time between two steps without reply, and between two checks for subscribers [s]."""
 _LOOK_WAITING = 0.1
-"""Wall time between two looks for answers that are overdue [s]."""
+"""Wall time between two checks for overdue replies [s]."""
 _PATIENCE = 1.0
-"""Wall time without an answer after which a state is published again [s]."""
+"""Wall time without a reply after which a state is repeated [s]."""

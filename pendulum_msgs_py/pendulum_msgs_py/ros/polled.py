@@ -1,9 +1,8 @@
-"""Inputs and requests that a node looks at when it needs them, instead of being woken for each message.
+"""Inputs and requests that a node polls instead of being woken for each message.
 
-A plant that acts at deadlines has no use for a torque before the next one. Emptying its inputs there saves it one
-wake-up a period, a third of its time at 1 kHz, and bounds what a flood of messages can cost. A recorder empties its
-inputs every few milliseconds, a page when a picture is due. Requests to a plant wait for their turn as well: who asks
-without pause would keep Python's lock, and with it the threads of actuator and e-stop, and a processor.
+A plant with deadlines needs no torque before the next one: polling there saves one wake-up a period, a third of its
+time at 1 kHz, and bounds the cost of a flood of messages. Requests are polled too: a client that calls without pause
+would hold the GIL, and block the threads of actuator and e-stop.
 """
 
 from __future__ import annotations
@@ -24,22 +23,17 @@ from pendulum_msgs_py.ros.timers import create_wall_timer
 __all__ = ["REST_AFTER_READING", "PolledInput", "PollingNode", "WaitedInput"]
 
 REST_AFTER_READING = 4.0
-"""Time without a look after something big was read, in the time that it took the processor: a fifth of it at most."""
+"""Pause after reading, relative to its CPU time: reading takes at most a fifth."""
 _LOOK_FOR_REQUESTS = 0.01
-"""Time between two looks for requests [s]."""
+"""Poll period of requests [s]."""
 _LONGEST_REST = 0.1
-"""Longest time without a look [s]: after a change of state, which computes, somebody waits to go on."""
+"""Longest pause [s]: a client waits after a change of state, which computes long."""
 _LONGEST_LOOK = 0.001
-"""Time of the processor after which a look takes no further request [s]; a period at 500 Hz has 2 ms."""
+"""CPU time after which a poll takes no further request [s]; a period at 500 Hz has 2 ms."""
 
 
 class PolledInput:
-    """A subscription to raw messages that its owner empties.
-
-    Args:
-        subscription: Of a :class:`PollingNode`, raw.
-        depth: Messages that it keeps; also the most that one look takes, however fast others publish.
-    """
+    """A raw subscription of a :class:`PollingNode` that its owner polls, at most ``depth`` messages at once."""
 
     def __init__(self, subscription: Subscription, depth: int) -> None:
         self.subscription = subscription
@@ -50,24 +44,20 @@ class PolledInput:
         self._signal: ArrivalSignal | None = None
 
     def watch(self) -> None:
-        """Have the middleware say when something comes, for an owner who looks often at what seldom comes."""
+        """Let the middleware signal arrivals, for frequent polls of rare messages."""
         self._signal = ArrivalSignal([self.subscription])
 
     @property
     def descriptor(self) -> int:
-        """The event counter to which each message adds, where somebody watches; else -1."""
+        """The event counter of arrivals, or -1 without :meth:`watch`."""
         return -1 if self._signal is None else self._signal.descriptor
 
     def came(self) -> bool:
-        """Return whether anything may have come since this was asked last; always, where nobody watches."""
+        """Return whether anything may have come since the last call; always, without :meth:`watch`."""
         return self._signal is None or self._signal.came()
 
     def take(self, receive: Callable[[bytes, int], object]) -> None:
-        """Hand over what has come since the last look, to the thread that owns the node.
-
-        Args:
-            receive: Gets each message, serialised, and the system time at which it reached this process [ns].
-        """
+        """Pass new messages, serialised, with their arrival in system time [ns], in the node's thread."""
         for _ in self._looks:
             taken = self._take(self._type, True)
             if taken is None:
@@ -75,22 +65,19 @@ class PolledInput:
             receive(taken[0], taken[1]["received_timestamp"])
 
     def messages(self) -> Iterator[tuple[bytes, Mapping[str, int]]]:
-        """Yield what has come since the last look, serialised, with what the middleware knows of it; in any thread."""
+        """Yield new messages, serialised, with the middleware's information; from any thread."""
         with self.subscription.handle:
             while (taken := self._take(self._type, True)) is not None:
                 yield taken
 
 
 class WaitedInput(PolledInput):
-    """A subscription to raw messages that its owner waits for, where the middleware says when one comes.
-
-    Where it does not, on other systems or with another middleware, an executor hands the messages over as ever, and
-    there is nothing to wait for.
+    """A raw subscription that its owner waits for if the middleware signals arrivals; otherwise an executor serves it.
 
     Args:
-        subscription: Of a :class:`PollingNode`, raw; ``receive`` is its callback.
-        depth: Messages that it keeps; also the most that one look takes.
-        receive: Gets each message, serialised, in the thread that owns the node.
+        subscription: Of a :class:`PollingNode`, with ``receive`` as callback.
+        depth: Its depth, which also bounds the messages of one poll.
+        receive: Gets each message, serialised, in the node's thread.
         signal: Of this subscription alone.
     """
 
@@ -104,15 +91,11 @@ class WaitedInput(PolledInput):
 
     @property
     def works(self) -> bool:
-        """Whether its owner waits for it; otherwise the executor attends to it."""
+        """Whether its owner waits for it."""
         return self._arrivals.works
 
     def serve(self, longest: float) -> bool:
-        """Hand over what has come, and what comes within a time; return whether anything did.
-
-        Args:
-            longest: Time after which nothing more is waited for [s].
-        """
+        """Pass new messages, and those that come within a time [s]; return whether there were any."""
         ends, any_came = time.monotonic() + longest, False
         while True:
             for _ in self._looks:
@@ -127,9 +110,9 @@ class WaitedInput(PolledInput):
 
 
 class PollingNode(Node):
-    """A node that can have polled inputs besides the subscriptions that an executor attends to.
+    """A node with polled inputs, alongside subscriptions served by an executor.
 
-    Without ``__init__``, since rclpy's lifecycle node, which it may be joined with, calls that of ``Node`` directly.
+    It has no ``__init__``: rclpy's lifecycle node, a possible sibling, calls that of ``Node`` directly.
     """
 
     _polled: frozenset[Subscription] = frozenset()
@@ -140,39 +123,37 @@ class PollingNode(Node):
     _next_look = 0.0
     _attend_at = 0.0
     request_ns = 0
-    """System time at which the request being answered reached this process [ns]; 0 where that is not known."""
+    """Arrival of the request being answered, in system time [ns]; 0 if unknown."""
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        """The subscriptions that an executor attends to."""
+        """The subscriptions served by an executor."""
         return (each for each in super().subscriptions if each not in self._polled)
 
     @property
     def services(self) -> Iterator[Service]:
-        """The services that an executor attends to."""
+        """The services served by an executor."""
         return (each for each in super().services if each not in self._served_in_turn)
 
     @property
     def notified_of_requests(self) -> bool:
-        """Whether the middleware says when a request has come; otherwise each service is looked at every 10 ms."""
+        """Whether the middleware signals requests; otherwise each service is polled every 10 ms."""
         return self._requests is not None and self._requests.works
 
     @property
     def request_descriptor(self) -> int:
-        """The event counter to which each request adds; -1 where there is none."""
+        """The event counter of requests; -1 for none."""
         return -1 if self._requests is None else self._requests.descriptor
 
     def wake(self) -> None:
-        """Have the node's thread look for requests, and for what else it does between two slices; from any thread."""
+        """Make the node's thread poll now, from any thread."""
         if self._requests is not None:
             self._requests.wake()
 
     def poll_services(self, *, timer: bool = True) -> None:
-        """Attend to the services that there are at a bounded rate from now on, one request after the other.
+        """Serve the present services by polling at a bounded rate, one request after the other.
 
-        Args:
-            timer: Look by a timer; without one, the owner of the node's thread calls :meth:`attend` where it wakes up
-                anyway. Each tick of a timer wakes two threads.
+        Without ``timer``, the owner of the node's thread calls :meth:`attend`; each tick of a timer wakes two threads.
         """
         self._in_turn = deque(self.services)
         self._served_in_turn = frozenset(self._in_turn)
@@ -181,7 +162,7 @@ class PollingNode(Node):
             create_wall_timer(self, _LOOK_FOR_REQUESTS, self._look_for_requests)
 
     def attend(self) -> float:
-        """Look for requests if it is time to; return the time until it is [s], 0 after a look that took some itself."""
+        """Poll requests if due; return the time until the next poll [s], 0 after one."""
         left = self._attend_at - time.monotonic()
         if left > 0.0:
             return left
@@ -190,14 +171,14 @@ class PollingNode(Node):
         return 0.0
 
     def _look_for_requests(self) -> None:
-        """Answer what waits, or as much of it as a look may take; DDS keeps the ten newest requests of a client."""
+        """Answer waiting requests within the limit of a poll; DDS keeps the ten newest of a client."""
         if time.monotonic() < self._next_look:
             return
         if self._requests is not None and not (self._requests.came() or self._more_requests):
             return
         began, spent, silent = time.thread_time(), 0.0, 0
         while silent < len(self._in_turn) and spent <= _LONGEST_LOOK:
-            # Each has its turn, whoever else is asked without pause.
+            # Round robin, also under a flood of requests to one service.
             service = self._in_turn[0]
             self._in_turn.rotate(-1)
             silent = 0 if self._answer_one(service) else silent + 1
@@ -207,14 +188,14 @@ class PollingNode(Node):
             self._next_look = time.monotonic() + min(_LONGEST_REST, REST_AFTER_READING * spent)
 
     def _answer_one(self, service: Service) -> bool:
-        """Answer the oldest request that waits; return whether there was one."""
+        """Answer the oldest request; return whether there was one."""
         request, header = take_request(service)
         if header is None:
             return False
         self.request_ns = header.received_timestamp
         response = service.srv_type.Response()
         if isinstance(request, TooLarge):
-            # With an empty answer, so that nobody waits for another.
+            # An empty response, so that the client does not wait.
             self.get_logger().error(
                 f"request to {service.srv_name} has {request.size / 1e3:.0f} kB; expected at most "
                 f"{MOST_BYTES / 1e3:.0f} kB: not read",
@@ -226,7 +207,7 @@ class PollingNode(Node):
         return True
 
     def create_polled_input(self, message_type: type, topic: str, profile: QoSProfile) -> PolledInput:
-        """Return an input that no executor is woken for."""
+        """Return an input that wakes no executor."""
         subscription = self.create_subscription(message_type, topic, _never_called, profile, raw=True)
         self._polled |= {subscription}
         return PolledInput(subscription, profile.depth)
@@ -234,14 +215,9 @@ class PollingNode(Node):
     def create_waited_input(
         self, message_type: type, topic: str, profile: QoSProfile, receive: Callable[[bytes], object]
     ) -> WaitedInput:
-        """Return an input that the owner of the node's thread waits for, where the middleware says when one comes.
+        """Return an input for the owner of the node's thread to wait for.
 
-        Args:
-            message_type: Of the topic.
-            topic: Its name.
-            profile: Quality of service.
-            receive: Gets each message, serialised: from :meth:`WaitedInput.serve`, or from the executor where the
-                middleware does not tell.
+        ``receive`` gets each message, serialised: from :meth:`WaitedInput.serve`, or from the executor without signals.
         """
         subscription = self.create_subscription(message_type, topic, receive, profile, raw=True)
         signal = ArrivalSignal([subscription])
@@ -250,7 +226,7 @@ class PollingNode(Node):
         return WaitedInput(subscription, profile.depth, receive, signal)
 
     def destroy_polled_input(self, polled: PolledInput) -> None:
-        """Let go of an input."""
+        """Destroy an input."""
         self.destroy_subscription(polled.subscription)
         self._polled -= {polled.subscription}
 

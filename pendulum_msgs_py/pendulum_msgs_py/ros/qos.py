@@ -16,28 +16,26 @@ def _profile(
 
 
 _KEPT = 2000
-"""Messages that a fast publisher keeps for a reliable reader that is late, four seconds at 500 Hz.
+"""History of a fast publisher for late reliable readers, four seconds at 500 Hz.
 
-With the usual ten, a recorder that the scheduler lets wait for 20 ms loses messages in spite of being reliable: a
-writer that keeps the last ten overwrites what was not acknowledged yet.
+With the usual ten, a recorder delayed by 20 ms loses messages: the writer overwrites unacknowledged ones.
 """
 
 STATE = _profile(_KEPT)
-"""Published states and applied effort: reliable, because a best-effort publisher never matches RViz or a recorder."""
+"""Published states and applied effort: reliable, as a best-effort publisher never matches RViz or a recorder."""
 COMMAND = _profile(_KEPT)
 """Published torques of controllers and disturbances."""
 CLOCK = _profile(_KEPT)
-"""Simulated time; for those who record it."""
+"""Simulated time; the history serves recorders."""
 TRAJECTORY = _profile(1)
 EVENTS = _profile(100, DurabilityPolicy.TRANSIENT_LOCAL)
 """Phase changes of an experiment; late recorders get the earlier ones too."""
 DIAGNOSTICS = _profile(100)
 NEWEST_STATE = _profile(1, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""The subscription of controllers and viewers to states: only the newest is worth an answer, or a look.
+"""Subscription of controllers and viewers to states.
 
-Acknowledging each state and each torque would cost a seventh of a loop in real time and a tenth of its speed in
-lockstep. Nothing needs it: in real time the next state comes before a repeated one would, and in lockstep the plant
-publishes a state again that is not answered.
+Acknowledging each state and torque would cost a seventh of a real-time loop and a tenth of a lockstep run's speed. In
+real time the next state precedes a repetition, and in lockstep the plant repeats an unanswered state.
 """
 COMMAND_INPUT = _profile(10, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""A plant's subscription to torques, a few deep, so that a second commander is seen and not overwritten."""
+"""A plant's subscription to torques, deep enough that a second commander is detected."""

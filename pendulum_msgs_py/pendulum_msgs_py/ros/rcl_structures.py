@@ -1,4 +1,4 @@
-"""Structures of rcl in C, and the library that has its functions: the very one that rclpy has loaded."""
+"""C structures of rcl, and the library that rclpy has loaded."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class SerializedMessage(ctypes.Structure):
 
 @functools.cache
 def loaded_rcl() -> Any:
-    """Return the library, with the functions of serialised messages declared; None where it is not as it is known."""
+    """Return the library with functions of serialised messages declared, or None if it differs."""
     try:
-        # By its handle, what it is linked to is found as well: the middleware and its memory.
+        # Its handle also finds symbols of the libraries it is linked to.
         rcl = ctypes.CDLL("librcl.so", mode=os.RTLD_NOW | os.RTLD_NOLOAD)
         pointer = ctypes.c_void_p
         rcl.rcutils_get_default_allocator.argtypes, rcl.rcutils_get_default_allocator.restype = [], Allocator
@@ -44,6 +44,6 @@ def loaded_rcl() -> Any:
 
 
 def default_allocator() -> Allocator:
-    """Return the allocator that rcl uses where nobody gave it another."""
+    """Return rcl's default allocator."""
     allocator: Allocator = loaded_rcl().rcutils_get_default_allocator()
     return allocator

@@ -1,11 +1,9 @@
-"""Requests taken and answered without Python's lock, and refused where they are too large to be read quickly.
+"""Requests taken and answered without the GIL, and refused if too large.
 
-rclpy takes a request, unpacks it and makes objects of it in one call that holds Python's lock: no other thread of the
-process runs meanwhile, neither an actuator's nor an e-stop's. A request of 8 MB that sets 80 000 parameters took more
-than 0.3 s so. Here rcl takes it while other threads run, and Python sees it only where it is small.
-
-Memory that Python owns is lent to rcl for the time of a call and no longer; requests and answers themselves are made
-and unmade by the generated code of their types.
+rclpy takes and unpacks a request in one call that holds the GIL and so blocks the threads of actuator and e-stop, for
+more than 0.3 s with a request of 8 MB that sets 80 000 parameters. Here rcl takes it while other threads run, and
+Python sees small ones only. rcl uses Python's memory during a call only; the types' generated code creates and destroys
+messages.
 """
 
 from __future__ import annotations
@@ -24,23 +22,18 @@ from pendulum_msgs_py.ros.rcl_structures import SerializedMessage, default_alloc
 __all__ = ["MOST_BYTES", "RequestHeader", "TooLarge", "send_response", "take_request"]
 
 MOST_BYTES = 64_000
-"""Largest request that is read, as it came [bytes]: some 600 parameters, which take Python 5 ms."""
-_OK, _TIMEOUT, _NOTHING_TAKEN = 0, 2, 601
-"""Codes of rcl (``rcl/types.h``)."""
+"""Largest request that is read [bytes]: some 600 parameters, which take Python 5 ms."""
+_OK, _TIMEOUT, _NOTHING_TAKEN = 0, 2, 601  # rcl/types.h
 
 
 class TooLarge(NamedTuple):
-    """In place of a request that is not read.
-
-    Attributes:
-        size: Its size [bytes].
-    """
+    """Stands for an unread request of this size [bytes]."""
 
     size: int
 
 
 class _RequestId(ctypes.Structure):
-    """``rmw_request_id_t``, and room for one of another version."""
+    """``rmw_request_id_t``, with space for another version's."""
 
     _fields_ = [
         ("writer_guid", ctypes.c_uint8 * 16),
@@ -50,7 +43,7 @@ class _RequestId(ctypes.Structure):
 
 
 class RequestHeader(ctypes.Structure):
-    """``rmw_service_info_t``: who asked, when; the attributes are those of rclpy's own."""
+    """``rmw_service_info_t``, with the attributes of rclpy's own."""
 
     _fields_ = [
         ("source_timestamp", ctypes.c_int64),
@@ -60,14 +53,7 @@ class RequestHeader(ctypes.Structure):
 
 
 def take_request(service: Service) -> tuple[Any, Any]:
-    """Take the oldest request that waits, with its header; None twice where none does.
-
-    Args:
-        service: No executor attends to it.
-
-    Returns:
-        The request, or :class:`TooLarge` in its place, and the header to answer it by.
-    """
+    """Take a service's oldest request, or :class:`TooLarge`, and its header; None twice if none waits."""
     rcl = _rcl()
     if rcl is None:
         with service.handle:
@@ -89,13 +75,9 @@ def take_request(service: Service) -> tuple[Any, Any]:
 
 
 def send_response(service: Service, send: Callable[[Any, Any], None], response: Any, header: Any) -> bool | None:
-    """Answer a request; return whether its client has gone, None where rclpy does not tell.
+    """Send a response; return whether the client has gone, None if rclpy hides it.
 
-    Args:
-        service: Whose answer it is.
-        send: rclpy's own way, for the header of a request that rclpy has taken.
-        response: The answer.
-        header: Of the request.
+    ``send`` is rclpy's own function, for the header of a request that rclpy has taken.
     """
     rcl = _rcl()
     if rcl is None or not isinstance(header, RequestHeader):
@@ -122,13 +104,7 @@ def send_response(service: Service, send: Callable[[Any, Any], None], response: 
 
 
 class _Kind(NamedTuple):
-    """How the generated code makes and unmakes messages of a type.
-
-    Attributes:
-        create: Returns the address of a new message.
-        destroy: Unmakes it.
-        support: Address of what tells the middleware of its fields.
-    """
+    """Generated code of a message type: address of a new message, its destructor, and the type support."""
 
     create: Callable[[], int]
     destroy: Callable[[int], None]
@@ -158,7 +134,7 @@ def _address(capsule: Any) -> int:
 
 @functools.cache
 def _rcl() -> Any:
-    """Return the very library that rclpy has loaded, or None where it has not all that is called here."""
+    """Return the library that rclpy has loaded, or None if a function is missing."""
     rcl = loaded_rcl()
     try:
         for name in ("rcl_take_request_with_info", "rcl_send_response", "rmw_serialize", "rmw_deserialize"):

@@ -1,4 +1,4 @@
-"""The one way to run a node: signals, executor, errors, and a plant that is safe before the process ends."""
+"""Runs a node: signals, executor, errors, and a plant that is safe before the process ends."""
 
 from __future__ import annotations
 
@@ -46,31 +46,31 @@ from pendulum_msgs_py.ros.polled import PollingNode
 __all__ = ["Closeable", "Paced", "run_node"]
 
 _SPIN_SLICE = 0.5
-"""EventsExecutor.spin() hangs in the Jazzy wheels; spinning in finite slices works [s]."""
+"""EventsExecutor.spin() hangs in the Jazzy wheels; finite slices work [s]."""
 _M_MMAP_THRESHOLD = -3
 _LARGEST_HEAP_BLOCK = 128 * 1024
 """[bytes]"""
 _ECHO_TIME = 1.0
-"""Time within which a repeated stop signal is taken for an echo of the first [s]."""
+"""Time within which a repeated stop signal counts as an echo of the first [s]."""
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _KEPT_OPEN: list[socket.socket] = []
-"""Write ends of the signal sockets: closed by the garbage collector, they would take the wakeup with them."""
+"""Write ends of the signal sockets: the garbage collector would close them."""
 
 
 @runtime_checkable
 class Paced(Protocol):
-    """A node with deadlines of its own."""
+    """A node with deadlines."""
 
     def run_due(self) -> float | None:
-        """Do what is due; return the time until the next deadline [s], or None if there will be none."""
+        """Run what is due; return the time until the next deadline [s], or None for none."""
 
 
 @runtime_checkable
 class Closeable(Protocol):
-    """A node that has something to make safe before it goes."""
+    """A node that must be made safe."""
 
     def close(self) -> None:
-        """Stop moving, say so on the graph, release what is held. Called once, with the context still valid."""
+        """Stop moving, publish that, release resources. Called once, with a valid context."""
 
 
 def run_node(
@@ -82,18 +82,18 @@ def run_node(
     specs: Iterable[ParameterSpec] = (),
     example: str = "",
 ) -> int:
-    """Run one node until it asks to stop, its starter ends, SIGINT, SIGTERM or SIGHUP; return the exit code.
+    """Run one node until it stops, its starter ends, SIGINT, SIGTERM or SIGHUP; return the exit code.
 
-    rclpy's own signal handlers invalidate the context before a last zero torque could be sent, so signals are taken
-    by a thread here: the node is closed first, then the context is shut down. A second signal ends at once.
+    rclpy's signal handlers would invalidate the context before the last zero torque is sent, so a thread here handles
+    signals: the node is closed first, then the context. A second signal ends the process at once.
 
     Args:
-        make_node: Makes the node; its argument is a function that asks the runner to stop.
+        make_node: Makes the node, given a function that stops the runner.
         argv: Arguments of the process, ROS arguments included.
         program: ``PACKAGE EXECUTABLE``, for help.
         description: What the node does, one sentence.
         specs: Its parameters, for help.
-        example: A command line to show in help.
+        example: A command line for help.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if completion.asked():
@@ -149,16 +149,15 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
             node.poll_services(timer=pace is None)
             attend = None if pace is None else node.attend
         check_closed(node.context.get_domain_id())
-        # Whoever may not have it is no plant that was ready.
         if node.has_parameter(REALTIME_PRIORITY.name):
             priority = int(node.get_parameter(REALTIME_PRIORITY.name).value)
             # Simulated time has no deadlines.
             lockstep = node.has_parameter("clock") and node.get_parameter("clock").value == "lockstep"
             run_in_real_time(max(0, priority) if lockstep else priority)
-        # The first line that rclpy logs takes 30 ms; said now, it does not come in the middle of a loop.
+        # rclpy's first log line takes 30 ms: now, not in the loop.
         node.get_logger().info("ready")
         executor.add_node(node)
-        # What is there now stays: the collector need not look at it again in the middle of a loop.
+        # Long-lived objects need not be collected again in the loop.
         gc.collect()
         gc.freeze()
         while not stopped.done() and rclpy.ok():
@@ -168,7 +167,7 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
             if left is None:
                 executor.spin_until_future_complete(stopped, _SPIN_SLICE)
             else:
-                # One event at most, so that a flood of them cannot make the node miss its deadlines.
+                # At most one event: a flood must not make the node miss deadlines.
                 executor.spin_once(max(0.0, left))
     except PendulumError as error:
         exit_code = report_error(error)
@@ -179,27 +178,27 @@ def _run(make_node: Callable[[Callable[[], None]], Node], arguments: Sequence[st
             exit_code = 1
     finally:
         exit_code = _close(node, executor) or exit_code
-        # Whoever still could stop it, such as the thread that hears signals, keeps nothing of it alive.
+        # The thread that handles signals must not keep it alive.
         node = None
-        # The interpreter gives signals their default back while it ends, and a launcher repeats the terminal's SIGINT:
-        # a node that has ended properly would then count as killed.
+        # While the interpreter ends, signals have their defaults, and a launcher repeats the terminal's SIGINT: a node
+        # that has ended properly would count as killed.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     return exit_code
 
 
 def _wake_punctually() -> None:
-    """Ask the kernel to wake this thread, and those it will start, when they want and not 50 us later."""
+    """Wake this thread and its children on time, not up to 50 us later."""
     with contextlib.suppress(OSError):
         Path("/proc/self/timerslack_ns").write_text("1000", encoding="ascii")
 
 
 def _give_memory_back() -> None:
-    """Keep big blocks of memory out of the heap, where what is freed below a block in use stays with the process.
+    """Keep large blocks out of the heap, where freed memory below a used block stays with the process.
 
-    glibc does so for blocks above 128 KiB, but raises that bound to whatever was freed: after one pause of the disk or
-    the machine a recorder kept its longest queue for good. A bound that has been set stays where it is (mallopt(3)).
+    glibc does so above 128 KiB, but raises that bound to any freed size: after one stall of the disk a recorder kept
+    its longest queue for good. An explicit bound stays (mallopt(3)).
     """
-    with contextlib.suppress(OSError, AttributeError):  # another C library has other habits
+    with contextlib.suppress(OSError, AttributeError):  # another C library
         ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGEST_HEAP_BLOCK)
 
 
@@ -211,7 +210,7 @@ def _make(make_node: Callable[[Callable[[], None]], Node], stop: Callable[[], No
 
 
 def _sentence(error: Exception) -> str:
-    """Return the first sentence of an error of rcl, which tells the rest again, with its line numbers in C."""
+    """Return the first sentence of an error of rcl, without its C line numbers."""
     text = str(error)
     quoted = re.search(r"Couldn't parse .*?(?=, at )", text)
     return " ".join((quoted.group(0) if quoted else text).split())
@@ -240,20 +239,20 @@ def _close(node: Node | None, executor: rclpy.executors.Executor) -> int:
 
 
 def _listen_for_stop_signals() -> socket.socket:
-    """Return a socket that gets one byte, the signal's number, for each stop signal.
+    """Return a socket that receives the number of each stop signal as one byte.
 
-    The byte is written by the C handler in whichever thread the kernel picks, so that neither a busy callback nor
-    an idle executor delays it. A handler is set even where a shell started us in the background, SIGINT ignored.
+    The C handler writes it in any thread, so neither a busy callback nor an idle executor delays it. A handler is set
+    even if a shell started the process in the background with SIGINT ignored.
     """
     reader, writer = socket.socketpair()
     writer.setblocking(False)
     signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-    # Those of a node that ran in this process before: their thread ends.
+    # Those of an earlier node in this process: ends its thread.
     while _KEPT_OPEN:
         _KEPT_OPEN.pop().close()
     _KEPT_OPEN.append(writer)
     for stop_signal in _STOP_SIGNALS:
-        # A closed terminal is to be ignored by what nohup started.
+        # nohup ignores a closed terminal.
         if stop_signal is not signal.SIGHUP or signal.getsignal(stop_signal) is not signal.SIG_IGN:
             signal.signal(stop_signal, lambda _number, _frame: None)
     return reader
@@ -265,7 +264,7 @@ def _watch_signals(signals: socket.socket, stop: Callable[[], None]) -> None:
         return
     stops.append(first)
     stop()
-    # A launcher passes on the Ctrl-C that the terminal has sent already: only a later one is a second wish.
+    # A launcher repeats the terminal's Ctrl-C: only a later one counts as a second.
     patience_ends = time.monotonic() + _ECHO_TIME
     second = _next_stop_signal(signals)
     while second and time.monotonic() < patience_ends:
@@ -277,7 +276,7 @@ def _watch_signals(signals: socket.socket, stop: Callable[[], None]) -> None:
 
 
 def _next_stop_signal(signals: socket.socket) -> int:
-    """Return the number of the next stop signal; 0 when there will be none, since the node has ended."""
+    """Return the next stop signal, or 0 once the node has ended."""
     while number := signals.recv(1):
         if number[0] in _STOP_SIGNALS:
             return number[0]

@@ -1,4 +1,4 @@
-"""Hearing from a plant's diagnostics what it is, beside a loop that must not wait for that."""
+"""Compares the plant that runs, from its diagnostics, with the one that a node was designed for."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _SAYS_NOTHING = len(describe_plants([]))
 
 
 class RunningPlant:
-    """The plant behind a node's ``joint_states``, compared with the one that the node was designed for.
+    """The plant behind a node's ``joint_states``.
 
-    Diagnostics are polled, so that no message of anybody wakes the node, and read only where they are news.
+    Diagnostics are polled, so that no message wakes the node, and parsed only if they are new.
 
     Args:
-        node: The node; its plant is the one in the namespace of its states.
-        designed: The plant that it was designed for.
+        node: The node; the plant is in the namespace of its states.
+        designed: The plant it was designed for.
 
     Attributes:
-        mismatch: How the plant that runs is another one, in words; empty where it is not, or does not say.
+        mismatch: The difference as text; empty if none or unknown.
     """
 
     def __init__(self, node: PollingNode, designed: PlantParameters) -> None:
@@ -42,7 +42,7 @@ class RunningPlant:
         self._source = node.create_polled_input(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
 
     def poll(self) -> None:
-        """Take what was said since the last look; warn on the log where the plant turns out to be another one."""
+        """Read new diagnostics; log a warning if the plant differs."""
         self._source.take(self._on_diagnostics)
 
     def _on_diagnostics(self, data: bytes, _arrived_ns: int) -> None:

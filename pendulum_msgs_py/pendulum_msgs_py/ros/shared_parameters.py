@@ -1,4 +1,4 @@
-"""Parameters that a file gives to every node, as in a ``/**:`` section: what of them a node may leave to others."""
+"""Parameters that a file gives to every node, as in a ``/**:`` section: which a node may ignore."""
 
 from __future__ import annotations
 
@@ -14,21 +14,17 @@ from pendulum_msgs_py.parameters import load_yaml, parameter_sections
 __all__ = ["given_to_every_node", "refuse_near_misses"]
 
 _MISSPELT = 0.85
-"""Likeness from which a name is a misspelling of ours, not another node's; the names of our own nodes differ more."""
+"""Similarity from which a name counts as a misspelling; names of our nodes differ more."""
 
 
 def given_to_every_node(arguments: Sequence[str], node: str) -> set[str]:
-    """Return the names that reached a node only because a parameter file gives them to everybody.
+    """Return the parameters that a node (full name) gets only because a file gives them to every node.
 
-    A section whose pattern ends in ``*`` or ``**`` (``/**``, ``/sim/*``) names no node. What a section that does
-    (``controller``, ``/**/controller``) or ``-p`` gives as well is meant for this one.
-
-    Args:
-        arguments: Arguments of the process, ROS arguments included.
-        node: Full name of the node.
+    A section whose pattern ends in ``*`` or ``**`` (``/**``, ``/sim/*``) names no node; one that does (``controller``,
+    ``/**/controller``), or ``-p``, means this one.
 
     Raises:
-        ParameterError: A parameter file holds what ROS reads and this project refuses, such as a key given twice.
+        ParameterError: A parameter file is refused, for example for a duplicate key.
     """
     files = [value for flag, value in pairwise(arguments) if flag == "--params-file"]
     sections = [section for file in files for section in parameter_sections(load_yaml(file, "parameter file"))]
@@ -46,14 +42,9 @@ def given_to_every_node(arguments: Sequence[str], node: str) -> set[str]:
 
 
 def refuse_near_misses(names: Iterable[str], known: Iterable[str], *, where: str) -> None:
-    """Raise a ParameterError for the first name that looks like a misspelling of a known one.
+    """Raise a ParameterError for the first unknown name that resembles a known one.
 
-    A shared section may hold what other nodes know, but a limit that is misspelt there would silently not be in force.
-
-    Args:
-        names: Names that the node does not have.
-        known: Names that it has.
-        where: Full name of the node, for the message.
+    A shared section may hold other nodes' parameters, but a misspelt limit would silently not be in force.
     """
     known = list(known)
     for name in names:
@@ -74,7 +65,7 @@ def _flat(content: Mapping[str, Any], prefix: str) -> Iterator[str]:
 
 
 def _matches(pattern: str, node: str) -> bool:
-    """Tell whether a section is for a node: ``*`` stands for one part of the name, ``**`` for any number of them."""
+    """Return whether a section is for a node: ``*`` matches one part of the name, ``**`` any number."""
     parts = pattern.strip("/").split("/")
     expression = "".join({"*": "/[^/]+", "**": "(?:/[^/]+)*"}.get(part, f"/{re.escape(part)}") for part in parts)
     return re.fullmatch(expression, node) is not None

@@ -1,8 +1,7 @@
-"""Simulated time for nodes that live by the stamps of what they answer.
+"""Simulated time for nodes that use the stamps of the states they answer.
 
-rclpy has a node in simulated time take each message on ``/clock`` as it comes: one more message to send and one more
-wake-up for each step of a plant in lockstep, a fifth of what a controller costs there. None of ours asks what time it
-is while it answers.
+rclpy would take each message on ``/clock``: one more message and wake-up for each lockstep step, a fifth of a
+controller's time. No node here reads the clock while it replies.
 """
 
 from __future__ import annotations
@@ -21,11 +20,9 @@ __all__ = ["live_by_stamps"]
 
 
 def live_by_stamps(node: Node, newest_ns: Callable[[], int | None]) -> None:
-    """Let a node in simulated time hear ``/clock`` no more; its time is the newest stamp, twice a second of wall time.
+    """Unsubscribe a node from ``/clock``, if subscribed; its time follows the newest stamp, twice a second.
 
-    Args:
-        node: The node; one in real time is left as it is.
-        newest_ns: Returns the newest stamp that it answered [ns], or None before the first.
+    ``newest_ns`` returns the newest answered stamp [ns], or None.
     """
     clocks = [each for each in node.subscriptions if each.msg_type is Clock]
     for clock in clocks:

@@ -1,4 +1,4 @@
-"""Timers that keep the wall's time."""
+"""Timers of wall time."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ __all__ = ["create_wall_timer"]
 
 
 def create_wall_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
-    """Return a timer of steady time, deaf to simulated time and to steps of the system clock; period in [s]."""
+    """Return a timer of steady time, independent of simulated time and clock steps; period in [s]."""
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
