@@ -1,4 +1,4 @@
-"""The programs of this package: name and entry point, read by ``setup.py`` and ``python -m``."""
+"""The programs of this package, read by ``setup.py`` and ``python -m``."""
 
 __all__ = ["EXECUTABLES"]
 

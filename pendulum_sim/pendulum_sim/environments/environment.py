@@ -1,9 +1,8 @@
-"""Gymnasium environments of a plant, single and vector: ``PendulumX59-v0``, ``PendulumAcrobot-v0`` and its sisters.
+"""Gymnasium environments of a plant, single and vector: ``PendulumX59-v0``, ``PendulumAcrobot-v0`` and others.
 
-Observation: x = [deviation of each joint from upright, velocity of each], what turns wrapped: 0 is upright.
-Action: one effort per driven joint [N m or N], clamped to its limit.
-Reward: -(x' Q x + u' R u) at the state in which the action was chosen, with the mechanism's weights by default.
-Episodes never terminate; they are truncated after 5 s, or 10 s where a mechanism has to swing up, whatever the step.
+Observation: x = [deviation of each joint from upright, wrapped if it turns; velocity of each joint]. Action: one effort
+per driven joint [N m or N], clamped to its limit. Reward: -(x' Q x + u' R u) at the state of the action, with the
+mechanism's weights by default. Episodes never terminate; they are truncated after 5 s, or 10 s for a swing-up.
 
 Importing this module registers them, and so does ``gymnasium.make("pendulum_sim.environments.environment:ID")``.
 """
@@ -37,34 +36,34 @@ IDS: dict[str, dict[str, Any]] = {
     "PendulumDouble-v0": {"plant": "double_pendulum", **_SWING_UP},
     "PendulumFuruta-v0": {"plant": "furuta", **_SWING_UP},
 }
-"""Environments, and the arguments that they have where none are given."""
+"""Environments with their default arguments."""
 _WINDOW_FPS = 50.0
-"""Pictures a second in a window, which follows real time; a picture of each step would be ten times too many."""
+"""Pictures a second in a window, which follows real time."""
 
 
 class PlantEnv(gymnasium.Env[Array, Array]):
     """One plant.
 
     Args:
-        plant: Preset, path of a plant file, or parameters; any plant, series elastic too.
+        plant: Preset, path of a plant file, or parameters.
         dt: Step over which an action is held [s].
         method: Integrator; ``auto`` chooses by the plant.
         substeps: Integration steps in a step.
         start: ``bottom``, ``top`` or ``random``; ``reset(options={"state": x})`` overrides it.
         disturbance: Half width of uniform noise on each driven joint [N m or N].
         hold: Steps for which a noise sample is held.
-        q: Weights of each deviation and velocity in the reward; None for the mechanism's.
+        q: Weights of deviations and velocities; None for the mechanism's.
         r: Weight of the efforts; None for the mechanism's.
         render_mode: None, ``human`` or ``rgb_array``.
         screen_size: Width and height of the picture [px].
         episode_time: Time after which an episode is truncated, inf for never [s]; ``max_episode_steps`` of
-            ``gymnasium.make`` can only make it shorter.
+            ``gymnasium.make`` can only shorten it.
 
     Raises:
         ParameterError: An argument is outside its domain.
     """
 
-    # The class's for 2 ms; each environment has the rate of its own steps, a frame each, so that videos are in time.
+    # For 2 ms; each environment sets the rate of its own steps, so that videos run in real time.
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 500}  # noqa: RUF012  # gymnasium's
 
     def __init__(
@@ -109,14 +108,11 @@ class PlantEnv(gymnasium.Env[Array, Array]):
             self._hold, self._h, self._substeps = task.hold, motion.h, task.substeps
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """Start an episode.
+        """Start an episode; return the observation, shape (2n,), and an empty dict.
 
         Args:
             seed: Seed of starts and noise.
-            options: ``state``: the start x in the observation's convention; ``start``: one of ``STARTS``.
-
-        Returns:
-            Observation, shape (2n,), and an empty dict.
+            options: ``state``: the start x, as observed; ``start``: one of ``STARTS``.
         """
         super().reset(seed=seed)
         known = options or {}
@@ -130,13 +126,10 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         return self._motion.observe()[0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold efforts for one step.
-
-        Args:
-            action: u, shape (m,) [N m or N].
+        """Hold efforts u, shape (m,), for one step [N m or N].
 
         Returns:
-            Observation (2n,), reward, terminated (never), truncated (when its time is over), and an empty dict.
+            Observation (2n,), reward, terminated (never), truncated (time over), and an empty dict.
         """
         if type(action) is not np.ndarray:
             action = np.asarray(action, dtype=np.float32)
@@ -161,11 +154,11 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         return observation, reward, False, self._steps >= self._limit, {}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the present state: into a window, or as an array of shape (height, width, 3)."""
+        """Draw the state into a window, or return an array of shape (height, width, 3)."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() was called, but render_mode is None; expected human or rgb_array")
             return None
-        # Imported late: training runs without pictures.
+        # Imported late: training needs no pictures.
         from pendulum_sim.pictures.drawing import Window
         from pendulum_sim.pictures.plant_picture import PlantPicture
 
@@ -182,20 +175,18 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         return picture
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window."""
         if self._window is not None:
             self._window.close()
         self._window = self._picture = None
 
 
 class PlantVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
-    """Many equal plants: smooth pendulums in one compiled step, smooth mechanisms in one of arrays, others in turn.
+    """``num_envs`` equal plants: smooth pendulums in one compiled step, smooth mechanisms as arrays, others in turn.
 
-    Smooth are those without dry friction, stops, lag, delay and drivetrain. Plant i, reset with a list of seeds, starts
-    and is disturbed as a single environment reset with seed i.
-
-    There are ``num_envs`` of them, >= 1. An episode is truncated after ``max_episode_steps``, or ``episode_time`` where
-    that is None, and restarts with the step after that. All other arguments are those of :class:`PlantEnv`.
+    Smooth plants have no dry friction, stops, lag, delay or drivetrain. With a list of seeds, plant i equals a single
+    environment of seed i. An episode is truncated after ``max_episode_steps``, or else ``episode_time``, and restarts
+    with the next step. All other arguments are those of :class:`PlantEnv`.
 
     Raises:
         ParameterError: An argument is outside its domain.
@@ -243,16 +234,12 @@ class PlantVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start all episodes, or some.
+        """Start all episodes, or some; return observations, shape (N, 2n), and an empty dict.
 
         Args:
-            seed: One seed for all, whose plants then share a generator, or one for each; where one is None, its
-                generator stays.
-            options: ``start``: one of ``STARTS``; ``state``: starts x, shape (2n,) or (N, 2n), in the observation's
-                convention; ``reset_mask``: which to start, shape (N,).
-
-        Returns:
-            Observations, shape (N, 2n), and an empty dict.
+            seed: One seed, of a shared generator, or one for each plant; None keeps its generator.
+            options: ``start``: one of ``STARTS``; ``state``: starts x, shape (2n,) or (N, 2n), as observed;
+                ``reset_mask``: which to start, shape (N,).
 
         Raises:
             ParameterError: An option is unknown, or has another shape.
@@ -268,10 +255,7 @@ class PlantVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         return self._motion.observe(), {}
 
     def step(self, actions: Array) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Hold efforts for one step.
-
-        Args:
-            actions: Shape (N, m) [N m or N].
+        """Hold efforts, shape (N, m), for one step [N m or N].
 
         Returns:
             Observations (N, 2n), rewards (N,), terminated (N,), truncated (N,), and an empty dict.
@@ -281,7 +265,7 @@ class PlantVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         observations, rewards = self._motion.step(np.reshape(actions, self._actions))
         restart = np.flatnonzero(self._done)
         if restart.size:
-            # By gymnasium's rule for NEXT_STEP this step starts their next episodes; its action is ignored.
+            # gymnasium's NEXT_STEP: this step starts their next episodes and ignores their actions.
             self._restart(restart, {})
             observations[restart] = self._motion.observe()[restart]
             rewards[restart] = 0.0
@@ -301,7 +285,6 @@ class PlantVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
             self._motion.place(np.array([index]), *begin(options, self._generators[index], 1, own))
 
     def _take_seeds(self, seed: int | list[int | None] | None) -> None:
-        """Set the generators: one for all plants, or one for each; None in a list leaves that generator as it is."""
         if isinstance(seed, (list, tuple, np.ndarray)):
             if len(seed) != self.num_envs:
                 raise ParameterError(f"seed has {len(seed)} entries; expected one for each of {self.num_envs} plants")
@@ -318,7 +301,7 @@ class PlantVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
 
 
 def register() -> None:
-    """Register the environments with gymnasium; done on import, and harmless twice."""
+    """Register the environments with gymnasium; done on import, and repeatable."""
     for name, arguments in IDS.items():
         if name not in gymnasium.registry:
             gymnasium.register(

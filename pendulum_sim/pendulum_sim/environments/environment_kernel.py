@@ -1,7 +1,6 @@
-"""Compiled step of the environments: one lane for a single pendulum, many for a vector of them.
+"""Compiled step of the environments, for one pendulum (lane) or many.
 
-The state of the lanes stands in one flat array of rows, like a block of the batch engine, and the equations are the
-same compiled ones.
+The lanes' state is one flat array of rows, like a block of the batch engine, with the same compiled equations.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ ROWS = ("x", "v", "torque", "disturbance", "amplitude", "limit", "q_1", "q_2", "
 def lane_table(
     parameters: PlantParameters, method: str, h: float, lanes: int, amplitude: float, q: tuple[float, ...], r: float
 ) -> NDArray[np.float64]:
-    """Return the rows for a number of equal pendulums, at rest hanging down, shape (rows, lanes).
+    """Return the rows of equal pendulums at rest hanging down, shape (rows, lanes).
 
     Raises:
         ParameterError: The method is unstable on this plant at that step.
@@ -47,12 +46,7 @@ def lane_table(
 
 @cache
 def step_kernel(method: str, lanes: int) -> Any:
-    """Return ``step(w, keys, counts, hold, h, substeps, actions, observations, rewards)`` for a number of lanes.
-
-    Args:
-        method: Integrator, a compiled one.
-        lanes: Pendulums side by side; the length of a row of ``w``.
-    """
+    """Return ``step(w, keys, counts, hold, h, substeps, actions, observations, rewards)`` for a number of pendulums."""
     plant_rows = len(PACKED)
     integrator = get_integrator(method)
     coefficient_rows = len(integrator.coefficients(1.0, 1e-3))
@@ -89,7 +83,7 @@ def step_kernel(method: str, lanes: int) -> Any:
             deviation = wrap(w[j] - UPRIGHT)
             v = w[o_v + j]
             w[o_torque + j] = min(limit, max(-limit, effort + w[o_disturbance + j]))
-            # Zero times the action: an action that is not finite shows in the reward, where a clamp would hide it.
+            # Zero times the action: a non-finite action shows in the reward; the clamp would hide it.
             rewards[j] = 0.0 * actions[j] - (
                 w[o_q_1 + j] * deviation * deviation + w[o_q_2 + j] * v * v + w[o_r + j] * effort * effort
             )

@@ -1,4 +1,4 @@
-"""How the plants of an environment move: smooth pendulums compiled, smooth mechanisms as arrays, others one by one."""
+"""Motion of an environment's plants: smooth pendulums compiled, smooth mechanisms as arrays, others one by one."""
 
 from __future__ import annotations
 
@@ -19,11 +19,7 @@ _LANES = 256
 
 
 class Lanes:
-    """Smooth pendulums in one compiled step, which computes noise, reward and observation, too.
-
-    Args:
-        task: Of the environment.
-        count: Pendulums.
+    """``count`` smooth pendulums in one compiled step, noise, reward and observation included.
 
     Attributes:
         w: Rows of the kernel, one block of lanes after another.
@@ -53,9 +49,9 @@ class Lanes:
         return self.counts.reshape(-1)[: self._count]
 
     def place(self, which: NDArray[np.intp], x: Array, keys: list[int]) -> None:
-        """Start some at states x of shape (k, 2)."""
+        """Start some plants at states x, shape (k, 2)."""
         if self._count == 1:
-            # Indexing by arrays would cost a single pendulum ten times as much.
+            # Array indexing would take ten times as long.
             self.w[0, :3] = x[0, 0] + self._task.goal[0], x[0, 1], 0.0
             self.keys[0, 0], self.counts[0, 0] = keys[0], 0
             return
@@ -67,7 +63,7 @@ class Lanes:
         self.counts[block, lane] = 0
 
     def step(self, actions: Array) -> tuple[Array, Array]:
-        """Hold a torque each (N, 1) for one step; return observations (N, 2) and rewards (N,)."""
+        """Hold torques (N, 1) for one step; return observations (N, 2) and rewards (N,)."""
         count = self._count
         self._flat[:count] = actions.reshape(-1)
         blocks = len(self.w)
@@ -98,18 +94,13 @@ class Lanes:
 
     @property
     def effort(self) -> Array:
-        """Torques of the last step, disturbance included, of the first block, shape (lanes,) [N m]."""
+        """Torques of the last step in the first block, disturbance included, shape (lanes,) [N m]."""
         found: Array = self.w[0, 2 * self._lanes : 3 * self._lanes]
         return found
 
 
 class Stepped:
-    """Plants of any kind: many smooth mechanisms in one step of arrays, others one after another.
-
-    Args:
-        task: Of the environment.
-        count: Plants.
-    """
+    """``count`` plants of any kind: many smooth mechanisms as arrays, others one after another."""
 
     def __init__(self, task: EnvironmentTask, count: int) -> None:
         self._task, parameters = task, task.parameters
@@ -125,7 +116,7 @@ class Stepped:
         self._seen = self.observe()
 
     def place(self, which: NDArray[np.intp], x: Array, keys: list[int]) -> None:
-        """Start some at states x of shape (k, 2n)."""
+        """Start some plants at states x, shape (k, 2n)."""
         n = self._task.joints
         for index, own, key in zip(which.tolist(), x, keys, strict=True):
             position, velocity = own[:n] + self._task.goal, own[n:]
@@ -168,6 +159,6 @@ class Stepped:
 
 
 def make_motion(task: EnvironmentTask, count: int) -> Lanes | Stepped:
-    """Return what moves a number of plants."""
+    """Return the motion of ``count`` plants."""
     compiled = task.parameters.is_pendulum and is_smooth(task.parameters) and task.method != "adaptive"
     return Lanes(task, count) if compiled else Stepped(task, count)

@@ -1,4 +1,4 @@
-"""What a single environment and a vector of them share: plant, spaces, reward, starts and noise."""
+"""Task of single and vector environments: plant, spaces, reward, starts and noise."""
 
 from __future__ import annotations
 
@@ -22,16 +22,12 @@ __all__ = ["EPISODE_TIME", "STARTS", "Array", "EnvironmentTask"]
 
 STARTS = ("bottom", "top", "random")
 EPISODE_TIME = 5.0
-"""Time after which an episode is truncated: the length of the thesis's runs [s]."""
+"""Default time after which an episode is truncated, as long as the thesis's runs [s]."""
 Array = NDArray[np.float64]
 
 
 class EnvironmentTask:
-    """Plant, spaces, reward, starts and noise, from the arguments of the environments.
-
-    Raises:
-        ParameterError: An argument is outside its domain.
-    """
+    """Plant, spaces, reward, starts and noise from the environments' arguments, checked by ParameterErrors."""
 
     def __init__(
         self,
@@ -81,7 +77,7 @@ class EnvironmentTask:
         high = np.full(2 * n, np.inf)
         high[:n][self.turns] = np.pi
         if parameters.is_pendulum and parameters.drivetrain is None and parameters.damping > 0.0:
-            # b |theta'| cannot exceed the sum of all other torques for long: beyond that speed it only slows down.
+            # Where b |theta'| exceeds the sum of all other torques, the pendulum slows down.
             torques = parameters.effort_limit + parameters.gravity + abs(parameters.torque_offset) + disturbance
             high[1] = max(20.0, 1.1 * torques / parameters.damping)
         self.observation_space = spaces.Box(-high, high, dtype=np.float64)
@@ -107,14 +103,7 @@ class EnvironmentTask:
     def begin(
         self, options: Mapping[str, Any], generator: np.random.Generator, count: int, state: Array | None = None
     ) -> tuple[Array, list[int]]:
-        """Return starts x of shape (count, 2n), and the keys of the noise of episodes.
-
-        Args:
-            options: ``start``, one of ``STARTS``.
-            generator: Of starts and noise.
-            count: How many.
-            state: The starts, of :meth:`given`, where they are not drawn.
-        """
+        """Return starts x, shape (count, 2n), drawn unless given as ``state``, and the keys of the episodes' noise."""
         x = self._draw(options.get("start", self.start), generator, count) if state is None else state
         return x, [noise.stream_key(int(seed)) for seed in generator.integers(2**63, size=count)]
 
@@ -132,7 +121,7 @@ class EnvironmentTask:
         """Return the ends of x of random starts: of a turn, or between stops with a margin."""
         low, high = np.full(2 * self.joints, -1.0), np.ones(2 * self.joints)
         for i, (own, goal) in enumerate(zip(self.parameters.joints, self.goal, strict=True)):
-            # Without a stop on one side, half a turn or 1 m from the other, or from 0.
+            # Without a stop on one side: half a turn or 1 m from the other, or from 0.
             reach = math.pi if self.turns[i] else 1.0
             first, last = own.lower_stop, own.upper_stop
             if first is None and last is None:
@@ -147,7 +136,7 @@ class EnvironmentTask:
         return low, high
 
     def given(self, options: Mapping[str, Any], count: int) -> Array | None:
-        """Return the starts of the option ``state``, in the observation's convention, shape (count, 2n); None without.
+        """Return the starts of the option ``state`` as observed, shape (count, 2n), or None.
 
         Raises:
             ParameterError: They have another shape, or are not finite.
@@ -170,7 +159,7 @@ class EnvironmentTask:
         return clamped
 
     def noise(self, key: int, count: int) -> list[float]:
-        """Return the disturbance of each driven joint in a step, as a batch of plants draws it."""
+        """Return the disturbance of each driven joint in a step, as the batch engine draws it."""
         first = count // self.hold * len(self.limits)
         return [self.disturbance * noise.unit_interval(noise.scramble(key, first + i)) for i in range(len(self.limits))]
 
@@ -190,7 +179,6 @@ def _check_start_name(start: object) -> None:
 
 def _checked_weights(q: object, r: float, joints: int) -> tuple[Array, float]:
     weights = np.asarray(q, dtype=np.float64)
-    # Below zero they would pay for what they are to keep small.
     if weights.shape != (2 * joints,) or not (np.isfinite(weights) & (weights >= 0.0)).all():
         raise ParameterError(
             f"q is {q}; expected {2 * joints} finite numbers >= 0, the weights of each deviation and each velocity"

@@ -1,8 +1,8 @@
 """``export_model``: write a plant as URDF or MJCF, from the same bodies as it is drawn with.
 
-x points to the right, y away from the viewer, z up; hanging down is position 0 of every hinge. The parameters of a
-pendulum are M_c and G_c, not mass and length: any link with m l^2 <= M_c and m g l = G_c moves the same. The one drawn
-has nine tenths of its inertia in the bob, which positive angles turn towards +x.
+x points right, y away from the viewer, z up; position 0 of a hinge hangs down. A pendulum has M_c and G_c, not mass and
+length: any link with m l^2 <= M_c and m g l = G_c moves the same. The exported one has nine tenths of its inertia in
+the bob, which positive angles turn towards +x.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from pendulum_sim.exports.xml_files import add, document_text, lateness, number,
 __all__ = ["main", "mjcf", "urdf"]
 
 _TIMESTEP, _STIFF_TIMESTEP = 0.002, 0.00025
-"""Timestep of rigid links, and of one behind a spring [s]."""
+"""Timestep of rigid links, and behind a spring [s]."""
 _ROD_RADIUS = 0.008
 _STEEL = 7850.0
 _CASING, _ROD, _BOB = "0.25 0.25 0.28 1", "0.6 0.62 0.66 1", "0.85 0.3 0.2 1"
 _FAST = 100.0
-"""Velocity limit where no drivetrain sets one [rad/s or m/s]."""
+"""Velocity limit without a drivetrain [rad/s or m/s]."""
 _ORIGIN = (0.0, 0.0, 0.0)
 
 
 class _AtJoint(NamedTuple):
-    """What acts at a joint, motor and gears in slow motion included: limits, friction, and the inertia of a rotor."""
+    """Limits, friction and rotor inertia at a joint, motor and gears in slow motion included."""
 
     effort: float
     velocity: float
@@ -52,19 +52,15 @@ class _AtJoint(NamedTuple):
 
 
 def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: str = "/sim") -> str:
-    """Return the URDF of a plant, for RViz, robot_state_publisher and Gazebo; joints bear the contract's names.
+    """Return the URDF of a plant, for RViz, robot_state_publisher and Gazebo; joints have the contract's names.
 
-    It has no word for rotors, which are left out, and no motor behind a spring. Of a series-elastic plant the joint has
-    the damping and dry friction of link and motor together, as in slow motion; the rotor's inertia joins that of the
-    link. An effort is then that of the motor: ``torque_gain`` times the command of this project's plants.
-
-    Args:
-        parameters: The plant.
-        ros2_control: Hardware for ros2_control: ``none``, or of a pendulum ``gz`` or ``topic_based``.
-        namespace: Namespace of the plant behind ``topic_based``.
+    URDF has no rotors and no motor behind a spring: a series-elastic joint gets the damping and dry friction of link
+    and motor together, as in slow motion, and the rotor's inertia joins the link's. Its effort is the motor's:
+    ``torque_gain`` times the command of this project's plants. ``ros2_control`` is ``none``, or of a pendulum ``gz`` or
+    ``topic_based``, whose plant is in ``namespace``.
 
     Raises:
-        ParameterError: A body has no positive inertia about its own centre of mass; or ros2_control is for one joint.
+        ParameterError: A body has no positive inertia about its centre of mass; or ros2_control with several joints.
     """
     if ros2_control != "none" and not parameters.is_pendulum:
         raise ParameterError(
@@ -90,10 +86,10 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
         joint_of = add(robot, "joint", name=joint.name, type=kind)
         add(joint_of, "parent", link=parent)
         add(joint_of, "child", link=body.name)
-        # The measured angle is angle_offset when the link hangs: the frame is turned back by as much.
+        # The measured angle of a hanging link is angle_offset: the frame is turned back by it.
         add(joint_of, "origin", xyz=_vector(body.origin), rpy=f"0 {number(own.angle_offset)} 0")
         add(joint_of, "axis", xyz=_vector(body.axis))
-        # topic_based drives this project's plants, which take commands; anything else moves the joint itself.
+        # topic_based sends commands to this project's plants; other hardware moves the joint itself.
         limit = at.effort
         if ros2_control == "topic_based":
             limit = parameters.effort_limit
@@ -110,12 +106,12 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
 def mjcf(parameters: PlantParameters) -> str:
     """Return the MJCF of a plant for MuJoCo, with its rotors as armature of tendons.
 
-    What MuJoCo has no word for is left out: Stribeck's curve, further friction terms, and the spring's hysteresis and
-    hardening. Its dry friction is regularised: it creeps where this one sticks; its end stops are springs. With a
-    drivetrain there is a second joint, the motor's, coupled by a spring.
+    MuJoCo has no Stribeck curve, further friction terms, or hysteresis and hardening of a spring. Its dry friction
+    creeps where this one sticks; its end stops are springs. A drivetrain is a second joint, the motor's, coupled by a
+    spring.
 
     Raises:
-        ParameterError: A body has no positive inertia about its own centre of mass, which MuJoCo refuses.
+        ParameterError: A body has no positive inertia about its centre of mass.
     """
     drive, parts = parameters.drivetrain, _parts(parameters)
     one = len(parts) == 1
@@ -186,7 +182,7 @@ def _at_joint(own: JointParameters, parameters: PlantParameters) -> _AtJoint:
 
 
 def _tip_radius(parameters: PlantParameters, body: Body) -> float:
-    """Return the radius of the ball at the end of a link: of a pendulum's bob, if it were of steel [m]."""
+    """Return the radius of the ball at the end of a link, of a pendulum's a steel bob's [m]."""
     if len(parameters.joints) > 1:
         return 2.0 * _ROD_RADIUS
     return min((3.0 * body.mass / (4.0 * math.pi * _STEEL)) ** (1.0 / 3.0), 0.4 * math.dist(body.tip, _ORIGIN))
@@ -229,7 +225,7 @@ def _urdf_link(link: ElementTree.Element, body: Body, radius: float) -> None:
     if length == 0.0:
         _urdf_visual(link, "box", _ORIGIN, _CASING, size="0.16 0.1 0.06")
         return
-    # A cylinder lies along z: along x it is turned about y.
+    # A cylinder lies along z.
     turned = "0 1.5707963267948966 0" if body.tip[0] else "0 0 0"
     middle = [0.5 * value for value in body.tip]
     _urdf_visual(link, "cylinder", middle, _ROD, turned, radius=number(_ROD_RADIUS), length=number(length))

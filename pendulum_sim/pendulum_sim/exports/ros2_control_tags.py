@@ -1,4 +1,4 @@
-"""What ros2_control requires in a URDF: the joint's interfaces, and the hardware behind them."""
+"""Elements of a URDF for ros2_control: the joint's interfaces, and the hardware behind them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pendulum_msgs_py.errors import ParameterError
 __all__ = ["HARDWARE", "add_ros2_control"]
 
 HARDWARE = ("none", "gz", "topic_based")
-"""No hardware; Gazebo's simulation; a plant of this project, through its topics."""
+"""None; Gazebo's simulation; a plant of this project, through its topics."""
 
 _GZ_LIBRARY = "gz_ros2_control-system"
 _GZ_PLUGIN = "gz_ros2_control::GazeboSimROS2ControlPlugin"
@@ -19,16 +19,9 @@ _HEIGHT = 1.0
 
 
 def add_ros2_control(robot: ElementTree.Element, hardware: str, namespace: str, effort_limit: float) -> None:
-    """Add to a URDF what ros2_control reads.
+    """Add ros2_control's elements to a URDF; hardware is one of :data:`HARDWARE`, else a ParameterError.
 
-    Args:
-        robot: Root element of the URDF.
-        hardware: One of :data:`HARDWARE`.
-        namespace: Namespace of the plant, for ``topic_based``.
-        effort_limit: Largest torque [N m].
-
-    Raises:
-        ParameterError: The hardware is unknown.
+    ``namespace`` is the plant's, for ``topic_based``; ``effort_limit`` in [N m].
     """
     if hardware not in HARDWARE:
         raise ParameterError(f"ros2_control is {hardware!r}; expected one of {', '.join(HARDWARE)}")
@@ -46,8 +39,8 @@ def add_ros2_control(robot: ElementTree.Element, hardware: str, namespace: str, 
         parameters = {
             "joint_states_topic": f"{space}/{JOINT_STATES}",
             "joint_commands_topic": f"{space}/joint_commands",
-            # It publishes a command only where positions and commanded positions differ by more than this; there are
-            # no commanded positions here: a hanging pendulum would get no commands.
+            # It publishes a command only if positions and commanded positions differ by more than this; without
+            # commanded positions a hanging pendulum would get none.
             "trigger_joint_command_threshold": "-1",
         }
         for name, value in parameters.items():
@@ -59,8 +52,7 @@ def add_ros2_control(robot: ElementTree.Element, hardware: str, namespace: str, 
     for name in ("position", "velocity", "effort"):
         add(joint, "state_interface", name=name)
     if hardware == "gz":
-        # Gazebo lets fall what does not hang on the world. A link without inertia it leaves out, and with it the joint
-        # that hangs on it.
+        # In Gazebo a model without a joint to the world falls, and a link without inertia is dropped with its joint.
         base = next(link for link in robot.iter("link") if link.get("name") == "base_link")
         inertial = add(base, "inertial")
         add(inertial, "mass", value="1.0")

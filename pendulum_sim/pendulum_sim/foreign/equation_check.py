@@ -1,8 +1,7 @@
 """Whether a plant moves as its equation predicts: both run from equal starts under equal efforts, joint by joint.
 
-Only the plant's states are read, so that the check shares no assumption with the source of the equation. A cause is
-named only if it was tested: by running a copy of the plant in which it is switched off, or by the shape of the
-residual.
+Only the plant's states are read, so the check shares no assumption with the source of the equation. A cause is named
+only if it was tested: by a copy of the plant with it switched off, or by the shape of the residual.
 """
 
 from __future__ import annotations
@@ -25,54 +24,56 @@ __all__ = ["TOLERANCE", "EquationCheck", "Switches", "check_equation", "check_re
 Array = NDArray[np.float64]
 
 TOLERANCE = 0.05
-"""Largest error of angle and velocity, as a share of the largest motion of the same kind. First-order integrators at
-usual timesteps and MuJoCo's regularised dry friction stay below it; by as much the spread of a balanced pendulum
-changes within the margins of the verdict."""
+"""Largest error of angle and velocity, relative to the largest motion of the same kind.
+
+First-order integrators at usual timesteps and MuJoCo's regularised friction stay below it; an error of that size
+changes the spread of a balanced pendulum within the margins of the verdict.
+"""
 _WINDOW, _LEAST_PERIODS, _MOST_PERIODS = 0.2, 5, 200
 """Length of a run [s], and its bounds in periods."""
 _ANGLES = 25
-"""Number of start angles over a full turn, both ends included."""
+"""Start angles over a full turn."""
 _RANDOM_STARTS = 24
 _SLIDE = 0.1
-"""Distance from the middle at which a joint that slides starts [m]."""
+"""Start distance of a sliding joint from the middle [m]."""
 _SMALL = 0.1
-"""Small effort as a share of the limit."""
+"""Small effort, relative to the limit."""
 _FINE = (0.02, 0.005)
-"""Efforts of a controller near its goal, as shares of the limit: a dead zone shows there alone."""
+"""Efforts near a controller's goal, relative to the limit: they show a dead zone."""
 _FLOOR = 0.02
-"""Share of the motion under full effort below which a difference is ignored: it is too small for a controller."""
+"""Differences below this share of the motion under full effort are ignored."""
 _ABRUPT = 0.5
-"""Error right behind a stop; of what grows with the angle it is less."""
+"""Error right behind a stop; other causes grow with the angle."""
 _OUTSIDE = 3.0
-"""Error that stands for a run that ended with a fault."""
+"""Error of a run that ended with a fault."""
 _HELPS = 0.7
-"""A cause that is switched off leaves at most this share of the error."""
+"""Largest remaining share of the error after a cause is switched off."""
 _EXPLAINS = 0.9
-"""Share of the left-over's power that one term explains before the term is named."""
+"""Share of the residual's power that one term must explain."""
 _MOST_CAUSES = 4
 _WORST = 16
 """Runs on which causes are tested."""
 _JUMP = 4.0
-"""Times its velocity that an angle may move in a period before it jumps."""
+"""An angle jumps if it moves more than this times its velocity in a period."""
 _LAGS = 40
 _LEAST = 1e-3
-"""Share of the limit below which a dead zone is none."""
+"""Smallest dead zone, relative to the limit."""
 _DEAD = 0.02
-"""Share of the equation's response below which there is none."""
+"""Smallest response, relative to the equation's."""
 _CLOSE = 0.05
-"""What a response may leave over of another that is taken for the same."""
+"""Relative residual up to which two responses are the same."""
 _LOST = 0.3
-"""Share of a start's velocity that is left a period later where it was not taken."""
+"""Largest share of a start's velocity a period later if the start ignored it."""
 _SAME_TURN = 0.99
-"""Mean of unit vectors from which angles differ by one angle."""
+"""Mean of unit vectors from which angles differ by a constant."""
 _LEAST_JUMP = 0.5
-"""Least jump [rad or m]."""
+"""Smallest jump [rad or m]."""
 _OTHER_PERIOD = 0.2
-"""Share by which a period is another; integrators of first order differ by less."""
+"""Relative difference of two periods, above that of first-order integrators."""
 _FREE, _FINE_STEP, _SMALL_STEP, _FULL, _MOVING = "free swing", "fine step", "small step", "full step", "moving"
 _OWN = ("another scale of the effort", "another damping", "another weight")
 _FEW = 4
-"""Runs that are too few to conclude from."""
+"""Too few runs for a conclusion."""
 _TERMS = (
     "another scale of the effort",
     "another damping",
@@ -85,16 +86,11 @@ _TERMS = (
     "a weight that is no sine of the angle",
     "a weight that is no sine of the angle",
 )
-"""Names of what the terms of an acceleration stand for: u, v, v |v|, sign v, q, 1, sin q, cos q, sin 2 q, cos 2 q."""
+"""Terms of an acceleration: u, v, v |v|, sign v, q, 1, sin q, cos q, sin 2 q, cos 2 q."""
 
 
 class Switches(NamedTuple):
-    """What can be switched off in a copy of a plant.
-
-    Attributes:
-        causes: The tested causes, as text.
-        without: Returns a copy without some of them.
-    """
+    """Causes that can be switched off in a copy of a plant, and ``without``, which returns such a copy."""
 
     causes: tuple[str, ...]
     without: Callable[[tuple[str, ...]], JointPlant]
@@ -102,15 +98,15 @@ class Switches(NamedTuple):
 
 @dataclass(frozen=True)
 class EquationCheck:
-    """What the check found.
+    """Result of the check.
 
     Attributes:
         joints: Names of the joints.
-        errors: Largest error of each joint, as a share of the largest motion of the same kind [-].
+        errors: Largest error of each joint, relative to the largest motion of the same kind [-].
         runs: Number of runs.
         where: The run with the largest error, as text.
-        causes: The confirmed causes, as text; empty where none was confirmed.
-        left: Largest error without these causes; None where none was switched off [-].
+        causes: Confirmed causes, as text.
+        left: Largest error without these causes; None if none was switched off [-].
     """
 
     joints: tuple[str, ...]
@@ -122,11 +118,11 @@ class EquationCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether every joint moves as the equation predicts, within :data:`TOLERANCE`."""
+        """Whether every joint is within :data:`TOLERANCE`."""
         return max(self.errors) <= TOLERANCE
 
     def __str__(self) -> str:
-        """One sentence."""
+        """Return one sentence."""
         percent = 100.0 * TOLERANCE
         worst = int(np.argmax(self.errors))
         if self.agrees:
@@ -145,8 +141,6 @@ class EquationCheck:
 
 
 class _Probe(NamedTuple):
-    """One run: its kind, start and held effort."""
-
     kind: str
     position: Vector
     velocity: Vector
@@ -155,7 +149,7 @@ class _Probe(NamedTuple):
 
 @dataclass
 class _Trace:
-    """States of one run, shape (periods + 1, joints), as far as it got."""
+    """States of one run, shape (periods + 1, joints), until a fault."""
 
     position: Array
     velocity: Array
@@ -164,7 +158,7 @@ class _Trace:
 
 @dataclass
 class _Runs:
-    """Probes, the equation's traces of them by two integrators, and the largest motion of each kind."""
+    """Probes, the equation's traces by two integrators, and the largest motion of each kind."""
 
     probes: list[_Probe] = field(default_factory=list)
     traces: list[_Trace] = field(default_factory=list)
@@ -183,11 +177,11 @@ def check_equation(
     """Return how far a plant deviates from an equation, and why.
 
     Args:
-        plant: The plant; it is left in any state, so reset it afterwards.
-        equation: What a controller would be designed on, with the same period and joints.
-        coarse: The equation by an integrator of first order with that period, whose error is tolerated.
-        switches: What can be switched off; called only where the two differ.
-        reseeded: The plant with other random numbers, where it has any.
+        plant: The plant; reset it afterwards.
+        equation: Basis of a controller's design, with the same period and joints.
+        coarse: The equation by a first-order integrator with that period, whose error is tolerated.
+        switches: Switchable causes, tried only if the two differ.
+        reseeded: The plant with other random numbers, if it has any.
     """
     count = max(_LEAST_PERIODS, min(_MOST_PERIODS, math.ceil(_WINDOW / plant.dt)))
     runs = _plan(equation, coarse, count)
@@ -205,16 +199,13 @@ def check_equation(
 
 
 def check_recording(position: Array, velocity: Array, effort: Array, equation: JointPlant) -> Array:
-    """Return the error of each joint in every piece of a recording, of a plant that cannot be put anywhere.
+    """Return the errors, shape (pieces, joints), of a recorded plant, relative to the largest motion of a piece [-].
 
     Args:
         position: At the equation's period, shape (n, joints) [rad or m].
         velocity: Shape (n, joints) [rad/s or m/s].
         effort: Held from each state on, shape (n, driven joints) [N m or N].
-        equation: What a controller would be designed on.
-
-    Returns:
-        Shape (pieces, joints), as a share of the largest motion of a piece [-].
+        equation: Basis of a controller's design.
     """
     count = max(_LEAST_PERIODS, min(_MOST_PERIODS, math.ceil(_WINDOW / equation.dt)))
     runs, traces = _Runs(), []
@@ -244,7 +235,7 @@ def check_recording(position: Array, velocity: Array, effort: Array, equation: J
 
 
 def _plan(equation: JointPlant, coarse: JointPlant | None, count: int) -> _Runs:
-    """Return the runs and the equation's results: from rest first, then at the speeds that these reached."""
+    """Return runs with the equation's results: from rest first, then at the speeds that these reached."""
     runs = _Runs()
     limits, joints = equation.parameters.effort_limits, len(equation.parameters.coordinates.joints)
     still, none = (0.0,) * joints, (0.0,) * len(limits)
@@ -259,7 +250,7 @@ def _plan(equation: JointPlant, coarse: JointPlant | None, count: int) -> _Runs:
     for share in _FINE:
         for i, limit in enumerate(limits):
             effort = tuple(share * limit if j == i else 0.0 for j in range(len(limits)))
-            # Where nothing else moves it: beside its weight, so little is no motion.
+            # From 0 at rest: elsewhere gravity would hide such small efforts.
             rest += [_Probe(_FINE_STEP, still, still, tuple(sign * u for u in effort)) for sign in (1.0, -1.0)]
     _add(runs, equation, coarse, rest, count)
     fastest = np.max([runs.scales[kind][1] for kind in (_FREE, _SMALL_STEP)], axis=0)
@@ -296,7 +287,7 @@ def _add(runs: _Runs, equation: JointPlant, coarse: JointPlant | None, probes: S
 
 
 def _run(plant: JointPlant, probe: _Probe, count: int) -> _Trace:
-    """Run a probe; a plant that fails leaves a shorter trace and its sentence."""
+    """Run a probe; a fault shortens the trace."""
     none = (0.0,) * len(probe.position)
     rows = [(probe.position, probe.velocity)]
     fault = ""
@@ -312,7 +303,7 @@ def _run(plant: JointPlant, probe: _Probe, count: int) -> _Trace:
 
 
 def _error(runs: _Runs, i: int, trace: _Trace) -> Array:
-    """Return the error of each joint; a state may be a period early or late, as first-order integrators make it."""
+    """Return the error of each joint; a state may be a period early or late, as with first-order integrators."""
     if trace.fault:
         return np.full(trace.position.shape[1], _OUTSIDE)
     errors = []
@@ -327,7 +318,7 @@ def _error(runs: _Runs, i: int, trace: _Trace) -> Array:
 
 
 def _scales(runs: _Runs, i: int) -> tuple[Array, Array]:
-    """Return the motion that the errors of a run are shares of: of position and velocity, for each joint."""
+    """Return the motions that a run's errors are relative to: position and velocity of each joint."""
     of_kind, full = runs.scales[runs.probes[i].kind], runs.scales[_FULL]
     position, velocity = (np.maximum(np.maximum(a, _FLOOR * b), 1e-12) for a, b in zip(of_kind, full, strict=True))
     return position, velocity
@@ -347,13 +338,9 @@ def _describe(probe: _Probe, plant: JointPlant) -> str:
 
 @dataclass
 class _Case:
-    """A plant that differs from its equation.
+    """A plant that differs from its equation, with all runs.
 
     Attributes:
-        plant: The plant.
-        equation: The equation.
-        runs: Runs, and the equation's results.
-        traces: The plant's results.
         errors: Largest error of each run [-].
         joint: The joint with the largest error.
         count: Periods of a run.
@@ -368,7 +355,7 @@ class _Case:
     count: int
 
     def whole(self, kind: str = "") -> list[tuple[_Probe, _Trace, _Trace]]:
-        """Return runs that did not fail, of one kind or all: start, the plant's trace, the equation's."""
+        """Return the runs without fault, of one kind or all: start, the plant's trace, the equation's."""
         every = zip(self.runs.probes, self.traces, self.runs.traces, strict=True)
         return [each for each in every if not each[1].fault and kind in {"", each[0].kind}]
 
@@ -394,7 +381,7 @@ def _causes(
 
 
 def _switched(case: _Case, switches: Switches, worst: Sequence[int]) -> tuple[tuple[str, ...], float | None]:
-    """Return what makes the plant move as its equation when it is switched off: one thing after another."""
+    """Return the causes that must be switched off, one after another, for the plant to move as its equation."""
     off: tuple[str, ...] = ()
     traces = {i: case.traces[i] for i in worst}
     size, left = _size(case.errors[list(worst)]), float(np.max(case.errors))
@@ -407,8 +394,7 @@ def _switched(case: _Case, switches: Switches, worst: Sequence[int]) -> tuple[tu
             for i in worst:
                 runs[i] = _run(plant, case.runs.probes[i], case.count)
                 if len(runs) == _FEW and all(np.array_equal(runs[k].velocity, traces[k].velocity) for k in runs):
-                    # The plant has no such thing.
-                    break
+                    break  # without effect
             else:
                 errors = np.array([_error(case.runs, i, runs[i]).max() for i in worst])
                 tried.append((_size(errors), float(errors.max()), cause, runs))
@@ -421,12 +407,12 @@ def _switched(case: _Case, switches: Switches, worst: Sequence[int]) -> tuple[tu
 
 
 def _size(errors: Array) -> float:
-    """Return one figure for the errors of runs, in which no run counts for more than all of its motion [-]."""
+    """Return one figure for the errors of runs, each counted up to all of its motion [-]."""
     return float(np.sqrt(np.mean(np.minimum(errors, 1.0) ** 2)))
 
 
 def _noise(case: _Case, reseeded: JointPlant, worst: Sequence[int]) -> str:
-    """Name random numbers where the same run with others ends elsewhere, and what a reset leaves behind."""
+    """Name random numbers if another seed changes a run, or state that a reset leaves behind."""
 
     def differs(plant: JointPlant) -> float:
         largest = 0.0
@@ -437,7 +423,7 @@ def _noise(case: _Case, reseeded: JointPlant, worst: Sequence[int]) -> str:
                 largest = max(largest, float(off.max()))
         return largest
 
-    # Without other numbers the same run ends elsewhere only by what came before it.
+    # With the same seed a run differs only by what came before it.
     if (size := differs(case.plant)) > TOLERANCE:
         return f"a reset that leaves something behind (with the same seed a run differs by {100.0 * size:.2g} %)"
     size = differs(reseeded)
@@ -445,7 +431,7 @@ def _noise(case: _Case, reseeded: JointPlant, worst: Sequence[int]) -> str:
 
 
 def _reset(case: _Case) -> str:
-    """Name a start that is not taken: a period later the plant is where it was not put, wherever that was."""
+    """Name a start that the plant does not take."""
     swings, j = case.whole(_FREE), case.joint
     if not swings:
         return ""
@@ -476,7 +462,7 @@ def _reset(case: _Case) -> str:
     if power > 0.0:
         kept = float(np.dot([theirs.velocity[1, j] for _, theirs, _ in moving], asked)) / power
         ours = float(np.dot([mine.velocity[1, j] for _, _, mine in moving], asked)) / power
-        # Of another unit of velocity the angle moves on.
+        # With another unit of velocity the angle moves all the same.
         went = float(np.dot([np.diff(theirs.position[:2, j])[0] for _, theirs, _ in moving], asked)) / power
         if max(kept, went / case.plant.dt) < _LOST and ours > 1.0 - _LOST:
             return "a reset that ignores the velocity (it starts at rest)"
@@ -499,12 +485,12 @@ def _wrap(case: _Case) -> str:
 
 
 def _period(case: _Case) -> str:
-    """Name a period or a unit by which angle and velocity do not belong together."""
+    """Name a period or a unit by which angle and velocity do not match."""
     dt, j = case.plant.dt, case.joint
     ratios = []
     for _, theirs, _ in case.whole(_MOVING):
         moved, speeds = float(np.diff(theirs.position[1:3, j])[0]), theirs.velocity[1:3, j]
-        # By the integrator, a step goes at any velocity between its first and its last.
+        # Integrators use any velocity between a step's first and last.
         period = moved if speeds.min() <= moved / dt <= speeds.max() else dt * float(speeds.mean())
         if period:
             ratios.append(moved / period)
@@ -520,7 +506,7 @@ def _period(case: _Case) -> str:
 
 
 def _response(case: _Case, plant: JointPlant, driven: int, effort: float, speed: float = 0.0) -> Array | None:
-    """Return what a step of effort adds to the velocity of its joint, from 0 at rest or at a velocity of that joint."""
+    """Return the velocity that a step of effort adds to its joint, from 0 at rest or at a velocity."""
     coordinates = plant.parameters.coordinates
     still, none = (0.0,) * len(coordinates.joints), (0.0,) * len(coordinates.driven)
     moving = tuple(speed if i == coordinates.driven[driven] else 0.0 for i in range(len(still)))
@@ -534,7 +520,7 @@ def _response(case: _Case, plant: JointPlant, driven: int, effort: float, speed:
 
 
 def _dead(case: _Case) -> str:
-    """Name an effort below which a joint that moves anyhow, so that no friction holds it, does not answer."""
+    """Name an effort below which a moving joint, not held by friction, does not respond."""
     for i, limit in enumerate(case.plant.parameters.effort_limits):
         speed = float(case.runs.scales[_FREE][1][case.plant.parameters.coordinates.driven[i]])
         speed = speed or float(case.runs.scales[_SMALL_STEP][1][case.plant.parameters.coordinates.driven[i]])
@@ -558,11 +544,11 @@ def _dead(case: _Case) -> str:
 
 
 def _clipped(case: _Case) -> str:
-    """Name an effort beyond which more does nothing, or a speed beyond which nothing gets."""
+    """Name an effort beyond which more has no effect, or a largest speed."""
     j, joints = case.joint, case.plant.parameters.coordinates.joints
     speeds = [float(np.max(np.abs(theirs.velocity[1:, j]))) for _, theirs, _ in case.whole()]
     fastest = max(speeds, default=0.0)
-    # A start and its mirror image come equally fast, under efforts both ways.
+    # A start and its mirror image reach equal speeds, under efforts both ways.
     if sum(speed > (1.0 - 1e-6) * fastest for speed in speeds) > 2 * _FEW:
         return f"a limit of its speed (nothing is faster than {fastest:.3g} {joints[j].velocity_unit})"
     for i, limit in enumerate(case.plant.parameters.effort_limits):
@@ -580,7 +566,7 @@ def _clipped(case: _Case) -> str:
 
 
 def _late(case: _Case) -> str:
-    """Name a delayed effort, if the equation with that delay responds as the plant does."""
+    """Name a delayed effort, if the equation with that delay responds alike."""
     dt = case.plant.dt
     for i, limit in enumerate(case.plant.parameters.effort_limits):
         theirs, mine = (_response(case, plant, i, _SMALL * limit) for plant in (case.plant, case.equation))
@@ -603,7 +589,7 @@ def _late(case: _Case) -> str:
 
 
 def _unlike(theirs: Array, mine: Array) -> float:
-    """Return the relative residual of one curve after fitting another, independent of their sizes [-]."""
+    """Return the relative residual of one curve after scaling another to it [-]."""
     power = float(np.dot(mine, mine))
     if power == 0.0:
         return 1.0
@@ -629,13 +615,13 @@ def _stop(case: _Case) -> str:
 
 
 def _shape(case: _Case) -> str:
-    """Name the one term that explains what the equation leaves over of the accelerations."""
+    """Name the one term that explains the residual of the accelerations."""
     j, dt, w = case.joint, case.plant.dt, max(2, case.count // 6)
     driven = case.plant.parameters.coordinates.driven
     rows, left = [], []
     for i, (probe, theirs, mine) in enumerate(zip(case.runs.probes, case.traces, case.runs.traces, strict=True)):
         if theirs.fault or probe.kind == _FINE_STEP:
-            # In a joint that friction holds, its torque has no sign of the velocity.
+            # A joint held by friction has no sign of velocity.
             continue
         scale = _scales(case.runs, i)[1][j]
         q, v = float(np.mean(theirs.position[: w + 1, j])), float(np.mean(theirs.velocity[: w + 1, j]))
@@ -665,6 +651,6 @@ def _shape(case: _Case) -> str:
 
     own = [_TERMS.index(name) for name in _OWN]
     alone = [(explained(i), i) for i in own]
-    # A found equation has taken some of a term that it lacks for its own.
+    # A fitted equation has absorbed part of a missing term.
     share, best = max(alone) if max(alone)[0] >= _EXPLAINS else max((explained(*own, i), i) for i in range(len(_TERMS)))
     return f"{_TERMS[best]} (explains {100.0 * share:.0f} % of what is left over)" if share >= _EXPLAINS else ""

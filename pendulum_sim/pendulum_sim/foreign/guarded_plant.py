@@ -1,4 +1,4 @@
-"""What may go wrong with a third-party simulation, each named in one sentence."""
+"""Failures of a third-party simulation, each reported in one sentence."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from pendulum_sim.stepping.plant import Plant, PlantState
 __all__ = ["GuardedPlant", "PaceWatch", "StallWatch", "in_one_sentence"]
 
 _LATEST = 0.5
-"""Distance behind the wall's time at which a simulation that is too slow is given up [s]."""
+"""Lag behind wall time at which a slow simulation ends [s]."""
 _LARGEST_STEP = 10.0
-"""Cap on one step's duration, in periods: one pause of the machine is not the simulation's."""
+"""Longest duration of one step that counts, in periods: a pause of the machine is not the simulation's."""
 _MEMORY = 0.02
 """Weight of the newest step in the mean."""
 
 
 class GuardedPlant:
-    """A plant of which no exception and no value that is not a number gets out."""
+    """A plant whose exceptions and non-finite states become a FaultError."""
 
     def __init__(self, plant: Plant, name: str) -> None:
         self._plant = plant
@@ -37,19 +37,11 @@ class GuardedPlant:
         return self._plant.state
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Restart.
-
-        Raises:
-            FaultError: The simulation fails to, or starts with values that are not finite.
-        """
+        """Restart; raise a FaultError if that fails."""
         return self._try("reset", self._plant.reset, theta, theta_dot)
 
     def step(self, effort: float, push: float = 0.0) -> PlantState:
-        """Advance by one period.
-
-        Raises:
-            FaultError: The simulation ended with an exception, or its state is not finite.
-        """
+        """Advance by one period; raise a FaultError if that fails."""
         return self._try("step", self._plant.step, effort, push)
 
     def _try(self, what: str, function: Callable[..., PlantState], *arguments: float) -> PlantState:
@@ -64,23 +56,14 @@ class GuardedPlant:
 
 
 class PaceWatch:
-    """Distinguishes a simulation too slow for real time from a single pause of the machine.
-
-    Args:
-        period: Time that a step simulates [s].
-    """
+    """Distinguishes a simulation too slow for its period [s] from a single pause of the machine."""
 
     def __init__(self, period: float) -> None:
         self._period = period
         self._mean = 0.0
 
     def problem(self, duration: float, behind: float) -> str:
-        """Record a step; return as text why the simulation cannot run in real time, or nothing.
-
-        Args:
-            duration: Wall time that the step took [s].
-            behind: How far the plant's time is behind the wall's now [s].
-        """
+        """Record a step's wall time and the lag behind wall time [s]; return why it is too slow, or an empty string."""
         self._mean += _MEMORY * (min(duration, _LARGEST_STEP * self._period) - self._mean)
         if behind <= _LATEST or self._mean <= self._period:
             return ""
@@ -91,12 +74,7 @@ class PaceWatch:
 
 
 class StallWatch:
-    """Notices from a thread of its own that a step does not come back.
-
-    Args:
-        timeout: Time that a step may take [s].
-        on_stall: Called once, in that thread.
-    """
+    """Calls ``on_stall`` once, from its own thread, if a step takes longer than a timeout [s]."""
 
     def __init__(self, timeout: float, on_stall: Callable[[], Any]) -> None:
         self._timeout = timeout
@@ -106,12 +84,10 @@ class StallWatch:
         threading.Thread(target=self._watch, daemon=True).start()
 
     def __enter__(self) -> StallWatch:
-        """Start a step."""
         self._since = time.monotonic()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End a step."""
         self._since = None
 
     def close(self) -> None:
@@ -128,16 +104,7 @@ class StallWatch:
 
 @contextmanager
 def in_one_sentence(name: str, what: str, kind: type[PendulumError]) -> Iterator[None]:
-    """Turn an exception of foreign code, ``SystemExit`` included, into one sentence.
-
-    Args:
-        name: Name of the code.
-        what: What it does.
-        kind: Exception that is raised in its place.
-
-    Raises:
-        PendulumError: Of that kind; another PendulumError is passed on.
-    """
+    """Turn an exception of foreign code in ``what``, ``SystemExit`` included, into one sentence of error ``kind``."""
     try:
         yield
     except PendulumError as error:

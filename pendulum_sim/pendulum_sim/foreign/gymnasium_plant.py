@@ -1,6 +1,6 @@
 """An environment of Gymnasium as a plant: Pendulum-v1, this package's, and any with an adapter file.
 
-An adapter file::
+An adapter file, whose missing entries are those of a known environment::
 
     format: pendulum_simulation/1
     make: {g: 9.81}                        # arguments of gymnasium.make
@@ -12,9 +12,7 @@ An adapter file::
     start: state       # attribute that is set to start; or {options: state} or {options: [theta, theta_dot]} of reset
     period: dt                             # attribute, or {value: 0.05, unit: s}
     effort_limit: max_torque               # attribute, or {value: 2.0, unit: N m}; by default the action's bounds
-    equation: plant.yaml                   # plant file; by default it is found by trying the environment out
-
-What a file leaves out is as for a known environment, if it is one.
+    equation: plant.yaml                   # plant file; by default it is identified from the environment
 """
 
 from __future__ import annotations
@@ -61,7 +59,7 @@ KNOWN: dict[str, Adapter] = {
         "period": "dt",
     },
 }
-"""Adapters of the environments that need no file."""
+"""Adapters of known environments."""
 _KEYS = ("make", "set", "angle", "velocity", "torque", "read", "start", "period", "effort_limit", "equation")
 _ENTRIES = {
     "angle": ("index", "cos", "sin", "unit", "sign", "zero"),
@@ -73,27 +71,23 @@ _QUANTITIES = {"period": "s", "effort_limit": "N m"}
 _PROBES = 64
 _DRAWN, _FEW, _AS_WELL = 300, 5, 4.0
 _AS_GOOD = 0.1
-"""Share of a usual change that a step may be off and still counts."""
+"""Error of a step that still counts as a match, relative to a usual change."""
 _LITTLE = 0.1
-"""Share of the largest torque that no limit of speed or torque cuts."""
+"""Share of the largest torque that no limit cuts."""
 _SUBSTEPS, _ROUNDS = 20, 8
-"""Steps within a period by which the equation is solved, and rounds of its fit."""
+"""Integration steps of the equation in a period, and iterations of its fit."""
 _BETTER = 0.5
-"""Share of what one step of first order misses below which the solved equation is taken."""
+"""The solved equation is used if its error is below this share of a first-order step's."""
 _AHEAD = 0.5
-"""Distance from where its velocities lead up to which an angle is there [rad]."""
+"""Largest difference between an angle and its prediction from the velocities [rad]."""
 _STEPS = 3
-"""Steps of a probe at least, of which the last counts."""
+"""Fewest steps of a probe, of which the last counts."""
 _LATEST = 50
-"""Steps in which a torque moves an environment at the latest."""
+"""Latest step in which a torque takes effect."""
 
 
 def load_adapter(path: str | Path) -> Adapter:
-    """Return the contents of an adapter file.
-
-    Raises:
-        ParameterError: The file is refused; the message names file and entry.
-    """
+    """Return the content of an adapter file; a ParameterError names file and entry."""
     document = load_yaml(path, "adapter file")
     reject_unknown(document, ("format", *_KEYS), where=str(path))
     if document.pop("format", None) != FORMAT:
@@ -116,10 +110,10 @@ def load_gymnasium_plant(
     """Return an environment as a plant.
 
     Args:
-        env_id: Identifier for ``gymnasium.make``; ``module:ID`` imports the module that registers it first.
+        env_id: Identifier for ``gymnasium.make``; ``module:ID`` imports the module first.
         adapter: What the environment does not define.
         seed: Seed of every reset.
-        effort_limit: Largest torque where nothing else sets one; 0 for none [N m].
+        effort_limit: Largest torque if nothing else sets one; 0 for none [N m].
 
     Raises:
         ParameterError: Gymnasium is missing, or environment and adapter do not fit.
@@ -140,12 +134,12 @@ def load_gymnasium_plant(
 
 
 class GymnasiumPlant:
-    """An environment as a plant; see :func:`load_gymnasium_plant`. A push adds to the action: it has no other input.
+    """An environment as a plant; see :func:`load_gymnasium_plant`. A push adds to the action, its only input.
 
     Attributes:
-        parameters: The nearest equation of a pendulum.
+        parameters: The closest equation of a pendulum.
         dt: Time between two states [s].
-        remarks: What was chosen, as text.
+        remarks: Automatic choices, as text.
     """
 
     description = "gymnasium"
@@ -188,15 +182,11 @@ class GymnasiumPlant:
 
     @property
     def state(self) -> PlantState:
-        """The present state; the effort is the commanded one, as an environment measures none."""
+        """The present state; the effort is the command, as nothing is measured."""
         return PlantState(self._steps * self.dt, self._theta, self._theta_dot, self._applied)
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Restart with the seed, at an angle [rad] and a velocity [rad/s].
-
-        Raises:
-            ParameterError: The environment has no way to be set to that state.
-        """
+        """Restart with the seed, at an angle [rad] and a velocity [rad/s]; a ParameterError if that is impossible."""
         check_start(theta, theta_dot)
         start = self._adapter.get("start")
         if start is None:
@@ -224,7 +214,7 @@ class GymnasiumPlant:
             self._theta, self._theta_dot = float(theta), float(theta_dot)
         else:
             self._read(observation, fresh=True)
-            # The environment does not count whole turns; the plant does.
+            # The environment does not count whole turns.
             self._theta += 2.0 * math.pi * round((theta - self._theta) / (2.0 * math.pi))
         return self.state
 
@@ -243,7 +233,7 @@ class GymnasiumPlant:
         return self.state
 
     def reseeded(self) -> GymnasiumPlant:
-        """Return the same environment with resets from another seed; the two are run one after the other."""
+        """Return the same environment with another seed of its resets; run one at a time."""
         other = copy.copy(self)
         other._seed = self._seed + 1
         return other
@@ -310,7 +300,6 @@ class GymnasiumPlant:
         return answer[0]
 
     def _advance(self, command: float, push: float = 0.0) -> bool:
-        """Advance by one period; return whether the episode has ended."""
         self._action.flat[self._index] = (command + push) * self._per_torque
         answer = self._env.step(self._action)
         if not (isinstance(answer, tuple) and len(answer) == 5):
@@ -336,8 +325,8 @@ class GymnasiumPlant:
                 "holds both"
             ) from error
         if not fresh and math.isfinite(theta):
-            # Observations are wrapped; the plant's angles are not. Within a long period the joint may turn by more than
-            # half a turn, which the velocities report.
+            # Observations are wrapped, the plant's angles are not. In a long period the joint may turn by more than
+            # half a turn, which the velocities show.
             ahead = 0.5 * self.dt * (self._theta_dot + theta_dot)
             if not (abs(ahead) > math.pi and abs(wrap(theta - self._theta - ahead)) < _AHEAD):
                 ahead = 0.0
@@ -355,8 +344,8 @@ class GymnasiumPlant:
         if "equation" in self._adapter:
             found = load_plant(self._adapter["equation"])
             return found.with_values(effort_limit=self._limit, name=self._id)
-        # A step here and there: v' = a v + c u - d sin(theta), of which a and c give inertia and damping. The first
-        # steps are skipped, so that neither a reset nor a short delay of the effort biases the fit.
+        # Single steps: v' = a v + c u - d sin(theta), where a and c give inertia and damping. The first steps are
+        # skipped: neither a reset nor a short delay of the effort may bias the fit.
         generator = np.random.default_rng(0)
         rows, angles, after = np.empty((_PROBES, 3)), np.empty(_PROBES), np.empty(_PROBES)
         for i in range(_PROBES):
@@ -369,8 +358,8 @@ class GymnasiumPlant:
             after[i] = self._theta_dot
         if not (np.all(np.isfinite(rows)) and np.all(np.isfinite(after))):
             raise self._error(f"it is at {self._theta} rad, {self._theta_dot} rad/s; expected finite numbers")
-        # A stop or a limit in most of the probes must not bend the rest: of fits to few of them, the one that a third
-        # of all meet best, and then a fit to those that meet it about as well.
+        # Robust against stops and limits in most probes: of fits to few of them, the one that a third of all match
+        # best, then a fit to those that match it.
         fits = []
         for _ in range(_DRAWN):
             few = generator.choice(_PROBES, _FEW, replace=False)
@@ -399,8 +388,7 @@ class GymnasiumPlant:
             inertia = -damping * self.dt / math.log(float(a)) if a > 0.0 else self.dt / float(c)
         else:
             damping, inertia = 0.0, self.dt / float(c)
-        # One step of first order is not what a better integrator makes of a long period: what meets the probes better
-        # is the equation.
+        # For a long period a first-order step may be inaccurate: the solved equation is used if it matches better.
         rates = np.array([max(damping, 0.0), 1.0, max(0.0, float(d / c))]) / inertia
         for _ in range(2):
             rates = _fit_rates(rates, rows[kept], angles[kept], after[kept], self.dt)
@@ -414,7 +402,7 @@ class GymnasiumPlant:
 
 
 def _third(left: Array) -> float:
-    """Return what a third of all probes meet at least."""
+    """Return the error that a third of all probes stay below."""
     return float(np.sort(left)[_PROBES // 3])
 
 
@@ -432,7 +420,7 @@ def _moved(rates: Array, rows: Array, angles: Array, dt: float) -> Array:
 
 
 def _fit_rates(rates: Array, rows: Array, angles: Array, after: Array, dt: float) -> Array:
-    """Return the rates that meet the velocities after a period, by Gauss-Newton from others."""
+    """Return the rates that match the velocities after a period, by Gauss-Newton."""
     for _ in range(_ROUNDS):
         here = _moved(rates, rows, angles, dt)
         steps = 1e-6 * np.maximum(np.abs(rates), 1e-3 * float(np.max(rates)))

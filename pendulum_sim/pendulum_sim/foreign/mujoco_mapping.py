@@ -1,6 +1,6 @@
-"""The mapping file of a MuJoCo model: what the model file does not define in the contract's terms.
+"""The mapping file of a MuJoCo model: what the model does not define in the contract's terms.
 
-Every entry but the format may be left out::
+All entries but the format are optional::
 
     format: pendulum_simulation/1
     joint: hinge                            # the only hinge, or pendulum_joint, by default
@@ -36,7 +36,7 @@ _TEXTS = ("joint", "actuator")
 
 @dataclass(frozen=True)
 class MujocoMapping:
-    """What a model file does not define; None and empty text stand for an automatic choice.
+    """Content of a mapping file; None and empty text mean an automatic choice.
 
     Attributes:
         joint: Name of the hinge.
@@ -58,11 +58,7 @@ class MujocoMapping:
 
 
 def load_mujoco_mapping(path: str | Path) -> MujocoMapping:
-    """Return the mapping that a file holds.
-
-    Raises:
-        ParameterError: The file is refused; the message names file and entry.
-    """
+    """Return the mapping in a file; a ParameterError names file and entry."""
     document = load_yaml(path, "mapping file")
     names = [spec.name for spec in _QUANTITIES]
     reject_unknown(document, ("format", *_TEXTS, "sign", *names), where=str(path))

@@ -1,4 +1,4 @@
-"""A model file as MuJoCo reads it, meshes of a ROS description included."""
+"""Reads a model file with MuJoCo, meshes of a ROS description included."""
 
 from __future__ import annotations
 
@@ -14,11 +14,7 @@ _PACKAGE = "package://"
 
 
 def read_model(mujoco: Any, path: Path) -> tuple[Any, list[str]]:
-    """Return the compiled model, and as text what was left out of it.
-
-    Raises:
-        ParameterError: MuJoCo refuses it, or it is a source of a model.
-    """
+    """Return the compiled model and remarks on omitted meshes; a ParameterError if MuJoCo refuses it."""
     text = path.read_text(encoding="utf-8", errors="replace")
     if hint := xacro_hint(path, text):
         raise ParameterError(f"model {path} is no model yet: {hint}")
@@ -32,7 +28,7 @@ def read_model(mujoco: Any, path: Path) -> tuple[Any, list[str]]:
             if found is not None and (problem := _problem(mujoco, found)) == "":
                 mesh.file = str(found)
                 continue
-            # A mesh has no effect on the dynamics where a link has its inertia; where not, MuJoCo reports it.
+            # A mesh has no effect on a link with given inertia; MuJoCo reports a link without.
             for geom in [geom for geom in spec.geoms if geom.meshname == mesh.name]:
                 spec.delete(geom)
             why = "no such file" if found is None else problem
@@ -44,7 +40,7 @@ def read_model(mujoco: Any, path: Path) -> tuple[Any, list[str]]:
 
 
 def _find(name: str, path: Path) -> Path | None:
-    """Return the file of a mesh: by its path, or in the package that holds the model or lies next to it."""
+    """Return the file of a mesh: by its path, or in the package that contains the model or lies next to it."""
     folders = path.resolve().parents
     if name.startswith(_PACKAGE):
         inside = Path(name.removeprefix(_PACKAGE))
@@ -55,7 +51,7 @@ def _find(name: str, path: Path) -> Path | None:
 
 
 def _problem(mujoco: Any, mesh: Path) -> str:
-    """Return why MuJoCo cannot read a mesh, or nothing."""
+    """Return why MuJoCo cannot read a mesh, or an empty string."""
     spec = mujoco.MjSpec()
     spec.add_mesh(name="mesh", file=str(mesh))
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")

@@ -1,8 +1,8 @@
 """A model of MuJoCo as a plant: any MJCF or URDF with one hinge to drive.
 
-Actuators, friction, integrator and timestep are those of the file; a mapping file adds what is missing. A file
-of ``export_model`` needs none: a joint with the contract's name has its zero and its sign, and an actuator ``effort``
-on it takes the contract's command as it is.
+Actuators, friction, integrator and timestep are the file's; a mapping file adds what is missing. A file of
+``export_model`` needs none: a joint with the contract's name has its zero and sign, and an actuator ``effort`` on it
+takes the contract's command.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["MujocoPlant", "load_mujoco_plant"]
 
 CONTRACT_ACTUATOR = "effort"
 PERIOD = 0.002
-"""Time between two states, unless the timestep is longer [s]."""
+"""Default time between two states, unless the timestep is longer [s]."""
 _ANGLES = 24
 _ROUNDING = 1e-12
 _REST_ANGLES = 721
@@ -38,13 +38,13 @@ _BISECTIONS = 60
 def load_mujoco_plant(
     path: str | Path, mapping: MujocoMapping | None = None, *, rate_hz: float = 0.0, effort_limit: float = 0.0
 ) -> MujocoPlant:
-    """Return the plant that a model file describes.
+    """Return the plant of a model file.
 
     Args:
         path: MJCF or URDF.
         mapping: What the file does not define.
-        rate_hz: Rate of states; 0 for 500 Hz, or one of the file's timestep where that is longer [Hz].
-        effort_limit: Largest torque where neither file nor mapping has one; 0 for none [N m].
+        rate_hz: Rate of states; 0 for 500 Hz, or that of a longer timestep [Hz].
+        effort_limit: Largest torque if neither file nor mapping has one; 0 for none [N m].
 
     Raises:
         ParameterError: MuJoCo is missing or refuses the file, or the file has no hinge that can be driven.
@@ -60,12 +60,12 @@ def load_mujoco_plant(
 
 
 def _import_mujoco() -> Any:
-    # Imported late: it takes 60 MB, which only such a model needs.
+    # Imported late: it takes 60 MB.
     try:
         import mujoco
     except ImportError as error:
         raise ParameterError(how_to_install(error) or f"MuJoCo cannot be imported: {error}") from error
-    # It would write its warnings to a file of its own in the working folder; they are raised here as errors.
+    # It would write warnings to a file in the working folder; they are raised here as errors.
     mujoco.set_mju_user_warning(lambda _text: None)
     return mujoco
 
@@ -74,9 +74,9 @@ class MujocoPlant:
     """A hinge of a MuJoCo model as a plant; see :func:`load_mujoco_plant`.
 
     Attributes:
-        parameters: The nearest equation of a pendulum, read off the model in commanded torque.
+        parameters: The closest equation of a pendulum, read off the model in commanded torque.
         dt: Time between two states [s].
-        remarks: What was chosen, as text.
+        remarks: Automatic choices, as text.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class MujocoPlant:
     ) -> None:
         self._mujoco, self._model, self._path = mujoco, model, path
         self._data = mujoco.MjData(model)
-        # A reset of MuJoCo's own would hide that the simulation blew up.
+        # MuJoCo's own reset would hide that the simulation diverged.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         if mapping.timestep is not None:
             model.opt.timestep = mapping.timestep
@@ -107,7 +107,7 @@ class MujocoPlant:
         self._control_per_torque = mapping.control_per_torque or (1.0 if of_contract else 1.0 / per_control)
         gain = per_control * self._control_per_torque
         weight, hanging = self._weight()
-        # Rounding of the fit is no angle, and no half turn the other way round.
+        # Removes the fit's rounding, and -pi.
         hanging = 0.0 if abs(hanging) < _ROUNDING else hanging
         hanging = math.pi if abs(abs(hanging) - math.pi) < _ROUNDING else hanging
         if mapping.zero is not None:
@@ -140,7 +140,7 @@ class MujocoPlant:
         data = self._data
         theta = self._sign * (float(data.qpos[self._qpos]) - self._zero)
         if self._driven != self._dof:
-            # Of a motor behind a spring the spring is what a sensor at the joint feels.
+            # Behind a motor's spring a sensor at the joint measures the spring.
             effort = float(data.qfrc_spring[self._dof])
         elif self._actuator is None:
             effort = float(data.qfrc_applied[self._dof]) - self._sign * self._push
@@ -149,7 +149,7 @@ class MujocoPlant:
         return PlantState(self._steps * self.dt, theta, self._sign * float(data.qvel[self._dof]), self._sign * effort)
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Restart as the file does, except for the joint's angle [rad] and velocity [rad/s]; a motor moves with it."""
+        """Restart as the file does, except for the joint's angle [rad] and velocity [rad/s]; a motor follows."""
         check_start(theta, theta_dot)
         model, data = self._model, self._data
         self._mujoco.mj_resetData(model, data)
@@ -165,11 +165,7 @@ class MujocoPlant:
         return self.state
 
     def step(self, effort: float, push: float = 0.0) -> PlantState:
-        """Advance by one period.
-
-        Args:
-            effort: Commanded torque, held over the period; clamped to the limit [N m].
-            push: Torque on the link itself [N m].
+        """Advance by one period under a commanded torque, clamped to the limit, and a torque on the link [N m].
 
         Raises:
             FaultError: MuJoCo met values that are not finite, or too large.
@@ -196,11 +192,11 @@ class MujocoPlant:
 
     @property
     def switches(self) -> tuple[str, ...]:
-        """What :meth:`without` switches off."""
+        """Causes for :meth:`without`."""
         return CAUSES
 
     def without(self, causes: tuple[str, ...]) -> MujocoPlant:
-        """Return a copy with the same joint, zero and limit, in which some of the model is switched off."""
+        """Return a copy with the same joint, zero and limit, and some causes switched off."""
         other = copy.copy(self)
         other._model = copy.copy(self._model)
         dofs = {self._dof, self._driven}
@@ -339,7 +335,7 @@ class MujocoPlant:
         return limit
 
     def _put(self, angle: float) -> None:
-        """Put the joint, and a motor with it, at rest at an angle of the file's."""
+        """Put the joint, with a motor, at rest at an angle of the file's."""
         model, data = self._model, self._data
         self._mujoco.mj_resetData(model, data)
         data.qpos[self._qpos] = angle
@@ -362,7 +358,7 @@ class MujocoPlant:
         return float(math.hypot(a, b)), math.atan2(-b, a)
 
     def _rest(self, hanging: float) -> float:
-        """Return where the joint comes to rest: where it hangs, unless a spring pulls it elsewhere."""
+        """Return where the joint rests: hanging, unless a spring pulls it elsewhere."""
 
         def torque(angle: float) -> float:
             self._put(angle)
@@ -388,7 +384,7 @@ class MujocoPlant:
     def _describe(self, weight: float, hanging: float, gain: float, limit: float) -> PlantParameters:
         model, data, mujoco = self._model, self._data, self._mujoco
         self._put(hanging)
-        # A motor behind a spring moves with the link, where motion is slow.
+        # In slow motion a motor behind a spring moves with the link.
         dofs = sorted({self._dof, self._driven})
         inertia = 0.0
         for dof in dofs:
@@ -402,7 +398,7 @@ class MujocoPlant:
             if model.actuator_dyntype[self._actuator] != int(mujoco.mjtDyn.mjDYN_NONE):
                 lag = float(model.actuator_dynprm[self._actuator, 0])
             delay = float(model.actuator_delay[self._actuator])
-            # The motor's own, which MuJoCo stores apart from the joint's.
+            # MuJoCo stores the motor's separately.
             damping += float(model.actuator_damping[self._actuator]) * self._gear**2
         gain = abs(gain)
         return pendulum_plant(

@@ -1,4 +1,4 @@
-"""What of a MuJoCo model can be switched off, to test whether it makes the model differ from a pendulum's equation."""
+"""Parts of a MuJoCo model that can be switched off, to test whether they cause a deviation from an equation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["CAUSES", "switch_off"]
 
 _FINER = 8
 _LOCKED = 1e6
-"""Inertia that locks a joint, as a multiple of the largest of the model."""
+"""Inertia that locks a joint, relative to the largest of the model."""
 _DISABLED = {"contact": "mjDSBL_CONTACT", "an equality constraint": "mjDSBL_EQUALITY"}
 _CLEARED = {
     "the range of a joint": ("jnt_limited",),
@@ -31,18 +31,13 @@ _STIFFER = 100.0
 _FLUID, _JOINTS, _ACTUATORS = "the fluid around it", "other joints that move", "other actuators"
 _FLAG, _TIMESTEP = "a flag that disables a part of MuJoCo", "a timestep too long for the integrator"
 CAUSES = (*_DISABLED, *_CLEARED, _DRIVE, _FLUID, _JOINTS, _ACTUATORS, _FLAG, _TIMESTEP)
-"""What can be switched off, as text."""
+"""Names of these parts."""
 
 
 def switch_off(mujoco: Any, model: Any, cause: str, dofs: Collection[int], actuator: int | None) -> int:
-    """Switch one of ``CAUSES`` off in a model; return how many steps take the place of one.
+    """Switch one of ``CAUSES`` off in a model, in place; return how many steps replace one.
 
-    Args:
-        mujoco: The library.
-        model: The model; it is changed.
-        cause: What is switched off.
-        dofs: Degrees of freedom of the joint and of its motor.
-        actuator: Number of its actuator; None for none.
+    ``dofs`` are the degrees of freedom of the joint and its motor; ``actuator`` is its actuator's index, or None.
     """
     if cause in _DISABLED:
         model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, _DISABLED[cause]))
@@ -52,7 +47,7 @@ def switch_off(mujoco: Any, model: Any, cause: str, dofs: Collection[int], actua
         model.opt.density = model.opt.viscosity = 0.0
         model.opt.wind[:] = 0.0
     elif cause == _DRIVE and len(dofs) > 1:
-        # Of a motor that moves with the link the equation is that of a rigid one.
+        # A motor that moves with the link has a rigid plant's equation.
         model.tendon_stiffness[:] *= _STIFFER
     elif cause == _JOINTS:
         others = [i for i in range(model.nv) if i not in dofs]

@@ -1,4 +1,4 @@
-"""What pictures of plants have in common: colours, a canvas that is smoothed down, arcs, arrows and lines of text."""
+"""Common parts of pictures of plants: colours, a smoothed canvas, arcs, arrows and text."""
 
 from __future__ import annotations
 
@@ -28,24 +28,21 @@ BOB = (208, 84, 58)
 TORQUE = (38, 120, 178)
 DISTURBANCE = (222, 140, 20)
 OVERSAMPLING = 2
-"""Drawn twice as large and smoothed down: pygame's shapes have ragged edges."""
+"""Canvas size relative to the picture: smoothing removes pygame's ragged edges."""
 _MIN_SIZE, _MAX_SIZE = 120, 4096
 
 
 class Picture:
-    """A canvas, and what is drawn on it of any plant.
+    """A canvas, and the parts of a plant's picture.
 
     Args:
-        size: Width and height [px].
-        trail: Positions that the trail remembers.
+        size: Width and height, 120 to 4096 [px]; others are a ParameterError.
+        trail: Positions of the trail.
         lines: Lines of text that fill its height.
-
-    Raises:
-        ParameterError: The size is outside 120 to 4096 px.
 
     Attributes:
         size: Width and height [px].
-        canvas: What is drawn on, ``OVERSAMPLING`` times as large.
+        canvas: Drawing surface, ``OVERSAMPLING`` times as large.
         surface: The picture.
     """
 
@@ -63,16 +60,16 @@ class Picture:
         self._font = pygame.font.Font(None, max(400 // lines, min(self.size) // lines) * OVERSAMPLING)
 
     def array(self) -> NDArray[np.uint8]:
-        """Return the picture as red, green and blue, shape (height, width, 3)."""
+        """Return red, green and blue, shape (height, width, 3)."""
         pixels: NDArray[np.uint8] = self.pygame.surfarray.array3d(self.surface)
         return np.ascontiguousarray(pixels.transpose(1, 0, 2))
 
     def clear_trail(self) -> None:
-        """Forget where the plant has been."""
+        """Clear the trail."""
         self._trail.clear()
 
     def show_text(self, note: str) -> None:
-        """Draw nothing but a line of text, where a plant cannot be drawn yet."""
+        """Draw a line of text alone."""
         self.canvas.fill(BACKGROUND)
         self.draw_text([], note)
         self.finish()
@@ -80,11 +77,11 @@ class Picture:
     # --- parts ---------------------------------------------------------------------------------------------
 
     def finish(self) -> None:
-        """Make the picture of what is on the canvas."""
+        """Make the picture from the canvas."""
         self.pygame.transform.smoothscale(self.canvas, self.size, self.surface)
 
     def draw_text(self, rows: Sequence[tuple[str, Colour]], note: str) -> None:
-        """Draw lines at the top, each in its colour, and one at the bottom."""
+        """Draw coloured lines at the top, and one at the bottom."""
         margin = 10 * OVERSAMPLING
         for row, (text, colour) in enumerate(rows):
             image = self._font.render(text, True, colour)
@@ -94,7 +91,7 @@ class Picture:
             self.canvas.blit(image, (margin, self.canvas.get_height() - margin - image.get_height()))
 
     def draw_dial(self, origin: Any, length: float) -> None:
-        """Draw a mark every 15 degrees about a point, beyond a length."""
+        """Draw a mark every 15 degrees around a point, beyond a length."""
         for degrees in range(0, 360, 15):
             long = degrees % 90 == 0
             turn = math.radians(degrees)
@@ -103,7 +100,7 @@ class Picture:
             self.pygame.draw.line(self.canvas, INK if long else GREY, *ends, (3 if long else 2) * OVERSAMPLING // 2)
 
     def draw_trail(self, points: Sequence[Any], size: float) -> None:
-        """Draw where the tip has been, oldest first, paler and smaller with age."""
+        """Draw the tip's path, oldest first, paler and smaller with age."""
         for age, point in enumerate(points):
             share = (age + 1) / len(points) * 0.35
             colour = [round(b + (t - b) * share) for b, t in zip(BACKGROUND, BOB, strict=True)]
@@ -112,12 +109,8 @@ class Picture:
     def draw_arc(self, origin: Any, right: Any, up: Any, share: float, length: float) -> None:
         """Draw a torque as an arc with a head.
 
-        Args:
-            origin: Where the joint is [px].
-            right: Start of the arc, from the origin [px].
-            up: Where it is after a quarter of a turn, from the origin [px].
-            share: Torque, as a share of the one that is shown by three eighths of a turn.
-            length: Size of the plant in the picture [px].
+        ``right`` and ``up`` lead from the origin to the arc's start and to a quarter turn [px]; ``share`` is the torque
+        relative to that of a full arc; ``length`` is the plant's size [px].
         """
         share = max(-1.0, min(1.0, share))
         # A square root shows the small torques of regulation next to the full one.
@@ -134,7 +127,7 @@ class Picture:
         self.draw_head(points[-1], direction, 0.07 * length, TORQUE)
 
     def draw_force(self, begin: Any, along: Any, share: float, length: float) -> None:
-        """Draw what the motor of a slide gives as an arrow, with the scale of :meth:`draw_arc`."""
+        """Draw a slide's force as an arrow, with the scale of :meth:`draw_arc`."""
         share = math.copysign(math.sqrt(min(1.0, abs(share))), share)
         if abs(share) > 0.02:
             self.draw_arrow(begin, along, share, length, TORQUE, shortest=0.0)
@@ -149,15 +142,10 @@ class Picture:
         *,
         shortest: float = 0.15,
     ) -> None:
-        """Draw a torque or a force as an arrow whose length is its share of the largest one.
+        """Draw a torque or a force as an arrow from ``begin`` in the direction ``along`` [px].
 
-        Args:
-            begin: Its start [px].
-            along: Direction of a positive one [px].
-            share: Torque or force, as a share of the one that is shown by half of ``length``.
-            length: Size of the plant in the picture [px].
-            colour: Colour of the arrow.
-            shortest: Length of the arrow of nearly nothing, as a share of ``length``.
+        ``share`` is relative to that shown by half of ``length``, the plant's size [px]; ``shortest`` is the share of
+        ``length`` of the smallest arrow.
         """
         size = float(np.hypot(*along))
         if not share or size == 0.0:

@@ -1,4 +1,4 @@
-"""Pictures on the screen, and as files."""
+"""Pictures on the screen and in files."""
 
 from __future__ import annotations
 
@@ -23,15 +23,7 @@ _INVISIBLE = ("dummy", "offscreen", "evdev", "kmsdrm")
 
 
 class Window:
-    """A window on the screen that shows pictures.
-
-    Args:
-        size: Width and height of the pictures [px].
-        title: Title of the window.
-
-    Raises:
-        ParameterError: There is no display.
-    """
+    """A window for pictures of a size [px]; raises a ParameterError without a display."""
 
     def __init__(self, size: tuple[int, int], title: str = "pendulum") -> None:
         import pygame
@@ -43,7 +35,7 @@ class Window:
             raise ParameterError(f"DISPLAY and WAYLAND_DISPLAY are not set, so there is no window; {_EXPECTED}")
         try:
             pygame.display.init()
-            # SDL falls back to drivers that show nothing.
+            # SDL falls back to invisible drivers.
             if (driver := pygame.display.get_driver()) in _INVISIBLE and driver != chosen:
                 pygame.display.quit()
                 raise ParameterError(f"no window can be opened, {driver} shows none; {_EXPECTED}")
@@ -54,12 +46,7 @@ class Window:
         self._clock = pygame.time.Clock()
 
     def show(self, picture: Picture, *, fps: int = 0) -> None:
-        """Put a picture on the screen.
-
-        Args:
-            picture: What to show.
-            fps: Wait so that there are at most this many pictures per second; 0 for no wait.
-        """
+        """Show a picture; wait for at most ``fps`` pictures per second, 0 for no wait."""
         self._screen.blit(picture.surface, (0, 0))
         self._pygame.display.flip()
         if fps:
@@ -74,25 +61,12 @@ class Window:
 
 
 def save_png(path: str | Path, picture: NDArray[np.uint8]) -> Path:
-    """Write a picture of shape (height, width, 3) as PNG.
-
-    Raises:
-        ParameterError: The file cannot be written.
-    """
+    """Write a picture of shape (height, width, 3) as PNG; a ParameterError if that fails."""
     return _save(path, [picture], "PNG")
 
 
 def save_gif(path: str | Path, pictures: Sequence[NDArray[np.uint8]], fps: float) -> Path:
-    """Write an animation as GIF.
-
-    Args:
-        path: Where to write.
-        pictures: At least one, each of shape (height, width, 3).
-        fps: Pictures per second.
-
-    Raises:
-        ParameterError: There is no picture, or the file cannot be written.
-    """
+    """Write at least one picture of shape (height, width, 3) as GIF; a ParameterError if that fails."""
     if not pictures:
         raise ParameterError("an animation of 0 pictures; expected at least one")
     return _save(path, pictures, "GIF", duration=max(20, round(1000.0 / fps)), loop=0, append=True)

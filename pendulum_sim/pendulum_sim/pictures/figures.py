@@ -1,4 +1,4 @@
-"""Figures: the evolution of a run, and the overdamped phase plot with its fixed points."""
+"""The overdamped phase plot with its fixed points."""
 
 from __future__ import annotations
 
@@ -25,14 +25,10 @@ _STABLE, _UNSTABLE, _LINE = "#1b7f5c", "#c4472f", "#2b6cb0"
 
 
 def overdamped_points(parameters: PlantParameters, torque: float = 0.0) -> list[tuple[FixedPoint, float]]:
-    """Return the fixed points of an overdamped plant by angle, each with its rate: the slope of x' over x [1/s].
-
-    Args:
-        parameters: The plant.
-        torque: Constant commanded torque u_0 [N m].
+    """Return the fixed points of an overdamped plant under a torque [N m], by angle, with the slope of x' over x [1/s].
 
     Raises:
-        ParameterError: The plant has no gravity, or swings past its rest, so that it has no such flow.
+        ParameterError: The plant has no gravity, or is not overdamped.
     """
     if parameters.gravity <= 0.0:
         raise ParameterError(f"gravity is {parameters.gravity} N m; expected > 0")
@@ -48,13 +44,9 @@ def overdamped_points(parameters: PlantParameters, torque: float = 0.0) -> list[
 
 
 def plot_overdamped_phase(parameters: PlantParameters, torque: float = 0.0) -> Figure:
-    """Draw x' = (u_0 - G sin x) / b over x from -2 pi to 2 pi, with its fixed points and the direction of flow.
+    """Draw x' = (u_0 - G sin x) / b over x from -2 pi to 2 pi, with fixed points and direction of flow; u_0 in [N m].
 
-    Offsets count, and of a series-elastic plant the motor's damping and what it makes of a commanded torque.
-
-    Args:
-        parameters: The plant.
-        torque: Constant torque u_0 [N m].
+    It includes offsets, and a series-elastic plant's motor damping and torque gain.
 
     Source:
         Thesis, phase plot of the overdamped pendulum.
@@ -87,11 +79,7 @@ def plot_overdamped_phase(parameters: PlantParameters, torque: float = 0.0) -> F
 
 
 def save_figure(figure: Figure, path: str | Path) -> Path:
-    """Write a figure; the ending of the path chooses PNG, SVG or PDF.
-
-    Raises:
-        ParameterError: The file cannot be written, or the ending is unknown.
-    """
+    """Write a figure as .png, .svg or .pdf; a ParameterError for other endings or if that fails."""
     path = Path(path)
     if path.suffix.lower() not in {".png", ".svg", ".pdf"}:
         raise ParameterError(f"figure {path} ends in {path.suffix!r}; expected .png, .svg or .pdf")

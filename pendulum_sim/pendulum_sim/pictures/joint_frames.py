@@ -1,4 +1,4 @@
-"""Where the joints of a plant are in space, and about what they turn: from the bodies that files and RViz have too."""
+"""Positions and axes of a plant's joints in space, from the bodies of URDF and MJCF."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class JointFrame(NamedTuple):
     """A joint at a position of the plant; x to the right, y away from the viewer, z up.
 
     Attributes:
-        origin: Where the joint is; of one that slides, where it has slid to [m].
+        origin: Position of the joint, of a slide where it has slid to [m].
         axis: Axis of rotation by the right-hand rule, or of sliding.
         right: Unit vector from which a positive angle turns.
         up: Unit vector towards which it turns.
@@ -35,12 +35,7 @@ class JointFrame(NamedTuple):
 
 
 def joint_frames(parameters: PlantParameters, position: Vector) -> tuple[JointFrame, ...]:
-    """Return where each joint is.
-
-    Args:
-        parameters: The plant.
-        position: n positions [rad or m].
-    """
+    """Return the frame of each joint at n positions [rad or m]."""
     frames = []
     turned, at = np.eye(3), np.zeros(3)
     for body, joint, q in zip(
@@ -52,7 +47,6 @@ def joint_frames(parameters: PlantParameters, position: Vector) -> tuple[JointFr
         if joint.unit == "m":
             at = at + q * axis
         else:
-            # Columns of the rotation about the axis: what lies across it turns, what lies along it stays.
             basis = np.stack((right, up, axis), axis=1)
             cos, sin = np.cos(q), np.sin(q)
             turned = basis @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ basis.T @ turned
@@ -61,13 +55,13 @@ def joint_frames(parameters: PlantParameters, position: Vector) -> tuple[JointFr
 
 
 def across(body: Body) -> tuple[Array, Array]:
-    """Return unit vectors across a joint's axis, of the body before; a positive angle turns one towards the other."""
+    """Return unit vectors across a joint's axis, in the body before; a positive angle turns one towards the other."""
     axis = np.array(body.axis)
     right = np.array([0.0, 1.0, 0.0]) if abs(axis[0]) > abs(axis[1]) else np.array([1.0, 0.0, 0.0])
     return right, np.cross(axis, right)
 
 
 def full_effort(parameters: PlantParameters, index: int) -> float:
-    """Return the effort that is drawn in full: the joint's limit, or the strongest motor's of a passive one."""
+    """Return the effort of a full arc: the joint's limit, or for a passive joint the strongest motor's."""
     own = parameters.joints[index].actuator
     return own.effort_limit if own is not None else max(parameters.effort_limits, default=1.0)

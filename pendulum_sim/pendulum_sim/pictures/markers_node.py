@@ -1,7 +1,7 @@
 """``markers``: show torque and disturbance as arcs about the joints, a force as an arrow, in RViz and Foxglove.
 
-RViz's own Effort display draws revolute joints only (this one turns without end, so it is continuous) and drops
-messages whose ``frame_id`` is no frame (here it is the commander).
+RViz's own Effort display draws revolute joints only (this one is continuous) and drops messages whose ``frame_id`` is
+no frame (here it is the commander).
 """
 
 from __future__ import annotations
@@ -54,21 +54,14 @@ _ARCS = {
     names.DISTURBANCE: (1, 1.3, (0.89, 0.47, 0.10)),
     names.PUSH: (2, 1.6, (0.58, 0.30, 0.70)),
 }
-"""Topic: id of the marker, its radius as a multiple, its colour."""
+"""Topic: id of the marker, relative radius, colour."""
 
 
 def arc_points(effort: float, effort_scale: float, radius: float) -> list[tuple[float, float, float]]:
-    """Return the polyline of a torque: an arc that starts above the joint, with an arrow's head at its end.
+    """Return the polyline (x, y, z) of a torque [m]: an arc from above the joint, with an arrow head.
 
-    Positive torque turns from +z towards -x, the direction of the joint of the exported URDF (about -y).
-
-    Args:
-        effort: Torque [N m].
-        effort_scale: Torque of three quarters of a turn, where the arc ends [N m].
-        radius: Radius [m].
-
-    Returns:
-        Points (x, y, z) [m]; none for a torque too small to see.
+    Positive torque turns from +z towards -x, about the URDF's axis -y. At ``effort_scale`` the arc is three quarters of
+    a turn; a torque too small to see has no points.
     """
     angle = _FULL_ARC * max(-1.0, min(1.0, effort / effort_scale))
     if abs(angle) < 0.01:
@@ -84,16 +77,7 @@ def arc_points(effort: float, effort_scale: float, radius: float) -> list[tuple[
 
 
 def arrow_points(effort: float, effort_scale: float, radius: float) -> list[tuple[float, float]]:
-    """Return the polyline of a force: an arrow along the slide, with its head.
-
-    Args:
-        effort: Force [N].
-        effort_scale: Force at which it is as long as it gets [N].
-        radius: A third of that length [m].
-
-    Returns:
-        Points, along the slide and across it [m]; none for a force too small to see.
-    """
+    """Return the polyline of a force, along and across the slide [m]; its length is 3 radii at ``effort_scale``."""
     length = 3.0 * radius * max(-1.0, min(1.0, effort / effort_scale))
     if abs(length) < 0.01 * radius:
         return []
@@ -102,11 +86,7 @@ def arrow_points(effort: float, effort_scale: float, radius: float) -> list[tupl
 
 
 class MarkersNode(Node):
-    """Draws the torques of one plant.
-
-    Args:
-        stop: Requests the runner to end the process.
-    """
+    """Draws the torques of one plant; ``stop`` ends the process."""
 
     def __init__(self, stop: Callable[[], None]) -> None:
         super().__init__("markers")
@@ -168,17 +148,10 @@ class MarkersNode(Node):
 def joint_marker(
     plant: PlantParameters, index: int, effort: float, radius: float, factor: float, base: str
 ) -> tuple[str, list[NDArray[np.float64]]]:
-    """Return in which frame of the plant's URDF an effort is drawn, and its polyline.
+    """Return the frame in the plant's URDF of an effort's marker, and its polyline.
 
-    A torque is an arc about the joint's axis, in the frame of the link before; a force is an arrow that goes along.
-
-    Args:
-        plant: The plant.
-        index: Which joint.
-        effort: Its effort [N m or N].
-        radius: Radius of an arc [m].
-        factor: Multiple of the radius, for arcs outside of others and arrows above others.
-        base: Frame of the first joint, with the plant's prefix.
+    A torque is an arc about the joint's axis, in the frame of the link before; a force is an arrow that moves along.
+    ``factor`` scales the radius [m], for arcs outside of others; ``base`` is the first joint's frame, with prefix.
     """
     bodies, full = plant.mechanism.bodies(plant.packed), full_effort(plant, index)
     body = bodies[index]

@@ -29,7 +29,7 @@ def phase_plot(
 
     Example: python -m pendulum_sim phase_plot --plant thesis --torque 0.5 --out phase.png
     """
-    # Imported late: --help should not wait for matplotlib.
+    # Imported late: --help does not need matplotlib.
     from pendulum_msgs_py.programs.terminal import WholeTable, make_console
     from pendulum_sim.pictures.figures import overdamped_points, plot_overdamped_phase, save_figure
 

@@ -1,4 +1,4 @@
-"""Pictures of plants, from the points of their chain: for environments, viewer and pages."""
+"""Pictures of plants from the points of their chain, for environments, viewer and pages."""
 
 from __future__ import annotations
 
@@ -23,22 +23,13 @@ _LINKS = (LINK, BOB)
 _TILT = math.radians(25.0)
 """Elevation of the view of a spatial plant [rad]."""
 _LINES = 20, 26
-"""Lines of text that fill the height of a picture, of one joint and of several, which need more text."""
+"""Lines of text in a picture of one joint, and of several."""
 _RAIL = 10.0
-"""How far the rail is drawn to either side of a cart that nothing stops [m]."""
+"""Half the length of a rail without stops [m]."""
 
 
 class PlantPicture(Picture):
-    """Draws a plant from the side, or in space from a little above, with a driven joint filled and a passive one open.
-
-    Args:
-        parameters: The plant.
-        size: Width and height [px].
-        trail: Positions that the trail remembers.
-
-    Raises:
-        ParameterError: The size is too small or too large to draw.
-    """
+    """Draws a plant from the side, or in space from above; driven joints are filled, passive ones open."""
 
     def __init__(self, parameters: PlantParameters, size: tuple[int, int] = (600, 600), *, trail: int = 60) -> None:
         super().__init__(size, trail=trail, lines=_LINES[len(parameters.joints) > 1])
@@ -68,14 +59,14 @@ class PlantPicture(Picture):
         time: float | None = None,
         note: str | None = None,
     ) -> None:
-        """Draw the plant at a position.
+        """Draw the plant at n positions [rad or m].
 
         Args:
-            position: n positions [rad or m].
-            velocity: n velocities to write; empty for none.
-            effort: Efforts of driven joints by name, drawn as arcs, at a cart as an arrow [N m or N].
-            disturbance: What pushes joints, by name, drawn as arrows at the ends of their links [N m or N].
-            time: Time to write next to it [s]; None for none.
+            position: The positions.
+            velocity: n velocities as text; empty for none.
+            effort: Efforts of driven joints by name, drawn as arcs, of a cart as an arrow [N m or N].
+            disturbance: Pushes on joints by name, drawn as arrows at the ends of their links [N m or N].
+            time: Time as text [s]; None for none.
             note: A line of text; None for the plant's name.
         """
         self.canvas.fill(BACKGROUND)
@@ -106,7 +97,7 @@ class PlantPicture(Picture):
     # --- parts ---------------------------------------------------------------------------------------------
 
     def _draw_rail(self) -> None:
-        """Draw the rail of a cart, and the ends that stop it."""
+        """Draw the rail of a cart with its stops."""
         line, thick = self.pygame.draw.line, 0.022 * self._length
         left, right = (self._pixel((end, 0.0, 0.0)) for end in self._ends)
         line(self.canvas, GREY, left, right, max(2, round(thick)))
@@ -116,7 +107,7 @@ class PlantPicture(Picture):
                 line(self.canvas, INK, end - tall, end + tall, max(3, round(1.5 * thick)))
 
     def _draw_circle(self, pixel: Any) -> None:
-        """Draw where the end of an arm may be, and a mark where it points at position 0."""
+        """Draw the circle of an arm's end, and its position 0."""
         arm = self.parameters.value("arm_length")
         ring = [
             pixel((arm * math.cos(turn), arm * math.sin(turn), 0.0)) for turn in np.linspace(0.0, 2.0 * math.pi, 73)
@@ -130,7 +121,7 @@ class PlantPicture(Picture):
             cart = self.pygame.Rect(0, 0, 0.36 * length, 0.18 * length)
             cart.center = tuple(points[0])
             draw.rect(self.canvas, _LINKS[0], cart, border_radius=round(0.03 * length))
-        # A cart has no link of its own: its pole is the second.
+        # A cart has no link: its pole is the second.
         first = 1 if self._slides else 0
         for index, (start, end) in enumerate(pairwise(points), first):
             self._draw_link(start, end, _LINKS[index % 2], 0.028 * length)
@@ -151,7 +142,7 @@ class PlantPicture(Picture):
     def _draw_effort(self, joint: Joint, frame: JointFrame, share: float) -> None:
         origin = self._pixel(frame.origin)
         if joint.unit == "m":
-            # Below the cart: a pole that hangs or stands does not hide it, nor does a disturbance.
+            # Below the cart, where neither pole nor disturbance hides it.
             low = origin + np.array([0.0, 0.16 * self._length])
             self.draw_force(low, self._pixel(frame.origin + frame.axis) - origin, share, self._length)
             return
@@ -165,7 +156,7 @@ class PlantPicture(Picture):
         self.draw_arrow(origin, self._pixel(frame.tip + way) - origin, share, self._length)
 
     def _draw_from_above(self, chain: tuple[Point, ...]) -> None:
-        """Draw a spatial plant once more, small, from above: seen from the side, an arm along the view is a point."""
+        """Draw a spatial plant small, from above too: from the side, an arm along the view is a point."""
         width, height = self.canvas.get_size()
         middle, scale = np.array([width - 0.5 * self._length, height - 0.55 * self._length]), 0.5 * self._scale
 
@@ -209,11 +200,6 @@ class PlantPicture(Picture):
 
 
 def seen_from_the_side(mechanism: Mechanism, point: Point) -> tuple[float, float]:
-    """Return where a point of a plant lies in a picture, to the right and up [m]: of one in space from a little above.
-
-    Args:
-        mechanism: The plant's equations.
-        point: x, y and z [m].
-    """
+    """Return a point's place in a picture, to the right and up [m]; a spatial plant is seen from above."""
     x, y, z = point
     return (x, z * math.cos(_TILT) + y * math.sin(_TILT)) if mechanism.name == "furuta" else (x, z)

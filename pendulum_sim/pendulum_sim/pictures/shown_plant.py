@@ -1,4 +1,4 @@
-"""Which plant a picture shows: identified by the names of its joints and by its own description."""
+"""The plant in a picture, identified by its joints' names and its own description."""
 
 from __future__ import annotations
 
@@ -12,15 +12,11 @@ __all__ = ["ShownPlant", "shown_pendulum", "told_mechanism"]
 
 
 class ShownPlant:
-    """The plant behind a topic of states.
-
-    Args:
-        topic: Name of the topic, for messages.
-        pendulum: What is drawn where the plant has one joint.
+    """The plant behind a topic of states; ``pendulum`` is drawn for any plant of one joint.
 
     Attributes:
-        joints: The joints of which states are drawn, in their order: one where the plant is a pendulum.
-        parameters: The plant that is drawn; None until the description of one of several joints arrives.
+        joints: The drawn joints, in order.
+        parameters: The drawn plant; None until the description of one of several joints arrives.
     """
 
     def __init__(self, topic: str, pendulum: PlantParameters) -> None:
@@ -33,15 +29,11 @@ class ShownPlant:
 
     @property
     def missing(self) -> str:
-        """What is not known yet of the plant whose states come, as text; empty where it can be drawn."""
+        """What is still missing to draw the plant, or an empty string."""
         return "" if self.parameters is not None else f"waiting for the parameters of {', '.join(self.joints)}"
 
     def take_names(self, names: tuple[str, ...]) -> None:
-        """Take the names of a state's joints.
-
-        Raises:
-            ParameterError: No plant that can be drawn has these joints.
-        """
+        """Take the names of a state's joints; a ParameterError if no drawable plant has them."""
         if names == self._named:
             return
         known = [tuple(joint.name for joint in one.joints) for one in MECHANISMS.values()]
@@ -55,11 +47,7 @@ class ShownPlant:
         self._find()
 
     def take_description(self, text: str) -> None:
-        """Take the plant's description from its diagnostics.
-
-        Raises:
-            ParameterError: It is no description of plants.
-        """
+        """Take the plant's description from its diagnostics; a ParameterError for other text."""
         if text and text != self._told:
             self._told = text
             self._find()
@@ -67,20 +55,16 @@ class ShownPlant:
     def _find(self) -> None:
         told = told_mechanism(self._told)
         found = self._pendulum if len(self.joints) == 1 else told
-        # A description of other joints is that of the plant before, or after.
+        # A description of other joints is that of an earlier or later plant.
         self.parameters = found if found is not None and found.coordinates.names == self.joints else None
 
 
 def shown_pendulum(effort_scale: float) -> PlantParameters:
-    """Return what is drawn of any pendulum: all look alike but for the torque that is drawn in full [N m]."""
+    """Return the drawn pendulum; only the torque of a full arc [N m] matters."""
     return pendulum_plant(1.0, 0.0, 1.0, effort_limit=effort_scale)
 
 
 def told_mechanism(text: str) -> PlantParameters | None:
-    """Return the plant of several joints of a description that a plant gave, or None where it has one joint.
-
-    Raises:
-        ParameterError: The text is no description of plants.
-    """
+    """Return the plant of several joints in a description, or None; a ParameterError for other text."""
     plants = read_plants(text) if text else ()
     return next((plant for plant in plants if not plant.is_pendulum), None)

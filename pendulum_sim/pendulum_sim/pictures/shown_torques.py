@@ -1,4 +1,4 @@
-"""Which torques a picture of a plant shows: those that act on it, not those that are commanded."""
+"""Torques in a picture of a plant: those that act, not those that are commanded."""
 
 from __future__ import annotations
 
@@ -13,43 +13,38 @@ __all__ = ["SHOWN_TOPICS", "ShownTorques"]
 SHOWN_TOPICS = (names.APPLIED_EFFORT, names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH)
 """Topics that :class:`ShownTorques` reads."""
 _STALE_NS = NANOSECONDS // 2
-"""Age at which a torque is no longer drawn, by the clock of the states [ns]."""
+"""Age from which a torque is not drawn, by the states' clock [ns]."""
 _TOGETHER_NS = NANOSECONDS // 20
-"""Largest distance of the stamps of a command and a disturbance that act together: commands age in this time [ns]."""
+"""Largest distance between the stamps of command and disturbance that act together, a command's lifetime [ns]."""
 
 
 class ShownTorques:
-    """The newest torques of one plant, and which of them act."""
+    """The newest torques of one plant."""
 
     def __init__(self) -> None:
         self.mode = ""
         self._newest: dict[tuple[str, str], tuple[int, float]] = {}
 
     def note(self, topic: str, command: JointCommand) -> None:
-        """Take the efforts of a message of one of ``SHOWN_TOPICS``; one without a name is the pendulum's."""
+        """Record a message of one of ``SHOWN_TOPICS``; without names it is the pendulum's."""
         for joint, effort in zip(command.joints or (names.JOINT,), command.effort, strict=False):
             if math.isfinite(effort):
                 self._newest[topic, joint] = (command.stamp_ns, effort)
 
     def acting_on(self, topic: str, now_ns: int, joints: tuple[str, ...]) -> dict[str, float]:
-        """Return what acts on those of some joints that were in a message, by name, as :meth:`acting` does."""
+        """Return :meth:`acting` of those joints that were in a message, by name."""
         return {joint: self.acting(topic, now_ns, joint) for joint in joints if (topic, joint) in self._newest}
 
     @property
     def newest_ns(self) -> int:
-        """Newest stamp of all [ns]; 0 before the first."""
+        """Newest stamp [ns]; 0 before the first."""
         return max((stamp for stamp, _ in self._newest.values()), default=0)
 
     def acting(self, topic: str, now_ns: int, joint: str = names.JOINT) -> float:
-        """Return the torque of a topic that acts on the plant, 0 for none [N m; N where the joint slides].
+        """Return the torque of a topic that acts on a joint at a time of the states' clock [ns], or 0 [N m or N].
 
-        A disturbance is added by the plant to a controller's fresh command, under torque control alone, and the limit
-        may take some of it away: what acts of it is what the applied torque differs from the command by.
-
-        Args:
-            topic: ``applied_effort``, ``disturbance`` or ``push``.
-            now_ns: Time by the clock of the states [ns].
-            joint: Which joint's.
+        The plant adds a disturbance to a fresh command under torque control only, and the limit may cut it: what acts
+        is the difference between applied and commanded torque.
         """
         stamp_ns, effort = self._newest.get((topic, joint), (0, 0.0))
         if (topic, joint) not in self._newest or abs(now_ns - stamp_ns) >= _STALE_NS:

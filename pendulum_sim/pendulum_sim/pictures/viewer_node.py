@@ -66,14 +66,7 @@ _DISTURBING = (names.DISTURBANCE, names.PUSH)
 
 
 class ViewerNode(Node):
-    """Shows a plant; publishes nothing.
-
-    Args:
-        stop: Requests the runner to end the process.
-
-    Raises:
-        ParameterError: A parameter is refused, or there is no display for the window.
-    """
+    """Shows a plant, publishes nothing; a ParameterError without a display for its window."""
 
     def __init__(self, stop: Callable[[], None]) -> None:
         super().__init__("viewer")
@@ -104,7 +97,7 @@ class ViewerNode(Node):
             create_wall_timer(self, values["duration"], stop)
 
     def close(self) -> None:
-        """Write the requested files, and close the window."""
+        """Write the files, close the window."""
         self._draw()
         if self._values["png"]:
             save_png(self._values["png"], self._picture.array())
@@ -127,7 +120,7 @@ class ViewerNode(Node):
         if sample is None or not sample.is_finite():
             return
         if self._sample is None or self._start_ns is None or sample.stamp_ns < self._start_ns:
-            # A first state, or a plant that began again: what the trail remembers is another run.
+            # A first state, or a restarted plant: the trail is of another run.
             self._start_ns = sample.stamp_ns
             self._picture.clear_trail()
         self._sample = sample

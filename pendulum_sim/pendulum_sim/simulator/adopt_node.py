@@ -65,21 +65,18 @@ SPECS: tuple[ParameterSpec, ...] = (
     *LIMIT_SPECS,
 )
 _LATENESS = 2.0
-"""Periods between a state and the first effect of the command in reply, at most, on a graph."""
+"""Most periods between a state and the first effect of its command, on a graph."""
 _HEARD = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Matches publishers of either reliability."""
 _LAST_ZEROS = 5
-"""Zero efforts that are sent at the end."""
+"""Zero efforts at the end."""
 
 
 class AdoptNode(PollingNode):
-    """Applies the contract's rules to a plant that has none.
+    """Applies the contract's rules to a plant on the graph.
 
-    Each of its states is republished with its arrival time, and the reply is the torque that the rules allow.
-    Until it is armed, after a fault, an e-stop or without commands, that is zero.
-
-    Args:
-        stop: Requests the runner to end the process.
+    Each state is republished with its arrival time, and answered with the torque that the rules allow: zero until
+    armed, after a fault or an e-stop, or without commands.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:
@@ -109,16 +106,16 @@ class AdoptNode(PollingNode):
         )
         self._interface.hardware_id = f"adopted {values['states']}"
         self._commands = self.create_publisher(Float64MultiArray, values["commands"], 10)
-        # As bytes: a message that cannot be read must not end the node that holds the e-stop.
+        # As bytes: an unreadable message must not end the node with the e-stop.
         self.create_subscription(JointState, values["states"], self._on_state, _HEARD, raw=True)
-        # Where states stop, nothing else would report it and remove the torque.
+        # When states stop, nothing else would remove the torque.
         self.create_timer(
             0.25 * values["state_timeout"], self._on_silence, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
         self.get_logger().info(f"adopts joint {self._joint!r} of {values['states']}, efforts to {values['commands']}")
 
     def close(self) -> None:
-        """Disarm, and send zero efforts: the plant may hold the last one for ever."""
+        """Disarm, and send zero efforts: the plant may hold the last one forever."""
         self._interface.safe_stop("adopt ends")
         for _ in range(_LAST_ZEROS):
             self._send(0.0)
@@ -168,7 +165,7 @@ class AdoptNode(PollingNode):
         self._commands.publish(Float64MultiArray(data=self._efforts))
 
     def _sample(self, message: JointState, now_ns: int) -> JointSample | None:
-        """Return the contract's state for an adopted one, or None without such a joint or numbers."""
+        """Return the contract's state, or None without such a joint or finite numbers."""
         if self._joint not in message.name:
             self._refuse(f"a state of {', '.join(message.name) or 'no joint'}; expected {self._joint!r}")
             return None

@@ -1,4 +1,4 @@
-"""The simulations that the simulator's node can run: the built-in one, and third-party ones."""
+"""The simulations of the simulator node: the built-in one, and third-party ones."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Simulation(NamedTuple):
     """A simulation, ready to run.
 
     Attributes:
-        plant: What is stepped, once in a period.
-        name: Preset, file or identifier that was requested.
-        method: How it is integrated, as text.
-        remarks: Notes for the user on automatic choices, one line each.
+        plant: Stepped once in a period.
+        name: Requested preset, file or identifier.
+        method: Integrator, as text.
+        remarks: Automatic choices, one line each.
         sealed: Whether its parameters must not be shown.
-        check: Runs a third-party simulation against its equation; to be reset afterwards.
+        check: Checks a third-party simulation against its equation; reset the plant afterwards.
     """
 
     plant: JointPlant
@@ -47,11 +47,7 @@ class Simulation(NamedTuple):
 
     @property
     def pendulum(self) -> Plant:
-        """The plant, where it has one joint.
-
-        Raises:
-            ParameterError: It has several.
-        """
+        """The plant of one joint; a ParameterError for several."""
         if not isinstance(self.plant, OneJoint):
             raise ParameterError(f"simulation {self.name} has several joints; expected one")
         return self.plant.plant
@@ -64,9 +60,9 @@ class Engine:
     Attributes:
         program: Name of the executable.
         description: What it does, one sentence.
-        specs: The parameters that are its own.
-        make: Makes the simulation that the values of its parameters describe.
-        foreign: Whether it is third-party: everything it returns is checked, and its steps are timed.
+        specs: Its own parameters.
+        make: Makes the simulation from their values.
+        foreign: Third-party: its states are checked and its steps timed.
         example: A command line.
     """
 
@@ -85,7 +81,7 @@ _OF_EQUATION = (
     *("inertia", "damping", "gravity", "coulomb_friction", "angle_offset"),
     *("effort_limit", "actuator_time_constant", "transport_delay"),
 )
-"""What an importer finds of a plant's parameters."""
+"""Parameters that an importer identifies."""
 _EXACT_STEP = 1e-3
 """Longest step of the equation that a third-party simulation is checked against [s]."""
 _FOREIGN_SPECS = (
@@ -147,7 +143,7 @@ def _foreign(plant: MujocoPlant | GymnasiumPlant, name: str, label: str) -> Simu
         try:
             coarse = joint_plant(make_plant(plant.parameters, plant.dt, method="semi_implicit"))
         except ParameterError:
-            # It is unstable with that period, and so is a simulation that uses one.
+            # It is unstable with that period.
             coarse = None
         return check_equation(joint_plant(guarded), equation, coarse=coarse, switches=switches, reseeded=reseeded)
 
@@ -230,26 +226,14 @@ GYMNASIUM_PREFIX = "gymnasium:"
 
 
 def find_engine(simulation: str) -> tuple[Engine, dict[str, str]]:
-    """Return the engine of a third-party simulation, and the parameters that name it.
-
-    Args:
-        simulation: Path of a model file, or ``gymnasium:ID``.
-    """
+    """Return the engine of a model file or ``gymnasium:ID``, and the parameters that name it."""
     if simulation.startswith(GYMNASIUM_PREFIX):
         return GYMNASIUM, {"env": simulation.removeprefix(GYMNASIUM_PREFIX)}
     return MUJOCO, {"model": str(Path(simulation).expanduser().resolve())}
 
 
 def open_simulation(simulation: str, mapping: str = "") -> Simulation:
-    """Return a third-party simulation in this process, as its node would run it.
-
-    Args:
-        simulation: As in :func:`find_engine`.
-        mapping: Path of its mapping file; empty for none.
-
-    Raises:
-        ParameterError: It is refused.
-    """
+    """Return a third-party simulation in this process, with a mapping file or none; a ParameterError if refused."""
     engine, named = find_engine(simulation)
     defaults = {spec.name: spec.default for spec in engine.specs}
     return engine.make({**defaults, "seed": 0, "effort_limit": 0.0, **named, "mapping": mapping})

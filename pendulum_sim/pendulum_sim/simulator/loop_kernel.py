@@ -1,4 +1,4 @@
-"""The loop of a rigid plant, for the compiler's process: the integrators and equations of the interpreted plant."""
+"""The loop of a rigid plant, for the compiler's process, from the interpreted integrators and equations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["rigid_loop"]
 
 
 def rigid_loop(method: str) -> Any:
-    """Return the loop of a rigid plant by an integrator, compiled."""
+    """Return the compiled loop of a rigid plant with an integrator."""
     integrator = get_integrator(method)
     step = compile_tree(integrator.step, exact=True)
     coefficients_of = compile_tree(integrator.coefficients, exact=True)

@@ -1,4 +1,4 @@
-"""The rigid plant in the record of a compiled loop: what it is made of, lent and taken back."""
+"""The rigid plant in the record of a compiled loop."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["BUILDER", "LAYOUT", "MOST_COEFFICIENTS", "LoopPlant", "loop_plant"]
 BUILDER = "pendulum_sim.simulator.loop_kernel:rigid_loop"
 _MOST_SEGMENTS = 16
 _MOST_WHOLE = 62
-"""Whole periods of a transport delay at most."""
+"""Most whole periods of a transport delay."""
 MOST_COEFFICIENTS = 16
 _INTERPRETED = frozenset({"adaptive"})
-"""Methods that call a library of Python's."""
+"""Methods that call a Python library."""
 
 LAYOUT = np.dtype(
     [
@@ -39,11 +39,11 @@ LAYOUT = np.dtype(
     ],
     align=True,
 )
-"""State, commands on their way, sub-steps of a period with their coefficients, and parameters."""
+"""State, delayed commands, sub-steps of a period with their coefficients, and parameters."""
 
 
 class LoopPlant:
-    """A rigid plant that a compiled loop can step."""
+    """A rigid plant for a compiled loop."""
 
     def __init__(self, plant: RigidPlant) -> None:
         self.plant = plant
@@ -52,7 +52,7 @@ class LoopPlant:
         self.layout = LAYOUT
 
     def describe(self, record: Any) -> None:
-        """Write what stays as it is into a record of :data:`LAYOUT`: parameters, and the sub-steps of a period."""
+        """Write parameters and sub-steps into a record of :data:`LAYOUT`."""
         plant = self.plant
         record.limit, record.dry = plant.parameters.effort_limit, plant.dry
         record.waits = len(plant.delay.line)
@@ -71,7 +71,7 @@ class LoopPlant:
         record.line[: len(plant.delay.line)] = tuple(plant.delay.line)
 
     def take_back(self, record: Any) -> None:
-        """Take over the state that a loop has left."""
+        """Read the state back."""
         plant = self.plant
         plant.theta, plant.theta_dot, plant.effort = record.theta, record.theta_dot, record.torque
         plant.steps = record.steps
@@ -79,11 +79,7 @@ class LoopPlant:
 
 
 def loop_plant(joint_plant: JointPlant) -> LoopPlant:
-    """Return a plant for a compiled loop.
-
-    Raises:
-        NoMachineCodeError: It is stepped by Python.
-    """
+    """Return a plant for a compiled loop; a NoMachineCodeError if it is stepped by Python."""
     plant = joint_plant.plant if isinstance(joint_plant, OneJoint) else None
     if not isinstance(plant, RigidPlant):
         raise NoMachineCodeError("the plant is not a rigid pendulum of ours")

@@ -50,9 +50,9 @@ __all__ = ["SPECS", "SimulatorNode", "main", "run_engine"]
 
 _SENSOR_PREFIX = "sensor."
 _LONGEST_COMPILED = 0.005
-"""Longest period that is worth compiling, and that stopping the plant may wait for [s]."""
+"""Longest period that is compiled, as a stop waits for it [s]."""
 _LEAST_PERIODS = 2.0
-"""Age in periods that a command may reach at least."""
+"""Shortest command timeout in periods."""
 
 _SHARED_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
@@ -84,19 +84,14 @@ SPECS: tuple[ParameterSpec, ...] = (*OWN.specs, *_SHARED_SPECS)
 
 
 class SimulatorNode(PollingNode):
-    """A simulated pendulum as a plant. The node has the name of the role, whatever the engine.
-
-    Args:
-        stop: Requests the runner to end the process.
-        engine: What simulates.
-    """
+    """A simulated pendulum as a plant; the node has the name of its role with every engine."""
 
     def __init__(self, stop: Callable[[], None], engine: Engine = OWN) -> None:
         super().__init__("simulator", enable_logger_service=True)
         self._settings = NodeParameters(self, self._specs(engine), self._given_start)
         values = self._settings.values
         self._simulation = engine.make(values)
-        # Before the first reset, which undoes the steps of the check.
+        # Before the first reset, which undoes its steps.
         self._checked = None if self._simulation.check is None else self._simulation.check()
         self._plant = self._simulation.plant
         self._coordinates = self._plant.parameters.coordinates
@@ -112,7 +107,7 @@ class SimulatorNode(PollingNode):
             sensor_noise, **{spec.name: values[_SENSOR_PREFIX + spec.name] for spec in SENSOR_SPECS}
         )
         self._statistics = LoopStatistics(period_ns)
-        # Where a file's timestep makes periods as long as that, each command would be too old when it is applied.
+        # With a long period from a file's timestep, commands would expire before they are applied.
         least = _LEAST_PERIODS * self._dt
         limits = limits_from_parameters(
             values,
@@ -177,7 +172,7 @@ class SimulatorNode(PollingNode):
             (self.get_logger().info if self._checked.agrees else self.get_logger().warning)(line)
 
     def close(self) -> None:
-        """Stop the plant: a last zero torque is published, so that a recording shows it."""
+        """Stop the plant and publish a last zero torque, for recordings."""
         self._interface.safe_stop("simulator ends")
         self._interface.publish_applied(self._stamp_ns, self._no_effort)
         self._interface.close()
@@ -209,7 +204,7 @@ class SimulatorNode(PollingNode):
     # --- the loop ------------------------------------------------------------------------------------------
 
     def run_due(self) -> float:
-        """Let the loop do what is due; return the time until it is due again [s]."""
+        """Run due periods; return the time until the next call [s]."""
         due: float = self._loop.run_due()
         return due
 
@@ -219,7 +214,7 @@ class SimulatorNode(PollingNode):
         effort = drive.effort
         if drive.kind is DriveKind.POSITION:
             assert self._servo is not None
-            # The servo compensates the weight, so the hand-over's feed-forward would count it twice.
+            # The servo compensates gravity: the handover's feed-forward would count it twice.
             (theta,), (theta_dot,), (limit,) = (
                 self._state.position,
                 self._state.velocity,
@@ -234,12 +229,11 @@ class SimulatorNode(PollingNode):
         if problem:
             self._fail(problem)
             return None, self._no_effort
-        # In real time this is the deadline, not the moment at which Python got there.
         self._stamp_ns = stamp_ns
         return self._measure(), effort
 
     def _step(self, effort: Vector, push: Vector, stamp_ns: int) -> str:
-        """Step the plant; return why it cannot continue although the step returned, or nothing."""
+        """Step the plant; return why it cannot continue, or an empty string."""
         pace = self._pace
         if pace is None:
             with self._stall:
@@ -251,7 +245,7 @@ class SimulatorNode(PollingNode):
         return pace.problem(time.monotonic() - begun, (self._wall() - stamp_ns) / NANOSECONDS)
 
     def _fail(self, reason: str) -> None:
-        """Stop a failed simulation, report it, and refuse to arm before a reset."""
+        """Stop a failed simulation until a reset."""
         self._failure = reason
         self._loop.halted = True
         self._supervisor.fault(reason, self._interface.clock())
@@ -261,7 +255,7 @@ class SimulatorNode(PollingNode):
         return f"{self._failure}; reset it first" if self._failure else ""
 
     def _end_stalled(self) -> None:
-        """End the process from outside of the step that does not come back: it holds the only thread of the node."""
+        """End the process from outside of the stalled step, which blocks the node's only thread."""
         name, timeout = self._simulation.name, self._settings.values["step_timeout"]
         reason = f"a step of simulation {name} did not come back within {timeout:g} s"
         self._supervisor.fault(reason, self._interface.clock())
@@ -286,7 +280,7 @@ class SimulatorNode(PollingNode):
         self._interface.sample = self._measure() or JointSample(self._stamp_ns, *self._state[1:])
 
     def _specs(self, engine: Engine) -> tuple[ParameterSpec, ...]:
-        """Return the parameters; the units of limits are those of the joints of the plant that was given."""
+        """Return the parameters; limits have the units of the given plant's joints."""
         specs, given = (*engine.specs, *_SHARED_SPECS), self._parameter_overrides.get("plant")
         plant = "" if given is None or engine is not OWN else str(given.value)
         return in_units_of(specs, load_plant_to_run(plant)[0].coordinates) if plant else specs
@@ -303,10 +297,10 @@ class SimulatorNode(PollingNode):
         return self._given_start(values)
 
     def _given_start(self, values: Mapping[str, Any]) -> tuple[Vector, Vector]:
-        """Return position and velocity of a given start, by their names or, of one joint, by their former ones.
+        """Return position and velocity of a given start, also by the former names of one joint.
 
         Raises:
-            ParameterError: A number is not finite, there are too few or too many, or both names are used.
+            ParameterError: A number is not finite, their count is wrong, or both names are used.
         """
         for name in ("initial_position", "initial_velocity", "initial_theta", "initial_theta_dot"):
             if not np.isfinite(values[name]).all():

@@ -1,19 +1,16 @@
-"""A rigid link with dry friction and true stiction: when it sticks, when and which way it slips.
+"""A rigid link with dry friction and true stiction.
 
 ::
 
     M_c theta'' + b_c theta' + F sgn(theta') + G_c sin(theta - theta_0) = tau + tau_0 + push
     F = tau_C' + (tau_S' - tau_C') exp(-(theta' / v_s)^2),   tau' = tau + a(|theta'|, |G_c sin(theta - theta_0)|)
 
-a is the sum of the friction terms of :mod:`pendulum_msgs_py.plants.friction_terms`.
+a is the sum of the friction terms of :mod:`pendulum_msgs_py.plants.friction_terms`. Between events the direction of
+friction is fixed and the equation smooth, so each integrator keeps its order. A zero crossing of the velocity is
+located inside the step; there the link sticks, exactly at rest, while |net torque| <= tau_S'.
 
-Between events the direction of friction is fixed and the equation smooth, so each integrator keeps its
-order. A zero crossing of the velocity inside a step is located, and there the link sticks if friction can
-hold the other torques (|net| <= tau_S'), and is then exactly at rest: theta does not change by a bit until
-they exceed it.
-
-Source: D. Karnopp, "Computer simulation of stick-slip friction in mechanical dynamic systems", 1985, with
-the events located instead of a velocity band, which would creep.
+Source: D. Karnopp, "Computer simulation of stick-slip friction in mechanical dynamic systems", 1985, with the events
+located instead of a velocity band, which would creep.
 """
 
 from __future__ import annotations
@@ -27,12 +24,12 @@ from pendulum_sim.stepping.integrators import Acceleration, Coefficients, PlantT
 __all__ = ["DRY", "LAG", "PACKED", "acceleration_with_friction", "advance_dry", "is_dry", "static_friction_balance"]
 
 PACKED = tuple(spec.name for spec in PLANT_SPECS if spec.name not in {"effort_limit", "transport_delay"})
-"""Order of the values in a ``PlantTuple``: that of plant files."""
+"""Order of the values in a ``PlantTuple``."""
 _INERTIA, _DAMPING, _GRAVITY, _COULOMB, _STATIC, _STRIBECK, _OFFSET, _ANGLE, LAG, _TERMS = range(10)
-"""Where they stand in it; ``LAG`` is the actuator's time constant, the values of the friction terms are the last."""
+"""Indices in it; ``LAG`` is the actuator's time constant, the friction terms come last."""
 _added_friction = added_friction(PACKED)
 DRY = (_STATIC, *(_TERMS + index for index in STRENGTHS))
-"""Where the values stand that are all 0 where there is no dry friction."""
+"""Indices of the values that are all 0 without dry friction."""
 
 _MAX_EVENTS = 8
 _MAX_ROOT_STEPS = 60
@@ -41,16 +38,8 @@ _MAX_ROOT_STEPS = 60
 def acceleration_with_friction(
     theta: float, theta_dot: float, torque: float, direction: float, plant: PlantTuple
 ) -> float:
-    """Return theta'' with friction acting against ``direction`` (-1, 0 for none, or 1) [rad/s^2].
-
-    Args:
-        theta: Measured angle [rad].
-        theta_dot: Velocity [rad/s].
-        torque: Torque of actuator and push [N m].
-        direction: Sign of the velocity during this step.
-        plant: Parameters, packed.
-    """
-    # By index: a slice would cost an interpreted plant a tenth of its time.
+    """Return theta'' under a torque of actuator and push [N m], friction against ``direction`` -1, 0 or 1 [rad/s^2]."""
+    # By index: a slice would take a tenth of an interpreted plant's time.
     gravity = plant[_GRAVITY]
     angle = theta - plant[_ANGLE]
     friction = 0.0
@@ -64,16 +53,13 @@ def acceleration_with_friction(
 
 
 def static_friction_balance(theta: float, torque: float, plant: PlantTuple) -> tuple[float, float]:
-    """Return the net torque on a link at rest and the friction that can hold it, tau_S' [N m].
-
-    Args: as in :func:`acceleration_with_friction`.
-    """
+    """Return the net torque on a link at rest and the largest static friction tau_S' [N m]."""
     weight = gravity_torque(theta - plant[_ANGLE], plant[_GRAVITY])
     return torque + plant[_OFFSET] - weight, plant[_STATIC] + _added_friction(0.0, abs(weight), plant)
 
 
 def is_dry(plant: PlantTuple) -> bool:
-    """Return whether a plant has dry friction or any friction term: else its equation is smooth."""
+    """Return whether a plant has dry friction or any friction term."""
     dry = False
     for index in DRY:
         dry = dry or plant[index] > 0.0
@@ -93,16 +79,16 @@ def advance_dry(
     c: Coefficients,
     plant: PlantTuple,
 ) -> tuple[float, float]:
-    """Return (theta, theta_dot) after h, sticking and slipping as often as that takes.
+    """Return (theta, theta_dot) after h [s], with as many events as occur.
 
     Args:
         step: Step function of the integrator.
         coefficients_of: Its coefficient function, for steps cut short by an event.
-        acceleration: :func:`acceleration_with_friction` (compiled or not).
+        acceleration: :func:`acceleration_with_friction`, compiled or not.
         theta: Angle [rad].
         theta_dot: Velocity [rad/s].
         torque: Actuator torque at the start [N m].
-        command: Commanded torque during the step [N m].
+        command: Commanded torque [N m].
         push: Torque on the link itself [N m].
         h: Step [s].
         c: Coefficients for h.
@@ -117,8 +103,7 @@ def advance_dry(
                 theta, actuator_torque(torque, command, h - left, time_constant) + push, plant
             )
             if abs(net) <= hold:
-                # Held now; a lagging torque may still outgrow friction within this step, and slips from the
-                # next on.
+                # A lagging torque that outgrows friction within this step slips from the next on.
                 return theta, 0.0
             direction = 1.0 if net > 0.0 else -1.0
         else:
@@ -141,7 +126,7 @@ def advance_dry(
         if v_1 * direction >= 0.0:
             return theta_1, v_1
         if theta_dot == 0.0:
-            # It broke away against the net torque: an artefact of a step far too long. Keep it where it is.
+            # It broke away against the net torque, an artefact of too long a step: hold it.
             return theta, 0.0
         low, v_low, high, v_high = 0.0, theta_dot, left, v_1
         side = 0

@@ -1,19 +1,17 @@
-"""Integrators by name, each one step of theta'' = a(theta, theta', tau) with a known torque over the step.
+"""Integrators by name, each one step of theta'' = a(theta, theta', tau) with a known torque.
 
-A step gets the torque at its start, middle and end (a first-order actuator lag makes it an exponential
-there), and the direction in which dry friction acts, which does not change within a step: ``plant`` sees to
-that. The exponential methods split off the fast linear pole, theta'' + lambda theta' = N(theta, theta',
-tau) with lambda = b_c / M_c, and integrate it exactly; for the pendulum of the thesis lambda is 214 1/s.
-
-With z = -lambda h and phi_0 = exp, phi_k+1(z) = (phi_k(z) - 1/k!) / z, the flow of a constant N is::
+A step gets the torque at its start, middle and end (exponential with an actuator lag), and the direction of dry
+friction, fixed within a step by ``plant``. The exponential methods integrate the fast linear pole exactly: theta'' +
+lambda theta' = N(theta, theta', tau) with lambda = b_c / M_c, 214 1/s for the thesis's pendulum. With z = -lambda h,
+phi_0 = exp and phi_k+1(z) = (phi_k(z) - 1/k!) / z, the flow of a constant N is::
 
     theta'(h) = phi_0 theta'_0 + h phi_1 N,   theta(h) = theta_0 + h phi_1 theta'_0 + h^2 phi_2 N
 
-All functions are scalar and use ``math`` only; :mod:`pendulum_sim.batches.compiling` compiles the very same ones.
+All functions are scalar and use ``math`` only; :mod:`pendulum_sim.batches.compiling` compiles the same ones.
 
-Sources: Cox and Matthews, "Exponential time differencing for stiff systems", J. Comput. Phys. 176, 2002,
-eq. 26 to 29 (``etd4``) and the exponential midpoint rule (``etd2``); Hairer, Norsett, Wanner, "Solving
-Ordinary Differential Equations I", II.1 (RK4) and II.5 (DOP853).
+Sources: Cox and Matthews, "Exponential time differencing for stiff systems", J. Comput. Phys. 176, 2002, eq. 26 to 29
+(``etd4``) and the exponential midpoint rule (``etd2``); Hairer, Norsett, Wanner, "Solving Ordinary Differential
+Equations I", II.1 (RK4) and II.5 (DOP853).
 """
 
 # ruff: noqa: ARG001  (all steps have one signature, and few need every argument)
@@ -28,7 +26,7 @@ from pendulum_msgs_py.errors import ParameterError
 __all__ = ["INTEGRATORS", "METHODS", "Integrator", "PlantTuple", "get_integrator", "phi_functions"]
 
 PlantTuple = tuple[float, ...]
-"""Plant parameters as the scalar functions take them; ``plant.pack`` makes it."""
+"""Plant parameters for scalar functions, from ``plant.pack``."""
 Coefficients = tuple[float, ...]
 Acceleration = Callable[[float, float, float, float, PlantTuple], float]
 """a(theta, theta_dot, torque, direction, plant) [rad/s^2]."""
@@ -43,11 +41,10 @@ class Integrator:
 
     Attributes:
         name: Its name.
-        order: Power of the step with which the global error falls.
-        step: ``step(acceleration, theta, theta_dot, torque_0, torque_mid, torque_1, direction, h, c, plant)``
-            returns (theta, theta_dot) after h.
-        coefficients: ``coefficients(damping_rate, h)`` returns the numbers ``c`` that depend on the step
-            only.
+        order: Order of the global error.
+        step: ``step(acceleration, theta, theta_dot, torque_0, torque_mid, torque_1, direction, h, c, plant)`` returns
+            (theta, theta_dot) after h.
+        coefficients: ``coefficients(damping_rate, h)`` returns ``c``, which depends on the step only.
         description: One sentence.
     """
 
@@ -59,13 +56,10 @@ class Integrator:
 
 
 def phi_functions(z: float) -> tuple[float, float, float, float, float]:
-    """Return phi_0 to phi_4 at z, to full precision for every z <= 0.
+    """Return phi_0 to phi_4 at z = -lambda h <= 0 to full precision.
 
-    The recurrence divides a difference by z and loses digits near 0; there the power series of phi_4
-    converges in a few terms and the recurrence runs downwards, where it gains digits.
-
-    Args:
-        z: -lambda h [-].
+    The recurrence loses digits near 0; there the series of phi_4 converges in a few terms, and the recurrence runs
+    downwards.
     """
     if abs(z) < 1.0:
         term = 1.0 / 24.0
@@ -85,7 +79,7 @@ def phi_functions(z: float) -> tuple[float, float, float, float, float]:
 
 
 def no_coefficients(damping_rate: float, h: float) -> Coefficients:
-    """Return nothing of use: these methods need no more than h; one number, so that the tuple has a type."""
+    """Return (lambda, h), for methods that need no others."""
     return (damping_rate, h)
 
 
@@ -180,10 +174,9 @@ def etd2_step(
 
 
 def etd4_coefficients(damping_rate: float, h: float) -> Coefficients:
-    """Return lambda, the weights of the half flow and those of the last sum for :func:`etd4_step`.
+    """Return lambda, the weights of the half flow and of the final sum for :func:`etd4_step`.
 
-    The top entry of phi_k(hL) [0, 1] is h phi_k+1(z): the angle has the velocity's weights with one index
-    more.
+    The top entry of phi_k(hL) [0, 1] is h phi_k+1(z): the angle has the velocity's weights with the next index.
     """
     half = 0.5 * h
     e_half, p1_half, p2_half, _, _ = phi_functions(-damping_rate * half)
@@ -250,7 +243,7 @@ def adaptive_step(
     plant: PlantTuple,
 ) -> tuple[float, float]:
     """Adaptive Runge-Kutta of order eight (DOP853) at a relative tolerance of 1e-12; the reference."""
-    # Imported late: stepping in real time should not wait for scipy.
+    # Imported late: real-time stepping does not need scipy.
     from scipy.integrate import solve_ivp
 
     rise = torque_mid - torque_0
@@ -280,17 +273,13 @@ INTEGRATORS: Mapping[str, Integrator] = {
         Integrator("adaptive", 8, adaptive_step, no_coefficients, "DOP853 of scipy at 1e-12: the reference."),
     )
 }
-"""All methods by name; a new one is one step function and one row here."""
+"""All methods; a new one is one step function and one row."""
 
 METHODS = tuple(INTEGRATORS)
 
 
 def get_integrator(name: str) -> Integrator:
-    """Return a method by name.
-
-    Raises:
-        ParameterError: There is no such method.
-    """
+    """Return a method by name; a ParameterError if unknown."""
     if name not in INTEGRATORS:
         raise ParameterError(f"method is {name!r}; expected one of {', '.join(METHODS)}")
     return INTEGRATORS[name]

@@ -1,4 +1,4 @@
-"""What the simulator's node steps: a plant of n joints of which m are driven, one joint being n = m = 1."""
+"""The plant of the simulator node: n joints of which m are driven."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from pendulum_sim.stepping.plants import make_plant
 __all__ = ["JointPlant", "OneJoint", "joint_plant", "make_joint_plant", "random_start"]
 
 _SLIDE = 0.1
-"""Largest distance from the middle at which a joint that slides starts at random [m]."""
+"""Largest distance of a sliding joint's random start from the middle [m]."""
 
 
 class OneJoint:
-    """A plant of one joint, its numbers as tuples."""
+    """A plant of one joint with tuples."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
@@ -43,27 +43,19 @@ class OneJoint:
 
 
 JointPlant = MechanismPlant | OneJoint
-"""A plant whose states and efforts are tuples in the order of its joints."""
 
 
 def joint_plant(plant: Plant | MechanismPlant) -> JointPlant:
-    """Return a plant of any number of joints as one that takes and gives tuples."""
+    """Return a plant of any number of joints with tuples."""
     return plant if isinstance(plant, MechanismPlant) else OneJoint(plant)
 
 
 def make_joint_plant(
     parameters: PlantParameters, dt: float, *, method: str = "auto", substeps: int | None = None
 ) -> JointPlant:
-    """Return the plant that the parameters describe.
+    """Return the plant of these parameters; arguments and errors as :func:`~pendulum_sim.stepping.plants.make_plant`.
 
-    Args:
-        parameters: The plant.
-        dt: Period over which commands are held [s].
-        method: As of :func:`~pendulum_sim.stepping.plants.make_plant`; for other plants than a pendulum ``auto``.
-        substeps: Integration steps in a period; None chooses by the plant.
-
-    Raises:
-        ParameterError: The method does not go with the plant, or an argument is outside its domain.
+    With several joints ``method`` is ``auto``, and one substep the default.
     """
     if parameters.is_pendulum:
         return OneJoint(make_plant(parameters, dt, method=method, substeps=substeps))
@@ -76,7 +68,7 @@ def make_joint_plant(
 
 
 def random_start(plant: JointPlant, generator: np.random.Generator) -> tuple[Vector, Vector]:
-    """Return positions and velocities of a start: in a turn, or near the middle, between stops; at most 1 rad/s."""
+    """Return a random start: within a turn, or near the middle, between stops; at most 1 rad/s or m/s."""
     joints = plant.parameters.coordinates.joints
     position = []
     for joint, (low, high) in zip(joints, plant.parameters.stops, strict=True):

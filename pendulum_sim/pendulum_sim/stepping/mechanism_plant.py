@@ -1,8 +1,7 @@
 """A plant of several joints, stepped under held commands.
 
-What happens to a command on its way, in this order, as in :mod:`pendulum_sim.stepping.plant`: it is clamped to the
-joint's effort limit, waits for the transport delay, passes the first-order lag, and adds to gravity, friction and
-``push``, the effort on the joints themselves.
+A command is clamped to the effort limit, waits for the transport delay, passes the first-order lag, and adds to
+gravity, friction and ``push``, as in :mod:`pendulum_sim.stepping.plant`.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ from pendulum_sim.stepping.plant import DelayLine, check_step, period_segments
 __all__ = ["MechanismPlant", "MechanismState", "check_decay", "check_stable_step", "is_smooth"]
 
 _RK4_STABLE = 2.78
-"""Largest damping rate times step at which Runge-Kutta of order four decays."""
+"""Largest damping rate times step at which RK4 is stable."""
 
 
 class MechanismState(NamedTuple):
-    """What a plant of several joints is doing at one instant.
+    """State of a plant of several joints.
 
     Attributes:
         time: Time since the reset [s].
@@ -43,12 +42,7 @@ class MechanismState(NamedTuple):
 
 
 class MechanismPlant:
-    """One plant of several joints.
-
-    Args:
-        parameters: The plant.
-        dt: Period over which commands are held [s], > 0.
-        substeps: Integration steps in a period, >= 1.
+    """One plant of several joints, with commands held over dt [s] and ``substeps`` integration steps in it.
 
     Raises:
         ParameterError: An argument is outside its domain, the integrator would be unstable, or actuators have different
@@ -81,14 +75,10 @@ class MechanismPlant:
         return MechanismState(self._steps * self.dt, self._position, self._velocity, self._effort)
 
     def reset(self, position: Vector | None = None, velocity: Vector | None = None) -> MechanismState:
-        """Restart, the actuators without effort and no command on its way.
-
-        Args:
-            position: n positions; None for hanging at 0 [rad or m].
-            velocity: n velocities; None for rest.
+        """Restart at n positions [rad or m] and velocities, 0 by default, with actuators and delays empty.
 
         Raises:
-            ParameterError: They have another length, are not finite, or lie beyond an end stop.
+            ParameterError: Their number is wrong, or one is not finite or beyond an end stop.
         """
         self._position = self.parameters.check_start(self._still if position is None else position)
         velocity = self._still if velocity is None else tuple(float(value) for value in velocity)
@@ -105,11 +95,11 @@ class MechanismPlant:
         """Advance by one period.
 
         Args:
-            effort: m commanded efforts, held over the period; clamped to the effort limits [N m or N].
+            effort: m commanded efforts, clamped to the limits [N m or N].
             push: n efforts on the joints themselves, neither clamped nor delayed; None for none.
 
         Raises:
-            ParameterError: There are more or fewer than m, or n, or one is not finite (nothing moves then).
+            ParameterError: Their number is wrong, or one is not finite (nothing moves then).
         """
         if len(effort) != len(self._limits):
             self._spread(effort)
@@ -117,7 +107,7 @@ class MechanismPlant:
             push = self._still
         elif len(push) != len(self._still):
             raise ParameterError(f"push has {len(push)} values; expected {len(self._still)}, one per joint")
-        # Clamping would make the full effort of a command that is no number.
+        # Clamping NaN would give the full effort.
         if not all(map(math.isfinite, (*effort, *push))):
             raise ParameterError(f"effort is {list(effort)} and push {list(push)}; expected finite numbers")
         ends = [
@@ -149,17 +139,13 @@ class MechanismPlant:
 
 
 def is_smooth(parameters: PlantParameters) -> bool:
-    """Return whether a plant is free of dry friction, end stops, lag, delay and drivetrain."""
+    """Return whether a plant has no dry friction, end stops, lag, delay or drivetrain."""
     late = any(actuator.transport_delay for actuator in parameters.actuators)
     return parameters.drivetrain is None and not _has_events(parameters) and not late
 
 
 def check_stable_step(parameters: PlantParameters, h: float) -> None:
-    """Refuse a step at which damping alone would make the integrator unstable.
-
-    Raises:
-        ParameterError: Names the largest step that would do.
-    """
+    """Raise a ParameterError, with the largest stable step, if damping makes RK4 unstable at this step."""
     damping = np.diag([joint.damping for joint in parameters.joints])
     n = len(parameters.joints)
     rate = 0.0
@@ -170,11 +156,7 @@ def check_stable_step(parameters: PlantParameters, h: float) -> None:
 
 
 def check_decay(rate: float, h: float, whose: str) -> None:
-    """Refuse a step that is too long for a rate of decay [1/s].
-
-    Raises:
-        ParameterError: Names the largest step that would do.
-    """
+    """Raise a ParameterError, with the largest stable step, if a step is too long for a rate of decay [1/s]."""
     if rate * h > _RK4_STABLE:
         raise ParameterError(
             f"step is {h} s on {whose}, whose damping decays at {rate:.4g} 1/s; expected at most "

@@ -1,8 +1,7 @@
-"""The plants: a rigid link, or one on a series-elastic actuator, stepped under a held command.
+"""The rigid plant, stepped under a held command, and parts of all plants.
 
-What happens to a command on its way to the link, in this order: it is clamped to the effort limit, waits
-for the transport delay (any fraction of a period), passes the first-order lag, and adds to gravity,
-friction and ``push``, the torque on the link itself. Sensors are not in here: see
+A command is clamped to the effort limit, waits for the transport delay (any fraction of a period), passes the
+first-order lag, and adds to gravity, friction and ``push``, the torque on the link itself. Sensors are separate:
 :mod:`pendulum_sim.stepping.sensors`.
 """
 
@@ -36,13 +35,13 @@ _MAX_DELAY_STEPS = 100_000
 
 
 class PlantState(NamedTuple):
-    """What a plant is doing at one instant.
+    """State of a plant of one joint.
 
     Attributes:
         time: Time since the reset [s].
         theta: Angle, 0 hanging, pi upright; not wrapped [rad].
         theta_dot: Velocity [rad/s].
-        effort: Torque at the joint, as an ideal sensor in the actuator would measure it [N m].
+        effort: Torque at the joint, as an ideal sensor in the actuator measures it [N m].
     """
 
     time: float
@@ -52,7 +51,7 @@ class PlantState(NamedTuple):
 
 
 class Plant(Protocol):
-    """What simulator, environment and tests need of a plant."""
+    """A plant of one joint."""
 
     parameters: PlantParameters
     dt: float
@@ -62,10 +61,10 @@ class Plant(Protocol):
         """The present state."""
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Restart at an angle [rad] and a velocity [rad/s], the actuator without torque."""
+        """Restart at an angle [rad] and a velocity [rad/s], without torque."""
 
     def step(self, effort: float, push: float = 0.0) -> PlantState:
-        """Advance by one period under a commanded torque and a torque on the link [N m].
+        """Advance one period under a commanded torque and a torque on the link [N m].
 
         Raises:
             ParameterError: One of them is not finite (nothing moves then).
@@ -73,16 +72,11 @@ class Plant(Protocol):
 
 
 class DelayLine:
-    """Commands on their way: the newest one acts after a delay of whole and broken periods.
-
-    Args:
-        delay: Transport delay [s], >= 0.
-        dt: Period [s], > 0.
-    """
+    """Delayed commands; the delay [s] is any number of periods dt [s]."""
 
     def __init__(self, delay: float, dt: float) -> None:
         periods = delay / dt
-        # A delay meant as whole periods must not become a sliver of one by rounding.
+        # Rounding must not leave a sliver of a period.
         if abs(periods - round(periods)) < 1e-9:
             periods = float(round(periods))
         if periods > _MAX_DELAY_STEPS:
@@ -97,7 +91,7 @@ class DelayLine:
         self.line.extend([0.0] * (self.whole + 2))
 
     def push(self, command: float) -> tuple[float, float]:
-        """Take the command of this period; return those before and after its broken part [N m]."""
+        """Add this period's command; return those before and after the fractional part [N m]."""
         self.line.append(command)
         return self.line[0], self.line[1]
 
@@ -105,13 +99,10 @@ class DelayLine:
 def period_segments(dt: float, fraction: float, substeps: int) -> list[tuple[bool, float]]:
     """Cut a period where the delayed command changes, and each part into equal sub-steps.
 
-    Args:
-        dt: Period [s].
-        fraction: Where in the period the command changes, 0 for at its start [-].
-        substeps: Sub-steps of a whole period.
+    ``fraction`` is the place of the change in dt [s], 0 for its start; ``substeps`` those of a whole period.
 
     Returns:
-        (whether the newer command acts, length [s]) of each sub-step in order; the lengths sum to dt.
+        (whether the newer command acts, length [s]) of each sub-step; the lengths sum to dt.
     """
     segments: list[tuple[bool, float]] = []
     for newer, share in ((False, fraction), (True, 1.0 - fraction)):
@@ -122,7 +113,7 @@ def period_segments(dt: float, fraction: float, substeps: int) -> list[tuple[boo
 
 
 def pack(parameters: PlantParameters) -> PlantTuple:
-    """Return the parameters of a rigid plant in the order that the scalar functions take them."""
+    """Return a rigid plant's parameters in the order of ``PACKED``."""
     return tuple(float(getattr(parameters, name)) for name in PACKED)
 
 
@@ -140,21 +131,9 @@ def advance_rigid(
     plant: PlantTuple,
     dry: bool,
 ) -> tuple[float, float, float]:
-    """Return (theta, theta_dot, torque of the actuator) of a rigid link after h, under one command.
+    """Return (theta, theta_dot, torque of the actuator) of a rigid link after h [s]; arguments as :func:`advance_dry`.
 
-    Args:
-        step: Step function of the integrator.
-        coefficients_of: Its coefficient function, for steps cut short by an event.
-        acceleration: :func:`pendulum_sim.stepping.dry_friction.acceleration_with_friction`, compiled or not.
-        theta: Angle [rad].
-        theta_dot: Velocity [rad/s].
-        torque: Torque of the actuator at the start [N m].
-        command: Commanded torque during the step [N m].
-        push: Torque on the link itself [N m].
-        h: Step [s].
-        c: Coefficients for h.
-        plant: Parameters, packed.
-        dry: Whether it has dry friction, :func:`pendulum_sim.stepping.dry_friction.is_dry`.
+    ``dry`` is :func:`pendulum_sim.stepping.dry_friction.is_dry`.
     """
     lag = plant[LAG]
     if dry:
@@ -172,10 +151,10 @@ def advance_rigid(
 
 
 class RigidPlant:
-    """One rigid link: the equation of the thesis, and dry friction, lag and delay where it has them.
+    """One rigid link: the thesis's equation, with dry friction, lag and delay.
 
     Args:
-        parameters: The plant; its drivetrain must be None.
+        parameters: The plant, without drivetrain.
         dt: Period over which a command is held [s], > 0.
         method: Integrator, one of ``integrators.METHODS``.
         substeps: Integration steps in a period, >= 1.
@@ -215,15 +194,7 @@ class RigidPlant:
         return PlantState(self.steps * self.dt, self.theta, self.theta_dot, self.effort)
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Restart, the actuator without torque and no command on its way.
-
-        Args:
-            theta: Angle [rad].
-            theta_dot: Velocity [rad/s].
-
-        Raises:
-            ParameterError: One of them is not finite.
-        """
+        """Restart at an angle [rad] and a velocity [rad/s], with actuator and delay empty; both must be finite."""
         check_start(theta, theta_dot)
         self.theta, self.theta_dot, self.effort = float(theta), float(theta_dot), 0.0
         self.steps = 0
@@ -231,11 +202,7 @@ class RigidPlant:
         return self.state
 
     def step(self, effort: float, push: float = 0.0) -> PlantState:
-        """Advance by one period.
-
-        Args:
-            effort: Commanded torque, held over the period; clamped to the effort limit [N m].
-            push: Torque on the link itself, neither clamped nor delayed [N m].
+        """Advance one period under a commanded torque, clamped to the limit, and a torque on the link [N m].
 
         Raises:
             ParameterError: One of them is not finite (nothing moves then).
@@ -282,7 +249,7 @@ def command_within(limit: float, effort: float, push: float) -> float:
 
 
 def check_step(dt: float, substeps: int) -> None:
-    """Refuse a period or a number of sub-steps that no plant can take."""
+    """Raise a ParameterError for an invalid period or number of sub-steps."""
     if not (math.isfinite(dt) and dt > 0.0):
         raise ParameterError(f"dt is {dt} s; expected a finite number > 0")
     if substeps < 1:
@@ -290,7 +257,7 @@ def check_step(dt: float, substeps: int) -> None:
 
 
 def check_start(theta: float, theta_dot: float) -> None:
-    """Refuse a start that is not finite."""
+    """Raise a ParameterError for a start that is not finite."""
     if not math.isfinite(theta):
         raise ParameterError(f"initial theta is {theta} rad; expected a finite number")
     if not math.isfinite(theta_dot):

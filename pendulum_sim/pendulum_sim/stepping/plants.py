@@ -1,4 +1,4 @@
-"""The plant that a parameter file describes: rigid or series elastic."""
+"""The plant of a parameter file: rigid or series elastic."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def make_plant(parameters: PlantParameters, dt: float, *, method: str = "auto", 
     Args:
         parameters: Parameters, with a drivetrain for a series-elastic plant.
         dt: Period over which a command is held [s].
-        method: One of ``integrators.METHODS``; ``auto`` is ``etd4`` for a rigid plant and ``semi_implicit``
-            for a series-elastic one, which has no other.
-        substeps: Integration steps in a period; None for 1 (rigid), or as many as steps of 0.25 ms need.
+        method: One of ``integrators.METHODS``; ``auto`` is ``etd4``, or for a series-elastic plant ``semi_implicit``,
+            its only one.
+        substeps: Integration steps in a period; None for 1 (rigid), or steps of at most 0.25 ms.
 
     Raises:
-        ParameterError: The method does not go with the plant, or an argument is outside its domain.
+        ParameterError: The method does not fit the plant, or an argument is outside its domain.
     """
     if parameters.drivetrain is None:
         return RigidPlant(

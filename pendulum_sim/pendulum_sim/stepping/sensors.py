@@ -1,9 +1,8 @@
-"""Sensors, outside the equations: what is measured of a state, and whether the measurement arrives.
+"""Sensors: what is measured of a state, and whether the sample arrives.
 
-In this order: a drawn error of the sampling instant moves the angle along its velocity (jitter), a bias and
-Gaussian noise are added, the value is rounded to the sensor's step, and the sample may be lost. All are off
-by default. Each has a generator of its own, so that switching one on leaves the numbers of the others as
-they were.
+In this order: jitter of the sampling instant moves the angle along its velocity, bias and Gaussian noise are added, the
+value is rounded, the sample may be lost. All are off by default. Each has its own generator, so that switching one on
+does not change the others' numbers.
 """
 
 from __future__ import annotations
@@ -37,16 +36,14 @@ SENSOR_SPECS: tuple[ParameterSpec, ...] = (
 
 
 def quantise(value: float, step: float) -> float:
-    """Return the multiple of ``step`` nearest to a value, or the value itself for a step of 0."""
+    """Return the nearest multiple of a step, or the value for a step of 0."""
     return round(value / step) * step if step > 0.0 else value
 
 
 class Sensors:
-    """Sensors of position, velocity and effort, alike at each joint, in its own units.
+    """Sensors of position, velocity and effort, equal at each joint, in its units.
 
-    Args:
-        generator: Source of all random numbers; it is spawned, never drawn from.
-        **parameters: Values by name as in ``SENSOR_SPECS``; what is missing is off.
+    ``generator`` is spawned, never drawn from; parameters are named as in ``SENSOR_SPECS``.
 
     Raises:
         ParameterError: A name is unknown or a value outside its domain.
@@ -71,14 +68,7 @@ class Sensors:
         self.dropped = 0
 
     def measure(self, stamp_ns: int, position: Vector, velocity: Vector, effort: Vector) -> JointSample | None:
-        """Return the measurement of a state, or None for a sample that is lost.
-
-        Args:
-            stamp_ns: Time of the state [ns].
-            position: True positions of the joints [rad or m].
-            velocity: True velocities [rad/s or m/s].
-            effort: True efforts at the joints [N m or N].
-        """
+        """Return the measurement of a state, or None for a lost sample; units of each joint."""
         if self.ideal:
             return JointSample(stamp_ns, position, velocity, effort)
         if self._jitter:

@@ -1,9 +1,8 @@
 """The link on a series-elastic actuator: motor, gear train, dry friction, spring with hysteresis.
 
-The torque command drives the motor in feed-forward, u = tau R / (N V K_t eta), as the actuator does with
-its effort loop off: what slows the link then is the back EMF of the winding, K_t K_e N^2 / R = 11.8 N m
-s/rad, next to 1.4 of motor and gears. The efficiency is in the command only. Equations and sources:
-``pendulum_msgs_py.dynamics.series_elastic``.
+The torque command drives the motor in feed-forward, u = tau R / (N V K_t eta), as the actuator does with its effort
+loop off: the back EMF of the winding then damps with K_t K_e N^2 / R = 11.8 N m s/rad, motor and gears with 1.4. The
+efficiency is in the command only. Equations and sources: ``pendulum_msgs_py.dynamics.series_elastic``.
 """
 
 from __future__ import annotations
@@ -35,16 +34,16 @@ from pendulum_sim.stepping.stability import MOST_GROWTH, growth_of_map
 __all__ = ["MAX_SUBSTEP", "SeriesElasticPlant", "SeriesElasticTuple", "pack_series_elastic", "series_elastic_step"]
 
 MAX_SUBSTEP = 2.5e-4
-"""Longest step at which the semi-implicit scheme is trusted with springs up to 1000 N m/rad [s]."""
+"""Longest step of the semi-implicit scheme, for springs up to 1000 N m/rad [s]."""
 
 SeriesElasticTuple = tuple[float, ...]
 _TERMS = 21
-"""Where the values of the friction terms begin in it."""
+"""Index of the first friction term."""
 _added_friction = added_friction((*[""] * _TERMS, *TERM_PARAMETERS))
 
 
 def pack_series_elastic(parameters: PlantParameters) -> SeriesElasticTuple:
-    """Return link and drivetrain in the order that :func:`series_elastic_step` takes them."""
+    """Return link and drivetrain in the order of :func:`series_elastic_step`."""
     drive = parameters.drivetrain
     if drive is None:
         raise ParameterError(f"plant {parameters.name!r} has no drivetrain; expected a series-elastic plant")
@@ -71,18 +70,10 @@ def series_elastic_step(
     h: float,
     plant: SeriesElasticTuple,
 ) -> tuple[float, float, float, float, float]:
-    """Return motor angle and velocity, link angle and velocity, hysteresis state after a step.
+    """Return motor angle and velocity, link angle and velocity, and Dahl state after h [s].
 
-    Args:
-        q_m: Motor angle at the output side [rad].
-        v_m: Its velocity [rad/s].
-        q: Link angle [rad].
-        v: Its velocity [rad/s].
-        z: Dahl state [-].
-        pwm: Duty in [-1, 1] [-].
-        disturbance: Torque on the link itself, offset included [N m].
-        h: Step [s].
-        plant: Parameters, packed.
+    Angles in [rad], the motor's at the output side; ``pwm`` in [-1, 1]; ``disturbance`` on the link, offset included [N
+    m].
     """
     (
         inertia, damping, gravity, coulomb, static, stribeck_velocity, angle_offset,
@@ -111,10 +102,7 @@ def series_elastic_step(
 class SeriesElasticPlant:
     """A link behind motor, gears and spring.
 
-    Args:
-        parameters: The plant, with its drivetrain.
-        dt: Period over which a command is held [s], > 0.
-        substeps: Integration steps in a period; None for as many as keep them at 0.25 ms or less.
+    Commands are held over dt [s]; ``substeps`` None keeps integration steps at 0.25 ms or less.
 
     Raises:
         ParameterError: There is no drivetrain, or an argument is outside its domain.
@@ -139,7 +127,7 @@ class SeriesElasticPlant:
         self.q_m = self.v_m = self.theta = self.theta_dot = self.z = self.effort = 0.0
 
     def _check_stability(self, substeps: int) -> None:
-        """Refuse steps at which motor and spring blow up, judged without dry friction, which would hide it."""
+        """Refuse unstable steps, judged without dry friction, which would hide that."""
         drive = self.parameters.drivetrain
         assert drive is not None
         smooth = self.parameters.with_values(
@@ -157,7 +145,7 @@ class SeriesElasticPlant:
                 q_m, v_m, q, v = (float(value) for value in x)
                 return np.array(series_elastic_step(q_m, v_m, q, v, 0.0, 0.0, 0.0, h, packed)[:4])
 
-            # A hardening spring is stiffest where it is wound up; upright, one pole grows in truth.
+            # A hardening spring is stiffest when wound up; upright, one pole truly grows.
             return all(
                 growth_of_map(step, np.array([angle + deflection, 0.0, angle, 0.0]), h, growing) <= MOST_GROWTH
                 for angle, growing in ((0.0, 0), (math.pi, 1))
@@ -174,19 +162,11 @@ class SeriesElasticPlant:
 
     @property
     def state(self) -> PlantState:
-        """The present state; the effort is the one of the spring's deflection."""
+        """The present state; the effort is that of the spring's deflection."""
         return PlantState(self._steps * self.dt, self.theta, self.theta_dot, self.effort)
 
     def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Restart with the spring carrying gravity, the hysteresis loop open and the motor unpowered.
-
-        Args:
-            theta: Link angle [rad].
-            theta_dot: Velocity of link and motor [rad/s].
-
-        Raises:
-            ParameterError: One of them is not finite.
-        """
+        """Restart at a finite angle [rad] and velocity [rad/s], the spring carrying gravity, the motor unpowered."""
         check_start(theta, theta_dot)
         weight = gravity_torque(theta - self.parameters.angle_offset, self.parameters.gravity)
         self.theta, self.theta_dot, self.v_m = float(theta), float(theta_dot), float(theta_dot)
@@ -198,11 +178,7 @@ class SeriesElasticPlant:
         return self.state
 
     def step(self, effort: float, push: float = 0.0) -> PlantState:
-        """Advance by one period.
-
-        Args:
-            effort: Commanded torque, held over the period; clamped to the effort limit [N m].
-            push: Torque on the link itself [N m].
+        """Advance one period under a commanded torque, clamped to the limit, and a torque on the link [N m].
 
         Raises:
             ParameterError: One of them is not finite (nothing moves then).

@@ -1,9 +1,8 @@
-"""Position control of the simulated joint: stiff, critically damped, and honest about the torque it uses.
+"""Position control of the simulated joint, critically damped.
 
     u = G sin(theta) + b theta_ref' + k (theta_ref - theta) + (c - b) (theta_ref' - theta')
 
-places the poles of M e'' + c e' + k e = 0 with c = max(b, 2 M w), k = c w - M w^2, so that the slow one is
--w.
+places the poles of M e'' + c e' + k e = 0 with c = max(b, 2 M w), k = c w - M w^2: the slow one is -w.
 """
 
 from __future__ import annotations
@@ -18,29 +17,22 @@ __all__ = ["PositionServo"]
 
 
 class PositionServo:
-    """Model-based position controller, clamped to the plant's effort limit.
-
-    Args:
-        parameters: The plant.
-        dt: Period at which it is called [s].
-    """
+    """Model-based position controller with period dt [s], clamped to the plant's effort limit."""
 
     def __init__(self, parameters: PlantParameters, dt: float) -> None:
-        # The slow pole is the fastest that the period allows, at most 60 1/s: a quarter of a radian of phase per period
-        # leaves a margin to the held command and the plant's own delays.
+        # A quarter of a radian of phase per period leaves a margin for the held command and the plant's delays.
         lateness = dt + parameters.transport_delay + parameters.actuator_time_constant
         omega = min(60.0, 0.25 / lateness)
         inertia, damping, gain = parameters.inertia, parameters.damping, 1.0
         drive = parameters.drivetrain
         if drive is not None:
-            # The spring lies between motor and measured angle: stay well below the resonance of link and
-            # spring.
+            # Stay well below the resonance of link and spring.
             omega = min(omega, 0.25 * math.sqrt(drive.stiffness / parameters.inertia))
             inertia += drive.reflected_inertia
             damping += drive.motor_damping + shorted_winding_damping(
                 drive.torque_constant, drive.back_emf_constant, drive.gear_ratio, drive.winding_resistance
             )
-            # In feed-forward a command of 1 N m makes 1/eta at the motor.
+            # In feed-forward a command of 1 N m gives 1/eta at the motor.
             gain = drive.efficiency
         total = max(damping, 2.0 * inertia * omega)
         self._stiffness = gain * (total * omega - inertia * omega * omega)
@@ -52,15 +44,7 @@ class PositionServo:
     def effort(
         self, theta: float, theta_dot: float, position: float, velocity: float, *, limit: float = math.inf
     ) -> float:
-        """Return the torque that follows a reference [N m].
-
-        Args:
-            theta: Angle [rad].
-            theta_dot: Velocity [rad/s].
-            position: Wanted angle [rad].
-            velocity: Wanted velocity [rad/s].
-            limit: Largest torque that is allowed, where it is lower than the plant's own [N m].
-        """
+        """Return the torque [N m] towards a wanted position [rad] and velocity [rad/s], within the lower limit."""
         parameters = self._parameters
         weight = gravity_torque(theta - parameters.angle_offset, parameters.gravity)
         wanted = (

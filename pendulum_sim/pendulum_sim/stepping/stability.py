@@ -1,9 +1,8 @@
-"""Whether an integrator is stable on a plant at a step: judged on its own map of the linear model.
+"""Whether an integrator is stable on a plant at a step, by the eigenvalues of its own map of the linear model.
 
-Near its two equilibria a rigid pendulum is ``theta'' = tau / M_c - lambda theta' -+ omega^2 theta`` with
-lambda = b_c / M_c and omega^2 = |G_c| / M_c. A step of an integrator maps such a state linearly; the eigenvalues of the
-map are those of the discretised plant. Hanging, both poles decay, so both eigenvalues must; upright one pole grows, and
-one eigenvalue may. No stability function is needed: the very step that simulates is evaluated.
+Near its equilibria a rigid pendulum is ``theta'' = tau / M_c - lambda theta' -+ omega^2 theta`` with lambda = b_c / M_c
+and omega^2 = |G_c| / M_c. Hanging, both eigenvalues of a step must decay; upright one pole grows, and one eigenvalue
+may. The step that simulates is evaluated itself.
 
 Source: Hairer and Wanner, "Solving Ordinary Differential Equations II", IV.2 (stability of one-step methods).
 """
@@ -24,11 +23,11 @@ __all__ = ["MOST_GROWTH", "check_stability", "growth_of_map", "growth_rate", "st
 
 Array = NDArray[np.float64]
 MOST_GROWTH = 0.1
-"""Growth that counts as stable [1/s]: some methods let an undamped pendulum gain energy, far more slowly than this."""
+"""Growth that counts as stable [1/s]: some methods add energy to an undamped pendulum, far more slowly."""
 _MOST_SUBSTEPS = 10_000
 _PART = 65_536
 _DIFFERENCE = 1e-5
-"""Half the distance of the points that a slope is taken from [rad, rad/s]."""
+"""Half the step of finite differences [rad, rad/s]."""
 
 
 def growth_rate(
@@ -38,7 +37,7 @@ def growth_rate(
     h: float,
     coefficients: Sequence[Array],
 ) -> Array:
-    """Return how fast a decaying motion of the plant grows when it is integrated, below 0 where it decays [1/s].
+    """Return the growth of a decaying motion when integrated [1/s], below 0 if stable.
 
     Args:
         integrator: The method; not ``adaptive``, which chooses its steps itself.
@@ -50,7 +49,7 @@ def growth_rate(
     rates = np.asarray(damping_rates, dtype=np.float64)
     stiffness = np.abs(np.asarray(stiffness_rates, dtype=np.float64))
     if max(rates.size, stiffness.size) > _PART:
-        # Parts that stay in the processor's cache.
+        # Parts fit the processor's cache.
         rates, stiffness, *wide = np.broadcast_arrays(rates, stiffness, *coefficients)
         parts = [slice(first, first + _PART) for first in range(0, rates.size, _PART)]
         return np.concatenate(
@@ -69,7 +68,7 @@ def growth_rate(
 def _eigenvalue_sizes(
     integrator: Integrator, rates: Array, stiffness: Array, h: float, coefficients: Sequence[Array]
 ) -> tuple[Array, Array]:
-    """Return the absolute values of the eigenvalues of one step, the smaller first."""
+    """Return the absolute eigenvalues of one step, the smaller first."""
 
     def linear(theta: float, theta_dot: float, torque: float, direction: float, plant: PlantTuple) -> float:  # noqa: ARG001
         return -rates * theta_dot - stiffness * theta  # type: ignore[return-value]  # whole arrays at once
@@ -88,17 +87,9 @@ def _eigenvalue_sizes(
 def check_stability(
     integrator: Integrator, parameters: PlantParameters, dt: float, substeps: int, longest_step: float
 ) -> None:
-    """Refuse a method that blows up on a plant.
+    """Raise a ParameterError, with a stable alternative, if a method is unstable on a rigid plant.
 
-    Args:
-        integrator: The method.
-        parameters: The plant, a rigid one.
-        dt: Period [s].
-        substeps: Sub-steps of a period.
-        longest_step: The longest of them, where a delay cuts the period [s].
-
-    Raises:
-        ParameterError: It is unstable at that step; the message has a step that is stable.
+    ``longest_step`` is the longest sub-step of a period dt that a delay may cut [s].
     """
     if integrator.name == "adaptive" or _is_stable(integrator, parameters, longest_step):
         return
@@ -114,13 +105,9 @@ def check_stability(
 
 
 def growth_of_map(step: Callable[[Array], Array], x: Array, h: float, growing: int = 0) -> float:
-    """Return how fast what should decay grows under a map that is nearly linear around a state [1/s].
+    """Return the growth [1/s] of what should decay under a nearly linear map over h [s] around a state, shape (n,).
 
-    Args:
-        step: Maps a state to that after the step.
-        x: The state, shape (n,).
-        h: Step [s].
-        growing: Poles of the plant that truly grow there.
+    ``growing`` poles truly grow there.
     """
     n = len(x)
     jacobian = np.empty((n, n))
@@ -136,7 +123,7 @@ def growth_of_map(step: Callable[[Array], Array], x: Array, h: float, growing: i
 
 
 def stable_substeps(integrator: Integrator, parameters: PlantParameters, dt: float) -> int:
-    """Return the least number of sub-steps of a period at which a method is stable; 0 if none up to 10 000 is."""
+    """Return the smallest stable number of sub-steps of a period; 0 if none up to 10 000 is."""
     count = 1
     while count <= _MOST_SUBSTEPS and not _is_stable(integrator, parameters, dt / count):
         count = max(count + 1, math.ceil(1.02 * count))
