@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
@@ -53,6 +54,9 @@ _FAST = 0.005
 
 _POOR = 0.25
 """Share of what straight lines miss from which on a fit is tried again by way of shorter windows."""
+
+_DELAYS = tuple(0.01 * k for k in range(9))
+"""Delays from which a search may start [s]."""
 
 _CLEARS = 0.2
 """Share of the error that is left at most where a few windows, in which something pushed, made it."""
@@ -207,6 +211,10 @@ class _Search:
         data = self._windows(length)
         first = self._attempt(start, data, length)
         tried = [first] if isinstance(first, _Attempt) else []
+        if DELAY in (self.extras or DELAY) and not (tried and tried[0].fit.worst <= _POOR):
+            start = self._late(start, data)
+            again = self._attempt(start, data, length)
+            tried += [again] if isinstance(again, _Attempt) else []
         shortest = None
         for shorter in (length / 3.0, length / 9.0):
             if (tried and min(one.fit.worst for one in tried) <= _POOR) or shorter < _SHORTEST:
@@ -225,6 +233,17 @@ class _Search:
         if best is None:
             raise DataError(better_reading(self.plant, data) or str(first))
         return best
+
+    def _late(self, start: MechanismModel, data: list[Windows]) -> MechanismModel:
+        """Return the start with the delay that explains most: a search from far below it ends in a poor minimum."""
+        at, weights, costs = start.index([DELAY]), first_weights(data), {}
+        for delay in (start[DELAY], *_DELAYS):
+            values = start.values.copy()
+            values[at] = delay
+            late = start.with_values(values)
+            with suppress(DataError):
+                costs[fit(late, data, (), weights, most=4, tolerance=1e-2).cost] = late
+        return costs[min(costs)] if costs else start
 
     def _windows(self, length: float) -> list[Windows]:
         data = [prepare_windows(recording, length, stride=self.stride) for recording in self.recordings]
