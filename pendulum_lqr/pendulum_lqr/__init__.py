@@ -1,4 +1,4 @@
-"""Linearisation, design, controllers, estimators and disturbances for the torque-driven pendulum.
+"""Linearisation, design, controllers, estimators and disturbances for torque-driven pendulums.
 
-The core (everything but the ``*_node`` modules) knows no ROS and no clock: time and state are arguments.
+Everything but the ``*_node`` modules is independent of ROS and clocks: time and state are arguments.
 """

@@ -1,1 +1,1 @@
-"""What all controllers have: interface, tables of names, velocities, rates, laws as functions, a policy's answers."""
+"""Common parts of controllers: interface, table of names, velocity estimates, rates, laws as functions, policies."""

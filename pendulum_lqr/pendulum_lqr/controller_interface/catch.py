@@ -20,7 +20,7 @@ __all__ = ["Catch", "CatchingController"]
 
 _LET_GO = 2.0
 _SHARE = 0.9
-"""Share of the proven level in which it takes over, where that is no parameter."""
+"""Default share of the proven level in which it takes over."""
 
 
 @dataclass
@@ -28,12 +28,10 @@ class Catch:
     """LQR at the set-point with hysteresis: takes over inside x' S x <= level, releases beyond twice the proven level.
 
     Attributes:
-        gain: Gain and Riccati solution.
-        level: Level at which it takes over.
-        release: Level at which it releases, larger.
-        effort_limit: Largest torque [N m].
+        release: Level of release, larger than ``level``.
+        effort_limit: [N m].
         set_point: Angle from upright [rad].
-        hold: Torque that holds it [N m].
+        hold: Holding torque [N m].
         active: Whether it is in charge.
     """
 
@@ -46,7 +44,7 @@ class Catch:
     active: bool = False
 
     def __post_init__(self) -> None:
-        """Take plain floats out of arrays: indexing these on every state costs more than the law itself."""
+        """Extract floats: indexing arrays on every state costs more than the law itself."""
         self._k0, self._k1 = (float(value) for value in self.gain.K)
         self._s00, self._s01, self._s11 = (float(self.gain.S[row]) for row in ((0, 0), (0, 1), (1, 1)))
 
@@ -55,7 +53,7 @@ class Catch:
         self.active = False
 
     def holds(self, angle: float, velocity: float) -> bool:
-        """Return whether the LQR is in charge at a state, and remember it."""
+        """Return whether the LQR is in charge at a state, and store that."""
         angle = wrap(angle - self.set_point)
         cost = self._s00 * angle * angle + 2.0 * self._s01 * angle * velocity + self._s11 * velocity * velocity
         self.active = cost <= (self.release if self.active else self.level)
@@ -73,11 +71,7 @@ class Catch:
 
 
 class CatchingController(BaseController):
-    """Swings a rigid pendulum up to where an LQR takes over; a subclass defines how.
-
-    Attributes:
-        catch: LQR with hysteresis at the set-point.
-    """
+    """Swings a rigid pendulum up (defined by a subclass) to where the LQR ``catch`` takes over."""
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(p["effort_limit"], p["set_point"])
@@ -99,10 +93,10 @@ class CatchingController(BaseController):
 def _proven(
     plant: PlantParameters, q: tuple[float, ...], r: float, effort_limit: float, set_point: float
 ) -> tuple[Gain, float, float]:
-    """Return gain, proven level and holding torque of an LQR under a torque limit; lag and delay are not in the proof.
+    """Return gain, proven level and holding torque of an LQR under a torque limit; the proof neglects lag and delay.
 
     Raises:
-        DesignError: The set-point takes more torque than there is, or no region around it can be proven.
+        DesignError: The torque cannot hold the set-point, or no region around it can be proven.
     """
     prompt = plant.with_values(actuator_time_constant=0.0, transport_delay=0.0)
     model = linearise(prompt, UPRIGHT + set_point)

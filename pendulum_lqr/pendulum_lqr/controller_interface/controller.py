@@ -1,7 +1,7 @@
-"""The table of controllers, what their classes share, and how one is designed by its name.
+"""Table of controllers, their common classes, and design by name.
 
-A controller is a class in a file of its own under ``controllers/`` plus one line in ``CONTROLLERS``. It sees the states
-of all joints and returns efforts of the driven ones; it depends on neither ROS nor a clock.
+A controller is a class in a file under ``controllers/`` plus one line in ``CONTROLLERS``. It maps the states of all
+joints to efforts of the driven ones, independent of ROS and clocks.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ ONE_JOINT, SEVERAL_JOINTS, RIGID = "one joint", "several joints", "a plant witho
 
 
 class Row(NamedTuple):
-    """A row of the table of controllers.
+    """Row of the table of controllers.
 
     Attributes:
-        target: ``module:class``; the module is imported on demand, so that LQR does not pay for CasADi.
-        needs: What the plant must have; nothing for every plant.
-        several: ``module:class`` of the method that plants of several joints have under the same name.
+        target: ``module:class``, imported on demand, so that LQR does not import CasADi.
+        needs: Required properties of the plant.
+        several: ``module:class`` of the method of this name for several joints.
     """
 
     target: str
@@ -83,7 +83,6 @@ CONTROLLERS: dict[str, Row] = {
     "playback": Row(f"{_HERE}.playback:Playback"),
     "policy": Row(f"{_HERE}.policy:LearnedPolicy", _ANY),
 }
-"""The controllers by name."""
 
 START_TIME = ParameterSpec(
     "start_time",
@@ -106,29 +105,17 @@ COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
     ParameterSpec("velocity", "measured", "", "Source of the velocity.", choices=("measured", *VELOCITY_ESTIMATORS)),
     START_TIME,
 )
-"""Parameters that every controller of one joint has; those of several joints have the last one."""
+"""Parameters of every controller of one joint; those of several joints have only the last one."""
 
 
 def soft_start(effort: float, limit: float, t: float, start_time: float) -> float:
-    """Return a torque within the limit that applies at this time after the first state [N m].
-
-    Args:
-        effort: The desired torque [N m].
-        limit: Largest torque in the end [N m].
-        t: Time since the first state [s].
-        start_time: Time in which the largest torque rises from zero to the limit [s].
-    """
+    """Return a torque within the limit [N m], which rises from 0 to ``limit`` [N m] over ``start_time`` [s]."""
     bound = limit if t >= start_time else limit * max(0.0, t) / start_time
     return min(bound, max(-bound, effort))
 
 
 class BaseController(Controller):
-    """A controller of a plant of one joint, which defines ``command``: a limit, a set-point, and no state.
-
-    Attributes:
-        effort_limit: Largest torque [N m].
-        set_point: Angle to hold, from upright [rad].
-    """
+    """A controller of one joint with ``command``: ``effort_limit`` [N m], ``set_point`` from upright [rad]."""
 
     def __init__(self, effort_limit: float, set_point: float = 0.0) -> None:
         super().__init__((effort_limit,))
@@ -145,11 +132,11 @@ class BaseController(Controller):
 
 
 class LawController(BaseController):
-    """A controller that is one pure function of numbers: its node can run it in compiled code.
+    """A controller that is one pure function of numbers, which its node can run compiled.
 
     Args:
-        law: The function, of a module; it begins with ``effort_limit`` and ``set_point`` among its numbers.
-        effort_limit: Largest torque [N m].
+        law: Module-level function; its numbers begin with ``effort_limit`` and ``set_point``.
+        effort_limit: [N m].
         set_point: Angle to hold, from upright [rad].
         numbers: The law's own numbers, at most ``MOST_NUMBERS - OWN``.
         memory: Its memory before the first state, at most ``MOST_MEMORY``.
@@ -175,28 +162,28 @@ class LawController(BaseController):
         self._use(law, numbers, memory)
 
     def _use(self, law: Law | None, numbers: Iterable[float], memory: Iterable[float] = ()) -> None:
-        """Set the law, its own numbers and its memory before the first state."""
+        """Set the law, its own numbers and its initial memory."""
         self.law = law
         self._call = self._without_law if law is None else law
-        # In one piece, unless a subclass commands something else: each call around it costs as much as a law.
+        # Direct call unless a subclass overrides command: each wrapping call costs as much as a law.
         self._direct = law if type(self).command is LawController.command else None
-        # Plain floats: indexing an array of two on every state costs more than the law itself.
+        # Floats: indexing arrays on every state costs more than the law itself.
         self.numbers = tuple(float(number) for number in (self.effort_limit, self.set_point, *numbers))
         self._at_first = [float(value) for value in memory]
         self.memory = list(self._at_first)
 
     def reset(self) -> None:
-        """Remember what it did before its first state."""
+        """Restore the memory before the first state."""
         self.memory[:] = self._at_first
 
     def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
-        """Return the torque that the law has for the state [N m]."""
+        """Return the law's torque for the state [N m]."""
         if self._direct is None:
             return super().efforts(t, position, velocity)
         return (self._direct(t, wrap_angle(position[0] - UPRIGHT), velocity[0], self.memory, self.numbers),)
 
     def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque [N m] that the law has for the state."""
+        """Return the law's torque for the state [N m]."""
         return self._call(t, x[0], x[1], self.memory, self.numbers)
 
     def _without_law(self, t: float, angle: float, velocity: float, _memory: Any, _numbers: Any) -> float:
@@ -204,12 +191,7 @@ class LawController(BaseController):
 
 
 class EstimatedVelocity(Controller):
-    """A controller of one joint that sees an estimated velocity in place of the measured one.
-
-    Args:
-        inner: The controller.
-        estimator: The velocity estimator; its input is the torque of the last command.
-    """
+    """A controller of one joint with estimated velocity; the estimator's input is the torque of the last command."""
 
     def __init__(self, inner: Controller, estimator: VelocityEstimator) -> None:
         super().__init__(inner.effort_limits)
@@ -234,7 +216,7 @@ class EstimatedVelocity(Controller):
         return f"{self.inner.describe()}, velocity by {type(self.estimator).__name__}"
 
     def carry_over(self, previous: Controller) -> None:
-        """Take over the filter too, where the previous controller had one of the same kind."""
+        """Take over the filter too, if the previous controller had one of the same kind."""
         if isinstance(previous, EstimatedVelocity):
             if type(previous.estimator) is type(self.estimator):
                 self.estimator = previous.estimator
@@ -243,12 +225,7 @@ class EstimatedVelocity(Controller):
 
 
 class SoftStart(Controller):
-    """A controller whose efforts begin at zero and may reach their limits after a while; a predictive one ignores it.
-
-    Args:
-        inner: The controller.
-        start_time: Time from the first state until it has all of its effort [s].
-    """
+    """A controller whose effort limits rise from zero over ``start_time`` [s]; a predictive one ignores it."""
 
     def __init__(self, inner: Controller, start_time: float) -> None:
         super().__init__(inner.effort_limits)
@@ -260,7 +237,7 @@ class SoftStart(Controller):
         self.inner.reset()
 
     def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
-        """Return the inner controller's efforts, within what they may be so long after the start [N m or N]."""
+        """Return the inner controller's efforts, within the limits at this time [N m or N]."""
         wanted = zip(self.inner.efforts(t, position, velocity), self.effort_limits, strict=True)
         return tuple(soft_start(effort, limit, t, self.start_time) for effort, limit in wanted)
 
@@ -269,7 +246,7 @@ class SoftStart(Controller):
         return f"{self.inner.describe()}, torque rises in {self.start_time:g} s"
 
     def carry_over(self, previous: Controller) -> None:
-        """Take over what the previous controller remembers; how long ago it began is the caller's."""
+        """Take over the previous controller's state; the caller keeps the start time."""
         self.inner.carry_over(previous)
 
 
@@ -279,15 +256,10 @@ def controller_names(*, several: bool = False) -> list[str]:
 
 
 def controller_class(name: str, plant: PlantParameters | None = None) -> type[Controller]:
-    """Return the class behind a name of ``CONTROLLERS``.
-
-    Args:
-        name: The name.
-        plant: The plant that it is for; None for any of one joint.
+    """Return the class of a name in ``CONTROLLERS``, for a plant, or None for any of one joint.
 
     Raises:
-        ParameterError: No such controller for this plant; the message lists those there are. Or a library of it is not
-            installed.
+        ParameterError: No such controller for this plant (the message lists those available), or a library is missing.
     """
     several = plant is not None and not plant.is_pendulum
     if not isinstance(name, str) or name not in CONTROLLERS:  # a file may say 7
@@ -316,19 +288,14 @@ def controller_class(name: str, plant: PlantParameters | None = None) -> type[Co
 
 
 def _target(row: Row, *, several: bool) -> str:
-    """Return ``module:class`` of a row for plants of one joint or several; empty where it has none."""
+    """Return ``module:class`` of a row for plants of one joint or several; empty if it has none."""
     if several and row.several:
         return row.several
     return "" if (ONE_JOINT if several else SEVERAL_JOINTS) in row.needs else row.target
 
 
 def controller_parameters(name: str, plant: PlantParameters | None = None) -> tuple[ParameterSpec, ...]:
-    """Return the specs of a controller: common ones first, but for those of which it has its own.
-
-    Args:
-        name: The name.
-        plant: The plant that it is for, on which defaults may depend; None for any of one joint.
-    """
+    """Return the specs of a controller for a plant (None: any of one joint), common ones first unless overridden."""
     kind = controller_class(name, plant)
     own = kind.parameters(plant)
     common = COMMON_PARAMETERS if plant is None or plant.is_pendulum else (START_TIME,)
@@ -348,15 +315,15 @@ def make_controller(
 
     Args:
         name: Name in ``CONTROLLERS``.
-        plant: Parameters of the plant to design for.
+        plant: Plant to design for.
         period: Sampling period of the loop [s].
-        values: Parameters by name; others at their default.
-        checked: Whether a loop that is unstable is refused; not where the period is a guess. Gains set by hand
-            (``tuning`` manual) are not checked.
+        values: Parameters by name; others have defaults.
+        checked: Refuse an unstable loop; not while the period is a guess. Manual gains (``tuning`` manual) are not
+            checked.
 
     Raises:
-        ParameterError: Unknown controller or parameter, a value out of domain, a design that does not exist, or a loop
-            that is unstable on the linear model of the plant at this period, delay included.
+        ParameterError: Unknown controller or parameter, a value out of domain, no such design, or a loop that is
+            unstable on the linear model of the plant at this period, including delay.
     """
     kind = controller_class(name, plant)
     p = validate(controller_parameters(name, plant), values or {})

@@ -1,4 +1,4 @@
-"""What every controller offers, whatever plant it is for: states of n joints in, efforts of the m driven ones out."""
+"""Interface of all controllers: states of n joints in, efforts of the m driven ones out."""
 
 from __future__ import annotations
 
@@ -14,55 +14,55 @@ __all__ = ["Controller", "unwrapped"]
 
 
 class Controller:
-    """What turns states into efforts. A subclass defines ``efforts``, or for one joint alone ``command``.
+    """Maps states to efforts. A subclass defines ``efforts``, or for one joint alone ``command``.
 
     Attributes:
         effort_limits: Largest effort of each driven joint [N m or N].
-        feedback: What it is near its set-point where that is a gain; None for any other law.
-        inner: The controller that this one wraps; None for one that computes efforts itself.
+        feedback: Gain near the set-point; None for a law without one.
+        inner: Wrapped controller, or None.
     """
 
     SUMMARY: ClassVar[str] = ""
     """One sentence for tables."""
     PARAMETERS: ClassVar[tuple[ParameterSpec, ...]] = ()
-    """Parameters of this controller that are the same for every plant."""
+    """Parameters that are the same for every plant."""
     SAMPLED: ClassVar[bool] = True
-    """Whether its commands depend on the period of states; for others the period is only checked."""
+    """Whether commands depend on the period of states; for others the period is only checked."""
     BALANCES: ClassVar[bool] = False
-    """Whether it holds one place, so that it must settle at the period at which states come."""
+    """Whether it holds a fixed point, so that it must settle at the period of the states."""
     DESIGNING: ClassVar[str] = ""
-    """What its design does, to be logged, where that takes seconds."""
+    """Log text for a design that takes seconds."""
     PREDICTS: ClassVar[bool] = False
-    """Whether it predicts the plant from the torques that it sent, and so needs the holding torque."""
+    """Whether it predicts the plant from its own torques, and so needs the holding torque."""
     STARTS_SOFTLY: ClassVar[bool] = False
     """Whether it applies ``start_time`` itself; for others a wrapper does."""
     FEEDBACK: ClassVar[bool] = True
-    """Whether it closes a loop whose linear model has to be stable."""
+    """Whether it closes a loop whose linear model must be stable."""
     TIME_INVARIANT: ClassVar[bool] = True
-    """Whether a state gives the same command at any time, so that the loop has a frequency response."""
+    """Whether commands do not depend on time, so that the loop has a frequency response."""
 
     feedback: Feedback | None = None
     inner: Controller | None = None
     notice: str = ""
-    """Notice for the user while it runs; empty for nothing."""
+    """Notice for the user while it runs."""
 
     def __init__(self, effort_limits: Vector) -> None:
         self.effort_limits = effort_limits
 
     @classmethod
     def parameters(cls, plant: Any) -> tuple[ParameterSpec, ...]:
-        """Return what can be set, with defaults for a plant, None for any of one joint; ``PARAMETERS`` by default."""
+        """Return the parameters with defaults for a plant, or None for any of one joint."""
         return cls.PARAMETERS
 
     @classmethod
     def design(cls, plant: Any, period: float, p: Mapping[str, Any]) -> Controller:
-        """Return the controller for a plant; by default what the class makes of these three.
+        """Return the controller for a plant, by default an instance of the class with these arguments.
 
         Args:
-            plant: The plant.
+            plant: Plant.
             period: Period of the states, or an assumed one while it is unknown [s].
-            p: Checked values of the common parameters and :meth:`parameters`; of one joint ``effort_limit`` is already
-                the one to keep.
+            p: Checked values of the common parameters and :meth:`parameters`; of one joint with the final
+                ``effort_limit``.
 
         Raises:
             ParameterError: The values do not make a controller for this plant at this period.
@@ -73,42 +73,30 @@ class Controller:
 
     @classmethod
     def judged_at(cls, p: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
-        """Return what is set, one judgement after the other, where the loop is judged before it moves a plant.
+        """Return changed parameters for each check of the loop before it moves a plant.
 
-        Where a loop rests is one thing, whether it is stable another: the holding torque belongs to the first.
-
-        Args:
-            p: Checked values of all parameters.
+        The holding torque affects the fixed point, not stability, so the loop is checked with feedforward.
         """
         return ({} if p.get("feedforward", True) else {"feedforward": True},)
 
     def check(self, period: float) -> None:
-        """Refuse a period at which states come and for which this controller is not; any period by default [s].
-
-        Raises:
-            ParameterError: It is not for this period.
-        """
+        """Raise ParameterError if the controller is not for this period of the states [s]."""
 
     def reset(self) -> None:
-        """Forget everything: integrals, filters, phases; nothing by default."""
+        """Reset integrals, filters and phases."""
 
     def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return the m efforts for a state [N m or N].
 
         Args:
-            t: Time of the state since the controller was started [s]; it increases from call to call.
+            t: Time of the state since the start [s]; it increases from call to call.
             position: n positions, hanging at 0 and not wrapped [rad or m].
             velocity: n velocities [rad/s or m/s].
         """
         return (self.command(t, (deviation_from_upright(position[0]), velocity[0])),)
 
     def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque for a state of the only joint [N m].
-
-        Args:
-            t: As of :meth:`efforts`.
-            x: [wrap(theta - pi) [rad], theta_dot [rad/s]].
-        """
+        """Return the torque of one joint [N m] for x = [wrap(theta - pi) [rad], theta_dot [rad/s]]."""
         return self.efforts(t, (UPRIGHT + x[0],), (x[1],))[0]
 
     def describe(self) -> str:
@@ -116,15 +104,15 @@ class Controller:
         return type(self).__name__
 
     def carry_over(self, previous: Controller) -> None:
-        """Take over integrals and filters from the controller that this one replaces, so that torque does not jump."""
+        """Take over integrals and filters from the replaced controller, so that torque does not jump."""
         self.take_over(unwrapped(previous))
 
     def take_over(self, previous: Controller) -> None:
-        """Take over what the previous controller remembers, wrappers apart; nothing by default."""
+        """Take over the state of the previous controller, without wrappers; nothing by default."""
 
 
 def unwrapped(controller: Controller) -> Controller:
-    """Return the controller itself, without what gives it its velocity and what lets its effort rise."""
+    """Return the innermost controller, without wrappers for velocity and soft start."""
     while controller.inner is not None:
         controller = controller.inner
     return controller

@@ -1,4 +1,4 @@
-"""Laws of controllers as functions of numbers: interpreted here, compiled in loops that run compiled."""
+"""Laws of controllers as functions of numbers: interpreted here, compiled in compiled loops."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ __all__ = [
 Law = Callable[[float, float, float, MutableSequence[float], Sequence[float]], float]
 """``law(t, angle, velocity, memory, numbers)`` -> torque [N m].
 
-The time since the first state [s], the angle from upright [rad] and the velocity [rad/s] are those of a state, all
-finite; ``numbers`` are what was designed, ``memory`` is what the law stores from state to state and changes in place.
-It is compiled unchanged, so it uses numbers, ``math``, indices and functions of this project that do likewise.
+Time since the first state [s], angle from upright [rad] and velocity [rad/s] are finite; ``numbers`` come from the
+design, ``memory`` is state, changed in place. It is compiled unchanged, so it uses only numbers, ``math``, indices and
+functions of this project that do likewise.
 """
 
 EFFORT_LIMIT, SET_POINT, OWN = range(3)
@@ -35,7 +35,7 @@ MOST_NUMBERS, MOST_MEMORY = 320, 128
 
 
 def clamped(effort: float, limit: float) -> float:
-    """Return a torque within a limit [N m]; what is no number stays none."""
+    """Return a torque within a limit [N m]; NaN passes unchanged."""
     if effort > limit:
         return limit
     if effort < -limit:  # not by max(), whose result for NaN differs where it is compiled
@@ -44,7 +44,7 @@ def clamped(effort: float, limit: float) -> float:
 
 
 def within_limits(wanted: Iterable[float], limits: Vector) -> Vector:
-    """Return efforts within limits either way [N m or N]; NaN stays NaN, which the sender refuses."""
+    """Return efforts within symmetric limits [N m or N]; NaN passes unchanged, and the sender refuses it."""
     return tuple([top if u > top else max(float(u), -top) for u, top in zip(wanted, limits, strict=True)])
 
 
@@ -54,13 +54,13 @@ def deviation(angle: float, set_point: float) -> float:
 
 
 def winds_up(push: float, wanted: float, effort: float) -> bool:
-    """Return whether an integral must stand still: it would push its effort further beyond the limit (N m or N).
+    """Return whether an integral must pause because it would push its effort further beyond the limit [N m or N].
 
-    It may come back while the effort is at its limit (conditional integration); what is not a number is not integrated.
+    Conditional integration: it may unwind at the limit; NaN is not integrated.
 
     Args:
-        push: Of the integral's next step on the effort, of any size.
-        wanted: The effort, that step included.
+        push: Effect of the integral's next step on the effort, of any size.
+        wanted: Effort including that step.
         effort: The same within its limit.
     """
     return not (wanted == effort or (wanted - effort) * push < 0.0)

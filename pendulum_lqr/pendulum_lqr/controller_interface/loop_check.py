@@ -1,7 +1,7 @@
-"""Does a controller hold the plant that it was designed for, at the rate at which it will run?
+"""Stability check of a controller with its own plant at its actual rate.
 
-The controller itself, filters and estimators included, closes the loop around the sampled linear model, motor, lag and
-delay included. What grows there is refused before it moves a machine.
+The controller, with filters and estimators, closes the loop around the sampled linear model with motor, lag and delay.
+Growth is refused before the loop moves a machine.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["growth", "require_settling", "require_stable", "settles", "settling_lqr"]
 
 _START = 1e-5
-"""Deviation from which the loop is released [rad]; a hundred times as much is still far from every limit."""
+"""Initial deviation [rad]; a hundred times as much is still far from every limit."""
 _WINDOW = 100
-"""Samples whose spread is compared with that of the windows before."""
+"""Samples per window, whose spread is compared with that of earlier windows."""
 _WINDOWS = 100
 _DEAD, _FALLEN = 0.2, 100.0 * _START
 """A spread below this share of the largest one has died out; beyond this deviation [rad] it never will."""
@@ -34,17 +34,16 @@ _STRETCH, _UNEVEN = 25, 1.02
 
 
 def growth(controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> float:
-    """Return by how much motion grows after a release: below 1 it dies out, inf if it has grown a hundredfold.
+    """Return the growth of motion after a release: below 1 it decays, inf if it has grown a hundredfold.
 
-    Of a law that is a gain it is the spectral radius of the sampled loop, to the power of a window. Any other loop is
-    followed until its motion has died out, for 10 000 samples at most.
+    For a gain it is the spectral radius of the sampled loop, to the power of a window. Any other loop is simulated
+    until its motion decays, for 10 000 samples at most.
 
     Args:
-        controller: Any controller; one that predicts has to feed forward the torque that holds. It is reset before
-            and after.
-        plant: The plant that it meets.
-        period: The period at which it will be called [s].
-        set_point: The angle that it holds, from upright [rad].
+        controller: Any controller, reset before and after; a predictive one must feed forward the holding torque.
+        plant: Plant of the loop.
+        period: Sampling period [s].
+        set_point: Angle from upright [rad].
     """
     model = linearise(plant, UPRIGHT + set_point)
     if (feedback := controller.feedback) is not None:
@@ -76,7 +75,7 @@ def growth(controller: Controller, plant: RigidPlant, period: float, set_point: 
             controller.reset()
             return spreads[-1] / spreads[-2]
     controller.reset()
-    # Between such long stretches the phase of an oscillation in its window hardly counts.
+    # Over such long stretches the phase of an oscillation hardly matters.
     return max(spreads[-_STRETCH:]) / max(spreads[-2 * _STRETCH : -_STRETCH]) / _UNEVEN
 
 
@@ -86,18 +85,7 @@ def settles(controller: Controller, plant: RigidPlant, period: float, set_point:
 
 
 def require_stable(name: str, controller: Controller, plant: RigidPlant, period: float, set_point: float = 0.0) -> None:
-    """Refuse a controller whose loop with its own plant is unstable.
-
-    Args:
-        name: Of the controller.
-        controller: The controller.
-        plant: The plant that it was designed for.
-        period: Sampling period [s].
-        set_point: The angle that it holds, from upright [rad].
-
-    Raises:
-        DesignError: The loop grows.
-    """
+    """Raise DesignError if the loop of a controller with its own plant grows; ``set_point`` from upright [rad]."""
     if settles(controller, plant, period, set_point):
         return
     model = linearise(plant, UPRIGHT + set_point)
@@ -117,18 +105,9 @@ def require_settling(
     remedy: str,
     position: Vector | None = None,
 ) -> None:
-    """Refuse a gain whose sampled loop with the plant grows, lags and delay included.
+    """Raise DesignError if the sampled loop of a gain with the plant grows, including lags and delay.
 
-    Args:
-        name: Of the controller.
-        plant: The plant.
-        feedback: The gain.
-        period: Sampling period [s].
-        remedy: What helps.
-        position: About which; None for upright [rad or m].
-
-    Raises:
-        DesignError: The loop grows.
+    ``period`` in [s]; ``remedy`` is for the message; ``position`` [rad or m], None for upright.
     """
     radius = delayed_spectral_radius(linearise(plant, position), feedback.K, period, summed=feedback.summed)
     if radius >= 1.0:
@@ -139,12 +118,12 @@ def require_settling(
 
 
 def settling_lqr(plant: RigidPlant | PlantParameters, q: ArrayLike, r: ArrayLike, period: float) -> Gain:
-    """Return the best gain on what is measured about upright, which holds at a sampling period [s].
+    """Return the best gain on the measured states about upright that is stable at a sampling period [s].
 
     Arguments as of :func:`~pendulum_lqr.linear.design.output_lqr`.
 
     Raises:
-        DesignError: There is no such gain, or its sampled loop grows, lags and delay included.
+        DesignError: There is no such gain, or its sampled loop grows, including lags and delay.
     """
     gain = output_lqr(linearise(plant), q, r)
     require_settling("lqr", plant, Feedback(gain.K), period, "a shorter period, larger r or smaller q")

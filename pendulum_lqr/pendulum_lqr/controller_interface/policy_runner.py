@@ -1,7 +1,4 @@
-"""A policy's commands for successive states: samples, network, rate limit, soft start, and where it gives up.
-
-It holds for any number of joints: the controllers of one joint and of several share it.
-"""
+"""Commands of a learned policy, for any number of joints: samples, network, rate limit, soft start, deactivation."""
 
 from __future__ import annotations
 
@@ -22,21 +19,17 @@ from pendulum_msgs_py.parameters import ParameterSpec
 __all__ = ["START_TIME", "ZERO", "PolicyRunner", "check_policy_period", "policy_specs", "states_to_hold"]
 
 START_TIME = 0.2
-"""Time from the first state until a policy has all of its effort, by default [s]."""
+"""Default time from the first state to a policy's full effort [s]."""
 ZERO = "zero"
 _SAME_PERIOD = 0.05
-"""Share by which a period may differ from a whole part of the policy's."""
+"""Relative tolerance of a period that must be a whole fraction of the policy's."""
 _LATE = 0.2
 _INTERVALS = 15
-"""Intervals between states whose median may be off by this share at most while it runs."""
+"""Number of intervals between states whose median may be off by ``_LATE`` at run time."""
 
 
 def policy_specs(fallbacks: Sequence[str]) -> tuple[ParameterSpec, ...]:
-    """Return the parameters of a controller that runs a policy file.
-
-    Args:
-        fallbacks: The controllers that may take over where it gives up, ``ZERO`` first.
-    """
+    """Return the parameters of a controller that runs a policy file; ``fallbacks`` starts with ``ZERO``."""
     return (
         ParameterSpec("policy", "", "", "Policy file (.npz)."),
         ParameterSpec("fallback", ZERO, "", "Who answers where the policy gives up: zero torque, or a controller at "
@@ -47,12 +40,12 @@ def policy_specs(fallbacks: Sequence[str]) -> tuple[ParameterSpec, ...]:
 
 
 def states_to_hold(policy: Policy, period: float) -> int:
-    """Return for how many states a command of a policy holds, at their period [s]."""
+    """Return the number of states per command of a policy, at their period [s]."""
     return max(1, round(policy.period / period))
 
 
 def check_policy_period(policy: Policy, period: float) -> None:
-    """Refuse a period of the states that the policy's is no whole multiple of [s]."""
+    """Refuse a period of the states [s] that is no whole fraction of the policy's."""
     parts = policy.period / period
     if abs(parts / max(1, round(parts)) - 1.0) > _SAME_PERIOD:
         raise DesignError(
@@ -62,16 +55,16 @@ def check_policy_period(policy: Policy, period: float) -> None:
 
 
 class PolicyRunner:
-    """The commands of a policy for states of n joints, m efforts each, until it gives up.
+    """Commands of a policy for states of n joints, m efforts each, until it gives up.
 
     Args:
-        policy: The policy.
-        hold: States for which a command holds.
+        policy: Policy.
+        hold: States per command.
         limits: Largest effort of each driven joint [N m or N].
-        start_time: Time from the first state until it has all of its effort [s].
+        start_time: Time from the first state to full effort [s].
 
     Attributes:
-        notice: Why it gave up; empty as long as it did not.
+        notice: Why it gave up, or empty.
     """
 
     def __init__(self, policy: Policy, hold: int, limits: Vector, start_time: float) -> None:
@@ -91,7 +84,7 @@ class PolicyRunner:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past, and that it gave up."""
+        """Forget the past, including having given up."""
         self.notice = ""
         self._observation: Any = None
         self._effort: Vector = self._still
@@ -99,7 +92,7 @@ class PolicyRunner:
         self._times: list[float] = []
 
     def answer(self, t: float, x: Vector, v: Vector) -> Vector | None:
-        """Return the efforts of the driven joints, or None where it gives up or has given up [N m or N].
+        """Return the efforts of the driven joints, or None once it has given up [N m or N].
 
         Args:
             t: Time since the start [s].
@@ -134,7 +127,7 @@ class PolicyRunner:
         self._effort = efforts
 
     def fall_back(self, t: float, state: Sequence[float], answer: Callable[[], Sequence[float]] | None) -> Vector:
-        """Return the efforts of a fallback, softly started; none without one, or if the state or they are not finite.
+        """Return the efforts of a fallback, with soft start; zero without one, or if state or efforts are not finite.
 
         Args:
             t: Time since the start [s].
@@ -147,20 +140,20 @@ class PolicyRunner:
         return self.begun(t, efforts) if all(map(math.isfinite, efforts)) else self._still
 
     def begun(self, t: float, efforts: Sequence[float]) -> Vector:
-        """Return efforts within what they may be so long after the start [N m or N]."""
+        """Return efforts within the limits at this time since the start [N m or N]."""
         return tuple(
             soft_start(effort, limit, t, self.start_time) for effort, limit in zip(efforts, self.limits, strict=True)
         )
 
     def describe(self, after: str) -> str:
-        """Return which policy it is, and whether it gave up; ``after`` names what commands then."""
+        """Return a description of the policy, and whether it gave up; ``after`` names what commands then."""
         policy = self.policy
         sizes = "-".join(str(size) for size in policy.network.sizes)
         text = f"{policy.name} ({policy.task}, {sizes}) every {policy.period:g} s, fallback {after}"
         return f"{text}; {self.notice}" if self.notice else text
 
     def take_over(self, previous: PolicyRunner) -> None:
-        """Take over samples and efforts from another run of the same kind of policy, and whether it gave up."""
+        """Take over samples, efforts and notice from another run of the same kind of policy."""
         self.notice = previous.notice
         own, other = self.policy, previous.policy
         if (own.layout, own.history, own.velocity_scale, own.effort_limit) == (
@@ -224,7 +217,7 @@ class PolicyRunner:
                 return
 
     def _watch_period(self, t: float) -> None:
-        """Give up where states come at another rate than in training, whatever was configured."""
+        """Give up if states come at another rate than in training."""
         self._times.append(t)
         if len(self._times) <= _INTERVALS:
             return

@@ -1,4 +1,4 @@
-"""The measured rate of states, and whether a controller is stable at it."""
+"""Measured rate of states, and whether a controller is stable at it."""
 
 from __future__ import annotations
 
@@ -22,24 +22,23 @@ __all__ = [
 ]
 
 ASSUMED_PERIOD = 0.01
-"""Period of a design before the first states [s]: that of the thesis's loop."""
+"""Design period before the first states [s]: that of the thesis's loop."""
 TOLERANCE = 0.2
-"""Share by which the measured period may differ from that of the design: a late state now and then is no other rate."""
+"""Relative tolerance of the measured period, since single states may be late."""
 _WINDOW = 15
 _ENOUGH = 9
 _GAP_NS = NANOSECONDS
 _FAST_PERIOD = 2e-3
-"""Period at which a design in continuous time settles if it does at any [s]."""
+"""Period at which a stable continuous-time design settles [s]."""
 
 
 class PeriodWatch:
     """Measures the period of states by their stamps: the median of the last intervals.
 
-    A state that was lost on the way doubles one interval, two states that a stall has brought together shorten one;
-    neither moves the median.
+    A lost state doubles one interval, and a stall can bring two together; neither changes the median.
 
     Args:
-        exact: Stamps are simulated time, where one interval is exact and nothing may wait for more.
+        exact: Stamps are simulated time, in which one interval suffices.
     """
 
     def __init__(self, *, exact: bool = False) -> None:
@@ -49,7 +48,7 @@ class PeriodWatch:
         self._intervals_ns: deque[int] = deque(maxlen=1 if exact else _WINDOW)
 
     def add(self, stamp_ns: int) -> bool:
-        """Take the stamp of a state [ns]; return whether the plant has restarted, which voids earlier intervals."""
+        """Add the stamp of a state [ns]; return whether the plant has restarted, which voids earlier intervals."""
         newest, self.newest_ns = self.newest_ns, stamp_ns
         if newest is None or stamp_ns == newest:
             return False
@@ -61,7 +60,7 @@ class PeriodWatch:
         return True
 
     def extend(self, stamps_ns: Sequence[int]) -> None:
-        """Take the stamps of states that went on from each other, the oldest first [ns]."""
+        """Add stamps of consecutive states, the oldest first [ns]."""
         most = self._intervals_ns.maxlen
         assert most is not None
         newest = stamps_ns[-most - 1 :]
@@ -72,12 +71,12 @@ class PeriodWatch:
 
     @property
     def only_interval_ns(self) -> int | None:
-        """The one interval that is enough in simulated time [ns]; None in real time, or before it is known."""
+        """The one interval that suffices in simulated time [ns]; None in real time, or before it is known."""
         return self._intervals_ns[0] if self._exact and self._intervals_ns else None
 
     @property
     def period(self) -> float | None:
-        """The period [s], to three digits; None before it is known."""
+        """Period [s], to three digits; None before it is known."""
         if len(self._intervals_ns) < (1 if self._exact else _ENOUGH):
             return None
         return float(f"{statistics.median(self._intervals_ns) / NANOSECONDS:.3g}")
@@ -89,21 +88,12 @@ def goes_on(interval_ns: int) -> bool:
 
 
 def differs(measured: float, designed: float) -> bool:
-    """Return whether states come at another rate than a design counts on; both are periods [s]."""
+    """Return whether a measured period differs from that of the design [s]."""
     return abs(measured / designed - 1.0) > TOLERANCE
 
 
 def require_period(what: str, designed: float, period: float) -> None:
-    """Refuse states at another period than that of the design.
-
-    Args:
-        what: What is done at each state, such as ``the trajectory is followed``.
-        designed: The period of the design [s].
-        period: That of the states [s].
-
-    Raises:
-        ParameterError: They differ.
-    """
+    """Raise ParameterError if states come at another period than the design's [s]; ``what`` starts the message."""
     if differs(period, designed):
         raise ParameterError(f"{what} every {designed:g} s; expected states at that period")
 
@@ -121,14 +111,13 @@ def rate_problem(
 ) -> str:
     """Return why a controller must not run on states at another rate than it was designed for; empty if it may.
 
-    Refused is what would settle at its own rate and does not at theirs: a controller that never settles, such as
-    one of zero torque, is intended.
+    Only a controller that settles at its own rate is refused: one that never settles, such as zero torque, is intended.
 
     Args:
         kind: Class of the controller.
         name: Its name.
         make: Designs it.
-        plant: The plant that it was designed for.
+        plant: Plant of the design.
         designed: Period of the design [s].
         measured: Period of the states [s].
         uses: Whether its commands depend on the period.

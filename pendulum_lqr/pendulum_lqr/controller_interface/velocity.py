@@ -1,6 +1,6 @@
-"""The velocity: measured, or estimated from positions.
+"""Velocity, measured or estimated from positions.
 
-Positions come in [-pi, pi) and may jump from one end to the other; every estimator takes differences the short way.
+Positions are in [-pi, pi) and may jump between the ends; every estimator takes differences the short way.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ _WINDOW, _ORDER = 7, 2
 
 
 class VelocityEstimator(Protocol):
-    """A filter from positions (and what else there is) to velocity."""
+    """Filter from position, measured velocity and effort to velocity."""
 
     def reset(self) -> None:
-        """Forget all past samples."""
+        """Forget all samples."""
 
     def update(self, t: float, position: float, velocity: float, effort: float) -> float:
         """Return the velocity at a sample [rad/s].
@@ -51,11 +51,7 @@ class VelocityEstimator(Protocol):
 
 
 class FilteredDifference:
-    """Backward difference through a first-order low-pass, v += (1 - exp(-dt/T)) (dx/dt - v).
-
-    Args:
-        time_constant: T [s].
-    """
+    """Backward difference through a first-order low-pass, v += (1 - exp(-dt/T)) (dx/dt - v), T in [s]."""
 
     def __init__(self, time_constant: float) -> None:
         self.time_constant = time_constant
@@ -68,7 +64,7 @@ class FilteredDifference:
         self._velocity = 0.0
 
     def update(self, t: float, position: float, velocity: float, effort: float) -> float:
-        """Return the filtered difference; the first sample takes the measured velocity [rad/s]."""
+        """Return the filtered difference; the measured velocity at the first sample [rad/s]."""
         if self._t is None:
             self._velocity = velocity
         else:
@@ -81,17 +77,14 @@ class FilteredDifference:
 
 
 class SavitzkyGolay:
-    """Derivative, at its newest sample, of a polynomial fitted to the last samples.
-
-    Args:
-        period: Sampling period [s].
+    """Derivative, at the newest sample, of a polynomial fitted to the last samples; ``period`` in [s].
 
     Source: Savitzky and Golay, Analytical Chemistry 36(8), 1964; coefficients by scipy.
     """
 
     def __init__(self, period: float) -> None:
         self.period = period
-        # Here, because it costs every controller 40 MB that few have a use for.
+        # Imported here, because it costs 40 MB that few controllers need.
         import scipy.signal
 
         weights = scipy.signal.savgol_coeffs(_WINDOW, _ORDER, deriv=1, delta=period, pos=_WINDOW - 1, use="dot")
@@ -106,7 +99,7 @@ class SavitzkyGolay:
     def update(self, t: float, position: float, velocity: float, effort: float) -> float:
         """Return the fitted velocity; the measured one until the window is full, and after a gap [rad/s]."""
         samples = self._unwrapped
-        # The coefficients hold for equal steps: after a gap in the samples the window restarts.
+        # The coefficients need equal steps: restart the window after a gap.
         if samples and not 0.5 * self.period < t - self._t < 1.5 * self.period:
             samples.clear()
         samples.append(position if not samples else samples[-1] + wrap(position - samples[-1]))
@@ -121,8 +114,8 @@ class SavitzkyGolay:
 class KalmanVelocity:
     """Stationary Kalman filter on the plant linearised at upright, correcting from positions only.
 
-    Motor, spring, lag and torques on their way are in its model. Gravity is taken from the true sine, so that the
-    filter also holds far from upright.
+    The model has motor, spring, lag and torques in transit, and gravity as the true sine, so that it also holds far
+    from upright.
 
     Args:
         plant: Plant parameters.
@@ -139,7 +132,7 @@ class KalmanVelocity:
         prompt = discretise(replace(model, delay=0.0), period)
         drive = prompt.B * torque_noise
         self._gain = kalman_gain(prompt.A, np.eye(1, n), drive @ drive.T, [[position_noise**2]]).L[:, 0]
-        # Without gravity the step is exact for any angle; gravity joins on the link, as the sine that it is.
+        # Without gravity the step is exact for any angle; gravity acts on the link, as a sine.
         free = linearise(plant.with_values(gravity=0.0, torque_offset=0.0))
         sampled = discretise(free, period)
         self._A, self._on_their_way = sampled.A[:n, :n], sampled.A[:n, n:]
@@ -151,12 +144,12 @@ class KalmanVelocity:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the estimate; no torque is on its way."""
+        """Forget the estimate and torques in transit."""
         self._estimate: NDArray[np.float64] | None = None
         self._sent.extend([0.0] * (self._sent.maxlen or 0))
 
     def update(self, t: float, position: float, velocity: float, effort: float) -> float:
-        """Return the filtered velocity; the first sample takes the measured one [rad/s]."""
+        """Return the filtered velocity; the measured one at the first sample [rad/s]."""
         plant = self._plant
         at = position if self._estimate is None else float(self._estimate[0])
         push = plant.gravity * math.sin(at - plant.angle_offset) + plant.torque_offset
@@ -168,13 +161,13 @@ class KalmanVelocity:
         self._sent.append(effort)
         turn = position - wrap(position - float(x[0])) - float(x[0])
         x = x + self._gain * wrap(position - float(x[0]))
-        # Angles stay on the turn on which they are measured, the motor's and the link's.
+        # Motor and link angles stay on the measured turn.
         x[[index for index, name in enumerate(self._states) if name in {"theta", "motor_angle"}]] += turn
         self._estimate = x
         return float(x[1])
 
     def _first(self, state: str, position: float, velocity: float, push: float) -> float:
-        """Return a state of the plant when first seen: no torque in the actuator, the link carried by the spring."""
+        """Return a state at the first sample: no torque in the actuator, the link carried by the spring."""
         drive = self._plant.drivetrain
         if state == "motor_angle" and drive is not None:
             return position + spring_deflection(-push, drive.stiffness, drive.stiffness_hardening)

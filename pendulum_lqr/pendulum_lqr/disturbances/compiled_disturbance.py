@@ -1,4 +1,4 @@
-"""A disturbance in compiled code: what its torques depend on and change is lent to a loop, and taken back."""
+"""A disturbance in compiled code: its state is lent to a loop, and taken back."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ DISTURBING = np.dtype(
     ],
     align=True,
 )
-"""``count`` intervals are known; the newest follows them in a ring. ``duration_ns`` is 0 for one without an end."""
+"""``count`` intervals are known; the newest follows them in a ring. ``duration_ns`` is 0 for no end."""
 
 
 class CompiledDisturbance:
     """Publishes uniform noise or zero, :class:`pendulum_msgs_py.loops.answer_record.Answerer`.
 
     Args:
-        loops: A loop for each joint; one joint alone is compiled.
-        ready: Returns whether nothing is left to be done before a torque.
-        refusal: Why no loop is used; empty where one is.
+        loops: A loop for each joint; only a single joint is compiled.
+        ready: Returns whether the next torque needs no other work.
+        refusal: Why no loop is used, or empty.
     """
 
     def __init__(self, loops: Sequence[DisturbanceLoop], ready: Callable[[], bool], refusal: str = "") -> None:
@@ -51,7 +51,7 @@ class CompiledDisturbance:
             self.kind = LoopKind(DISTURBING, "pendulum_lqr.disturbances.disturbance_kernel:uniform_loop", ())
 
     def lend(self, own: Any) -> bool:
-        """Write what torques depend on into a record; return whether the next state may be a nominal one."""
+        """Write the state of the torques into a record; return whether the next state may be a nominal one."""
         loop, signal = self._loop, self._loop.signal
         if not isinstance(signal, UniformNoise):
             self.refusal = "only uniform noise is compiled"

@@ -1,8 +1,8 @@
 """Disturbance torques as pure functions of (parameters, seed, time since the start).
 
-Time is an integer of nanoseconds and a random signal is a function of (seed, sample index), so simulator, hardware and
-replay get the same torque at the same time, independent of the loop and its rate. A random signal changes every
-``hold_time``; how long a sample is held matters more to the response than the plant does, so it is always explicit.
+Time is in integer nanoseconds and random signals are functions of (seed, sample index), so simulator, hardware and
+replay get the same torque at the same time, at any loop rate. A random signal changes every ``hold_time``, which
+affects the response more than the plant does, so it is always explicit.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 _MOST_BANDWIDTH = 0.25
-"""Bandwidth of coloured noise per rate of its samples, up to which its -3 dB point lies where it should [-]."""
+"""Largest bandwidth of coloured noise per sample rate, up to which its -3 dB point is accurate [-]."""
 
 # Taps (1-based) of maximum-length shift registers; P. Alfke, Xilinx XAPP 052, 1996, table 3.
 _TAPS: dict[int, tuple[int, ...]] = {
@@ -43,15 +43,15 @@ _TAPS: dict[int, tuple[int, ...]] = {
 
 
 Disturbance = Callable[[int], float]
-"""A torque over time: from the time since the start [ns] to the torque [N m]; 0 before the start."""
+"""From the time since the start [ns] to the torque [N m]; 0 before the start."""
 
 
 def make_disturbance(values: Mapping[str, object], recorded: Disturbance | None = None) -> Disturbance:
-    """Return the disturbance that a set of parameters describes.
+    """Return the disturbance that parameters of ``DISTURBANCE_SPECS`` describe; others have defaults.
 
     Args:
-        values: Parameters of ``DISTURBANCE_SPECS``; others at their default.
-        recorded: The signal of kind ``from_bag``, made by :func:`from_bag` from what a recording holds.
+        values: Parameters.
+        recorded: Signal of kind ``from_bag``, made by :func:`from_bag`.
 
     Raises:
         ParameterError: A value is refused, or ``from_bag`` lacks its recording.
@@ -71,21 +71,16 @@ def make_disturbance(values: Mapping[str, object], recorded: Disturbance | None 
 
 
 def torques(disturbance: Disturbance, elapsed_ns: ArrayLike) -> NDArray[np.float64]:
-    """Return the torques at many times, shape as given [N m].
-
-    Args:
-        disturbance: The signal.
-        elapsed_ns: Times since the start, integers [ns].
-    """
+    """Return the torques at many times since the start [ns], shape as given [N m]."""
     times = np.asarray(elapsed_ns, dtype=np.int64)
     flat = [disturbance(int(time)) for time in times.ravel()]
     return np.array(flat, dtype=np.float64).reshape(times.shape)
 
 
 def from_bag(elapsed_ns: ArrayLike, values: ArrayLike) -> Disturbance:
-    """Return the replay of a recorded torque: each value from its time on until the next; 0 before and after.
+    """Return the replay of a recorded torque: each value until the next; 0 before and after.
 
-    The last value is held as long as the one before it.
+    The last value lasts as long as the one before.
 
     Args:
         elapsed_ns: Times since the start of the disturbance, increasing integers, shape (n,) [ns].
@@ -120,20 +115,14 @@ def from_bag(elapsed_ns: ArrayLike, values: ArrayLike) -> Disturbance:
 
 @dataclass(frozen=True)
 class UniformNoise:
-    """Independent samples, uniform in [-amplitude, amplitude].
-
-    Attributes:
-        seed: Of the samples.
-        amplitude: Largest torque [N m].
-        hold_ns: How long each is held [ns].
-    """
+    """Independent samples, uniform in [-amplitude, amplitude] [N m], each held for ``hold_ns`` [ns]."""
 
     seed: int
     amplitude: float
     hold_ns: int
 
     def __call__(self, time_ns: int) -> float:
-        """Return the torque so long after the start [N m]."""
+        """Return the torque at a time since the start [N m]."""
         return 0.0 if time_ns < 0 else float(noise.uniform(self.seed, time_ns // self.hold_ns, self.amplitude))
 
 
@@ -142,7 +131,7 @@ def _uniform(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
 
 
 def _gaussian(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
-    """White normal samples through a Gaussian window of finite length, so that sample i needs no history.
+    """White normal samples through a finite Gaussian window, so that sample i needs no history.
 
     The window exp(-t^2 / 2 sigma^2) has its -3 dB point at f = sqrt(ln 2) / (2 pi sigma); weights have unit energy.
     """
@@ -203,7 +192,7 @@ def _prbs(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
 
 
 def _require_sampled(name: str, frequency: float, hold_ns: int) -> None:
-    """Refuse a frequency that samples held so long show as another one, or as nothing at all (Shannon's limit)."""
+    """Refuse a frequency that the held samples would alias (Shannon's limit)."""
     if 2.0 * frequency * hold_ns >= NANOSECONDS:
         raise ParameterError(
             f"{name} is {frequency:g} Hz with hold_time {hold_ns / NANOSECONDS:g} s, whose samples would show another "
@@ -257,7 +246,7 @@ def _step(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
 
 
 def _pulse_train(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
-    """Pulses of pulse_width, once per 1/frequency, alternating in sign so that they push to both sides."""
+    """Pulses of pulse_width, once per 1/frequency, alternating in sign."""
     amplitude, start, width, period = p["amplitude"], p["start_time"], p["pulse_width"], 1.0 / p["frequency"]
     if width > period:
         raise ParameterError(f"pulse_width is {width} s; expected at most 1/frequency = {period:g} s")
@@ -271,7 +260,7 @@ def _pulse_train(p: Mapping[str, Any], hold_ns: int) -> Disturbance:
     def signal(t: float) -> float:
         if t < start:
             return 0.0
-        # A time that is a whole number of periods must not land in the pulse before by rounding.
+        # Rounding must not put a whole number of periods into the pulse before.
         count = math.floor((t - start) / period + 1e-9)
         if t - start - count * period >= width - 1e-12:
             return 0.0
@@ -286,7 +275,7 @@ class DisturbanceKind(NamedTuple):
     Attributes:
         make: From the checked parameters and the hold time [ns] to the torque.
         random: Whether it is a sequence of samples, and so needs a hold time.
-        parameters: Those that it alone has.
+        parameters: Parameters of this kind alone.
     """
 
     make: Callable[[Mapping[str, Any], int], Disturbance]
@@ -304,7 +293,7 @@ DISTURBANCES: dict[str, DisturbanceKind] = {
     "step": DisturbanceKind(_step),
     "pulse_train": DisturbanceKind(_pulse_train),
 }
-"""Kinds that follow from parameters alone; ``from_bag`` needs a recording and is made by :func:`from_bag`."""
+"""Kinds that follow from parameters alone; ``from_bag`` is made by :func:`from_bag`."""
 
 DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
@@ -376,4 +365,4 @@ DISTURBANCE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("pulse_width", 0.1, "s", "Length of each pulse of pulse_train.", minimum=0.0, exclusive_minimum=True),
     *(spec for kind in DISTURBANCES.values() for spec in kind.parameters),
 )
-"""Parameters of every kind; each kind reads those that it needs."""
+"""Parameters of all kinds."""

@@ -1,4 +1,4 @@
-"""The compiled loop of a disturbance, for the compiler's process alone."""
+"""Compiled loop of a disturbance, imported by the compiler's process only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["uniform_loop"]
 
 
 def uniform_loop() -> Any:
-    """Return the loop of uniform noise, or of none before its start and after its end, compiled."""
+    """Return the compiled loop of uniform noise, or of zero before its start and after its end."""
     scramble = compile_tree(noise.scramble, exact=True)
     unit_interval = compile_tree(noise.unit_interval, exact=True)
 

@@ -62,15 +62,14 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
     COMPILED,
     REALTIME_PRIORITY,
 )
-"""Parameters of the node itself, next to those of the signal."""
+"""Parameters of the node itself, without those of the signal."""
 
 
 class DisturbanceNode(PollingNode):
     """Publishes the disturbance for each new stamp of ``joint_states``.
 
-    Before the start and after the end it publishes zero, so that a plant in lockstep gets its reply and a plant in
-    real time never holds an old torque. Events ``noise_start`` and ``noise_end`` mark the first and the last state
-    that is disturbed.
+    Before the start and after the end it publishes zero, so that a plant in lockstep gets its reply and a plant in real
+    time never holds an old torque. Events ``noise_start`` and ``noise_end`` mark the first and last disturbed state.
 
     Args:
         stop: Requests the runner to end the process.
@@ -83,7 +82,7 @@ class DisturbanceNode(PollingNode):
         self._full_name = self.get_fully_qualified_name()
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._joints = _joints(self._settings.values)
-        # One for each joint; all get the same states, so they start and end together.
+        # One per joint; all get the same states, so they start and end together.
         self._loops = [
             DisturbanceLoop(
                 signal,
@@ -131,8 +130,6 @@ class DisturbanceNode(PollingNode):
             loop.stop()
         self._publish_diagnostics()
 
-    # --- callbacks -----------------------------------------------------------------------------------------
-
     def _on_state(self, data: bytes) -> None:
         stamp_ns, names_of_state = stamp_of_state(data, self._joints)
         if stamp_ns is None:
@@ -149,7 +146,7 @@ class DisturbanceNode(PollingNode):
             self._tell(answers[0].event, stamp_ns)
 
     def _tell_others(self, found: tuple[str, ...]) -> None:
-        """Log once that the states are of other joints, since no disturbance acts then."""
+        """Log once that the states are of other joints, because then no disturbance acts."""
         if found and not self._told_others:
             self._told_others = True
             self.get_logger().error(
@@ -183,8 +180,6 @@ class DisturbanceNode(PollingNode):
         signals, duration = prepared
         for loop, signal in zip(self._loops, signals, strict=True):
             loop.replace(signal, duration)
-
-    # --- pieces --------------------------------------------------------------------------------------------
 
     def _tell(self, name: str, stamp_ns: int, **more: object) -> None:
         details = {spec.name: self._settings[spec.name] for spec in DISTURBANCE_SPECS}

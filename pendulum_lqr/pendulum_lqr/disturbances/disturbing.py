@@ -1,4 +1,4 @@
-"""When a disturbance acts: the disturbance node without ROS."""
+"""Timing of a disturbance: the disturbance node without ROS."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 __all__ = ["INTERVALS", "DisturbanceAnswer", "DisturbanceLoop"]
 
 INTERVALS = 31
-"""Intervals between states of which the median counts: few enough to follow a plant that was started again at another
-rate, enough that neither states lost on the way nor two that came close together make a difference."""
+"""Number of intervals whose median is used: few enough to follow a restart at another rate, enough that lost or bunched
+states have no effect.
+"""
 
 
 class DisturbanceAnswer(NamedTuple):
-    """Torque for one state, and the event that it marks (``noise_start``, ``noise_end`` or empty)."""
+    """Torque for one state, and its event (``noise_start``, ``noise_end`` or empty)."""
 
     torque: float
     event: str
@@ -29,13 +30,12 @@ class DisturbanceAnswer(NamedTuple):
 class DisturbanceLoop:
     """Turns stamps into torques: zero, then the signal from the first state after the start, then zero again.
 
-    The torque for a state acts until the next state, so the signal is taken at the middle of that interval.
-    A plant at the rate of the signal's holds whose stamps jitter by a fraction of a millisecond would otherwise read
-    the edges of the holds: some samples twice, others never, and not the signal that another plant gets.
+    The torque for a state acts until the next state, so the signal is sampled in the middle of that interval. At the
+    edges of its holds, jitter of the stamps would repeat some samples and skip others.
 
     Args:
-        signal: The disturbance.
-        duration: How long it acts [s]; 0 until it is stopped.
+        signal: Disturbance.
+        duration: [s]; 0 until it is stopped.
         simulated_time: A stamp before the newest means a new simulation.
         autostart: Start with the first state, of a new simulation too.
     """
@@ -63,7 +63,7 @@ class DisturbanceLoop:
         return self._armed or self.start_ns is not None
 
     def start(self) -> bool:
-        """Start with the next state; return False if it runs already."""
+        """Start with the next state; return False if it is running."""
         if self.running:
             return False
         self._armed = True
@@ -72,27 +72,23 @@ class DisturbanceLoop:
     def stop(self) -> bool:
         """End with the next state; return False if it was not running."""
         was_running = self.running
-        # The end is an event only where there was a beginning, and one that was not published yet stays pending.
+        # Only a started disturbance has an end event, and an unpublished one stays pending.
         self._ending |= self.start_ns is not None
         self._armed, self.start_ns = False, None
         return was_running
 
     def replace(self, signal: Disturbance, duration: float) -> None:
-        """Take another signal for the next start."""
+        """Set another signal for the next start."""
         self.signal = signal
         self.duration_ns = round(duration * NANOSECONDS)
 
     def answer(self, stamp_ns: int) -> DisturbanceAnswer | None:
-        """Return the torque for a state, or None for a state that already has its torque or was overtaken.
-
-        Args:
-            stamp_ns: Stamp of the state [ns].
-        """
+        """Return the torque for a state's stamp [ns], or None for a state with a torque already or an old one."""
         newest = self.newest_stamp_ns
         if newest is not None and stamp_ns <= newest:
             if not self._simulated_time or stamp_ns == newest:
                 self.refused += 1
-                # A plant in lockstep repeats a state if the reply did not reach it: send the same reply again.
+                # A plant in lockstep repeats a state if the reply was lost: send the same reply again.
                 return DisturbanceAnswer(self.last_torque, "") if self._simulated_time else None
             self._begin_anew()
         elif newest is not None:
@@ -100,7 +96,7 @@ class DisturbanceLoop:
         self.newest_stamp_ns = stamp_ns
         self.answered += 1
         event = ""
-        # One event a state: after an end that is still pending, a new start waits for the next state.
+        # One event per state: after a pending end, a new start waits for the next state.
         if self._armed and not self._ending:
             self._armed, self.start_ns = False, stamp_ns
             event = Event.NOISE_START
@@ -124,12 +120,7 @@ class DisturbanceLoop:
         return self.newest_stamp_ns is not None and not self._armed and not self._ending
 
     def count(self, stamps_ns: Sequence[int], torque: float) -> None:
-        """Record states that the compiled loop has replied to, the newest with a torque [N m].
-
-        Args:
-            stamps_ns: Their stamps, at least one, each after the one before it [ns].
-            torque: The last reply.
-        """
+        """Record the stamps [ns] of states answered by the compiled loop, the newest with a torque [N m]."""
         for stamp_ns in stamps_ns:
             assert self.newest_stamp_ns is not None
             self.intervals_ns.append(stamp_ns - self.newest_stamp_ns)
@@ -139,11 +130,11 @@ class DisturbanceLoop:
 
     @property
     def _interval_ns(self) -> int:
-        """The interval between states [ns]; 0 before the second one."""
+        """Interval between states [ns]; 0 before the second one."""
         return round(statistics.median_low(self.intervals_ns)) if self.intervals_ns else 0
 
     def _begin_anew(self) -> None:
-        """Forget the plant whose simulation has ended, so that the next one gets what this one got."""
+        """Forget the plant whose simulation has ended, so that the next one gets the same signal."""
         armed = self._armed or self._autostart
         self.stop()
         self._armed = armed
@@ -152,11 +143,7 @@ class DisturbanceLoop:
         self.intervals_ns.clear()
 
     def summary(self, now_ns: int) -> Mapping[str, object]:
-        """Return the figures for diagnostics; the rate is that since the last summary.
-
-        Args:
-            now_ns: Monotonic time [ns].
-        """
+        """Return the figures for diagnostics at a monotonic time [ns]; the rate is since the last summary."""
         before_ns, before = self._window
         elapsed = (now_ns - before_ns) / NANOSECONDS
         rate = (self.answered - before) / elapsed if before_ns and elapsed > 0.0 else math.nan

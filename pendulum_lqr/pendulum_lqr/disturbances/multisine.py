@@ -1,9 +1,7 @@
 """A multisine: a periodic sum of cosines with random phases, for measuring a frequency response.
 
-All of its power lies on chosen lines, odd multiples of 1/period, and every whole period is the same: averaging over
-periods loses nothing to leakage, and what differs from period to period is noise. The lines that it leaves out stay
-silent in a linear plant; what shows up there is the plant's nonlinearity, such as friction.
-
+Its power is on chosen lines, odd multiples of 1/period, so averaging over periods has no leakage, and differences
+between periods are noise. Other lines are silent in a linear plant; power there shows nonlinearity, such as friction.
 Source: Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., 2012, sections 2.7 and 4.3.
 """
 
@@ -22,16 +20,13 @@ from pendulum_msgs_py.errors import ParameterError
 __all__ = ["multisine_harmonics", "multisine_phases", "multisine_wave"]
 
 _CANDIDATES = 32
-"""Sets of random phases of which the flattest signal is taken: same power, smaller peaks."""
+"""Sets of random phases, of which the one with the smallest peak is used."""
 
 
 def multisine_harmonics(parameters: Mapping[str, Any]) -> NDArray[np.int64]:
     """Return the excited lines as odd multiples of 1/signal_period, evenly spread over the octaves, shape (n,).
 
-    Fewer than ``lines`` where two would fall on one multiple.
-
-    Args:
-        parameters: ``signal_period`` [s], ``frequency``, ``frequency_end`` [Hz] and ``lines`` of a disturbance.
+    Coinciding lines are merged. Reads ``signal_period`` [s], ``frequency``, ``frequency_end`` [Hz] and ``lines``.
 
     Raises:
         ParameterError: No odd multiple lies in the band.
@@ -58,12 +53,7 @@ def multisine_harmonics(parameters: Mapping[str, Any]) -> NDArray[np.int64]:
 
 
 def multisine_phases(harmonics: NDArray[np.int64], seed: int) -> NDArray[np.float64]:
-    """Return the phases of the lines, shape (n,) [rad]: the flattest of 32 random sets of a seed.
-
-    Args:
-        harmonics: Lines as multiples of 1/period, shape (n,).
-        seed: One seed is one signal.
-    """
+    """Return the phases of the lines, shape (n,) [rad]: the set with the smallest peak of 32 random ones."""
     n, size = harmonics.size, 1 << max(6, math.ceil(math.log2(8.0 * float(harmonics[-1]))))
     if size > 1 << 18:
         return noise.uniform_array(seed, 0, n, math.pi)
@@ -77,18 +67,15 @@ def multisine_phases(harmonics: NDArray[np.int64], seed: int) -> NDArray[np.floa
 
 
 def multisine_wave(parameters: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return angular frequencies [rad/s], phases [rad] and the common amplitude [N m] of the lines.
+    """Return angular frequencies [rad/s], phases [rad] and the common amplitude a [N m] of the lines.
 
-    The amplitude makes ``amplitude`` the largest torque: d(t) = a sum_k cos(omega_k t + phase_k).
-
-    Args:
-        parameters: Checked parameters of a disturbance.
+    ``amplitude`` is the largest torque of d(t) = a sum_k cos(omega_k t + phase_k).
     """
     harmonics = multisine_harmonics(parameters)
     phases = multisine_phases(harmonics, int(parameters["seed"]))
     size = 1 << max(8, min(18, math.ceil(math.log2(16.0 * float(harmonics[-1])))))
     peak = float(np.abs(_wave(harmonics, phases, size)).max())
-    # Between the points of the raster a sum of lines can rise above them by 1/cos(pi k/size) at most.
+    # Between raster points a sum of lines can exceed them by 1/cos(pi k/size) at most.
     peak /= math.cos(math.pi * float(harmonics[-1]) / size) if 4 * harmonics[-1] < size else 0.7
     omega = 2.0 * math.pi * harmonics.astype(np.float64) / float(parameters["signal_period"])
     return omega, phases, float(parameters["amplitude"]) / peak

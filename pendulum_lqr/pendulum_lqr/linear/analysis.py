@@ -1,7 +1,7 @@
-"""What a gain does: time constant, damping, margins, and how slowly one may sample.
+"""Time constant, damping, margins and largest sampling period of a gain.
 
-Margins are those of the loop cut at the plant's input, L(s) = K (s I - A)^-1 B exp(-s delay), by python-control. A gain
-of two numbers acts on what is measured, K [theta, theta_dot]; one of n numbers on the whole state.
+Margins are those of the loop cut at the plant's input, L(s) = K (s I - A)^-1 B exp(-s delay). Gains have shape (k,) on
+the k measured states or (n,) on all; of several inputs one row each.
 """
 
 from __future__ import annotations
@@ -40,11 +40,9 @@ _PERIOD_LIMIT = 1e3
 
 
 class Feedback(NamedTuple):
-    """A sampled law u = -K [y; sums of the outputs ``summed``, that of this sample included].
+    """Sampled law u = -K [y; sums of the outputs ``summed``, including this sample].
 
-    Attributes:
-        K: Gain, shape (k + sums,) or (m, k + sums); without sums also on the whole state.
-        summed: Indices of the outputs that are summed up.
+    K has shape (k + sums,) or (m, k + sums), and without sums may act on the whole state.
     """
 
     K: Array
@@ -56,11 +54,11 @@ class Margins:
     """Robustness of a loop.
 
     Attributes:
-        gain_up: Factor by which the gain may grow, inf if by any [-].
-        gain_down: Factor to which the gain may shrink, 0 if to nothing [-].
+        gain_up: Largest stable factor on the gain, or inf [-].
+        gain_down: Smallest stable factor on the gain, or 0 [-].
         phase: Smallest phase margin, nan if the loop never crosses 1 [rad].
         crossover: Angular frequency of that margin [rad/s].
-        delay: Largest extra delay in the loop before it becomes unstable, inf if any [s].
+        delay: Largest stable extra delay, or inf [s].
         modulus: Smallest distance of L(j w) from -1; at least 1 for a continuous LQR [-].
     """
 
@@ -74,18 +72,17 @@ class Margins:
 
 @dataclass(frozen=True, slots=True)
 class LoopReport:
-    """Everything the design table shows about one gain.
+    """Row of the design table.
 
     Attributes:
         K: Gain (theta, theta_dot, ...), of several inputs row by row [N m/rad, N m s/rad, ...].
         poles: Closed-loop eigenvalues without the plant's delay, slowest first [1/s].
-        stable: Whether the loop is stable, the plant's delay included.
+        stable: Whether the loop is stable, including the plant's delay.
         time_constant: -1 / (largest real part), inf if unstable [s].
         damping_ratio: Smallest damping ratio of the poles [-]; 1 for real stable ones.
         natural_frequency: Magnitude of the slowest pole [rad/s].
-        margins: Gain, phase, delay and modulus margins; None without feedback, and of several inputs, whose loop is
-            not cut at one.
-        largest_period: Largest sampling period under zero-order hold that stays stable [s]; None without feedback.
+        margins: None without feedback, and for several inputs.
+        largest_period: Largest stable sampling period under zero-order hold [s]; None without feedback.
     """
 
     K: tuple[float, ...]
@@ -105,22 +102,12 @@ class LoopReport:
 
 
 def closed_loop_poles(model: LinearModel, K: ArrayLike) -> NDArray[np.complex128]:
-    """Return the eigenvalues of A - B K, slowest first [1/s].
-
-    Args:
-        model: Linear model.
-        K: Gain, shape (k,) or (n,); a row for each of several inputs.
-    """
+    """Return the eigenvalues of A - B K, slowest first [1/s]."""
     return sort_poles(np.linalg.eigvals(model.A - model.B @ _on_state(model, K)))
 
 
 def analyse(model: LinearModel, K: ArrayLike | None) -> LoopReport:
-    """Return the figures of one gain; ``None`` means the plant without feedback.
-
-    Args:
-        model: Linear model.
-        K: Gain, shape (k,) or (n,); a row for each of several inputs.
-    """
+    """Return the report of a gain; None means the plant without feedback."""
     k, m = model.outputs_and_inputs
     gain = np.zeros((m, k)) if K is None else np.asarray(K, dtype=np.float64)
     poles = closed_loop_poles(model, gain)
@@ -140,13 +127,7 @@ def analyse(model: LinearModel, K: ArrayLike | None) -> LoopReport:
 
 
 def loop_transfer(model: LinearModel, K: ArrayLike, omega: ArrayLike) -> NDArray[np.complex128]:
-    """Return L(j omega) = K (j omega I - A)^-1 B exp(-j omega delay).
-
-    Args:
-        model: Linear model.
-        K: Gain, shape (k,) or (n,); a row for each of several inputs.
-        omega: Angular frequencies, shape (n,) [rad/s].
-    """
+    """Return L(j omega) at angular frequencies of shape (n,) [rad/s]."""
     s = 1j * np.asarray(omega, dtype=np.float64)
     pencil = s[:, None, None] * np.eye(model.A.shape[0]) - model.A
     states = np.linalg.solve(pencil, np.broadcast_to(model.B, (s.size, *model.B.shape)))[:, :, 0]
@@ -155,15 +136,10 @@ def loop_transfer(model: LinearModel, K: ArrayLike, omega: ArrayLike) -> NDArray
 
 
 def loop_margins(model: LinearModel, K: ArrayLike) -> Margins:
-    """Return the margins of the loop cut at the plant's input, the plant's delay included.
-
-    Args:
-        model: Linear model.
-        K: Gain, shape (2,) or (n,), that stabilises the model.
-    """
+    """Return the margins of a stabilising gain, including the plant's delay."""
     gain = _on_state(model, K)
     gains, phases, crossovers = (_rational_crossings if model.delay == 0.0 else _delayed_crossings)(model, gain)
-    # The gain margin at zero frequency: an unstable plant needs some gain at rest, |L(0)| > 1.
+    # Gain margin at zero frequency: an unstable plant needs |L(0)| > 1.
     rest = -float((gain @ np.linalg.lstsq(model.A, model.B, rcond=None)[0])[0, 0])
     down = [g for g in gains if g < 1.0] + ([-1.0 / rest] if rest < -1.0 else [])
     up = [g for g in gains if g > 1.0]
@@ -186,7 +162,7 @@ def loop_margins(model: LinearModel, K: ArrayLike) -> Margins:
 
 def _rational_crossings(model: LinearModel, gain: Array) -> tuple[Array, Array, Array]:
     """Return gain margins [-], phase margins [rad] and their frequencies [rad/s] of a loop without delay."""
-    # Imported late: python-control brings matplotlib, which a controller node has no use for.
+    # Imported late: python-control imports matplotlib, which controller nodes do not need.
     import control
 
     # det(sI - A + B K) = det(sI - A) (1 + L)
@@ -199,10 +175,9 @@ def _rational_crossings(model: LinearModel, gain: Array) -> tuple[Array, Array, 
 
 
 def _delayed_crossings(model: LinearModel, gain: Array) -> tuple[Array, Array, Array]:
-    """Return the same of a loop with delay, whose transfer function is not rational.
+    """Return the same for a loop with delay, whose transfer function is not rational.
 
-    The crossings are bracketed on a grid up to where the loop has long gone, and refined one by one: python-control
-    would lay a spline through the grid, which takes a thousand times as long.
+    Crossings are bracketed on a grid and refined one by one: python-control's spline takes a thousand times as long.
     """
     omega = np.logspace(-4, math.log10(_last_frequency(model, gain)), 20_001)
     loop = loop_transfer(model, gain[0], omega)
@@ -228,14 +203,14 @@ def _delayed_crossings(model: LinearModel, gain: Array) -> tuple[Array, Array, A
 def delayed_spectral_radius(
     model: LinearModel, K: ArrayLike, period: float, delay: float = 0.0, summed: Sequence[int] = ()
 ) -> float:
-    """Return the largest |pole| of the sampled loop that acts after a delay; stable if < 1.
+    """Return the largest |pole| of the sampled loop; stable if < 1.
 
     Args:
-        model: Linear model; its lags and its delay are in the loop.
-        K: Gain, shape (k,), (n,) or (m, n); with sums as of :class:`Feedback`.
+        model: Linear model, with its lags and delay.
+        K: Gain, shape (k,), (n,) or (m, n); with sums as in :class:`Feedback`.
         period: Sampling period [s].
-        delay: Time from state to torque, beyond the model's own [s].
-        summed: Indices of the outputs whose sums the last columns of K are for.
+        delay: Time from state to torque, in addition to the model's [s].
+        summed: Indices of the outputs whose sums the last columns of K act on.
     """
     sampled = discretise(model, period, delay)
     gain, sums = np.array(np.atleast_2d(K), dtype=np.float64), len(summed)
@@ -249,12 +224,7 @@ def delayed_spectral_radius(
 
 
 def largest_stable_period(model: LinearModel, K: ArrayLike) -> float:
-    """Return the first sampling period at which the held loop loses stability [s]; 0 if it never has it.
-
-    Args:
-        model: Linear model.
-        K: Gain, shape (k,) or (n,); a row for each of several inputs.
-    """
+    """Return the first sampling period at which the held loop loses stability [s]; 0 if it is never stable."""
 
     def stable(period: float) -> bool:
         return delayed_spectral_radius(model, K, period) < 1.0
@@ -264,7 +234,7 @@ def largest_stable_period(model: LinearModel, K: ArrayLike) -> float:
     low = max(1e-3 / max(fastest, 1e-3), model.delay / 40.0)
     if not stable(low):
         return 0.0
-    # Periods are tried in steps of 2 %, so that an unstable band is not jumped over, then refined.
+    # Steps of 2 %, so that no unstable band is skipped, then refinement.
     while low < _PERIOD_LIMIT:
         if not stable(1.02 * low):
             return last_to_hold(stable, low, 1.02 * low)[0]
@@ -273,13 +243,7 @@ def largest_stable_period(model: LinearModel, K: ArrayLike) -> float:
 
 
 def last_to_hold(holds: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
-    """Return two neighbouring numbers, of which the lower one has a property and the higher one has not.
-
-    Args:
-        holds: Returns whether a number has it.
-        low: One that has.
-        high: One that has not.
-    """
+    """Return neighbouring numbers between ``low``, which has a property, and ``high``, which has not, by bisection."""
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if holds(middle) else (low, middle)
@@ -293,17 +257,12 @@ def _on_state(model: LinearModel, K: ArrayLike) -> NDArray[np.float64]:
 
 
 def bears_its_delay(model: LinearModel, K: ArrayLike) -> bool:
-    """Return whether a loop that is stable without the plant's delay stays so with it.
-
-    Args:
-        model: Linear model.
-        K: Gain, shape (k,) or (n,); a row for each of several inputs.
-    """
+    """Return whether a loop that is stable without the plant's delay is stable with it."""
     return model.delay < loop_margins(replace(model, delay=0.0), K).delay
 
 
 def _last_frequency(model: LinearModel, gain: NDArray[np.float64]) -> float:
-    """Return a frequency beyond which the loop has fallen below 1/100 [rad/s]."""
+    """Return a frequency beyond which the loop gain is below 1/100 [rad/s]."""
     omega = np.logspace(0, 7, 400)
     loud = np.abs(loop_transfer(model, gain[0], omega)) > 0.01
     return float(omega[min(int(np.max(np.nonzero(loud)[0], initial=0)) + 1, omega.size - 1)])

@@ -1,12 +1,12 @@
-"""The quadratic program of a linear MPC, with inputs alone as its unknowns, by OSQP; for any number of inputs.
+"""Quadratic program of a linear MPC with inputs as its only unknowns, solved by OSQP, for any number of inputs.
 
 ::
 
     u_k = v_k - K x_k,   x_(k+1) = (A - B K) x_k + B v_k,   K, S of the discrete LQR
     J = x_0' S x_0 + sum of v_k' (R + B' S B) v_k
 
-The unknown v is what the limits subtract from the LQR. Powers of A itself would grow with the plant's unstable modes:
-over a second of an acrobot's they are 1e5, squared in a Hessian 1e10, and the solver's results silently wrong.
+The unknown v is what the limits subtract from the LQR. Powers of A itself grow with the plant's unstable modes: 1e5 in
+a second of an acrobot, 1e10 in the Hessian, and the solver's results would be silently wrong.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ __all__ = ["CondensedMpc"]
 Matrix = NDArray[np.float64]
 
 _TOLERANCE = 1e-4
-"""Of the limit of an input or a state, and of the largest number in it; a hundredth takes ten times as long."""
+"""Relative to the limit of an input or state, and to the largest number in it; 1e-6 takes ten times as long."""
 
 
 class CondensedMpc:
     """Minimises the cost of the discrete LQR under limits of inputs and states over N samples.
 
-    Limits of inputs are hard. Limits of states are soft, one slack for each, because a hard state limit is infeasible
-    once a disturbance has broken it.
+    Input limits are hard. State limits are soft, with one slack each, because hard ones are infeasible once a
+    disturbance has violated them.
 
     Args:
         model: Sampled model, m inputs.
         gain: Its discrete LQR.
-        r: Cost of the inputs of a sample, shape (m, m).
+        r: Input cost of a sample, shape (m, m).
         horizon: N.
-        limited: Largest magnitude, > 0, of each state that is limited, by its index.
-        largest: Size of the largest inputs, shape (m,), > 0.
-        slack_weight: Cost of the square of the most by which a limit is broken.
+        limited: Largest magnitude, > 0, of each limited state, by its index.
+        largest: Magnitude of the largest inputs, shape (m,), > 0.
+        slack_weight: Cost of the squared largest violation of a limit.
 
     Raises:
-        DesignError: The numbers lie too far apart for the solver.
+        DesignError: The scales differ too much for the solver.
 
     Source:
         Rossiter, Kouvaritakis, Rice, A numerically robust state-space approach to stable-predictive control
@@ -69,8 +69,8 @@ class CondensedMpc:
         self._K = np.atleast_2d(gain.K) / self._scale[:, None]
         B = model.B * self._scale
         free, forced = _predictions(model.A - B @ self._K, B, n)
-        # Variables: n m inputs beyond the LQR's, then a slack for each limited state. Each is counted in its limit, and
-        # the cost in that of an input, so that a solver's tolerance means the same for 0.09 N m as for 10 N.
+        # Variables: n m inputs added to the LQR's, then a slack per limited state. Variables are scaled by their limits
+        # and the cost by that of an input, so that the tolerance means the same for 0.09 N m and 10 N.
         weight = np.outer(self._scale, self._scale) * (r + model.B.T @ gain.S @ model.B)
         one = float(np.trace(weight)) / m
         slack_cost = slack_weight * np.array(list(limited.values())) ** 2
@@ -97,7 +97,7 @@ class CondensedMpc:
         self.reset()
 
     def reset(self) -> None:
-        """Set the solver up again: its warm start and step size from past states would affect the next results."""
+        """Set the solver up again: warm start and step size from past states would affect the next results."""
         lower, upper = self._bounds(np.zeros(self.size), -self._scale, self._scale)
         self._solver = osqp.OSQP()
         try:
@@ -112,7 +112,7 @@ class CondensedMpc:
                 eps_rel=_TOLERANCE,
                 max_iter=1000,
                 polishing=False,
-                # By iterations: an adaptation by elapsed time would make results depend on the machine's load.
+                # By iterations: adaptation by elapsed time would make results depend on the machine's load.
                 adaptive_rho=1,
                 adaptive_rho_interval=50,
             )
@@ -123,21 +123,15 @@ class CondensedMpc:
             ) from error
 
     def first(self, state: Matrix, low: Matrix, high: Matrix) -> Matrix | None:
-        """Return the first inputs of the plan, shape (m,), or None where the solver finds none.
-
-        Args:
-            state: Of the sampled model.
-            low: Smallest inputs, shape (m,).
-            high: Largest inputs, shape (m,).
-        """
+        """Return the first inputs of the plan within ``low`` and ``high``, shapes (m,), or None without a solution."""
         lower, upper = self._bounds(state, low, high)
         if (lower <= 0.0).all() and (upper >= 0.0).all():
-            # The LQR's own way meets no limit, so nothing is better: v = 0.
+            # The LQR's path violates no limit, so v = 0 is optimal.
             lqr: Matrix = -self._scale * (self._K @ state)
             return lqr
         if not np.abs(self._free_inputs @ state).max() * _TOLERANCE < 1.0:
             # The LQR's inputs are so large that the tolerance is a whole limit: signs would be arbitrary. With NaN the
-            # solver would keep its previous data and return their solution.
+            # solver would silently keep its previous data.
             return None
         self._solver.update(l=lower, u=upper)
         result = self._solver.solve(raise_error=False)

@@ -1,7 +1,7 @@
-"""Optimal gains in continuous time: LQR, LQI, output feedback; the Kalman filter; and the checks of a design.
+"""Optimal gains in continuous time (LQR, LQI, output feedback), the Kalman filter, and checks of a design.
 
-Riccati equations are solved by scipy. python-control is imported only for margins and plots
-(:mod:`pendulum_lqr.linear.analysis`), because it imports matplotlib, which a controller on a robot should not need.
+scipy solves the Riccati equations. python-control is imported only for margins and plots (:mod:`.analysis`), because it
+imports matplotlib, which a controller on a robot does not need.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ __all__ = [
 Matrix = NDArray[np.float64]
 
 _RANK_TOLERANCE = 1e-9
-"""Smallest singular value, relative to the norm, under which a mode counts as out of reach."""
+"""Smallest singular value, relative to the norm, of a reachable mode."""
 
 
 _DISCOUNTS = 60
-"""Discounts that are tried until an output feedback is stable."""
+"""Largest number of discounts tried until an output feedback is stable."""
 
 
 class DesignError(ParameterError):
@@ -67,12 +67,7 @@ class Gain:
 
 @dataclass(frozen=True, slots=True)
 class KalmanGain:
-    """Stationary Kalman filter.
-
-    Attributes:
-        L: Filter gain that corrects a prediction, shape (n, outputs).
-        P: Covariance of the prediction, shape (n, n).
-    """
+    """Stationary Kalman filter: correction gain L, shape (n, outputs), and prediction covariance P, shape (n, n)."""
 
     L: Matrix
     P: Matrix
@@ -113,13 +108,12 @@ def continuous_lqr(model: LinearModel, q: ArrayLike, r: ArrayLike) -> Gain:
     """Return the gain on the whole state that minimises the integral of x' Q x + u' R u.
 
     Args:
-        model: Linear model; its delay is ignored, the margins show how much of it the loop tolerates.
-        q: Weights of the measured states, [theta, theta_dot] of one joint; the others cost nothing. See
-            :func:`cost_matrices`.
+        model: Linear model, without its delay; the margins show how much of it the loop tolerates.
+        q: Weights of the measured states, as in :func:`cost_matrices`; hidden states cost nothing.
         r: Weight of the efforts, > 0: one for all, or m.
 
     Raises:
-        DesignError: Weights out of domain, or a mode that torque cannot reach or that the cost does not see.
+        DesignError: Weights out of domain, or a mode that is uncontrollable or not in the cost.
 
     Source:
         Thesis, section 6.1; Anderson and Moore, Optimal Control, 1990, section 3.2.
@@ -138,20 +132,19 @@ def continuous_lqr(model: LinearModel, q: ArrayLike, r: ArrayLike) -> Gain:
 
 
 def output_lqr(model: LinearModel, q: ArrayLike, r: ArrayLike) -> Gain:
-    """Return the best gain on what is measured, u = -K [theta, theta_dot] of one joint.
+    """Return the best gain on the measured states, u = -K [theta, theta_dot] of one joint.
 
-    Where that is the whole state, it is the LQR. Where motor, spring or lags have states of their own, it is the gain
-    that costs least on average over releases of the resting plant from all positions and velocities: no gain on
-    measurements alone can be optimal for every start, and none has the LQR's guaranteed margins.
+    Without hidden states it is the LQR. With motor, spring or lags as hidden states, it minimises the average cost over
+    releases of the resting plant from all positions and velocities: no such gain is optimal for every start or has the
+    LQR's guaranteed margins.
 
     Args:
-        model: Linear model; its delay is not counted.
+        model: Linear model, without its delay.
         q: Weights of the k measured states.
         r: Weight of the efforts, > 0: one for all, or m.
 
     Returns:
-        K on the measured states, shape (k,) or (m, k); S (k, k) gives the cost to go of this gain, y' S y, from a
-        release at y.
+        K on the measured states, shape (k,) or (m, k); S (k, k) gives the cost to go, y' S y, from a release at y.
 
     Raises:
         DesignError: As :func:`continuous_lqr`; or no gain on the measurements stabilises the plant.
@@ -164,12 +157,7 @@ def output_lqr(model: LinearModel, q: ArrayLike, r: ArrayLike) -> Gain:
 
 
 def with_integrals(model: LinearModel, outputs: Sequence[int] = (0,)) -> LinearModel:
-    """Return the model with the integrals of some measured states as its last measured ones.
-
-    Args:
-        model: Linear model.
-        outputs: Which are integrated; of each driven joint the position, in the order of the joints.
-    """
+    """Return the model with the integrals of some measured states (by index) appended to the measured ones."""
     k, more = model.C.shape[0], len(outputs)
     size = model.A.shape[0] + more
     old = [*range(k), *range(k + more, size)]
@@ -192,7 +180,7 @@ def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike
         measurement: Covariance of v, shape (m, m), positive definite.
 
     Raises:
-        DesignError: The outputs do not show every mode that the noise drives, or a covariance is out of domain.
+        DesignError: A driven mode is unobservable, or a covariance is out of domain.
     """
     A = np.asarray(A, dtype=np.float64)
     C = np.atleast_2d(np.asarray(C, dtype=np.float64))
@@ -201,7 +189,7 @@ def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike
     for name, covariance in (("process", W), ("measurement", V)):
         if np.all(np.isfinite(covariance)):
             variances = np.linalg.eigvalsh(covariance)
-        # A covariance of few causes has zeros, of which rounding makes small numbers of either sign.
+        # Covariances of few causes have zero eigenvalues, which rounding makes small numbers of either sign.
         if not np.all(np.isfinite(covariance)) or variances[0] < -1e-12 * np.abs(variances).max():
             raise DesignError(f"{name} noise covariance is {covariance.tolist()}; expected finite, not negative")
     if not float(np.linalg.eigvalsh(V)[0]) > 0.0:
@@ -216,32 +204,15 @@ def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike
 
 
 def require_controllable(A: Matrix, B: Matrix, *, discrete: bool = False) -> None:
-    """Refuse a system with an unstable mode that the input does not reach (Hautus test).
-
-    Args:
-        A: State matrix, shape (n, n).
-        B: Input matrix, shape (n, m).
-        discrete: Whether stability is meant on the z-plane.
-
-    Raises:
-        DesignError: Names the mode.
-    """
+    """Raise DesignError for an unstable mode that the input does not reach (Hautus test)."""
     pole = _unreached_mode(A, B, discrete=discrete)
     if pole is not None:
         raise DesignError(f"mode at {_number(pole)} is not controllable: no torque reaches it; expected B = [0, 1/M]")
 
 
 def require_observable(A: Matrix, C: Matrix) -> None:
-    """Refuse a sampled system with an unstable mode that the outputs do not show (Hautus test).
-
-    Args:
-        A: State matrix, shape (n, n).
-        C: Output matrix, shape (m, n).
-
-    Raises:
-        DesignError: Names the mode.
-    """
-    # The dual of controllability: what A' and C' do not reach, A and C do not show.
+    """Raise DesignError for an unstable mode of a sampled system that the outputs do not show (Hautus test)."""
+    # By duality.
     pole = _unreached_mode(A.T, C.T, discrete=True)
     if pole is not None:
         raise DesignError(
@@ -250,7 +221,7 @@ def require_observable(A: Matrix, C: Matrix) -> None:
 
 
 def _unreached_mode(A: Matrix, B: Matrix, *, discrete: bool) -> complex | None:
-    """Return a mode that neither decays by itself nor is reached by the input, by the rank of [s I - A, B]."""
+    """Return a mode that neither decays nor is reached by the input, by the rank of [s I - A, B]."""
     for pole in np.linalg.eigvals(A):
         if not _decays(pole, discrete) and _deficient(np.hstack([pole * np.eye(A.shape[0]) - A, B])):
             return complex(pole)
@@ -258,7 +229,7 @@ def _unreached_mode(A: Matrix, B: Matrix, *, discrete: bool) -> complex | None:
 
 
 def _lift(model: LinearModel) -> Matrix:
-    """Return the states of a plant at ease at each value of the k measured ones, shape (n, k): the motor follows."""
+    """Return the states at each value of the k measured ones when the motor follows the link, shape (n, k)."""
     k, size = model.C.shape
     lift = np.eye(size, k)
     for name, measured in (("motor_angle", 0), ("motor_velocity", 1)):
@@ -294,12 +265,12 @@ def _output_feedback(model: LinearModel, Q: Matrix, R: Matrix, full: Gain) -> Ga
         found = scipy.optimize.minimize(objective, (K / scale).ravel(), jac=True, method="BFGS", options=options)
         return np.asarray(found.x.reshape(scale.shape) * scale)
 
-    # What the full gain would do if the hidden states followed; smaller, should it excite what they really do.
+    # The full gain's effect if hidden states followed; smaller multiples in case it excites them.
     follow = full.rows @ lift
     scale = np.maximum(np.abs(follow), 1e-3 * float(np.max(np.abs(follow))))
     best = min((share * follow for share in (1.0, 0.7, 0.5, 0.3, 0.2, 0.1)), key=abscissa)
-    # A cost that is discounted by exp(-2 discount t) is finite for a loop that grows more slowly; less discount with
-    # every gain found leads to one that is stable.
+    # A cost discounted by exp(-2 discount t) is finite for a loop that grows more slowly; reducing the discount with
+    # every gain found leads to a stable one.
     for _ in range(_DISCOUNTS):
         if (growth := abscissa(best)) < -1e-9:
             break
@@ -315,7 +286,7 @@ def _output_feedback(model: LinearModel, Q: Matrix, R: Matrix, full: Gain) -> Ga
 
 
 def _of_inputs(K: Matrix) -> Matrix:
-    """Return a gain as ``Gain.K`` holds it: without its only row where there is one input."""
+    """Return a gain in the shape of ``Gain.K``: without its only row for one input."""
     return K[0] if len(K) == 1 else K
 
 
@@ -329,7 +300,7 @@ def _decays(pole: complex, discrete: bool) -> bool:
 
 
 def _deficient(pencil: NDArray[np.complex128]) -> bool:
-    # Rows of different units (rad against rad/s) are brought to one size first, else the fast pole hides the slow one.
+    # Rows of different units (rad and rad/s) are scaled first, else the fast pole hides the slow one.
     scaled = pencil / np.maximum(np.linalg.norm(pencil, axis=1, keepdims=True), 1e-300)
     scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=0, keepdims=True), 1e-300)
     values = np.linalg.svd(scaled, compute_uv=False)

@@ -1,17 +1,11 @@
-"""The linear model of the plant that runs, of one joint or several: links, motor, spring and lags of the actuators.
+"""Linear model of the plant that runs, of one joint or several: links, motor, spring and lags of the actuators.
 
-The equations are those of :mod:`pendulum_msgs_py.dynamics` and of the mechanism, which the simulator steps too; their
-derivatives come by complex step, exact to rounding. For a mechanism of n joints, m of them driven, that gives
+Derivatives of the simulator's equations by complex step, exact to rounding. For n joints, m of them driven:
 
     x = [q - q*, v],   x' = A x + B du,   A = [[0, I], [d v'/dq, d v'/dv]],   B = [0; d v'/d torque at driven joints]
 
-and for the rigid pendulum ``M_c theta'' + b_c theta' + G_c sin(theta) = u``
-
-    A = [[0, 1], [-G_c cos(theta*) / M_c, -b_c / M_c]],   B = [0, 1 / M_c]
-
-An actuator with a lag T adds the state tau' = (u - tau) / T. The transport delay is a number of the model.
-Only the smooth part of a plant is linearised: dry friction, end stops and the hysteresis of a spring have no derivative
-at rest. Designs neglect them; a simulation of the nonlinear closed loop shows what they cost.
+An actuator lag T adds the state tau' = (u - tau) / T; transport delay is a number of the model. Dry friction, end stops
+and spring hysteresis have no derivative at rest and are neglected: simulate the nonlinear loop to see their effect.
 """
 
 from __future__ import annotations
@@ -64,7 +58,7 @@ __all__ = [
 Matrix = NDArray[np.float64]
 
 _BALANCED = 1e-9
-"""Share of the largest torque of gravity under which a joint counts as balanced."""
+"""Share of the largest gravity torque below which a joint counts as balanced."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +73,14 @@ class LinearModel:
         theta: Angle of the fixed point, 0 hanging down [rad]; of several joints the last position.
         effort: Commanded torque that holds the fixed point [N m]; of several driven joints the first.
         C: Output matrix, shape (k, n).
-        E: Input matrix of a torque on each link itself, such as a push, shape (n, joints); without delay.
+        E: Input matrix of an external torque on each link, shape (n, joints); without delay.
         delay: Time between a command and its first effect [s], the longest of all actuators; not in A.
-        states: Names of the states: theta, theta_dot, then motor_angle and motor_velocity (at the output side of the
-            gears) of a series-elastic plant, then torque, the lagged command, of a plant with a lag. Of a mechanism
-            the joints, their velocities (``JOINT_dot``), then the lagged efforts (``JOINT_effort``).
-        position: The fixed point, one value for each joint [rad or m].
+        states: theta, theta_dot, then motor_angle and motor_velocity (at the output side of the gears) of a
+            series-elastic
+            plant, then torque, the lagged command. Of a mechanism the joints, their velocities (``JOINT_dot``), then
+            the
+            lagged efforts (``JOINT_effort``).
+        position: Fixed point, one value for each joint [rad or m].
         efforts: The m efforts that hold it [N m or N].
     """
 
@@ -100,7 +96,7 @@ class LinearModel:
     efforts: Vector = ()
 
     def __post_init__(self) -> None:
-        """Fill in outputs and the link's input, which two states alone determine."""
+        """Fill in the defaults of C and E for one joint without hidden states."""
         n = self.A.shape[0]
         if self.C is None:
             object.__setattr__(self, "C", np.eye(2, n))  # type: ignore[unreachable]
@@ -116,12 +112,12 @@ class LinearModel:
 
     @property
     def outputs_and_inputs(self) -> tuple[int, int]:
-        """K and m."""
+        """The numbers k and m."""
         return self.C.shape[0], self.B.shape[1]
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Names of the states that are measured."""
+        """Names of the measured states."""
         return self.states[: self.C.shape[0]]
 
     @property
@@ -131,23 +127,20 @@ class LinearModel:
 
 
 def sort_poles(poles: NDArray[Any]) -> NDArray[np.complex128]:
-    """Return the poles with the slowest (largest real part) first."""
+    """Return the poles, slowest (largest real part) first."""
     values = np.asarray(poles, dtype=np.complex128)
     return values[np.lexsort((values.imag, -values.real))]
 
 
 class _Body(NamedTuple):
-    """A plant without lags at a fixed point: what is linearised.
+    """Plant without lags at a fixed point, as it is linearised.
 
     Attributes:
-        states: Names.
-        at: Their values at the fixed point.
-        rates: Their derivatives, of the states, the efforts of m actuators, and a torque on each joint.
-        efforts: What holds the fixed point, m values.
+        rates: Derivatives of the states, from states, m actuator efforts and a torque on each joint.
+        efforts: The m efforts that hold the fixed point.
         lags: Lag of each actuator [s].
-        lag_states: Name of the state that each lag adds.
-        measured: Number of leading states that are measured.
-        joints: Number of joints.
+        lag_states: Name of the state of each lag.
+        measured: Number of measured (leading) states.
         delay: Longest transport delay [s].
     """
 
@@ -163,24 +156,23 @@ class _Body(NamedTuple):
 
 
 def linearise(plant: RigidPlant | PlantParameters, at: float | Sequence[float] | None = None) -> LinearModel:
-    """Return the linear model about the fixed point at an angle, of the plant that the simulator runs.
+    """Return the linear model of the simulator's plant about a fixed point.
 
-    A rigid plant of n joints has 2n states, a series-elastic one four; a first-order lag adds one for each actuator
-    that has it. Transport delay is the model's ``delay``: :func:`~pendulum_lqr.linear.sampled_design.discretise` and
-    margins count it.
+    A rigid plant of n joints has 2n states, a series-elastic one four; each first-order lag adds one. Transport delay
+    is the model's ``delay``, included by :func:`~pendulum_lqr.linear.sampled_design.discretise` and margins.
 
     Args:
-        plant: Plant parameters; dry friction, end stops and the spring's hysteresis are not in the linear model.
-        at: Position of the fixed point, 0 hanging down, of one joint or of each [rad or m]; None for upright. Of one
-            joint every angle is one, held by the torque ``effort``; a mechanism needs one that its driven joints hold.
+        plant: Plant parameters; dry friction, end stops and hysteresis are neglected.
+        at: Position of the fixed point, 0 hanging down, of one joint or of each [rad or m]; None for upright. One joint
+            can
+            be held at every angle; a mechanism only where its driven joints can hold it.
 
     Raises:
-        ParameterError: The position is not finite, has another length, or a passive joint would fall from it; or no
-            joint is driven.
+        ParameterError: The position is not finite, has another length, or a passive joint would fall; or no joint is
+            driven.
 
     Source:
-        Thesis, section 6.2 "Linearisation about the unstable fixed point"; equations of
-        :mod:`pendulum_msgs_py.dynamics`.
+        Thesis, section 6.2 "Linearisation about the unstable fixed point"; :mod:`pendulum_msgs_py.dynamics`.
     """
     position: Vector = ()
     if isinstance(plant, PlantParameters) and not plant.is_pendulum:
@@ -223,7 +215,7 @@ def holding_effort(plant: PlantParameters, position: Sequence[float] | None = No
     """Return the efforts of the driven joints that hold a mechanism at a position, m values [N m or N].
 
     Args:
-        plant: The plant.
+        plant: Plant.
         position: n positions; None for upright [rad or m].
 
     Raises:
@@ -233,7 +225,7 @@ def holding_effort(plant: PlantParameters, position: Sequence[float] | None = No
     n = len(q)
     p = plant.packed
     weight = np.array(complex_step(lambda *x: (in_arithmetic(plant.mechanism.potential, cmath)(x, p),), q))[0]
-    # Relative to the largest torque of gravity, so that sin(pi), which is 1.2e-16, counts as zero.
+    # Relative to the largest gravity torque, so that sin(pi), which is 1.2e-16, counts as zero.
     still = (0.0,) * n
     around = [tuple(value + 0.5 * turn for value in q) for turn in (-np.pi, np.pi, 0.0, 1.0)]
     forces = [np.array(plant.mechanism.mass(at, p)) @ plant.acceleration(at, still, still) for at in around]
@@ -250,16 +242,13 @@ def holding_effort(plant: PlantParameters, position: Sequence[float] | None = No
 
 
 def low_frequency(model: LinearModel) -> tuple[float, float, float]:
-    """Return (M, b, k) of the second-order plant M x'' + b x' + k x = u that moves alike where motion is slow.
+    """Return (M, b, k) of the second-order plant M x'' + b x' + k x = u that matches at low frequency, without delay.
 
-    Exact for a rigid plant; for others the leading terms of 1 / P(s), in units of the commanded torque. Bandwidths and
-    starts of searches come from it, never a claim of stability.
-
-    Args:
-        model: Linear model; its delay is not counted.
+    Exact for a rigid plant; else the leading terms of 1 / P(s). Used for bandwidths and starts of searches, never to
+    claim stability.
     """
     n = model.A.shape[0]
-    # theta = x^0 + x^1 s + ... as the response to the command that moves theta by 1 at s = 0, order by order in s.
+    # theta = x^0 + x^1 s + ... is the response to the command that moves theta by 1 at s = 0, order by order in s.
     system = np.block([[model.A, model.B], [np.eye(1, n), np.zeros((1, 1))]])
     answer = np.linalg.solve(system, np.append(np.zeros(n), 1.0))
     terms = [float(answer[n])]
@@ -270,14 +259,7 @@ def low_frequency(model: LinearModel) -> tuple[float, float, float]:
 
 
 def state_derivative(plant: RigidPlant, theta: Any, theta_dot: Any, effort: Any) -> tuple[Any, Any]:
-    """Return (theta', theta'') of the smooth rigid plant, in [rad/s] and [rad/s^2].
-
-    Args:
-        plant: Plant parameters.
-        theta: Angle, 0 hanging down, a number or an array [rad].
-        theta_dot: Velocity [rad/s].
-        effort: Torque [N m].
-    """
+    """Return (theta', theta'') of the smooth rigid plant [rad/s, rad/s^2], for numbers or arrays."""
     torque = effort + offset_of(plant, "torque_offset")
     angle = theta - offset_of(plant, "angle_offset")
     equation = in_arithmetic(rigid_acceleration, np)
@@ -292,15 +274,15 @@ def acceleration_from_upright(
     arithmetic: ModuleType = math,
     sign_velocity: float = 0.0,
 ) -> Any:
-    """Return theta'' of the rigid plant, offsets included, with numbers, arrays or symbols [rad/s^2].
+    """Return theta'' of the rigid plant, including offsets, for numbers, arrays or symbols [rad/s^2].
 
     Args:
-        plant: Plant parameters; lag and delay are not in it.
+        plant: Plant parameters, without lag and delay.
         angle: Measured angle from upright [rad].
         velocity: [rad/s].
         effort: Torque of the actuator [N m].
         arithmetic: ``math``, ``numpy`` or ``casadi``, matching the arguments.
-        sign_velocity: Width over which Coulomb friction changes its sign, as tanh [rad/s]; 0 leaves it out.
+        sign_velocity: Width of the smoothed sign (tanh) of Coulomb friction [rad/s]; 0 neglects it.
     """
     torque = effort + plant.torque_offset
     if sign_velocity > 0.0 and plant.coulomb_friction > 0.0:

@@ -1,7 +1,7 @@
-"""Estimates of what is not measured: motor, spring and lags, and unknown constant efforts; of any number of joints.
+"""Observer of hidden states (motor, spring, lags) and unknown constant efforts, of any number of joints.
 
-A stationary Kalman filter of the sampled linear model. Efforts that are on their way are known, since they were sent;
-constant efforts d add to the commands and are modelled as random walks (disturbance observer):
+A stationary Kalman filter of the sampled linear model. Efforts in transit are known; constant efforts d add to the
+commands and are modelled as random walks (disturbance observer):
 
     x[k+1] = A x[k] + B (u - u* + d) + E w[k],   d[k+1] = d[k] + w',   y = [q - q*, v] + noise
 
@@ -30,23 +30,25 @@ __all__ = ["Observer"]
 Array = NDArray[np.float64]
 
 _FOLLOWS = {"motor_angle": 0, "motor_velocity": 1}
-"""Measured state that a hidden one of a plant at ease follows."""
+"""Measured state that a hidden one follows at rest."""
 
 
 class Observer:
-    """Estimate of deviations from a fixed point: states, efforts on their way, constant efforts.
+    """Estimate of deviations from a fixed point: states, efforts in transit, constant efforts.
 
     Args:
         model: Linear model at the fixed point.
         coordinates: Joints, and which of them are driven.
         period: Sampling period [s].
-        p: Standard deviations ``position_noise`` [rad or m], ``velocity_noise`` [rad/s or m/s], 0 where velocities are
-            not used, and ``effort_noise`` of the unknown effort on every joint [N m or N]; ``offset_noise``, how fast
-            constant efforts may wander, 0 for none [N m/s^0.5]; ``delay`` beyond the model's own [s]. Without
-            ``position_noise`` what is measured is taken as it is, and the rest is predicted.
+        p: Standard deviations ``position_noise`` [rad or m], ``velocity_noise`` [rad/s or m/s], 0 to ignore velocities,
+            and
+            ``effort_noise`` of the unknown effort on every joint [N m or N]; drift ``offset_noise`` of constant
+            efforts, 0 for
+            none [N m/s^0.5]; ``delay`` in addition to the model's [s]. Without ``position_noise`` measurements are used
+            unfiltered, and the rest is predicted.
 
     Attributes:
-        gain: L; None where what is measured is taken as it is.
+        gain: L; None for unfiltered measurements.
     """
 
     def __init__(self, model: LinearModel, coordinates: Coordinates, period: float, p: Mapping[str, Any]) -> None:
@@ -86,7 +88,7 @@ class Observer:
         self._A = A
 
     def reset(self) -> None:
-        """Forget everything: no effort is on its way."""
+        """Forget the estimate and efforts in transit."""
         self._estimate: Array | None = None
         self._sent.extend([0.0] * (self.pending * len(self._hold)))
 
@@ -98,9 +100,9 @@ class Observer:
         return self._estimate[self._n :]
 
     def correct(self, off: Vector, velocity: Vector) -> Array:
-        """Take a measurement and return [x; efforts on their way], as the gain of a design needs it, shape (n + p m,).
+        """Process a measurement and return [x; efforts in transit] for the gain of a design, shape (n + p m,).
 
-        Efforts are relative: the deviation from those that hold, the constant ones included.
+        Efforts are deviations from the holding ones, including constant efforts.
 
         Args:
             off: Measured deviations from the fixed point [rad or m].
@@ -130,19 +132,19 @@ class Observer:
         return np.concatenate([estimate[: self._n], moving])
 
     def predict(self, efforts: Vector) -> None:
-        """Move on by a period in which m efforts were sent [N m or N]."""
+        """Predict over a period in which m efforts were sent [N m or N]."""
         assert self._estimate is not None
         estimate = self._A @ self._estimate
         change = self._B @ (np.array(efforts) - self._hold)
         if self.pending:
             change = self._on_their_way @ (np.array(self._sent) - self._hold_of_all) + change
         estimate[: self._n] += change
-        # What was measured beyond all bounds once must not be remembered for ever.
+        # Forget a measurement beyond all bounds.
         self._estimate = estimate if math.isfinite(estimate @ estimate) else None
         self._sent.extend(efforts)
 
     def carry_over(self, previous: Observer) -> None:
-        """Take over the estimate of another observer of the same plant, about its own fixed point."""
+        """Take over the estimate of another observer of the same plant about another fixed point."""
         if previous._estimate is None or previous._n != self._n:
             return
         estimate = np.zeros(len(self._A))
@@ -162,7 +164,7 @@ class Observer:
         self._sent.extend([0.0] * (self.pending * len(self._hold)) + list(previous._sent))
 
     def _held_by(self, lagged: str) -> float:
-        """Return the effort that holds at the actuator whose lagged effort is a state of this name [N m or N]."""
+        """Return the holding effort of the actuator of a lagged-effort state [N m or N]."""
         names = self._coordinates.driven_names
         joint = lagged.removesuffix("_effort")
         return float(self._hold[names.index(joint) if joint in names else 0])

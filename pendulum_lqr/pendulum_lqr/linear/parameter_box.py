@@ -1,4 +1,4 @@
-"""How a gain fares on every plant that the identification leaves possible: worst margins over a box or an ellipsoid."""
+"""Worst-case margins of a gain over the plants that an identification permits: a box or an ellipsoid."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["IDENTIFIED", "UNCERTAIN", "ParameterBox", "WorstCase", "parse_box", 
 UNCERTAIN = ("inertia", "damping", "gravity", "angle_offset", "actuator_time_constant", "transport_delay")
 """Parameters of the linear model that may be uncertain."""
 IDENTIFIED = "identified"
-"""Selects the intervals of the plant file, with the correlation of its identification if that file is next to it."""
+"""Selects the intervals of the plant file, with the correlations in the identification's JSON file if present."""
 
 _INSIDE = 48
 """Plants drawn within a box, in addition to its corners, or on an ellipsoid."""
@@ -36,12 +36,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ParameterBox:
-    """Between which values the parameters of a plant lie.
+    """Ranges of a plant's parameters.
 
     Attributes:
         bounds: Lowest and highest value by parameter, in its unit.
-        correlation: Of the errors, in the order of ``bounds``, shape (k, k); None takes every corner for possible.
-        source: Where this comes from, as text.
+        correlation: Of the errors, in the order of ``bounds``, shape (k, k); None permits every corner.
+        source: Origin, as text.
     """
 
     bounds: Mapping[str, tuple[float, float]]
@@ -49,10 +49,9 @@ class ParameterBox:
     source: str = "given"
 
     def plants(self, plant: PlantParameters) -> list[PlantParameters]:
-        """Return the plant itself and others that are possible: corners and inside, or the edge of the ellipsoid.
+        """Return the plant itself and others: corners and interior points, or the surface of the ellipsoid.
 
-        Without correlation every corner of the box is there. With it, the plants lie on the ellipsoid that holds 95 %
-        of all outcomes of such an identification, all parameters together.
+        With correlation, plants lie on the joint 95 % confidence ellipsoid of all parameters.
 
         Source:
             Johnson and Wichern, Applied Multivariate Statistical Analysis, 6th ed., 2007, section 5.4 (ellipsoid).
@@ -63,13 +62,13 @@ class ParameterBox:
             corners = np.array(list(itertools.product(*self.bounds.values())))
             values = np.vstack([corners, rng.uniform(low, high, (_INSIDE, low.size))])
         else:
-            # Standard errors from 95 % intervals of single parameters; the joint region reaches further.
+            # Standard errors from 95 % intervals of single parameters; the joint region is larger.
             half = 0.5 * (high - low) / float(scipy.special.ndtri(0.975))
             weights, axes = np.linalg.eigh(self.correlation)
             factor = axes * np.sqrt(np.maximum(weights, 0.0))
             ball = rng.standard_normal((2 * _INSIDE, low.size))
             ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-            # Along each axis too: there the ellipsoid reaches furthest, and a draw hardly ever hits it.
+            # Along each axis too: the ellipsoid extends furthest there, and draws hardly ever hit it.
             ball = np.vstack([ball, np.eye(low.size), -np.eye(low.size)])
             reach = math.sqrt(float(scipy.special.chdtri(low.size, 0.05)))
             centre = np.array([getattr(plant, name) for name in self.bounds])
@@ -79,7 +78,7 @@ class ParameterBox:
             changes = dict(zip(self.bounds, map(float, row), strict=True))
             for name, value in changes.items():
                 if name != "angle_offset":
-                    # No plant has less; an inertia of nothing is none.
+                    # Physical bounds; inertia must be positive.
                     changes[name] = max(value, 1e-3 * plant.inertia if name == "inertia" else 0.0)
             found.append(plant.with_values(**changes))
         return found
@@ -90,10 +89,10 @@ class WorstCase:
     """A gain over many plants.
 
     Attributes:
-        plants: How many were evaluated.
-        unstable: How many of them the gain does not hold.
-        margins: The worst of each margin over the plants; None if it holds none of them.
-        where: Parameters of the plant with the smallest modulus margin, or of the first that is not held.
+        plants: Number of plants.
+        unstable: Number of plants that the gain does not stabilise.
+        margins: The worst of each margin; None if no plant is stable.
+        where: Parameters of the plant with the smallest modulus margin, or of the first unstable one.
     """
 
     plants: int
@@ -112,7 +111,7 @@ def worst_case(plants: Sequence[PlantParameters], K: ArrayLike, theta: float, na
     Args:
         plants: At least one, of one structure.
         K: Gain on angle and velocity, shape (2,).
-        theta: Measured angle that is held, 0 hanging down [rad].
+        theta: Measured angle, 0 hanging down [rad].
         names: Parameters to report of the worst plant.
     """
     unstable, found = 0, []
@@ -149,16 +148,17 @@ def worst_case(plants: Sequence[PlantParameters], K: ArrayLike, theta: float, na
 
 
 def parse_box(texts: Sequence[str], plant: PlantParameters, path: Path | None = None) -> ParameterBox:
-    """Return the box that texts such as ``inertia=10%`` or ``transport_delay=0:0.01`` name.
+    """Return the box of texts such as ``inertia=10%`` or ``transport_delay=0:0.01``.
 
     Args:
-        texts: One a parameter: a share in percent to either side, or lowest and highest value in the parameter's unit;
-            or ``identified`` alone, for the intervals of the plant file.
-        plant: The nominal plant.
+        texts: Per parameter a percentage to either side, or lowest and highest value in its unit; or ``identified``
+            alone,
+            for the intervals of the plant file.
+        plant: Nominal plant.
         path: Its file; None for a preset.
 
     Raises:
-        ParameterError: A text that is none of these, or a plant file without intervals.
+        ParameterError: An invalid text, or a plant file without intervals.
     """
     if IDENTIFIED in texts:
         if len(texts) > 1:
@@ -215,7 +215,7 @@ def _identified(path: Path | None) -> ParameterBox:
 
 
 def _correlation(path: Path, names: Sequence[str]) -> Array | None:
-    """Return the correlation of some parameters in an identification's JSON file, None where there is none."""
+    """Return the correlation of some parameters in an identification's JSON file, or None."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         order = list(document["covariance"]["names"])

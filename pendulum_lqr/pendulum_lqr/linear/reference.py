@@ -1,7 +1,7 @@
-"""Moving references of the angle: periodic ones, and the way onto them without a jump.
+"""Periodic references of the angle, and smooth transitions onto them.
 
-A reference is computed from parameters and stamps, not received on a topic, whose delay and losses would differ between
-simulator and machine. Where no way onto it is within the torque, the controller gives none.
+A reference is computed from parameters and stamps: delay and losses of a topic would differ between simulator and
+machine. If no transition is within the torque, the controller gives none.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ SHAPES = ("sine", "steps")
 
 
 class Motion(NamedTuple):
-    """Where a reference is: angle from upright, not wrapped [rad], velocity [rad/s] and acceleration [rad/s^2]."""
+    """Reference angle from upright, not wrapped [rad], velocity [rad/s] and acceleration [rad/s^2]."""
 
     angle: float
     velocity: float
@@ -26,18 +26,10 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """A deviation that dies out within a time, and with it its velocity and its acceleration.
+    """A deviation that decays within ``duration`` [s], with its velocity and acceleration: a fifth-order polynomial.
 
-    The polynomial of fifth order that has all six; between two rests it is the motion of least jerk.
-
-    Attributes:
-        start: When it begins [s].
-        duration: When it is over, after its start [s], > 0.
-        angle: Deviation at the start [rad].
-        velocity: Its velocity there [rad/s].
-        acceleration: Its acceleration there [rad/s^2].
-
-    Source: Flash, Hogan, J. Neuroscience 5(7), 1985, equation 3 (least jerk).
+    Between two rests it is the minimum-jerk motion. Times in [s]; angle [rad], velocity [rad/s] and acceleration
+    [rad/s^2] are those at the start. Source: Flash, Hogan, J. Neuroscience 5(7), 1985, equation 3 (minimum jerk).
     """
 
     start: float
@@ -66,17 +58,17 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """A periodic motion of the angle; its velocity and acceleration are continuous.
+    """A periodic motion of the angle with continuous velocity and acceleration.
 
-    Steps go to and fro between two angles. A step that the plant cannot follow would be an error by design, and one of
-    limited acceleration a torque that jumps: each is a motion of least jerk within ``move_time``, followed by rest.
+    Steps alternate between two angles, each by a minimum-jerk motion within ``move_time`` and then rest: a
+    discontinuous step would be an error by design, and one of limited acceleration a discontinuous torque.
 
     Attributes:
         shape: ``sine`` or ``steps``.
-        centre: Angle about which it moves, from upright [rad].
-        amplitude: How far it goes to either side [rad].
-        frequency: How often it repeats itself [Hz], > 0.
-        move_time: Of steps: duration of each [s], > 0 and at most half a period.
+        centre: Centre, from upright [rad].
+        amplitude: [rad].
+        frequency: [Hz], > 0.
+        move_time: Duration of each step [s], > 0 and at most half a period.
     """
 
     shape: str
@@ -87,7 +79,7 @@ class Reference:
 
     @property
     def period(self) -> float:
-        """Time after which it repeats itself [s]."""
+        """Period [s]."""
         return 1.0 / self.frequency
 
     @property
@@ -95,11 +87,11 @@ class Reference:
         """Largest velocity [rad/s]."""
         if self.shape == "sine":
             return 2.0 * math.pi * self.frequency * self.amplitude
-        # Half-way through a motion of least jerk: 15/8 of its mean velocity.
+        # The peak velocity of a minimum-jerk motion is 15/8 of its mean.
         return 1.875 * 2.0 * self.amplitude / self.move_time
 
     def at(self, t: float) -> Motion:
-        """Return where it is at a time since its start [s]."""
+        """Return the motion at a time since the start [s]."""
         if self.shape == "sine":
             w = 2.0 * math.pi * self.frequency
             sine, cosine = math.sin(w * t), math.cos(w * t)
@@ -107,7 +99,7 @@ class Reference:
             return Motion(self.centre + a * sine, a * w * cosine, -a * w * w * sine)
         half = 0.5 * self.period
         count = math.floor(t / half)
-        # Up in even halves, down in odd ones; what is left of a move dies out at its end.
+        # Up in even halves, down in odd ones.
         end = self.amplitude if count % 2 == 0 else -self.amplitude
         angle, velocity, acceleration = Way(count * half, self.move_time, -2.0 * end).at(t)
         return Motion(self.centre + end + angle, velocity, acceleration)

@@ -1,13 +1,13 @@
 """Region of attraction of u = clamp(-K x) under the torque limit: a proven part, and the whole by sampling.
 
-The proven part is a sublevel set of the Riccati solution's Lyapunov function V = x' S x. In the coordinates
-x = rho n(phi) with n' S n = 1, so that V = rho^2,
+The proven part is a sublevel set of the Riccati solution's Lyapunov function V = x' S x. In the coordinates x = rho
+n(phi) with n' S n = 1, so that V = rho^2,
 
     V' / rho^2 = 2 n' S [n_1, (-b n_1 - G n_0 g(rho n_0) + clamp(-K n, limits / rho)) / M]
     g(z) = (sin(theta* + z) - sin theta*) / z,   -sinc(z) at upright
 
-is bounded by interval arithmetic over cells of (rho, phi), which are split until every bound is negative. The
-quotient has no singularity at rho = 0, so that the proof covers the whole ellipse and not only its rim.
+is bounded by interval arithmetic over cells of (rho, phi), which are split until every bound is negative. The quotient
+has no singularity at rho = 0, so the proof covers the whole ellipse.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ Rollout = Callable[[Array, Array], tuple[Array, Array]]
 """Batch simulation: start angles (from upright [rad]) and velocities [rad/s], shape (n,), to those at the end."""
 
 _ARRIVED = (0.05, 0.1)
-"""What counts as arrived: |angle| [rad] and |velocity| [rad/s]. An angle a whole turn away has fallen."""
+"""|angle| [rad] and |velocity| [rad/s] that count as arrived. A full turn away is a fall."""
 _SPLITS = 14
 _MOST_CELLS = 400_000
-# Rounding of a dozen operations on doubles is far below this share of the terms summed.
+# Bound on the rounding of a dozen operations on doubles, relative to the terms summed.
 _ROUNDING = 1e-12
 
 
 class _Loop(NamedTuple):
-    """The plant as the proof sees it: the limits are those of the deviation from the holding torque."""
+    """Plant of the proof; limits are those of the deviation from the holding torque."""
 
     inertia: float
     damping: float
@@ -83,7 +83,7 @@ class Region:
         return float(np.count_nonzero(self.attracted) * cell)
 
     def counterexamples(self) -> int:
-        """Return how many samples in the proven set were not attracted: 0, or proof or sampling is wrong."""
+        """Return the number of samples in the proven set that were not attracted; any shows an error."""
         x, v = np.meshgrid(self.angles, self.velocities)
         S = self.S
         value = S[0, 0] * x * x + 2.0 * S[0, 1] * x * v + S[1, 1] * v * v
@@ -91,10 +91,10 @@ class Region:
 
 
 def proven_level(plant: RigidPlant, gain: Gain, effort_limit: float, theta: float = UPRIGHT) -> float:
-    """Return the largest level found for which {x' S x <= c} is proven to be attracted to a fixed point.
+    """Return the largest c for which {x' S x <= c} is proven to be attracted to a fixed point; 0 without a proof.
 
-    Dry friction is left out: with it a pendulum comes to rest near the fixed point and not at it. So are lag, delay and
-    drivetrain; ``angle_offset`` and ``torque_offset`` count.
+    Without dry friction (with which a pendulum comes to rest near the fixed point), lag, delay and drivetrain; with
+    ``angle_offset`` and ``torque_offset``.
 
     Args:
         plant: Plant parameters.
@@ -102,11 +102,8 @@ def proven_level(plant: RigidPlant, gain: Gain, effort_limit: float, theta: floa
         effort_limit: Torque limit [N m], > 0.
         theta: Measured angle of the fixed point, 0 hanging down [rad].
 
-    Returns:
-        c; 0 if nothing is proven.
-
     Raises:
-        DesignError: The limit is not positive, or not enough to hold the fixed point.
+        DesignError: The limit is not positive, or too small to hold the fixed point.
     """
     if not effort_limit > 0.0:
         raise DesignError(f"effort_limit is {effort_limit} N m; expected > 0")
@@ -125,12 +122,12 @@ def proven_level(plant: RigidPlant, gain: Gain, effort_limit: float, theta: floa
         -effort_limit - hold,
         effort_limit - hold,
     )
-    # The ellipse must not reach around a full turn, where the angle wraps.
+    # The ellipse must not extend around a full turn, where the angle wraps.
     reach = math.pi / float(np.linalg.norm(directions[0]))
     low, high = 0.0, reach
     if _decreases(loop, gain, directions, reach):
         return reach * reach
-    # A proof that fails for a thousandth fails for all: a dozen more attempts would only take seconds.
+    # If a thousandth of the reach fails, all fail: a dozen more attempts would only take seconds.
     if not _decreases(loop, gain, directions, 1e-3 * reach):
         return 0.0
     for _ in range(12):
@@ -143,13 +140,7 @@ def proven_level(plant: RigidPlant, gain: Gain, effort_limit: float, theta: floa
 
 
 def sublevel_ellipse(S: Array, level: float, points: int = 361) -> Array:
-    """Return the curve x' S x = level, shape (points, 2).
-
-    Args:
-        S: Positive definite matrix, shape (2, 2).
-        level: c >= 0.
-        points: How many points; the last is the first.
-    """
+    """Return the closed curve x' S x = level, shape (points, 2)."""
     directions = np.linalg.inv(scipy.linalg.cholesky(S, lower=True)).T
     phi = np.linspace(0.0, 2.0 * math.pi, points)
     return np.asarray(math.sqrt(level) * (directions @ np.vstack([np.cos(phi), np.sin(phi)])).T, dtype=np.float64)
@@ -165,7 +156,7 @@ def region_of_attraction(
     velocity_span: float = 10.0,
     points: int = 101,
 ) -> Region:
-    """Sample the region of attraction through a batch simulation and prove its inner part.
+    """Sample the region of attraction by batch simulation and prove its inner part.
 
     Args:
         plant: Plant parameters.
@@ -174,7 +165,7 @@ def region_of_attraction(
         rollout: Batch simulation of the closed loop, long enough to settle.
         angle_span: Half width of the grid in angle [rad].
         velocity_span: Half width of the grid in velocity [rad/s].
-        points: Points along each axis; an odd number has upright among them.
+        points: Points along each axis; an odd number includes upright.
     """
     angles = np.linspace(-angle_span, angle_span, points)
     velocities = np.linspace(-velocity_span, velocity_span, points)
@@ -188,10 +179,10 @@ def region_of_attraction(
 
 
 def rigid_rollout(plant: RigidPlant, gain: Gain, effort_limit: float, duration: float = 8.0) -> Rollout:
-    """Return a batch simulation of the smooth rigid plant under u = clamp(u* - K x); feedback sees wrapped angles.
+    """Return a batch simulation of the smooth rigid plant under u = clamp(u* - K x), with wrapped angles.
 
     Exponential midpoint rule: damping, the fast pole of a stiff plant, is exact, so that the slow motion sets the step.
-    The simulator's batch engine does the same for plants with friction; this one draws the design's figure.
+    For plants with friction use the simulator's batch engine.
 
     Args:
         plant: Plant parameters.
@@ -235,7 +226,7 @@ def rigid_rollout(plant: RigidPlant, gain: Gain, effort_limit: float, duration: 
 
 def _decreases(loop: _Loop, gain: Gain, directions: Array, reach: float) -> bool:
     """Return whether V' < 0 is proven for all 0 <= rho <= reach and all directions."""
-    # Upright without offsets, x and -x behave alike, so that half a turn is enough.
+    # At upright without offsets, x and -x are symmetric, so half a turn suffices.
     alike = loop.angle == UPRIGHT and loop.low == -loop.high
     rho = np.linspace(0.0, reach, 33)
     phi = np.linspace(0.0, math.pi, 129) if alike else np.linspace(-math.pi, math.pi, 257)
@@ -301,7 +292,7 @@ def _direction(row: Array, phi: _Interval) -> _Interval:
     low, high = phi.low - shift, phi.high - shift
     at_low, at_high = np.cos(low), np.cos(high)
     smallest, largest = np.minimum(at_low, at_high), np.maximum(at_low, at_high)
-    # A crest or a trough inside the interval: an even or odd multiple of pi lies between its ends.
+    # An extremum is inside if an even or odd multiple of pi lies between the ends.
     crest = np.floor(high / (2.0 * math.pi)) > np.floor(low / (2.0 * math.pi))
     trough = np.floor(high / (2.0 * math.pi) - 0.5) > np.floor(low / (2.0 * math.pi) - 0.5)
     return _Interval(
@@ -324,7 +315,7 @@ def _weight_quotient(angle: float, rho: _Interval, n0: _Interval) -> _Interval:
 
 
 def _sinc(rho: _Interval, n0: _Interval) -> _Interval:
-    """Return bounds of sin(z)/z for z = rho n0, |z| <= pi, where it falls with |z|."""
+    """Return bounds of sin(z)/z, which falls with |z|, for z = rho n0, |z| <= pi."""
     largest = rho.high * np.maximum(np.abs(n0.low), np.abs(n0.high))
     smallest = rho.low * np.where(n0.low * n0.high <= 0.0, 0.0, np.minimum(np.abs(n0.low), np.abs(n0.high)))
     # np.sinc(x) is sin(pi x) / (pi x).

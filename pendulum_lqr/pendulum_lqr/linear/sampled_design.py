@@ -1,4 +1,4 @@
-"""Optimal gains for a loop that samples: the model under zero-order hold and delay, its cost, and its LQR."""
+"""Optimal gains of sampled loops: the model under zero-order hold and delay, its cost, and its LQR."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["DiscreteModel", "closed_loop", "discrete_lqr", "discretise", "sample
 
 @dataclass(frozen=True, slots=True)
 class DiscreteModel:
-    """Sampled model ``z[k+1] = A z[k] + B u[k]`` whose state is [x; the inputs still on their way, oldest first].
+    """Sampled model ``z[k+1] = A z[k] + B u[k]`` whose state is [x; inputs in transit, oldest first].
 
     Attributes:
         A: Shape (n + p m, n + p m), of n states and m inputs.
         B: Shape (n + p m, m).
         period: Sampling period [s].
-        delay: Time from measuring a state to its torque acting, the plant's own included [s].
-        pending: p, number of samples whose inputs are still on their way.
+        delay: Time from measurement to the effect of the torque, including the plant's delay [s].
+        pending: p, number of samples whose inputs are in transit.
     """
 
     A: Matrix
@@ -35,7 +35,7 @@ class DiscreteModel:
 
 
 def discretise(model: LinearModel, period: float, delay: float = 0.0) -> DiscreteModel:
-    """Sample the model exactly under zero-order hold, its delay of any length included.
+    """Sample the model exactly under zero-order hold and any delay.
 
     With delay = (p - 1) period + rest, the input of sample k acts from rest on in interval k + p - 1, so that p past
     inputs join the state.
@@ -43,7 +43,7 @@ def discretise(model: LinearModel, period: float, delay: float = 0.0) -> Discret
     Args:
         model: Linear model.
         period: Sampling period, > 0 [s].
-        delay: Time from measuring a state to the command's arrival at the plant, beyond the model's own, >= 0 [s].
+        delay: Time from measurement to the command's arrival at the plant, in addition to the model's, >= 0 [s].
 
     Raises:
         DesignError: Period or delay out of domain.
@@ -57,7 +57,7 @@ def discretise(model: LinearModel, period: float, delay: float = 0.0) -> Discret
         raise DesignError(f"delay is {delay} s; expected a finite value >= 0")
     delay += model.delay
     pending, rest = _on_their_way(period, delay)
-    # The interval is split where the newer input takes over: older input first, for ``rest``.
+    # Split the interval where the newer input takes over: older input first, for ``rest``.
     phi_new, gamma_new = _hold(model, period - rest)
     phi_old, gamma_old = _hold(model, rest)
     n, m = model.B.shape
@@ -83,12 +83,7 @@ def discretise(model: LinearModel, period: float, delay: float = 0.0) -> Discret
 
 
 def closed_loop(model: DiscreteModel, K: ArrayLike) -> Matrix:
-    """Return A - B K of a gain that acts on the leading states alone, shape (n + p m, n + p m).
-
-    Args:
-        model: Sampled model with m inputs.
-        K: Gain on its first k states, shape (k,) or (m, k): on what is measured, or all but the inputs on their way.
-    """
+    """Return A - B K of a gain (k,) or (m, k) on the first k states, shape (n + p m, n + p m)."""
     gain = np.atleast_2d(np.asarray(K, dtype=np.float64))
     feedback = np.zeros(model.B.T.shape)
     feedback[:, : gain.shape[1]] = gain
@@ -96,16 +91,14 @@ def closed_loop(model: DiscreteModel, K: ArrayLike) -> Matrix:
 
 
 def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float | Matrix, cross: Matrix | None = None) -> Gain:
-    """Return the gain that minimises the sum of x' Q x + 2 x' N u + u' R u over the samples.
-
-    Its K has the shape (n + p m,) for one input and (m, n + p m) for several.
+    """Return the gain that minimises the sum of x' Q x + 2 x' N u + u' R u, shape (n + p m,) or (m, n + p m).
 
     Args:
         model: Sampled model with m inputs.
-        q: Weights of the leading states, shape (k,) or (k, k): of [theta, theta_dot], or the whole matrix that
-            :func:`sampled_cost` gives. What follows costs nothing.
-        r: Weight of each input, > 0, or R of shape (m, m), as :func:`sampled_cost` gives it.
-        cross: N, shape (k, m), as :func:`sampled_cost` gives it; none by default.
+        q: Weights of the leading states, shape (k,) or (k, k), or the matrix of :func:`sampled_cost`; others cost
+            nothing.
+        r: Weight of each input, > 0, or R of shape (m, m).
+        cross: N, shape (k, m), or None.
 
     Raises:
         DesignError: As :func:`continuous_lqr`.
@@ -132,20 +125,17 @@ def discrete_lqr(model: DiscreteModel, q: ArrayLike, r: float | Matrix, cross: M
 def sampled_cost(
     model: LinearModel, q: ArrayLike, r: float, period: float, delay: float = 0.0
 ) -> tuple[Matrix, Matrix, Matrix]:
-    """Return (Q_d, R_d, N_d), the continuous cost collected over one period of zero-order hold.
+    """Return the continuous cost of a period under hold: Q_d (n + p m, n + p m), R_d (m, m), N_d (n + p m, m).
 
-    A discrete LQR with these weights minimises the very cost of the continuous LQR, at any sampling period and delay.
-    A torque that is still on its way costs where it moves the state, in Q_d; its own cost is counted when it is sent.
+    A discrete LQR with these weights minimises the continuous LQR's cost, at any sampling period and delay. A torque in
+    transit costs where it moves the state, in Q_d; its own cost is counted when it is sent.
 
     Args:
         model: Linear model with n states and m inputs.
-        q: Continuous weights of what is measured, [theta, theta_dot] of one joint.
+        q: Continuous weights of the measured states.
         r: Continuous weight of each input.
         period: Sampling period [s].
-        delay: As in :func:`discretise`, whose p m inputs on their way join the state.
-
-    Returns:
-        Q_d of shape (n + p m, n + p m), R_d of shape (m, m), and N_d of shape (n + p m, m).
+        delay: As in :func:`discretise`.
 
     Source:
         C. Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23(3), 1978, theorem 1;
@@ -159,7 +149,7 @@ def sampled_cost(
     size = n + (pending + 1) * m
     state = np.eye(n, size)
     total = np.zeros((size, size))
-    # The period in the pieces in which one input acts: where it is in [state; on their way; new], and for how long.
+    # The parts of the period with one acting input each: its index in [state; in transit; new], and the duration.
     older, newer = (n, n + m) if rest > 0.0 else (n, n)
     for column, time in ((older, rest), (newer, period - rest)):
         if time == 0.0:
@@ -182,7 +172,7 @@ def _collected(model: LinearModel, Q: Matrix, time: float) -> Matrix:
     F[:n, n:] = model.B
     W = np.zeros((size, size))
     W[:n, :n] = model.C.T @ Q @ model.C
-    # Long intervals would overflow exp(+214 s): collect over short pieces and add them up.
+    # Long intervals would overflow exp(+214 s): sum over short pieces.
     pieces = max(1, math.ceil(float(np.abs(F).sum(axis=1).max()) * time / 2.0))
     step = time / pieces
     block = np.block([[-F.T, W], [np.zeros_like(F), F]])
@@ -198,7 +188,7 @@ def _collected(model: LinearModel, Q: Matrix, time: float) -> Matrix:
 
 
 def _on_their_way(period: float, delay: float) -> tuple[int, float]:
-    """Return how many whole inputs are in a delay, and the remaining fraction of a period [s]."""
+    """Return the number of inputs in transit during a delay, and the remaining fraction of a period [s]."""
     whole = math.floor(delay / period + 1e-9)
     rest = max(delay - whole * period, 0.0)
     if rest < 1e-9 * period:
@@ -207,7 +197,7 @@ def _on_their_way(period: float, delay: float) -> tuple[int, float]:
 
 
 def _padded_cost(q: ArrayLike, r: float | Matrix, size: int, m: int) -> tuple[Matrix, Matrix]:
-    """Return Q (size, size), zero beyond the states that q names, and R (m, m)."""
+    """Return Q (size, size), zero beyond the states of q, and R (m, m)."""
     given, inputs = np.asarray(q, dtype=np.float64), np.asarray(r, dtype=np.float64)
     Q2, _ = cost_matrices(q, float(inputs.flat[0]), len(given))
     Q = np.zeros((size, size))

@@ -1,4 +1,4 @@
-"""Gains and feedforward over the angle of a reference, and how stable a loop is whose gain moves with it."""
+"""Gains and feedforward scheduled over the angle of a reference, and the stability of the scheduled loop."""
 
 from __future__ import annotations
 
@@ -25,26 +25,25 @@ __all__ = ["Schedule", "ScheduledMargins", "scheduled_margins"]
 _KNOTS = 24
 """Angles of a full turn at which the Riccati equation is solved."""
 _CELLS = 720
-"""Cells of half a degree, within which is interpolated linearly: no state has time for splines."""
+"""Cells of half a degree for linear interpolation: splines are too slow at run time."""
 _FROZEN = 13
-"""Angles on the way of a reference at which its frozen loop is judged."""
+"""Angles along a reference at which the frozen loop is checked."""
 _BLOCKS = 2000
 _SMOOTH = 0.05
-"""Share of the fastest velocity over which the friction that is fed forward changes its sign."""
+"""Share of the largest velocity over which the friction feedforward changes its sign."""
 
 
 class Schedule:
-    """LQR gain K(theta), and the torque of a motion by the plant's own equation.
+    """LQR gain K(theta), and the feedforward torque of a motion.
 
-    The torque is u(theta) + b(theta) theta' + M(theta) theta'' with u(theta) the torque that holds the angle, and M and
-    b those of the linear model there, where motion is slow: exact for a rigid plant; of motor, spring and lag the
-    leading terms, beyond which come theta''' and theta'^2.
+    The torque is u(theta) + b(theta) theta' + M(theta) theta'', with the holding torque u and low-frequency M and b of
+    the linear model there: exact for a rigid plant; of motor, spring and lag the terms below theta''' and theta'^2.
 
     Args:
         plant: Plant parameters.
         q: Diagonal of Q [1/rad^2, s^2/rad^2].
         r: R [1/(N m)^2].
-        share: Share of the Coulomb friction that is fed forward.
+        share: Share of the Coulomb friction in the feedforward.
         fastest: Largest velocity of the reference [rad/s].
 
     Raises:
@@ -64,11 +63,7 @@ class Schedule:
         return k0, k1
 
     def feedforward(self, motion: Motion) -> float:
-        """Return the commanded torque that moves the plant so [N m].
-
-        Args:
-            motion: Angle from upright [rad], velocity [rad/s], acceleration [rad/s^2].
-        """
+        """Return the commanded torque of a motion [N m]."""
         _, _, damping, inertia = self._row(motion.angle)
         theta = UPRIGHT + motion.angle
         torque = equilibrium_effort(self._plant, theta) + damping * motion.velocity + inertia * motion.acceleration
@@ -88,8 +83,7 @@ class Schedule:
 def _table(plant: PlantParameters, q: tuple[float, ...], r: float) -> NDArray[np.float64]:
     """Return K_1 [N m/rad], K_2 and b [N m s/rad] and M [kg m^2] at the edges of the cells, shape (cells + 1, 4).
 
-    The Riccati equation is solved on a grid of angles, between which lies a periodic spline. The table is cached, since
-    another reference uses the same solutions.
+    A periodic spline interpolates Riccati solutions on a grid of angles. Cached, because references share them.
     """
     angles = np.linspace(-math.pi, math.pi, _KNOTS + 1)
     rows = []
@@ -108,14 +102,15 @@ def _table(plant: PlantParameters, q: tuple[float, ...], r: float) -> NDArray[np
 
 @dataclass(frozen=True, slots=True)
 class ScheduledMargins:
-    """How stable a scheduled loop is: frozen at each angle of its reference, and along it.
+    """Stability of a scheduled loop: frozen at each angle of its reference, and along it.
 
     Attributes:
-        angles: Where the loop was frozen, from upright, shape (n,) [rad].
+        angles: Angles of the frozen loops, from upright, shape (n,) [rad].
         radii: Largest |pole| of the sampled loop at each [-]; below 1.
-        moduli: Smallest distance of each L(j w) from -1, the hold and the plant's delay included [-].
-        time_constant: Time in which a deviation shrinks to 1/e in the long run along the moving reference [s], by the
-            product of all sampled loops over a period (Floquet), which no frozen loop shows.
+        moduli: Smallest distance of each L(j w) from -1, including hold and plant delay [-].
+        time_constant: Decay time of deviations along the moving reference [s], by the product of all sampled loops over
+            a
+            period (Floquet), which frozen loops do not show.
     """
 
     angles: tuple[float, ...]
@@ -134,7 +129,7 @@ class ScheduledMargins:
         return min(self.moduli)
 
     def describe(self) -> str:
-        """Return them in one line."""
+        """Return a summary in one line."""
         return (
             f"frozen loops: modulus margin {self.modulus:.3g}, largest pole {self.radius:.4g}; along the reference a "
             f"deviation dies out with {self.time_constant:.3g} s"
@@ -144,13 +139,7 @@ class ScheduledMargins:
 def scheduled_margins(
     plant: PlantParameters, period: float, reference: Reference, schedule: Schedule
 ) -> ScheduledMargins:
-    """Return the margins of a scheduled loop, of the plant without dry friction and torque limit.
-
-    Args:
-        plant: The plant that runs.
-        period: Sampling period [s].
-        reference: What is followed.
-        schedule: Gains.
+    """Return the margins of a scheduled loop sampled at ``period`` [s], without dry friction and torque limit.
 
     Raises:
         DesignError: A frozen loop, or that along the reference, is unstable.
@@ -197,7 +186,7 @@ def _rate_along(reference: Reference, period: float, angles: NDArray[np.float64]
         loop = (1.0 - share) * loops[index] + share * loops[following]
         product = np.linalg.matrix_power(loop, repeats) @ product
         count += repeats
-        # A product of many decays to nothing in a number, and its logarithm does not.
+        # Long products underflow; their logarithm does not.
         size = float(np.max(np.abs(product)))
         product, exponent = product / size, exponent + math.log(size)
     radius = float(np.max(np.abs(np.linalg.eigvals(product))))

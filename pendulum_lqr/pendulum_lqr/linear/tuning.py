@@ -1,6 +1,6 @@
-"""Tuning of the PID controller on the plant's own model, so that a comparison with LQR is fair.
+"""Tuning of the PID controller on the plant's model, for a fair comparison with LQR.
 
-Numerical tuning minimises the cost that the LQR minimises, over the three gains of a PID that sees the angle alone.
+Numerical tuning minimises the LQR's cost over the three gains of a PID on the angle alone.
 """
 
 from __future__ import annotations
@@ -24,13 +24,7 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class PidGains:
-    """Gains of u = -(k_p e + k_i integral of e + k_d de/dt).
-
-    Attributes:
-        kp: [N m/rad].
-        ki: [N m/(rad s)].
-        kd: [N m s/rad].
-    """
+    """Gains of u = -(k_p e + k_i integral of e + k_d de/dt) [N m/rad, N m/(rad s), N m s/rad]."""
 
     kp: float
     ki: float
@@ -40,14 +34,8 @@ class PidGains:
 def pid_loop(model: LinearModel, gains: PidGains, period: float, filter_time: float) -> tuple[Matrix, Matrix, Matrix]:
     """Return (A, B, F) of the sampled closed loop z[k+1] = A z[k] + B w[k], u[k] = F z[k].
 
-    The state is [that of the sampled plant, integral, angle at the sample before, filtered derivative at the sample
-    before]; w is a torque that disturbs, held like the controller's.
-
-    Args:
-        model: Linear model.
-        gains: PID gains.
-        period: Sampling period [s].
-        filter_time: Time constant of the derivative's filter [s].
+    The state is [that of the sampled plant, integral, previous angle, previous filtered derivative]; w is a disturbing
+    torque, held like the controller's. ``period`` and ``filter_time`` of the derivative in [s].
     """
     sampled = discretise(model, period)
     pole = math.exp(-period / filter_time)
@@ -70,19 +58,10 @@ def pid_loop(model: LinearModel, gains: PidGains, period: float, filter_time: fl
 
 
 def pid_cost(model: LinearModel, gains: PidGains, period: float, filter_time: float, q: ArrayLike, r: float) -> float:
-    """Return the LQR cost of a PID loop, summed over a release from 0.1 rad and the onset of 1 N m; inf if unstable.
+    """Return the LQR cost of a PID loop, for a release from 0.1 rad plus a step of 1 N m; inf if unstable or k_i = 0.
 
-    Both parts count x' Q x + R (u - u_end)^2 per second, where u_end is the torque that remains: without it any
-    integral action would cost infinitely much under a constant load. Without an integral (k_i = 0) the second part
-    is infinite.
-
-    Args:
-        model: Linear model.
-        gains: PID gains.
-        period: Sampling period [s].
-        filter_time: Time constant of the derivative's filter [s].
-        q: Weights of angle and velocity.
-        r: Weight of the torque.
+    Both count x' Q x + R (u - u_end)^2 per second with the final torque u_end: otherwise any integral action would cost
+    infinitely much under a constant load.
     """
     Q, R = cost_matrices(q, r)
     A, B, F = pid_loop(model, gains, period, filter_time)
@@ -93,7 +72,7 @@ def pid_cost(model: LinearModel, gains: PidGains, period: float, filter_time: fl
     weight[:2, :2] = Q
     weight += R[0, 0] * np.outer(F, F)
     S = scipy.linalg.solve_discrete_lyapunov(A.T, weight) * period
-    # A derivative that started at rest: the sample before showed the same angle.
+    # The derivative starts at rest: the previous sample had the same angle.
     release = np.zeros(size)
     release[[0, size - 2]] = 0.1
     if "motor_angle" in model.states:
@@ -104,13 +83,6 @@ def pid_cost(model: LinearModel, gains: PidGains, period: float, filter_time: fl
 
 def tune_numerically(model: LinearModel, period: float, filter_time: float, q: ArrayLike, r: float) -> PidGains:
     """Return the gains of least :func:`pid_cost`, by Nelder and Mead on their logarithms from several starts.
-
-    Args:
-        model: Linear model, unstable or not.
-        period: Sampling period [s].
-        filter_time: Time constant of the derivative's filter [s].
-        q: Weights of angle and velocity.
-        r: Weight of the torque.
 
     Raises:
         DesignError: No start leads to a stable loop.
@@ -128,7 +100,7 @@ def tune_numerically(model: LinearModel, period: float, filter_time: float, q: A
     for rate in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0):
         damping = max(own_damping, 2.0 * inertia * rate)
         kp = lift + rate * damping
-        # A derivative far below what the plant damps by itself is where the search for an overdamped plant starts.
+        # For an overdamped plant, start with a derivative far below its own damping.
         kd = max(damping - own_damping, 1e-3 * damping)
         starts.append(np.log([kp, 0.3 * rate * kp, kd]))
     start = min(starts, key=cost)
@@ -141,13 +113,7 @@ def tune_numerically(model: LinearModel, period: float, filter_time: float, q: A
 
 
 def ultimate_gain(model: LinearModel, period: float) -> tuple[float, float]:
-    """Return (K_u, T_u): the proportional gain at which the sampled loop oscillates for ever, and its period [s].
-
-    This is the limit cycle that a relay test finds, computed instead of waited for.
-
-    Args:
-        model: Linear model.
-        period: Sampling period [s].
+    """Return (K_u, T_u): the proportional gain at which the sampled loop oscillates persistently, and its period [s].
 
     Raises:
         DesignError: No proportional gain stabilises the plant, or none makes it oscillate.
@@ -177,14 +143,7 @@ def ultimate_gain(model: LinearModel, period: float) -> tuple[float, float]:
 
 
 def ziegler_nichols(model: LinearModel, period: float) -> PidGains:
-    """Return the classic gains K_p = 0.6 K_u, T_i = T_u / 2, T_d = T_u / 8.
-
-    Args:
-        model: Linear model.
-        period: Sampling period [s].
-
-    Raises:
-        DesignError: As :func:`ultimate_gain`.
+    """Return the classic gains K_p = 0.6 K_u, T_i = T_u / 2, T_d = T_u / 8; DesignError as :func:`ultimate_gain`.
 
     Source: Ziegler and Nichols, Transactions of the ASME 64, 1942, p. 759.
     """

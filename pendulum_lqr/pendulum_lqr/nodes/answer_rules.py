@@ -1,4 +1,4 @@
-"""Which states get a command, as functions of numbers: the compiled loop compiles these very ones."""
+"""Rules on which states get a command, as functions of numbers that the compiled loop compiles too."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = [
 NEW, STALE, FROM_FUTURE, DUPLICATE, OUT_OF_ORDER = range(5)
 """Results of :func:`judge_state`."""
 LONGEST = 2**62
-"""A timeout that no age comes near [ns]."""
+"""A timeout that no age reaches [ns]."""
 
 
 def judge_state(stamp_ns: int, now_ns: int, timeout_ns: int, newest_ns: int) -> int:
@@ -24,9 +24,9 @@ def judge_state(stamp_ns: int, now_ns: int, timeout_ns: int, newest_ns: int) -> 
 
     Args:
         stamp_ns: Stamp of the state [ns].
-        now_ns: Time of its arrival on the clock of the stamps; in simulated time, which has no age, the stamp [ns].
-        timeout_ns: Age beyond which it gets no command, either way, at most ``LONGEST`` [ns].
-        newest_ns: Stamp of the newest state that got a command, or could not; ``NEVER`` before the first [ns].
+        now_ns: Time of arrival on the clock of the stamps; in simulated time, which has no age, the stamp [ns].
+        timeout_ns: Largest age, positive or negative, at most ``LONGEST`` [ns].
+        newest_ns: Stamp of the newest processed state; ``NEVER`` before the first [ns].
     """
     age_ns = now_ns - stamp_ns
     if age_ns > timeout_ns:

@@ -1,4 +1,4 @@
-"""Which states a controller replies to, and the contents of its diagnostics: the controller node without ROS."""
+"""Selection of states that get a reply, and diagnostics: the controller node without ROS."""
 
 from __future__ import annotations
 
@@ -50,22 +50,20 @@ class ControlLoop:
     """Replies to each new state once, and counts.
 
     Args:
-        controller: The controller.
-        state_timeout: Age beyond which a state gets no command [s]; inf for any age.
+        controller: Controller.
+        state_timeout: Largest age of a state [s]; inf for any age.
         simulated_time: Stamps are those of a simulator, so that their age has no meaning and they may restart.
-        send: Called with a state and the efforts in reply [N m or N], before anything is counted.
+        send: Called with a state and the efforts [N m or N], before anything is counted.
         monotonic: Clock for the compute time [ns].
 
     Attributes:
-        controller: The controller.
-        simulated_time: Whether stamps are those of a simulator.
-        newest: The newest state that got a command, or could not; None before the first.
+        newest: Newest processed state; None before the first.
         answered_ns: Stamp of the newest state that got a command [ns]; None before the first.
-        kept_answer: The efforts in reply to it [N m or N], or None.
-        start_ns: Stamp of the first state since a restart [ns]; None before it.
-        timeout_ns: Age beyond which a state gets no command [ns].
+        kept_answer: Efforts for it [N m or N], or None.
+        start_ns: Stamp of the first state since a restart [ns], or None.
+        timeout_ns: Largest age of a state [ns].
         age: Ages of the states that got a command [ns].
-        compute_time: Times that the commands took [ns].
+        compute_time: Compute times of the commands [ns].
     """
 
     def __init__(
@@ -101,7 +99,7 @@ class ControlLoop:
 
     @property
     def newest_stamp_ns(self) -> int | None:
-        """Stamp of the newest state that got a command, or could not [ns]; None before the first."""
+        """Stamp of the newest processed state [ns]; None before the first."""
         return None if self.newest is None else self.newest.stamp_ns
 
     def restart(self) -> None:
@@ -118,23 +116,22 @@ class ControlLoop:
         self._take(controller)
 
     def _take(self, controller: Controller) -> None:
-        """Bind the control law."""
         self._efforts, self._limits = controller.efforts, controller.effort_limits
         self._nothing = (0.0,) * len(self._limits)
 
     def answer(self, sample: JointSample | None, now_ns: int, problem: str = "") -> Vector | None:
-        """Send the efforts for a state and return them, or None where the state is refused [N m or N].
+        """Send the efforts for a state and return them, or None if the state is refused [N m or N].
 
         Args:
-            sample: The state; None for a message without the plant's joints.
+            sample: State; None for a message without the plant's joints.
             now_ns: Time of arrival on the clock of the stamps [ns]; not used in simulated time.
-            problem: What is wrong with a message that carries no state.
+            problem: Problem of a message without a state.
         """
         refusal = self._judge(sample, now_ns)
         if refusal is not None:
             self.refused[refusal] += 1
             self.last_reason = problem if sample is None else self._problem(refusal, sample, now_ns)
-            # A plant in lockstep repeats a state if the reply did not reach it: send the same reply again, if any.
+            # A plant in lockstep repeats a state if the reply was lost: send the same reply again, if any.
             if sample is None or refusal is not StateRefusal.DUPLICATE or not self.simulated_time:
                 return None
             if self.kept_answer is not None:
@@ -150,7 +147,7 @@ class ControlLoop:
             time_s = (sample.stamp_ns - self.start_ns) / NANOSECONDS
             effort = self._efforts(time_s, sample.position, sample.velocity)
         except (ArithmeticError, ValueError, RuntimeError) as error:
-            # A solver that fails must not end the node: without a command the plant's timeout applies zero torque.
+            # A failing solver must not end the node: without a command the plant's timeout applies zero torque.
             effort, reason = (math.nan,), f"{type(error).__name__}: {error}"
         if not all(map(math.isfinite, effort)):
             unit = " N m" if len(sample.position) == 1 else ""  # of several joints, each has its own
@@ -185,12 +182,12 @@ class ControlLoop:
         """Count replies that were already sent.
 
         Args:
-            sample: The newest state that got a reply.
+            sample: Newest state that got a reply.
             effort: The reply [N m or N].
-            answered: How many got a reply.
-            saturated: How many of the replies were at a limit.
-            ages_ns: Their states' ages [ns].
-            compute_times_ns: Times that they took [ns].
+            answered: Number of replies.
+            saturated: Number of replies at a limit.
+            ages_ns: Ages of their states [ns].
+            compute_times_ns: Compute times [ns].
         """
         self.newest, self.kept_answer, self.last_effort = sample, effort, effort
         self.answered_ns = sample.stamp_ns
@@ -201,11 +198,7 @@ class ControlLoop:
             self.age.extend(ages_ns)
 
     def summary(self, now_ns: int) -> Mapping[str, object]:
-        """Return the figures for diagnostics; rate and saturation are those since the last summary.
-
-        Args:
-            now_ns: Monotonic time [ns].
-        """
+        """Return figures for diagnostics at a monotonic time [ns]; rate and saturation since the last summary."""
         before_ns, before_answered, before_saturated = self._window
         answers = self.answered - before_answered
         elapsed = (now_ns - before_ns) / NANOSECONDS
@@ -246,10 +239,10 @@ class ControlLoop:
         )
         if found == NEW:
             return None
-        # Angle and velocity alone: what the torque sensor shows is no part of the state.
+        # Angle and velocity alone: the measured torque is not part of the state.
         if self.simulated_time and newest is not None and sample[:3] != newest[:3]:
-            # One writer's messages never overtake each other, so simulated time that goes back, or another state under
-            # the same stamp, is a restarted simulation, however short the one before it was.
+            # Messages of one writer are never reordered, so simulated time that goes back, or another state with the
+            # same stamp, is a restarted simulation, however short the previous one was.
             self.restarts += 1
             self.restart()
             return None

@@ -1,4 +1,4 @@
-"""What ``bringup.launch.py`` brings up: its arguments, and the nodes for their values. Independent of launch."""
+"""Arguments of ``bringup.launch.py``, and the nodes for their values; independent of launch."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from pendulum_msgs_py.programs.graph import NodeProgram
 __all__ = ["ARGUMENTS", "SIDES", "Argument", "parameter_file", "programs"]
 
 SIDES = {"sim": ("sim",), "emulator": ("hw",), "hebi": ("hw",), "both": ("sim", "hw")}
-"""Plants by the argument ``plant``; each is a namespace too."""
+"""Plants, which are also namespaces, by the argument ``plant``."""
 _KINDS = next(tuple(spec.choices or ()) for spec in DISTURBANCE_SPECS if spec.name == "kind")
 _YES_NO = ("true", "false")
 _NODES = ("simulator", "bridge", "controller", "disturbance", "viewer", "markers", "recorder", "robot_state_publisher")
-"""Names of the nodes that a launch may start, for which a parameter file may have sections."""
+"""Nodes of a launch, for which a parameter file may have sections."""
 
 
 @dataclass(frozen=True)
 class Argument:
-    """One argument of the launch file: name, default, meaning and, where there are few, its choices."""
+    """Argument of the launch file."""
 
     name: str
     default: str
@@ -79,17 +79,14 @@ ARGUMENTS: tuple[Argument, ...] = (
     Argument("viewer", "false", "Open a window that draws each plant.", _YES_NO),
     Argument("rviz", "false", "Show the plants in RViz, with markers for torque and disturbance.", _YES_NO),
 )
-"""What ``--show-args`` lists."""
+"""Output of ``--show-args``."""
 
 
 def programs(value: Mapping[str, str]) -> list[NodeProgram]:
-    """Return the nodes of a run; recorders and RViz come from the launch file.
-
-    Args:
-        value: Values of all ``ARGUMENTS`` by name.
+    """Return the nodes of a run for values of all ``ARGUMENTS``; recorders and RViz come from the launch file.
 
     Raises:
-        ParameterError: A number is none, or the parameter file is not one that these nodes can read.
+        ParameterError: A number is invalid, or these nodes cannot read the parameter file.
     """
     parameter_file(value["params_file"])
     waits = _controller_waits(value)
@@ -124,16 +121,13 @@ def programs(value: Mapping[str, str]) -> list[NodeProgram]:
 
 
 def parameter_file(given: str) -> str:
-    """Return the absolute path of the ROS parameter file that all nodes get; empty where none was given.
+    """Return the absolute path of the ROS parameter file of all nodes; empty if there is none.
 
-    ``launch_ros`` only warns of a missing file, and starts the plant without its limits; rcl does not report a section
-    that no node reads.
-
-    Args:
-        given: Value of the argument ``params_file``.
+    Checked here because ``launch_ros`` only warns of a missing file, and starts the plant without its limits; rcl does
+    not report a section that no node reads.
 
     Raises:
-        ParameterError: The file cannot be read, holds no parameters, or has a section for a node of no launch.
+        ParameterError: The file cannot be read, has no parameters, or has a section for a node of no launch.
     """
     if not given.strip():
         return ""
@@ -166,7 +160,7 @@ def _lab(value: Mapping[str, str]) -> LabFile | None:
 
 def _bridge(space: str, value: Mapping[str, str], rate: float, lab: LabFile | None) -> NodeProgram:
     if lab is not None:
-        # A real pendulum starts where it is; nothing arms it but a call of its service.
+        # A real pendulum starts where it is; only a call of its service arms it.
         path = str(Path(value["lab"]).expanduser().resolve())
         return graph.bridge(space, lab_file=path, feedback_rate=rate)
     if value["plant"] == "hebi":
@@ -176,9 +170,9 @@ def _bridge(space: str, value: Mapping[str, str], rate: float, lab: LabFile | No
 
 
 def _controller_waits(value: Mapping[str, str]) -> dict[str, bool]:
-    """Return for each side whether its controller waits to be activated."""
+    """Return for each side whether its controller waits for activation."""
     asked = value["controller_waits"]
-    # Hanging, the angle from upright is pi: a balancing controller saturates before the bridge is armed.
+    # Hanging, the angle from upright is pi: a balancing controller would saturate before the bridge is armed.
     upright = value["start"] == "top" and value["plant"] != "hebi"
     return {
         side: asked == "true" or (asked == "auto" and side == "hw" and not upright) for side in SIDES[value["plant"]]

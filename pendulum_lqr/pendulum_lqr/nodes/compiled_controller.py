@@ -1,4 +1,4 @@
-"""A controller in compiled code: what its commands depend on and change is lent to a loop, and taken back."""
+"""A controller in compiled code: its state is lent to a loop, and taken back."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _LENT = np.dtype(
     ],
     align=True,
 )
-"""``interval_ns`` is 0 where states may come at any."""
+"""``interval_ns`` is 0 if any interval between states is permitted."""
 _NEWEST = np.dtype([("position", "f8"), ("velocity", "f8"), ("measured", "f8"), ("effort", "f8"), ("saturated", "i8")])
-"""The newest state and its reply; ``measured`` is the state's effort. Number of replies at the limit."""
+"""Newest state (``measured`` is its effort), its reply, and the number of replies at the limit."""
 ANSWERING = np.dtype(
     [
         ("lent", _LENT),
@@ -43,18 +43,18 @@ ANSWERING = np.dtype(
     ],
     align=True,
 )
-"""What is lent for a slice, what it returns of its newest reply, and the law's numbers and memory."""
+"""What is lent for a slice, its newest reply, and the law's numbers and memory."""
 
 
 class CompiledController:
     """Runs the law of a controller, :class:`pendulum_msgs_py.loops.answer_record.Answerer`.
 
     Args:
-        controller: The first controller. The loop is for its law, whatever is set around it: what is set may change,
-            and then nothing may wait for a compiler.
+        controller: First controller. The loop is for its law whatever its parameters, whose change must not wait for a
+            compiler.
         watch: Measures the period of states.
-        answering: Returns the answer loop, or None where the next state is not a nominal one.
-        refusal: Why no loop is used; empty where one is.
+        answering: Returns the answer loop, or None if the next state is not a nominal one.
+        refusal: Why no loop is used, or empty.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class CompiledController:
             self.kind = LoopKind(ANSWERING, "pendulum_lqr.nodes.controller_kernel:law_loop", choice)
 
     def lend(self, own: Any) -> bool:
-        """Write what commands depend on into a record; return whether the next state may be a nominal one."""
+        """Write the state of commands into a record; return whether the next state may be a nominal one."""
         loop = self._answering()
         if loop is None:
             return False
@@ -95,7 +95,7 @@ class CompiledController:
             return False
         if loop.simulated_time and interval_ns is None:
             return False
-        # In one piece: each item alone takes as long.
+        # One assignment: each item alone takes as long.
         own["lent"] = (
             loop.simulated_time,
             loop.timeout_ns,
@@ -135,7 +135,7 @@ class CompiledController:
 
 
 def law_of(controller: object) -> LawController | None:
-    """Return a controller that is its law, and nothing else; None for any other."""
+    """Return a controller that consists of its law alone; None for any other."""
     if (
         not isinstance(controller, LawController)
         or controller.law is None

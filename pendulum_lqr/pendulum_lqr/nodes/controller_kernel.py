@@ -1,4 +1,4 @@
-"""The compiled loop of a controller whose law is a function of numbers, for the compiler's process alone."""
+"""Compiled loop of a controller whose law is a function of numbers, imported by the compiler's process only."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WHOLE = 2**53
 
 
 def law_loop(law: str) -> Any:
-    """Return the loop of a controller by a law, ``module:function``, compiled."""
+    """Return the compiled loop of a controller by a law, ``module:function``."""
     module, _, function = law.partition(":")
     command = compile_tree(getattr(importlib.import_module(module), function), exact=True)
     judge = compile_tree(judge_state, exact=True)

@@ -86,10 +86,10 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
     REALTIME_PRIORITY,
     COMPILED,
 )  # fmt: skip
-"""Parameters of the node itself; those of the chosen controller join them."""
+"""Parameters of the node itself, without those of the controller."""
 
 _SAME_PERIOD = 0.02
-"""Share by which a measured period may differ from that of the design without another design."""
+"""Relative change of the measured period that needs no new design."""
 _MULTI_ARRAY_TOPIC = "~/commands"
 
 
@@ -119,9 +119,9 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._period = self._settings["period"] or ASSUMED_PERIOD
         self._period_measured = False
         if takes_time := self._kind.DESIGNING:
-            # Nothing interrupts a compiler: the first Ctrl-C waits for it, and nothing is commanded.
+            # A compiler cannot be interrupted: the first Ctrl-C waits for it, and nothing is commanded.
             self.get_logger().info(f"{takes_time}; Ctrl-C waits for it, a second one does not")
-        # A bad value at start ends the node with its reason instead of waiting for a transition to fail.
+        # A bad value at start ends the node with its reason instead of a failed transition.
         self._pending: Controller | None = self._design(self._settings.values)
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._watch = PeriodWatch(exact=self._simulated_time)
@@ -150,7 +150,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         )
         self._running_plant = RunningPlant(self, self._plant)
         live_by_stamps(self, lambda: None if self._loop is None else self._loop.newest_stamp_ns)
-        # Wall time on purpose: diagnostics must come even where simulated time stands still.
+        # Wall time on purpose: diagnostics must come even while simulated time stands still.
         create_wall_timer(self, DIAGNOSTICS_PERIOD, self._on_timer)
         if self._settings["autostart"]:
             self._autostart()
@@ -158,8 +158,6 @@ class ControllerNode(LifecycleNode, PollingNode):
     def run_due(self) -> float | None:
         """Process states for some milliseconds, or yield to others; return when it is due again [s]."""
         return self._answers.run_due()
-
-    # --- lifecycle -----------------------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Design the controller and print its gain."""
@@ -179,7 +177,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start answering, with nothing remembered from before."""
+        """Start answering, without memory of before."""
         if self._loop is None:
             return TransitionCallbackReturn.FAILURE
         if self._watch.period is not None and not self._settle_period(self._watch.period):
@@ -204,17 +202,15 @@ class ControllerNode(LifecycleNode, PollingNode):
         return super().on_shutdown(state)
 
     def close(self) -> None:
-        """Send zero torque while the context is still valid, and give it time to arrive."""
+        """Send zero torque while the context is still valid, and wait for its arrival."""
         self._send_zero()
         wait_until_heard(self._command_publisher)
         self._publish_diagnostics()
 
     def _may_lend(self) -> ControlLoop | None:
-        """Return the answer loop, where nothing is left to be done before a reply; else None."""
+        """Return the answer loop if a reply needs no other work, else None."""
         ready = self._active and self._period_known and (self._first_answer.gone or not self._simulated_time)
         return self._loop if ready else None
-
-    # --- callbacks -----------------------------------------------------------------------------------------
 
     def _on_state(self, data: bytes) -> None:
         if self._simulated_time and self._active and not self._first_answer.may_go():
@@ -235,7 +231,7 @@ class ControllerNode(LifecycleNode, PollingNode):
             )
 
     def _swap(self, controller: Controller) -> None:
-        """Take over the new design; a failed design never gets here, and leaves the old gain in force."""
+        """Take over a successful design; a failed one leaves the old gain in force."""
         if self._loop is None:
             self._pending = controller
             return
@@ -254,15 +250,13 @@ class ControllerNode(LifecycleNode, PollingNode):
             self.get_logger().warning(f"states refused so far: {counts}{reason}")
             self._told_refusals = refused
 
-    # --- pieces --------------------------------------------------------------------------------------------
-
     def _choose(self, name: str) -> str:
-        """Return which controller or plant is selected, before its own parameters can be declared."""
+        """Return the selected controller or plant, before its parameters can be declared."""
         spec = next(spec for spec in NODE_SPECS if spec.name == name)
         given = self._parameter_overrides.get(spec.name)
         return str(spec.check(spec.default if given is None else given.value))
 
-    # A design may take seconds without replies; plants on the same core are not to wait for it.
+    # A design may take seconds without replies; plants on the same core must not wait for it.
     @as_ordinary()
     def _design(self, values: Mapping[str, Any]) -> Controller:
         # Until the period is known, the loop's stability cannot be checked.
@@ -271,7 +265,7 @@ class ControllerNode(LifecycleNode, PollingNode):
         return make_controller(values["controller"], self._plant, self._period, own, checked=known)
 
     def _design_for(self, period: float) -> None:
-        """Take another period, judge the design at it, and use a new one where that makes a difference."""
+        """Set another period, check the design at it, and use a new one if it depends on it."""
         before, self._period = self._period, period
         if self._loop is None or (self._kind.DESIGNING and not self._uses_period()):
             return
@@ -297,13 +291,13 @@ class ControllerNode(LifecycleNode, PollingNode):
                 return True
             self.trigger_deactivate()
             return False
-        # A controller that needs the period, if it is not set, waits for the first few states. In lockstep there is no
-        # second state without a reply to the first; and a running controller continues while a plant restarts.
+        # A controller that needs an unset period waits for the first few states. In lockstep there is no second state
+        # without a reply to the first; and a running controller continues while a plant restarts.
         waits = self._uses_period() and not self._settings["period"] and not self._simulated_time
         return not waits or (self._loop is not None and self._loop.answered > 0)
 
     def _settle_period(self, measured: float) -> bool:
-        """Design for the measured period where none was given; return whether the controller is stable at it."""
+        """Design for the measured period if none was given; return whether the controller is stable at it."""
         values = self._settings.values
         self._refusal = ""
         plant = self._plant
@@ -348,7 +342,7 @@ class ControllerNode(LifecycleNode, PollingNode):
             self._command_publisher.publish(Float64MultiArray(data=[0.0] * len(self._driven)))
             return
         # Just after the last command: with the same stamp it would be refused as a duplicate. After a state without a
-        # command it would be a command of its own, which wakes the torque loop of a plant that is at rest.
+        # command it would be a command of its own, which enables the torque loop of a plant at rest.
         if (answered := self._loop.answered_ns) is not None:
             nothing = (0.0,) * len(self._driven)
             self._command_publisher.publish(encode_joints(answered + 1, self._full_name, self._driven, (), (), nothing))
@@ -413,7 +407,7 @@ def _specs_for_help(arguments: Sequence[str]) -> tuple[ParameterSpec, ...]:
     for argument in arguments:
         name, separator, value = argument.partition(":=")
         if separator and name == "controller" and value in controller_names():
-            # The node refuses one whose library is missing, in a sentence.
+            # The node reports a missing library itself.
             with contextlib.suppress(PendulumError):
                 return controller_parameters(value)
     return controller_parameters("lqr")

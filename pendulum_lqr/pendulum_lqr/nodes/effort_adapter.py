@@ -1,8 +1,7 @@
-"""Adds what commands of ros2_control's effort controllers lack: the stamp of the state that they reply to.
+"""Adds to commands of ros2_control's effort controllers the stamp of the state that they reply to.
 
-ros2_control's commands have no stamp that a plant could check, and its effort controllers hold the last one for ever.
-Here each command becomes one torque, as the reply to the newest state; none is ever repeated, so that a silent
-controller meets the plant's rule for stale commands.
+These commands have no stamp to check, and effort controllers hold the last one for ever. Here each command becomes one
+torque for the newest state and is never repeated, so that a silent controller triggers the plant's command timeout.
 """
 
 from __future__ import annotations
@@ -19,21 +18,17 @@ __all__ = ["EffortAdapter", "effort_of_array", "effort_of_joint"]
 
 
 def effort_of_array(data: Sequence[float]) -> float:
-    """Return the torque [N m] of a ``std_msgs/Float64MultiArray`` for a group of one joint.
-
-    Raises:
-        DataError: It has another number of values than one, or one that is not finite.
-    """
+    """Return the torque [N m] of a ``std_msgs/Float64MultiArray``; DataError unless it is one finite value."""
     if len(data) != 1:
         raise DataError(f"command has {len(data)} values; expected 1, the torque of {JOINT} [N m]")
     return _finite(data[0])
 
 
 def effort_of_joint(joints: Sequence[str], efforts: Sequence[float]) -> float:
-    """Return the torque [N m] for the pendulum's joint in a ``sensor_msgs/JointState`` that commands several.
+    """Return the torque [N m] for the pendulum's joint in a ``sensor_msgs/JointState`` of several joints.
 
     Raises:
-        DataError: The joint is not among them, efforts are missing, or its own is not finite.
+        DataError: The joint is missing, efforts are missing, or its own is not finite.
     """
     if JOINT not in joints:
         raise DataError(f"command is for {', '.join(joints) or 'no joint'}; expected {JOINT}")
@@ -51,8 +46,8 @@ def _finite(effort: float) -> float:
 class EffortAdapter:
     """Pairs commands with states.
 
-    A command replies to the newest state at once; if that one has a reply it waits for the next, and a later
-    command takes its place.
+    A command replies to the newest state at once; if that one has a reply it waits for the next, and a later command
+    replaces it.
 
     Args:
         timeout: Age at which a waiting command is dropped [s].
@@ -76,12 +71,7 @@ class EffortAdapter:
         return None if self._answered_ns < 0 else self._answered_ns
 
     def command(self, effort: float, now_ns: int) -> tuple[int, float] | None:
-        """Take a command and return stamp [ns] and torque [N m] to publish, or None where it has to wait.
-
-        Args:
-            effort: Torque [N m].
-            now_ns: Time on a steady clock [ns].
-        """
+        """Process a command at steady time [ns]; return stamp [ns] and torque [N m] to publish, or None to wait."""
         self.counts["commands"] += 1
         if self._waiting is not None:
             self.counts["replaced"] += 1
@@ -89,12 +79,7 @@ class EffortAdapter:
         return self._answer(now_ns)
 
     def state(self, stamp_ns: int, now_ns: int) -> tuple[int, float] | None:
-        """Take a state and return the reply to it, if a command was waiting.
-
-        Args:
-            stamp_ns: Its stamp [ns].
-            now_ns: Time on the same steady clock [ns].
-        """
+        """Process a state at steady time [ns]; return stamp [ns] and torque [N m] of a waiting command, or None."""
         # The plant was restarted or reset.
         self._newest_ns = stamp_ns
         if stamp_ns < self._answered_ns:

@@ -56,7 +56,7 @@ _COUNTS = ("commands", "answers", "replaced", "too_old", "refused")
 class EffortAdapterNode(Node):
     """Publishes each command of ros2_control's kind as the reply to the newest state.
 
-    While there is more than one publisher of commands none is passed on: they do not name their source.
+    While there are several publishers of commands none is passed on, because commands do not name their source.
 
     Args:
         stop: Requests the runner to end the process.
@@ -83,8 +83,8 @@ class EffortAdapterNode(Node):
         live_by_stamps(self, lambda: self._adapter.newest_stamp_ns)
 
     def close(self) -> None:
-        """End with zero torque while the context is still valid, and give it time to arrive."""
-        # After a newer state it would be a command of its own, which wakes the torque loop of a plant that is at rest.
+        """End with zero torque while the context is still valid, and wait for its arrival."""
+        # After a newer state it would be a command of its own, which enables the torque loop of a plant at rest.
         if (answered := self._adapter.answered_ns) is not None:
             self._publisher.publish(encode_joint_state(answered + 1, frame_id=self._full_name, effort=0.0))
             wait_until_heard(self._publisher)

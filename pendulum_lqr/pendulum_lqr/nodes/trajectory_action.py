@@ -1,7 +1,7 @@
-"""The result of a trajectory that was sent to a plant as a goal, by the plant's events.
+"""Result of a trajectory goal, from the events of the plant.
 
-A plant takes trajectories on a topic and reports on ``events``. An action has one end: reached,
-cancelled, or given up for a reason.
+A plant receives trajectories on a topic and reports on ``events``; an action ends once: reached, cancelled, or given
+up.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pendulum_msgs_py.contract.names import JOINT, Event
 __all__ = ["End", "Outcome", "PlantFollowing", "goal_problem"]
 
 _COMMANDED_BY = "commanded by "
-"""Start of a plant's reason for being under effort control."""
+"""Start of a plant's reason for effort control."""
 _POSITION, _EFFORT = Mode.POSITION.value, Mode.EFFORT.value
 
 
@@ -42,12 +42,12 @@ class End:
 
 
 def goal_problem(joints: list[str], other_joints: list[str], tolerances: Mapping[str, int]) -> End | None:
-    """Return why a goal is not passed on to a plant, or None. Points, limits and times are judged by the plant itself.
+    """Return why a goal is refused here, or None; the plant itself checks points, limits and times.
 
     Args:
         joints: Joints of its trajectory.
         other_joints: Joints of several degrees of freedom.
-        tolerances: Name of each list of tolerances -> how many it has.
+        tolerances: Number of tolerances by the name of their list.
     """
     if joints != [JOINT] or other_joints:
         return End(Outcome.WRONG_JOINTS, f"goal is for joints {[*joints, *other_joints][:5]}; expected [{JOINT!r}]")
@@ -64,8 +64,8 @@ def goal_problem(joints: list[str], other_joints: list[str], tolerances: Mapping
 class PlantFollowing:
     """One plant, and at most one goal that it follows.
 
-    The plant does not report the sender of a trajectory, nor that a new one replaces the one that it follows. So a
-    goal is started only while it follows none, and given up when another sender publishes one.
+    The plant reports neither the sender of a trajectory nor its replacement by another. So a goal is started only while
+    it follows none, and given up when another sender publishes one.
     """
 
     def __init__(self) -> None:
@@ -80,7 +80,7 @@ class PlantFollowing:
         return self._busy
 
     def begin(self) -> None:
-        """Note that a goal has been sent to the plant."""
+        """Record that a goal has been sent to the plant."""
         self.active, self._begun, self._cancelled = True, False, False
 
     def cancel(self) -> None:
@@ -88,11 +88,7 @@ class PlantFollowing:
         self._cancelled = True
 
     def on_event(self, event: Mapping[str, Any]) -> End | None:
-        """Take an event of the plant and return how the goal ended, or None.
-
-        Args:
-            event: With ``name``; ``mode`` and ``reason`` where it has them.
-        """
+        """Process an event with ``name``, and maybe ``mode`` and ``reason``; return how the goal ended, or None."""
         name, mode, reason = event.get("name"), event.get("mode"), str(event.get("reason", ""))
         if name == Event.PLANT_MODE:
             self._busy = mode == _POSITION
@@ -102,12 +98,12 @@ class PlantFollowing:
                 self._begun = True
                 return None
             if mode == _EFFORT:
-                # Before it follows, it may be commanded by torque; afterwards, none is taken before the end.
+                # Torque commands are possible before it follows, but not again before the end.
                 if not self._begun:
                     return None
                 if reason.startswith(_COMMANDED_BY):
                     return self._at_the_end(reason)
-                # It does not wait for torques at the end either: a plant that has just started does.
+                # Nor does it wait for torques at the end, which a plant that has just started does.
                 return self._end(Outcome.LEFT, f"plant is {mode}, as if it had started again: {reason}")
             return self._end(Outcome.LEFT, f"plant is {mode}: {reason}")
         if name == Event.TRAJECTORY_FINISHED:
@@ -126,12 +122,7 @@ class PlantFollowing:
         return self._end(Outcome.LEFT, "somebody else sent the plant a trajectory") if self.active else None
 
     def on_wait(self, seconds: float, patience: float) -> End | None:
-        """Record the time since a request; give the goal up where the plant has not reported on it.
-
-        Args:
-            seconds: Time since a trajectory was sent to the plant [s].
-            patience: Longest wait for it to begin, or to hold [s].
-        """
+        """Give the goal up if the plant has not reported within ``patience`` [s] of a request ``seconds`` [s] ago."""
         if not self.active or seconds <= patience or (self._begun and not self._cancelled):
             return None
         if self._cancelled:

@@ -1,1 +1,1 @@
-"""Learned policies: what they are, their files, and what other libraries trained."""
+"""Learned policies: definition, files, and import from other libraries."""

@@ -1,4 +1,4 @@
-"""Files of unknown origin, read within bounds: nothing larger than expected is taken into memory."""
+"""Files of unknown origin, read within bounds on their size."""
 
 from __future__ import annotations
 
@@ -15,12 +15,7 @@ __all__ = ["read_bounded", "read_parts", "sentence_of", "shown"]
 
 
 def read_bounded(path: Path, where: str, largest: int) -> bytes:
-    """Return the content of a file.
-
-    Args:
-        path: The file.
-        where: What it is, for messages.
-        largest: Bytes that it may have.
+    """Return the content of a file of at most ``largest`` bytes; ``where`` names it in messages.
 
     Raises:
         DataError: It is missing, no file, too large, or cannot be read.
@@ -49,16 +44,16 @@ def read_parts(
     """Return parts of a zip archive.
 
     Args:
-        content: The archive.
-        kind: What it is expected to be, for messages.
+        content: Archive.
+        kind: Expected kind, for messages.
         check: Refuses names and sizes before anything is unpacked, and returns the parts to read.
 
     Returns:
-        One content for each part. It has one byte more than the directory's size where there is more of it, since the
-        directory's size is not trusted.
+        Content of each part, with one byte more than the directory's size if there is more, because that size is not
+        trusted.
 
     Raises:
-        DataError: It is no whole archive, or ``check`` refuses it.
+        DataError: The archive is incomplete, or ``check`` refuses it.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -74,12 +69,12 @@ def read_parts(
 
 
 def shown(value: object) -> str:
-    """Return a value as a message shows it, cut where it is long."""
+    """Return a value for a message, shortened if long."""
     text = repr(value)
     return text if len(text) <= 100 else f"{text[:97]}..."
 
 
 def sentence_of(error: BaseException) -> str:
-    """Return the text of a library's error, as a part of one sentence."""
+    """Return the text of a library's error, as part of one sentence."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 160 else f"{text[:157]}..."

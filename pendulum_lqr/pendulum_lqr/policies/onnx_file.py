@@ -1,10 +1,9 @@
 """Policies as ONNX models, written without the library ``onnx``.
 
-One input ``observation`` (N, in) and one output ``action`` (N, out) within [-1, 1], in single precision: Gemm, Tanh or
-Relu, and Clip or Tanh at the end. The policy file's header is in the model's ``metadata_props``, each value
-as JSON, with ``observation``, the meaning of each input.
-
-Source: ONNX, ``onnx.proto3`` (intermediate representation 8), operators of opset 13; Protocol Buffers, "Encoding".
+Input ``observation`` (N, in), output ``action`` (N, out) within [-1, 1], in single precision: Gemm, Tanh or Relu, and
+Clip or Tanh at the end. ``metadata_props`` has the policy file's header, each value as JSON, and ``observation``, the
+meaning of each input. Source: ONNX, ``onnx.proto3`` (intermediate representation 8), operators of opset 13; Protocol
+Buffers, "Encoding".
 """
 
 from __future__ import annotations
@@ -25,18 +24,14 @@ from pendulum_msgs_py.whole_file import write_whole, writing
 __all__ = ["OPSET", "dumps_onnx", "observation_names", "write_onnx"]
 
 OPSET = 13
-"""The first in which every operator that is used here is what it is today."""
+"""First opset with the present form of every operator used here."""
 _IR_VERSION = 8
 _FLOAT, _INT = 1, 2
 _NOTE = "u = effort_limit * action, limited to a change of effort_rate * period; observation as metadata_props says"
 
 
 def write_onnx(path: str | Path, policy: Policy) -> Path:
-    """Write a policy as an ONNX model; it appears whole or not at all.
-
-    Raises:
-        DataError: The file cannot be written.
-    """
+    """Write a policy as an ONNX model, atomically; DataError if it cannot be written."""
     path = Path(path)
     with writing(f"model {path}", DataError):
         write_whole(path, dumps_onnx(policy))
@@ -61,7 +56,7 @@ def dumps_onnx(policy: Policy) -> bytes:
 
 
 def observation_names(policy: Policy) -> list[str]:
-    """Return what each input is, as ``joint: signal, sample``; sample 0 is the newest."""
+    """Return the meaning of each input, as ``joint: signal, sample``; sample 0 is the newest."""
     return [
         f"{policy.joints[joint]}: {signal}, sample {-age}"
         for age in range(policy.history - 1, -1, -1)
@@ -113,7 +108,7 @@ def _tensor(name: str, values: NDArray[np.float32] | np.float32) -> bytes:
 
 
 def _matrix(name: str, width: int) -> bytes:
-    """Return the type of a value of any number of rows."""
+    """Return the type of a value with any number of rows."""
     shape = _field(1, _text(2, "N")) + _field(1, _number(1, width))
     return _text(1, name) + _field(2, _field(1, _number(1, _FLOAT) + _field(2, shape)))
 

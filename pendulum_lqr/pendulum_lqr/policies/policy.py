@@ -1,4 +1,4 @@
-"""A learned policy: its task, its observation, and its network.
+"""A learned policy: task, observation and network, shared by training and controller.
 
 A policy sees the last ``history`` samples of its joints and returns an effort for each driven one::
 
@@ -6,10 +6,9 @@ A policy sees the last ``history`` samples of its joints and returns an effort f
     y_k = bounded(network([sample_(k-history+1), ..., sample_k])),  |y_k| <= 1
     u_k = u_(k-1) + clamp(effort_limit y_k - u_(k-1), effort_rate period)
 
-with x the angle from upright of each joint that turns, in [-pi, pi), q the deviation of each that slides, and u of each
-driven one; a policy may see a part of these, or x itself. Samples before the first equal the first, at zero effort.
-Vectors hold one value for each joint, in the order of ``joints``, those of efforts one for each driven joint;
-training and controller share this module, so that they agree.
+with x the angle from upright of each turning joint, in [-pi, pi), q the deviation of each slide, u of each driven
+joint; a policy may see some of these, or x itself. Samples before the first equal the first, at zero effort. Vectors
+have one value per joint, in the order of ``joints``, those of efforts one per driven joint.
 """
 
 from __future__ import annotations
@@ -49,12 +48,13 @@ __all__ = [
 Floats = NDArray[np.float32]
 
 MODELS = ("rigid_pendulum", "mechanism")
-"""What a policy is for: the pendulum, or a plant file's mechanism of several joints."""
+"""The pendulum, or a plant file's mechanism of several joints."""
 SIGNALS = ("angle", "cos", "sin", "position", "velocity", "effort")
-"""What a sample may hold of each joint, in this order: angle, cosine and sine of those that turn, the position of those
-that slide, the velocity of all, and of those that are driven the ``effort`` of the last command."""
+"""Signals of a sample, in this order: angle, cosine and sine of turning joints, position of slides, velocity of all,
+and of driven joints the ``effort`` of the last command.
+"""
 DEFAULT_SIGNALS = ("cos", "sin", "velocity", "effort")
-"""What policies of this project's training see: an angle jumps where cosine and sine do not."""
+"""Signals of this project's training: cosine and sine, because an angle jumps."""
 ACTIVATIONS = ("tanh", "relu")
 OUTPUTS = ("clip", "tanh")
 _SAME = 1e-3
@@ -65,13 +65,13 @@ class Network:
     """Dense layers with one activation between them, and an output within [-1, 1].
 
     Attributes:
-        weights: One matrix a layer, shape (out, in).
-        biases: One vector a layer, shape (out,).
+        weights: One matrix per layer, shape (out, in).
+        biases: One vector per layer, shape (out,).
         activation: One of ``ACTIVATIONS``.
-        output: How the last layer is bounded, one of ``OUTPUTS``.
+        output: Bound of the last layer, one of ``OUTPUTS``.
 
     Raises:
-        DataError: Shapes do not go together, or a value is not finite.
+        DataError: Shapes do not match, or a value is not finite.
     """
 
     weights: tuple[Floats, ...]
@@ -80,7 +80,6 @@ class Network:
     output: str = "clip"
 
     def __post_init__(self) -> None:
-        """Check everything that the arithmetic relies on."""
         if self.activation not in ACTIVATIONS:
             raise DataError(f"activation is {self.activation!r}; expected one of {', '.join(ACTIVATIONS)}")
         if self.output not in OUTPUTS:
@@ -101,14 +100,11 @@ class Network:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Values that go into each layer, and those that come out of the last one."""
+        """Number of inputs of each layer, and of outputs of the last one."""
         return (self.weights[0].shape[1], *(weight.shape[0] for weight in self.weights))
 
     def answer(self, observations: Floats) -> Floats:
-        """Return the bounded output for observations of shape (..., in), shape (..., out).
-
-        What is not finite on its way stays so, for the caller to see.
-        """
+        """Return the bounded output (..., out) for observations (..., in); NaN and infinity pass through."""
         x = observations
         last = len(self.weights) - 1
         with np.errstate(over="ignore", invalid="ignore"):
@@ -124,24 +120,24 @@ class Policy:
     """A network with the conditions of its use.
 
     Attributes:
-        network: The network.
-        name: Its name, for logs.
-        task: What it was trained for.
-        joints: Names of the joints, n of them, m driven; vectors of efforts have m values, the others n.
+        network: Network.
+        name: For logs.
+        task: Task of its training.
+        joints: Names of the n joints, m of them driven; vectors of efforts have m values, the others n.
         period: Time between two commands [s].
-        plant: The plant at the centre of training.
-        ranges: Lowest and highest value of each parameter of the plant that differed in training, by name.
+        plant: Nominal plant of the training.
+        ranges: Lowest and highest value of each plant parameter varied in training, by name.
         effort_limit: Largest effort of each driven joint [N m or N].
         effort_rate: Largest change of it; inf for none [N m/s or N/s].
         velocity_scale: Velocity that the network sees as 1 [rad/s or m/s].
-        angle_box: Largest deviation from upright that training visited; pi for all angles [rad or m].
-        velocity_box: Largest speed that training visited [rad/s or m/s].
-        signals: What it sees of each joint, a part of ``SIGNALS`` in their order.
-        history: Samples that it sees.
-        provenance: How it was trained: settings, seed, versions, results; plain JSON values.
+        angle_box: Largest deviation from upright in training; pi for all angles [rad or m].
+        velocity_box: Largest speed in training [rad/s or m/s].
+        signals: Signals of each joint, some of ``SIGNALS`` in their order.
+        history: Number of samples.
+        provenance: Settings, seed, versions, results of the training; plain JSON values.
 
     Raises:
-        DataError: The parts do not go together.
+        DataError: The parts do not match.
     """
 
     network: Network
@@ -161,12 +157,11 @@ class Policy:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check vectors, signals and sizes."""
         n = len(self.joints)
         if n < 1 or len(set(self.joints)) != n:
             raise DataError(f"joints are {list(self.joints)}; expected one name or more, no two the same")
         own = self.coordinates.names
-        # The one joint of a pendulum may have any name; of several, the order is part of what they are.
+        # The joint of a pendulum may have any name; of several, the order matters.
         if n != len(own) or (n > 1 and self.joints != own):
             raise DataError(f"joints are {list(self.joints)}; expected {', '.join(own)}, as plant {self.plant.name!r}")
         if not self.period > 0.0:
@@ -209,32 +204,24 @@ class Policy:
 
     @property
     def observation_size(self) -> int:
-        """Values that the network sees."""
+        """Number of inputs of the network."""
         return self.history * len(self.layout)
 
 
 def model_of(plant: PlantParameters) -> str:
-    """Return which of ``MODELS`` a plant is."""
+    """Return a plant's entry of ``MODELS``."""
     return MODELS[not plant.is_pendulum]
 
 
 def default_signals(coordinates: Coordinates) -> tuple[str, ...]:
-    """Return what policies of this project's training see: ``DEFAULT_SIGNALS``, and positions where a joint slides."""
+    """Return the signals of this project's training: ``DEFAULT_SIGNALS``, and positions if a joint slides."""
     if all(joint.turns for joint in coordinates.joints):
         return DEFAULT_SIGNALS
     return tuple(name for name in SIGNALS if name in {*DEFAULT_SIGNALS, "position"})
 
 
 def sample_layout(signals: Sequence[str], coordinates: Coordinates) -> tuple[tuple[str, int], ...]:
-    """Return signal and index of the joint of each value of a sample: signal by signal, for the joints that have it.
-
-    Args:
-        signals: Some of ``SIGNALS``.
-        coordinates: The joints.
-
-    Raises:
-        DataError: No joint has one of the signals.
-    """
+    """Return signal and joint index of each value of a sample, signal by signal; DataError if no joint has a signal."""
     found = []
     for signal in signals:
         own = [
@@ -256,17 +243,17 @@ def _has(joint: Joint, driven: bool, signal: str) -> bool:
 
 
 def fingerprint(plant: PlantParameters) -> str:
-    """Return 64 hexadecimal digits that two plants share if all their parameters are the same, names apart."""
+    """Return 64 hexadecimal digits that identify a plant's parameters, without names."""
     entry = json.loads(describe_plants([plant]))[0]
     del entry["name"]
     return hashlib.sha256(json.dumps(entry, sort_keys=True).encode()).hexdigest()
 
 
 def plant_problem(policy: Policy, plant: PlantParameters) -> str:
-    """Return as text why a policy is not for a plant; empty where it is.
+    """Return why a policy is not for a plant, or an empty string.
 
-    Each parameter has to lie within the range that was trained, or be that of the policy's plant within 0.1 %. A larger
-    effort limit is accepted: the policy applies its own; so is an end stop that its box does not reach.
+    Each parameter must lie within the trained range, or within 0.1 % of the policy's plant. A larger effort limit is
+    accepted, because the policy applies its own; so is an end stop beyond its box.
     """
     own = policy.plant
     if not own.is_pendulum or not plant.is_pendulum:
@@ -315,11 +302,7 @@ def _kind_of(plant: PlantParameters) -> str:
 
 
 def require_plant(policy: Policy, plant: PlantParameters) -> None:
-    """Refuse a plant that a policy is not for.
-
-    Raises:
-        ParameterError: The plant is another; the message has the difference.
-    """
+    """Raise ParameterError, with the difference, for a plant that a policy is not for."""
     problem = plant_problem(policy, plant)
     if problem:
         raise ParameterError(

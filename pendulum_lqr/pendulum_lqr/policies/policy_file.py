@@ -1,8 +1,8 @@
-"""Policies on disk: one ``.npz`` whose content is checked in full before any of it is used.
+"""Policy files: one ``.npz`` whose content is checked in full before any of it is used.
 
-A zip archive of arrays: ``header`` (JSON as bytes), ``weight_k`` and ``bias_k`` of each layer, and
-``test_observations`` with ``test_actions``, computed again on loading, so that another arithmetic or a damaged
-file shows. Nothing in it is executed: arrays of numbers alone, no pickles. Sizes are bounded before anything is read.
+A zip archive of arrays: ``header`` (JSON as bytes), ``weight_k`` and ``bias_k`` of each layer, ``test_observations``
+and ``test_actions``, recomputed on loading to detect different arithmetic and damaged files. No pickles; sizes are
+bounded before reading.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ __all__ = [
 
 FORMAT = "pendulum_policy/1"
 POLICY_SUFFIX = ".npz"
-"""What the name of a policy file ends with, where a controller's name may stand too."""
+"""Suffix of policy files, also where a controller's name is possible."""
 LARGEST_FILE = 4_000_000
-"""Largest file accepted, and largest sum of its arrays [bytes]: a network of 64 x 64 takes 20 thousand."""
+"""Largest file, and largest sum of its arrays [bytes]: a network of 64 x 64 takes 20 thousand."""
 _LARGEST_HEADER = 100_000
 _MOST_LAYERS = 8
 _TEST_VECTORS = 16
 _TOLERANCE = 1e-4
-"""How far a recomputed test vector may be off: other processors add in another order [-]."""
+"""Tolerance of recomputed test vectors: other processors add in another order [-]."""
 _VECTORS = ("effort_limit", "effort_rate", "velocity_scale", "angle_box", "velocity_box")
 _KEYS = {
     "format", "model", "name", "task", "joints", "period", "plant", "fingerprint", "ranges", *_VECTORS, "signals",
@@ -56,11 +56,7 @@ _KEYS = {
 
 
 def write_policy(path: str | Path, policy: Policy) -> Path:
-    """Write a policy file; it appears whole or not at all.
-
-    Raises:
-        DataError: The file cannot be written.
-    """
+    """Write a policy file, atomically; DataError if it cannot be written."""
     path = Path(path)
     content = dumps_policy(policy)
     with writing(f"policy file {path}", DataError):
@@ -103,14 +99,7 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def named_controller(text: str) -> tuple[str, dict[str, str]]:
-    """Return kind and parameters of a named controller, or of the one that runs a policy file.
-
-    Args:
-        text: A name, or the path of a policy file, which ends in ``POLICY_SUFFIX``.
-
-    Raises:
-        DataError: The file cannot be read.
-    """
+    """Return kind and parameters of a named controller or of a policy file, by suffix; DataError if unreadable."""
     if not text.endswith(POLICY_SUFFIX):
         return text, {}
     load_policy(text)
@@ -118,11 +107,7 @@ def named_controller(text: str) -> tuple[str, dict[str, str]]:
 
 
 def policy_record(parameters: Mapping[str, Any]) -> dict[str, str]:
-    """Return the entry of a run's record that identifies a controller's policy file, which may change later.
-
-    Returns:
-        The digest of the file under ``policy_sha256``; empty without a policy, or where its file cannot be read.
-    """
+    """Return ``policy_sha256`` for a run's record, because the file may change; empty without a readable policy."""
     path = parameters.get("policy")
     if not isinstance(path, str) or not path:
         return {}
@@ -134,15 +119,7 @@ def policy_record(parameters: Mapping[str, Any]) -> dict[str, str]:
 
 
 def loads_policy(content: bytes, where: str = "policy") -> Policy:
-    """Return the policy of a file's content.
-
-    Args:
-        content: The bytes.
-        where: What it is, for messages.
-
-    Raises:
-        DataError: as :func:`load_policy`.
-    """
+    """Return the policy of a file's content; ``where`` is for messages. Raises as :func:`load_policy`."""
     try:
         arrays = _read_arrays(content)
         header = _read_header(arrays.pop("header"))
@@ -155,7 +132,7 @@ def loads_policy(content: bytes, where: str = "policy") -> Policy:
 
 
 def header_of(policy: Policy) -> dict[str, Any]:
-    """Return all that a file holds of a policy except its weights, as JSON values."""
+    """Return a policy as JSON values, without its weights."""
     network = policy.network
     return {
         "format": FORMAT,
@@ -167,7 +144,7 @@ def header_of(policy: Policy) -> dict[str, Any]:
         "plant": json.loads(describe_plants([policy.plant]))[0],
         "fingerprint": fingerprint(policy.plant),
         "ranges": {name: list(pair) for name, pair in policy.ranges.items()},
-        # JSON has no infinity: no bound on the rate is null.
+        # JSON has no infinity: an unbounded rate is null.
         **{name: [v if math.isfinite(v) else None for v in getattr(policy, name)] for name in _VECTORS},
         "signals": list(policy.signals),
         "history": policy.history,
@@ -189,7 +166,7 @@ def _header_text(policy: Policy) -> str:
 
 
 def _read_arrays(content: bytes) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an archive, whose names and sizes are checked before it is unpacked."""
+    """Return the arrays of an archive, after a check of names and sizes."""
     if len(content) > LARGEST_FILE:
         raise DataError(f"it has {len(content)} bytes; expected at most {LARGEST_FILE}")
     names: list[str] = []
@@ -214,7 +191,7 @@ def _read_arrays(content: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _read_array(name: str, data: bytes, kind: type[np.generic]) -> NDArray[Any]:
-    """Return one array; its shape is compared with the bytes that there are before memory is taken for it."""
+    """Return one array, after a comparison of its shape with the available bytes."""
     stream = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(stream)

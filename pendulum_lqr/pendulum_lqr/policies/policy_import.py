@@ -1,4 +1,4 @@
-"""Make a policy of an actor that another library trained: its inputs and outputs have to be specified."""
+"""Conversion of another library's actor into a policy, by a specification of its inputs and outputs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["ActorSpec", "policy_of_actor"]
 _WORDS = (*SIGNALS, "-cos", "-sin")
 _SAME = 1e-3
 _BOX_MARGIN = 1.001
-"""An environment that clips at a bound reaches it to the last bit."""
+"""An environment that clips at a bound reaches it exactly."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class ActorSpec:
     """What an archive does not define of its actor.
 
     Attributes:
-        plant: The plant of its training.
+        plant: Plant of its training.
         period: Time between two commands [s].
-        observation: What it sees of a sample, in its order: words of ``SIGNALS``, with a minus where it sees the
-            negative (``-cos`` is the cosine of an angle from hanging); empty to infer it from the spaces.
-        history: Samples that it sees, the oldest first.
+        observation: Signals of a sample in order, with a minus for negatives (``-cos`` is the cosine of an angle from
+            hanging); empty to infer them from the spaces.
+        history: Number of samples, the oldest first.
         velocity_scale: Velocity that it sees as 1 [rad/s].
-        velocity_box: Largest speed that its training visited [rad/s]; 0 for the bound of its space.
-        effort_limit: Torque of its largest action [N m]; 0 where that is the plant's limit in N m.
+        velocity_box: Largest speed in training [rad/s]; 0 for the bound of its space.
+        effort_limit: Torque of its largest action [N m]; 0 if that is the plant's limit in N m.
     """
 
     plant: PlantParameters
@@ -125,7 +125,7 @@ def _plain(words: Sequence[str]) -> list[str]:
 
 
 def _columns(words: Sequence[str], history: int) -> NDArray[np.int64]:
-    """Return for each input of a policy its index in the actor's input, shape (history * n,)."""
+    """Return the index in the actor's input of each input of a policy, shape (history * n,)."""
     own = sorted(range(len(words)), key=lambda k: SIGNALS.index(_plain(words)[k]))
     return np.array([len(words) * sample + k for sample in range(history) for k in own])
 
@@ -136,9 +136,9 @@ def _signs(words: Sequence[str], history: int) -> NDArray[np.float64]:
 
 
 def _boxes(space: Space, words: Sequence[str], spec: ActorSpec) -> tuple[float, float]:
-    """Return the largest angle [rad] and velocity [rad/s], after a check of the bounds of each value."""
+    """Return the largest angle [rad] and velocity [rad/s], after a check of all bounds."""
     angle, velocity = math.pi, spec.velocity_box
-    # Stacked samples: the bounds lie in another order than the values (VecFrameStack repeats each bound).
+    # With stacked samples the bounds are in another order than the values (VecFrameStack repeats each bound).
     bounds = dict(zip(_plain(words), zip(space.low, space.high, strict=True), strict=True)) if spec.history == 1 else {}
     for word, (low, high) in bounds.items():
         expected = 1.0 if word in {"cos", "sin"} else high

@@ -1,10 +1,10 @@
-"""Actors of Stable-Baselines3: PPO, A2C, SAC and TQC archives, read without that library and without torch.
+"""Actors of Stable-Baselines3 (PPO, A2C, SAC, TQC), read without that library and without torch.
 
-The archive is a zip file with ``data`` (JSON, whose pickled parts are left alone) and ``policy.pth`` (the weights).
-An actor's output is that of ``model.predict(observation, deterministic=True)``::
+The archive is a zip file with ``data`` (JSON, whose pickled parts are ignored) and ``policy.pth`` (weights). The output
+is that of ``model.predict(observation, deterministic=True)``::
 
-    PPO, A2C    u = clip(network(o), low, high), tanh between the layers by default
-    SAC, TQC    u = high tanh(network(o)), relu between the layers by default
+    PPO, A2C  u = clip(network(o), low, high), tanh between the layers by default
+    SAC, TQC  u = high tanh(network(o)), relu between the layers by default
 
 Source: Stable-Baselines3, "On saving and loading"; sb3-contrib, ``TQC``.
 """
@@ -31,7 +31,7 @@ from pendulum_msgs_py.errors import DataError, PendulumError
 __all__ = ["LARGEST_ARCHIVE", "Actor", "Space", "load_actor"]
 
 LARGEST_ARCHIVE = 40_000_000
-"""Largest archive accepted [bytes]: optimisers of all networks are in it too."""
+"""Largest archive [bytes], including optimisers of all networks."""
 _LARGEST_DATA = 20_000_000
 _PARTS = ("data", "policy.pth")
 _VERSION = "_stable_baselines3_version"
@@ -39,7 +39,7 @@ _VERSION = "_stable_baselines3_version"
 
 @dataclass(frozen=True)
 class _Kind:
-    """Where the actor of a class of policies lies among its weights."""
+    """Location of the actor of a class of policies among its weights."""
 
     algorithm: str
     activation: str
@@ -73,33 +73,31 @@ _SETTINGS = (
     "optimizer_class", "optimizer_kwargs", "share_features_extractor", "normalize_images", "full_std",
     "use_expln", "clip_mean",
 )  # fmt: skip
-"""Settings of a policy that do not change its network, or that are handled here."""
+"""Settings of a policy that do not change its network, or are handled here."""
 
 
 @dataclass(frozen=True)
 class Space:
-    """A box of vectors: its bounds as the archive prints them, shape (n,)."""
+    """A box of vectors: its bounds in the archive's precision, shape (n,)."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether zero is its middle."""
+        """Whether it is centred at zero."""
         return bool(np.array_equal(self.low, -self.high))
 
 
 @dataclass(frozen=True)
 class Actor:
-    """The contents of an actor's archive.
+    """Contents of an actor's archive.
 
     Attributes:
         network: From observations to actions within [-1, 1], in units of the largest action.
         observations: Space of its inputs.
         actions: Space of its outputs, in the units of its environment.
-        algorithm: Of its training.
-        version: Of Stable-Baselines3.
-        steps: Steps of its training; None where the archive lacks it.
+        steps: Training steps; None if unknown.
         sha256: Of the archive.
     """
 
@@ -116,8 +114,9 @@ def load_actor(path: str | Path) -> Actor:
     """Return the actor of an archive.
 
     Raises:
-        DataError: The archive is missing, too large, damaged, foreign, or of a policy that is no plain network with
-            tanh or relu from a box of vectors to a symmetric box.
+        DataError: The archive is missing, too large, damaged, foreign, or not a plain network with tanh or relu from a
+            box of
+            vectors to a symmetric box.
     """
     path = Path(path).expanduser()
     where = f"archive {path}"
@@ -235,7 +234,7 @@ def _space(content: Mapping[str, Any], name: str) -> Space:
 
 
 def _vector(text: object) -> NDArray[np.float64] | None:
-    """Return what numpy prints of a vector, such as ``[-1. -1. -8.]``, or None."""
+    """Parse a vector printed by numpy, such as ``[-1. -1. -8.]``, or return None."""
     if not isinstance(text, str) or len(text) > 10_000 or not re.fullmatch(r"\[[-+.0-9einf\s]+\]", text):
         return None
     try:

@@ -1,10 +1,9 @@
-"""Weights from a file that ``torch.save`` wrote, read without torch and without executing anything.
+"""Weights from a ``torch.save`` file, read without torch and without executing anything.
 
-Such a file is a zip archive: ``data.pkl`` is a pickle that lists the tensors, ``data/<key>`` holds their numbers.
-The pickle is not unpickled: its operations are read one by one, and only those that put tensors into a dictionary mean
-anything. Any other one, and any name of code but the four of ``_NAMES``, refuses the file.
-
-Source: PyTorch, "Serialization semantics", format of ``torch.save``; Python, ``pickletools``.
+The zip archive has ``data.pkl``, a pickle that lists the tensors, and ``data/<key>`` with their numbers. The pickle is
+not unpickled: its operations are read one by one, and anything other than tensors in a dictionary, or a name of code
+outside ``_NAMES``, is refused. Source: PyTorch, "Serialization semantics", format of ``torch.save``; Python,
+``pickletools``.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class _Tensor(NamedTuple):
 
 
 def read_state(content: bytes) -> dict[str, NDArray[np.float32]]:
-    """Return the tensors by name of a ``state_dict`` that ``torch.save`` wrote.
+    """Return the tensors by name of a ``state_dict`` written by ``torch.save``.
 
     Raises:
         DataError: It is no such file, damaged, too large, or holds more than named tensors of finite numbers.
@@ -62,7 +61,7 @@ def read_state(content: bytes) -> dict[str, NDArray[np.float32]]:
         total = sum(entry.file_size for entry in entries)
         if total > LARGEST_STATE:
             raise DataError(f"its parts take {total} bytes; expected at most {LARGEST_STATE}")
-        # All lie in one folder, whose name is free.
+        # All are in one folder of any name.
         names[:] = [entry.filename.partition("/")[2] for entry in entries]
         if len(set(names)) != len(names) or "data.pkl" not in names:
             raise DataError(
@@ -110,10 +109,7 @@ def _tensors(pickled: bytes) -> dict[str, _Tensor]:
 
 
 class _Reader:
-    """Reads the operations of a pickle into plain values.
-
-    Messages show no value of it: a small pickle can name one that takes forever to print.
-    """
+    """Interprets the operations of a pickle; messages show none of its values, which could take forever to print."""
 
     def __init__(self) -> None:
         self._stack: list[Any] = []
@@ -121,7 +117,7 @@ class _Reader:
         self._memo: dict[int, Any] = {}
 
     def read(self, pickled: bytes) -> Any:
-        """Return what the pickle describes."""
+        """Return the described object."""
         for operation, argument, _ in pickletools.genops(pickled):
             if operation.name == "STOP":
                 return self._stack.pop()

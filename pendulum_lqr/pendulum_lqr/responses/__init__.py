@@ -1,1 +1,1 @@
-"""Frequency responses: of controllers, of measured machines, and what they certify."""
+"""Frequency responses of controllers and measured machines, and certificates from them."""

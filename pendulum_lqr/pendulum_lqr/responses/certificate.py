@@ -1,24 +1,18 @@
-"""Which designs carry over from a model to a machine whose frequency response was measured.
+"""Certificates that a design made on a model stabilises a machine with a measured frequency response.
 
-Two certificates, both by Vinnicombe's theorem and both with the upper confidence limit of the measurement:
+Two certificates, by Vinnicombe's theorem with the upper confidence limit of the measurement:
 
-``gap``        one number for the machine (the nu-gap in the task's units) below one number for the design, b(P, K)
-``frequency``  at each frequency, with the weights that certify most (:func:`.gap_metric.loop_distance`)
+``gap``          nu-gap of the machine (in the task's units) below the design's margin b(P, K)
+``frequency``    at each frequency, with the weights that certify most (:func:`.gap_metric.loop_distance`)
 
-They presume that the machine has as many unstable poles as the model, a pendulum upright one. Poles below the lowest
-line cannot be counted: of one joint the stiffness is continued to 0 with its error; of several, where the model has
-such poles, no loop with a mode below that line is certified. A stiffness that was overlooked, kappa [1/s^2], moves the
-response at the line omega by about kappa / omega^2, so one that no line shows is smaller than omega^2 and cannot tip a
-loop whose modes are all faster.
-
-They presume no resonance damped by less than :data:`.machine_response.LEAST_DAMPING`. A sharp one between two lines
-shows at both: what they deviate from a smooth plant is read as such a resonance, and a loop that it may bring to -1 is
-undecided. One that the measurement's error hides tips a loop only below the damping that each certificate names.
-
-Both concern the linear machine, on a grid dense enough for lightly damped loops
-(:mod:`pendulum_lqr.responses.machine_response` defines how it is made of measured lines). From the highest line to the
-Nyquist frequency the machine is taken to be smooth, or, where lines end well below, to roll off. Neither covers
-saturation, or dry friction at rest.
+Assumptions: the machine is linear (no saturation, no dry friction at rest) and has the model's number of unstable
+poles, one for an upright pendulum. Beyond the highest line it is smooth, or rolls off if lines end well below Nyquist.
+Poles below the lowest line cannot be counted. For one joint the stiffness is extrapolated to 0 with its error; for
+several, no loop with a mode below that line is certified if the model has such poles: an overlooked stiffness kappa
+[1/s^2] changes the response at omega by some kappa / omega^2, so a hidden one is below omega^2 and harmless to faster
+modes. No resonance is damped by less than :data:`.machine_response.LEAST_DAMPING`. A sharp one between two lines shows
+as their deviation from a smooth plant, and a loop that it could destabilise is undecided. One hidden by the
+measurement's error destabilises a loop only below the damping that the certificate reports.
 """
 
 from __future__ import annotations
@@ -46,21 +40,21 @@ __all__ = ["Certificate", "Certifier", "GapProfile", "compare_machine", "is_stab
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 _FAR = 10.0
-"""Loop distance from which no measurement of practical length decides."""
+"""Loop distance above which no practical measurement decides."""
 _FASTEST = 1e-6
 """Smallest eigenvalue of a sampled loop that counts as a mode."""
 
 
 @dataclass(frozen=True)
 class GapProfile:
-    """How far a machine is from a model, in scaled units.
+    """Distance of a machine from a model, in scaled units.
 
     Attributes:
         frequency: Shape (n,) [Hz].
         gap: Chordal distance, shape (n,).
         upper: Its upper confidence limit, shape (n,).
-        value: The nu-gap.
-        value_upper: Its upper confidence limit, the frequencies beyond the highest line included.
+        value: nu-gap.
+        value_upper: Its upper confidence limit, including frequencies beyond the highest line.
         at: Frequency of the limit [Hz].
         winding: Whether the winding number condition holds.
         scaling: Units.
@@ -77,13 +71,7 @@ class GapProfile:
 
 
 def compare_machine(plant: LinearModel, machine: Machine, scaling: SignalScaling = DEFAULT_SCALING) -> GapProfile:
-    """Return the gap between a model, sampled as the machine is, and the machine.
-
-    Args:
-        plant: The model.
-        machine: The measured machine.
-        scaling: Units of outputs and torque.
-    """
+    """Return the gap between a machine and a model sampled at its period."""
     model = scaling.plant(model_response(plant, machine.frequency, machine.period))
     measured = scaling.plant(machine.response)
     discs = np.abs(scaling.plant(machine.radius))
@@ -91,7 +79,7 @@ def compare_machine(plant: LinearModel, machine: Machine, scaling: SignalScaling
     upper = _sum_of_angles(kappa, _disc_distance(measured, discs))
     beyond = 0.0
     if not machine.up_to_nyquist:
-        # Where both only get smaller, they differ from nothing, and so from each other, by less than at the last line.
+        # If both decrease, their distances from zero, and so from each other, are below those at the last line.
         largest = np.linalg.norm(np.abs(measured[:, -1]) + discs[:, -1])
         angles = _size_angle(float(largest)), _size_angle(float(np.linalg.norm(model[:, -1])))
         beyond = float(_sum_of_angles(*map(np.array, angles)))
@@ -115,7 +103,7 @@ def _size_angle(size: float) -> float:
 
 
 def _sum_of_angles(first: ArrayLike, second: ArrayLike) -> Array:
-    """Return the sine of the sum of two angles given by their sines, 1 beyond 90 degrees: the triangle inequality."""
+    """Return the sine of the sum of two angles given by sines, 1 beyond 90 degrees (triangle inequality)."""
     angle = np.arcsin(np.clip(first, 0.0, 1.0)) + np.arcsin(np.clip(second, 0.0, 1.0))
     return np.asarray(np.sin(np.minimum(angle, np.pi / 2.0)), dtype=np.float64)
 
@@ -130,22 +118,23 @@ def _disc_distance(centre: Complex, discs: Array) -> Array:
 
 @dataclass(frozen=True)
 class Certificate:
-    """The certificate of one design on the machine.
+    """Certificate of one design on the machine.
 
     Attributes:
-        stable_on_model: Whether it stabilises the model that it was designed on, sampled as the machine is.
-        margin: b(P, K) of the model, in scaled units; 0 where it does not stabilise it.
-        by_gap: Whether the gap's upper limit lies below the margin.
-        by_frequency: Whether the loop distance lies below 1 at each frequency.
+        stable_on_model: Whether it stabilises its model, sampled at the machine's period.
+        margin: b(P, K) of the model, in scaled units; 0 if unstable.
+        by_gap: Whether the gap's upper limit is below the margin.
+        by_frequency: Whether the loop distance is below 1 at each frequency.
         distance: Largest loop distance; < 1 is safe.
-        at: Frequency of it [Hz].
-        worst_modulus: Smallest distance of any loop within the confidence discs from -1, the machine's own modulus
-            margin with 95 % confidence; 0 where a disc reaches it.
+        at: Its frequency [Hz].
+        worst_modulus: Smallest distance of any loop within the confidence discs from -1: the machine's modulus margin
+            with 95 % confidence; 0 if a disc reaches -1.
         possible: Whether at each frequency some plant within the confidence disc has a loop distance below 1.
-        unseen: Frequency from which a measurement would have to begin to show what moves the model's slow poles [Hz];
-            0 where it began there, or no such pole matters.
-        resonance: Frequency near which a resonance that the lines show may tip the loop [Hz]; 0 for none.
-        hidden_damping: Damping ratio from which a resonance that the measurement's error hides cannot tip it [-].
+        unseen: Lowest frequency that a measurement needs to show what moves the model's slow poles [Hz]; 0 if it had
+            it, or there are no such poles.
+        resonance: Frequency near which a visible resonance could destabilise the loop [Hz]; 0 for none.
+        hidden_damping: Damping ratio from which a resonance hidden by the measurement's error cannot destabilise it
+            [-].
     """
 
     stable_on_model: bool
@@ -167,7 +156,7 @@ class Certificate:
 
     @property
     def far(self) -> bool:
-        """Whether the error alone is so large that no measurement decides: ten times less takes a hundred as long."""
+        """Whether the error is too large for any measurement: a tenth of it takes a hundred times as long."""
         return self.undecided and not (self.unseen or self.resonance) and self.distance >= _FAR
 
     @property
@@ -177,23 +166,12 @@ class Certificate:
 
 
 def is_stable(sampled: DiscreteModel, K: ArrayLike) -> bool:
-    """Return whether a static gain stabilises a sampled model.
-
-    Args:
-        sampled: The model; its first states are what is measured: angle and velocity, or those of k joints.
-        K: Gain, shape (2,), or (2 k,).
-    """
+    """Return whether a static gain, shape (2,) or (2 k,), stabilises a sampled model with leading measured states."""
     return bool(np.max(np.abs(np.linalg.eigvals(closed_loop(sampled, K)))) < 1.0)
 
 
 class Certifier:
-    """Certifies designs that were made on one model, for one measured machine.
-
-    Args:
-        plant: The model.
-        machine: The machine.
-        scaling: Units of outputs and torque, for the gap.
-    """
+    """Certifies designs made on one model for one measured machine; ``scaling`` has the gap's units."""
 
     def __init__(self, plant: LinearModel, machine: Machine, scaling: SignalScaling = DEFAULT_SCALING) -> None:
         self.plant = plant
@@ -211,26 +189,21 @@ class Certifier:
         self._whole = scaling.plant(model_response(plant, whole, machine.period))
 
     def gain(self, K: ArrayLike) -> Certificate:
-        """Return the certificate of a static gain u = -K [theta, theta_dot].
-
-        Args:
-            K: Shape (2,) [N m/rad, N m s/rad], or (2 k,) for a plant of k joints.
-        """
+        """Return the certificate of a static gain, shape (2,) [N m/rad, N m s/rad], or (2 k,) of k joints."""
         stable = is_stable(self._sampled, K)
         found = self.feedback(np.asarray(K, dtype=np.complex128).reshape(-1, 1), stable=stable)
         if not (stable and self._has_slow_poles):
             return found
         modes = np.linalg.eigvals(closed_loop(self._sampled, K)).astype(np.complex128)
-        # Modes at 0 of a delay are the fastest there are.
+        # Modes at 0 come from a delay and are the fastest.
         slowest = float(np.min(np.abs(np.log(modes[np.abs(modes) > _FASTEST])))) / self.machine.period / (2.0 * np.pi)
         return replace(found, unseen=slowest) if slowest < self.machine.lowest else found
 
     def feedback(self, response: ArrayLike, *, stable: bool) -> Certificate:
-        """Return the certificate of any linear controller.
+        """Return the certificate of any linear controller u = -K y.
 
         Args:
-            response: u = -K y: response of the controller at the machine's frequencies and period, shape (2, n), or
-                (2, 1) for a gain.
+            response: K at the machine's frequencies and period, shape (2, n), or (2, 1) for a gain.
             stable: Whether the loop with the model is stable at the machine's period.
         """
         K, machine = np.asarray(response, dtype=np.complex128), self.machine
@@ -240,7 +213,7 @@ class Certifier:
         at = int(np.argmax(distance))
         plant = self._whole if K.shape[1] == 1 else self.scaling.plant(self._model)
         margin = float(np.min(pointwise_margin(plant, self.scaling.controller(K)))) if stable else 0.0
-        # Where much lies beyond the highest line, only a small loop is known to stay away from -1 there.
+        # If the plant matters beyond the highest line, only a small loop is known to stay away from -1 there.
         settled = machine.up_to_nyquist or bool((np.abs(second[-1]) + radius[-1] < 1.0) and (np.abs(first[-1]) < 1.0))
         room = np.maximum(np.abs(1.0 + second) - radius, 1e-300)
         ringing = np.zeros((2, *machine.radius.shape)) if machine.ringing is None else machine.ringing
@@ -266,7 +239,7 @@ class Certifier:
 
 
 def _same_winding(first: Complex, second: Complex) -> bool:
-    """Return whether two loops go round -1 equally often: the ratio of their return differences does not go round 0."""
+    """Return whether two loops encircle -1 equally often: the ratio of return differences does not encircle 0."""
     ratio = (1.0 + second) / (1.0 + first)
     steps = np.angle(ratio[1:] / ratio[:-1])
     if np.any(np.abs(steps) > 0.5 * np.pi) or not (ratio[0].real > 0.0 and ratio[-1].real > 0.0):

@@ -1,10 +1,9 @@
-"""The linear part of any controller as a frequency response: its output for small angles and velocities.
+"""Frequency response of any controller, linearised by simulation.
 
-A controller with an integral, an observer or an optimisation inside has no gain to read off. Run in closed loop with
-the model it was designed on, where everything stays bounded, it is disturbed at the measured angle and, in a second
-run, at the measured velocity, both by a small multisine. The two responses give both entries of K(e^{j w h}),
+A controller with integral, observer or optimisation has no gain to read off. In closed loop with its model, where
+everything stays bounded, small multisines disturb the measured angle and, in a second run, velocity; the responses give
 
-    u = -K y,    K = -U Y^-1    (U: 1 x 2, Y: 2 x 2 at each frequency)
+    u = -K y,  K = -U Y^-1  (U: 1 x 2, Y: 2 x 2 at each frequency)
 """
 
 from __future__ import annotations
@@ -27,22 +26,18 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _LENGTH = 20.0
-"""Length of a period of the excitation, in which lines lie 0.05 Hz apart [s]."""
+"""Period of the excitation, with lines 0.05 Hz apart [s]."""
 _MOST_PERIODS = 5
-"""Periods after which a loop that does not repeat itself counts as unstable."""
+"""Periods after which a loop that is not periodic counts as unstable."""
 _REPEATS = 1e-3
-"""Largest change of the state from period to period, relative to its largest value, that counts as repeating."""
+"""Largest change of the state per period, relative to its largest value, of a periodic loop."""
 _ANGLE, _VELOCITY = 1e-4, 1e-2
 """Size of the excitation, small enough for limits to stay away [rad, rad/s]."""
 _FALLEN = 0.5
 
 
 def require_time_invariant(name: str) -> None:
-    """Refuse a controller that depends on time, and so has no frequency response.
-
-    Raises:
-        ParameterError: It follows a reference that moves, or plays torques.
-    """
+    """Raise ParameterError for a controller that depends on time and so has no frequency response."""
     if not controller_class(name).TIME_INVARIANT:
         raise ParameterError(
             f"controller {name!r} answers by the time, and so has no frequency response; expected one that holds a "
@@ -65,11 +60,11 @@ def controller_response(
         plant: Plant that it is designed for.
         frequency: Shape (n,), below the Nyquist frequency [Hz]; interpolated between lines 0.05 Hz apart.
         period: Sampling period [s].
-        values: Its parameters by name; others at their default.
-        size: Of the disturbances, as a factor on 0.1 mrad and 0.01 rad/s.
+        values: Its parameters by name; others have defaults.
+        size: Factor on disturbances of 0.1 mrad and 0.01 rad/s.
 
     Raises:
-        ParameterError: No such controller, or it is not for this plant or period.
+        ParameterError: No such controller, or not for this plant or period.
     """
     require_time_invariant(name)
     model = discretise(linearise(plant), period)
@@ -103,7 +98,7 @@ def controller_response(
 def _closed_loop(
     controller: Controller, model: DiscreteModel, wave: Array, channel: int, period: float
 ) -> tuple[Array, Array] | None:
-    """Return torque and measurement over the last period, or None where the loop does not stay near upright."""
+    """Return torque and measurement over the last period, or None if the loop does not stay near upright."""
     size = wave.size
     state = np.zeros(model.A.shape[0])
     effort, measured = np.empty(size), np.empty((2, size))
@@ -122,7 +117,7 @@ def _closed_loop(
             largest = np.maximum(largest, np.abs(state))
             if not abs(state[0]) < _FALLEN:
                 return None
-        # A stable loop under a periodic input repeats itself; what grows, or creeps, does not.
+        # A stable loop under a periodic input becomes periodic; growth or drift does not.
         if turn and np.all(np.abs(state - before) <= _REPEATS * largest):
             return effort, measured
         before = state.copy()

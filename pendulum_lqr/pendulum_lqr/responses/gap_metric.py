@@ -1,14 +1,13 @@
-"""The nu-gap between two plants, the margin of a controller, and which controllers carry over from one to the other.
+"""The nu-gap between two plants, and the stability margin of controllers, from frequency responses.
 
-A plant has one input (torque) and one or more outputs (angle, velocity); all of it works on frequency responses, so
-that a measured plant serves as well as a model. Signals are divided by scales first: a gap has no meaning without
+Plants have one input (torque) and any outputs, measured or modelled. Signals are scaled first, because a gap depends on
 units.
 
-    chordal distance   kappa = |sin| of the angle between [1; P1] and [1; P2]
-    margin             rho   = |1 + K P| / (sqrt(1 + |P|^2) sqrt(1 + |K|^2))     (u = -K y)
-    nu-gap             delta = max kappa over frequency, 1 where the winding number condition fails
-    theorem            K stabilises P1 and delta(P1, P2) < b(P1, K) = min rho: K stabilises P2 too; so does it where the
-                       winding number condition holds and kappa < rho at each frequency
+    chordal distance     kappa = |sin| of the angle between [1; P1] and [1; P2]
+    margin               rho   = |1 + K P| / (sqrt(1 + |P|^2) sqrt(1 + |K|^2))   (u = -K y)
+    nu-gap               delta = max kappa over frequency, 1 if the winding number condition fails
+    theorem              K that stabilises P1 stabilises P2 if delta(P1, P2) < b(P1, K) = min rho, or if the winding
+                         number condition holds and kappa < rho at each frequency
 
 Source: Vinnicombe, Frequency domain uncertainty and the graph topology, IEEE TAC 38(9), 1993, theorems 3.1 and 4.3;
 Vinnicombe, Uncertainty and Feedback, Imperial College Press, 2001, sections 2.3 and 3.2.
@@ -44,21 +43,21 @@ Complex = NDArray[np.complex128]
 
 
 class SignalScaling(ABC):
-    """What counts as one unit of each signal: the deviations that the task allows, and the torque it has for them."""
+    """Units of signals: the deviations that the task permits, and the torque available for them."""
 
     @property
     @abstractmethod
     def outputs(self) -> Array:
-        """One unit of each output, shape (outputs, 1)."""
+        """Unit of each output, shape (outputs, 1)."""
 
     @property
     @abstractmethod
     def input(self) -> float:
-        """One unit of the torque or force."""
+        """Unit of the torque or force."""
 
     @abstractmethod
     def sentence(self) -> str:
-        """Return the result as a sentence."""
+        """Return the scaling as a sentence."""
 
     def plant(self, response: ArrayLike) -> Complex:
         """Return a response, shape (outputs, n), in scaled units."""
@@ -69,26 +68,19 @@ class SignalScaling(ABC):
         return np.asarray(response, dtype=np.complex128) * self.outputs / self.input
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as JSON values."""
+        """Return JSON values."""
         return asdict(self)  # type: ignore[call-overload]
 
 
 @dataclass(frozen=True, slots=True)
 class Scaling(SignalScaling):
-    """Scaling of a plant of one joint.
-
-    Attributes:
-        angle: [rad].
-        velocity: [rad/s].
-        torque: [N m].
-    """
+    """Scaling of a plant of one joint: angle [rad], velocity [rad/s] and torque [N m]."""
 
     angle: float = 0.03
     velocity: float = 3.0
     torque: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse scales that divide by nothing."""
         for name, unit in (("angle", "rad"), ("velocity", "rad/s"), ("torque", "N m")):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
@@ -96,16 +88,16 @@ class Scaling(SignalScaling):
 
     @property
     def outputs(self) -> Array:
-        """One unit of angle [rad] and velocity [rad/s]."""
+        """Units of angle [rad] and velocity [rad/s]."""
         return np.array([[self.angle], [self.velocity]])
 
     @property
     def input(self) -> float:
-        """One unit of the torque [N m]."""
+        """Unit of the torque [N m]."""
         return self.torque
 
     def sentence(self) -> str:
-        """Return the result as a sentence."""
+        """Return the scaling as a sentence."""
         return (
             f"One unit is {self.angle:g} rad of angle, {self.velocity:g} rad/s of velocity and "
             f"{self.torque:g} N m of torque: the deviations that the task allows, and the torque it has for them."
@@ -120,11 +112,10 @@ class JointScaling(SignalScaling):
     """Scaling of a plant of several joints, one of them driven.
 
     Attributes:
-        names: Of the outputs: joints, then their velocities.
+        names: Outputs: joints, then their velocities.
         units: Of each [rad, m, rad/s or m/s].
-        values: One unit of each, in these.
-        effort: One unit of the effort [N m or N].
-        effort_unit: Its unit.
+        values: Unit of scaling of each.
+        effort: Unit of scaling of the effort [N m or N].
     """
 
     names: tuple[str, ...]
@@ -137,14 +128,7 @@ class JointScaling(SignalScaling):
     def of_weights(
         cls, names: Sequence[str], units: Sequence[str], q: Sequence[float], r: float, effort_unit: str
     ) -> JointScaling:
-        """Return the scaling that an LQR's weights stand for: deviations that cost as much as each other.
-
-        Args:
-            names: Of the outputs.
-            units: Of each.
-            q: Weights of the outputs, > 0 [1/unit^2].
-            r: Weight of the effort, > 0.
-            effort_unit: Unit of the effort.
+        """Return the scaling of LQR weights q > 0 [1/unit^2] and r > 0: deviations of equal cost.
 
         Source:
             Bryson and Ho, Applied Optimal Control, 1975, section 5.2 (q = 1 / largest deviation squared).
@@ -153,16 +137,16 @@ class JointScaling(SignalScaling):
 
     @property
     def outputs(self) -> Array:
-        """One unit of each output."""
+        """Unit of each output."""
         return np.array(self.values)[:, None]
 
     @property
     def input(self) -> float:
-        """One unit of the effort."""
+        """Unit of the effort."""
         return self.effort
 
     def sentence(self) -> str:
-        """Return the result as a sentence."""
+        """Return the scaling as a sentence."""
         parts = [f"{v:.3g} {unit} of {name}" for name, unit, v in zip(self.names, self.units, self.values, strict=True)]
         return (
             f"One unit is {', '.join(parts)} and {self.effort:.3g} {self.effort_unit} of effort: what the plant's own "
@@ -172,11 +156,11 @@ class JointScaling(SignalScaling):
 
 @dataclass(frozen=True, slots=True)
 class NuGap:
-    """The gap of two plants.
+    """nu-gap of two plants.
 
     Attributes:
         value: 0 (same) to 1 (no controller is safe to carry over).
-        at: Index of the frequency at which it is largest.
+        at: Index of the frequency with the largest chordal distance.
         winding: Whether the winding number condition holds.
     """
 
@@ -190,14 +174,9 @@ def _rows(response: ArrayLike) -> Complex:
 
 
 def chordal_distance(first: ArrayLike, second: ArrayLike) -> Array:
-    """Return the chordal distance of two plants at each frequency, shape (n,), 0 to 1.
-
-    Args:
-        first: Scaled response, shape (outputs, n), or (n,) for one output.
-        second: The other one.
-    """
+    """Return the chordal distance, 0 to 1, shape (n,), of two scaled plants (outputs, n) or (n,)."""
     a, b = _rows(first), _rows(second)
-    # The wedge product of [1; a] and [1; b] gives the sine without the loss of digits of sqrt(1 - cos^2).
+    # The wedge product of [1; a] and [1; b] gives the sine without the cancellation of sqrt(1 - cos^2).
     square = np.sum(np.abs(a - b) ** 2, axis=0)
     for i in range(a.shape[0]):
         for j in range(i + 1, a.shape[0]):
@@ -207,7 +186,7 @@ def chordal_distance(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 def pointwise_margin(plant: ArrayLike, controller: ArrayLike) -> Array:
-    """Return rho at each frequency, shape (n,); its minimum is the margin b(P, K) where K stabilises P.
+    """Return rho at each frequency, shape (n,); its minimum is the margin b(P, K) of a stabilising K.
 
     Args:
         plant: Scaled response, shape (outputs, n), or (n,) for one output.
@@ -222,51 +201,47 @@ def pointwise_margin(plant: ArrayLike, controller: ArrayLike) -> Array:
 
 
 def winding_number(curve: ArrayLike) -> int:
-    """Return how often a curve over frequency 0 to infinity (or Nyquist), with its mirror image, goes round 0.
+    """Return how often a curve (n,) over frequency 0 to infinity (or Nyquist), with its mirror image, encircles 0.
 
-    Counter-clockwise for growing frequency is positive. The curve has to be dense enough not to turn by more than
-    90 degrees between two points, and its ends are taken to go on to the real axis the short way.
-
-    Args:
-        curve: Shape (n,), in order of frequency.
+    Counter-clockwise for growing frequency is positive. Neighbouring points must be within 90 degrees; the ends are
+    joined to the real axis the short way.
     """
     values = np.asarray(curve, dtype=np.complex128)
     steps = np.angle(values[1:] / values[:-1])
-    # Both ends of a real system are real: what is missing to the axis is the smaller way.
+    # Both ends of a real system are real: the shorter way to the axis is missing.
     low, high = (float(np.angle(value * np.sign(value.real or 1.0))) for value in (values[0], values[-1]))
     half = float(steps.sum()) + low - high
     return round(half / np.pi)
 
 
 def nu_gap(first: ArrayLike, second: ArrayLike, *, unstable: tuple[int, int] = (1, 1)) -> NuGap:
-    """Return the nu-gap of two plants from their responses.
+    """Return the nu-gap of two plants from their scaled responses.
 
     Args:
-        first: Scaled response on a grid from 0 to infinity (or to the Nyquist frequency), shape (outputs, n) or (n,).
+        first: Shape (outputs, n) or (n,), on a grid from 0 to infinity (or to the Nyquist frequency).
         second: The other one, on the same grid.
-        unstable: Number of unstable poles of each; a pendulum upright has one.
+        unstable: Number of unstable poles of each; an upright pendulum has one.
     """
     a, b = _rows(first), _rows(second)
     kappa = chordal_distance(a, b)
     at = int(np.argmax(kappa))
     inner = 1.0 + np.sum(np.conj(b) * a, axis=0)
-    # The sign is that of frequency running up the axis: 100/(2s+1) and 100/(2s-1) are 0.02 apart, not 1.
+    # The sign is that of increasing frequency: 100/(2s+1) and 100/(2s-1) are 0.02 apart, not 1.
     holds = bool(np.all(np.abs(inner) > 1e-12)) and winding_number(inner) == unstable[0] - unstable[1]
     return NuGap(float(kappa[at]) if holds else 1.0, at, holds)
 
 
 def loop_distance(first: ArrayLike, second: ArrayLike, radius: ArrayLike = 0.0) -> Array:
-    """Return, at each frequency, how far a second loop is from the first for the best weight, shape (n,); < 1 is safe.
+    """Return the distance of a second loop from the first for the best weight, at each frequency (n,); < 1 is safe.
 
-    The theorem may be used with any weights. With W of the plant and 1/W of the controller, the condition is linear in
-    |W|^2, so that the best weight at a frequency is one of two limits: the loops differ little relative to the return
-    difference (additive), |L2 - L1| < |1 + L1|, or their inverses do, |1 - L1/L2| < |1 + L1|. No other scaling
-    certifies more, and no scale has to be chosen.
+    The theorem holds for any weights. With W on the plant and 1/W on the controller, the condition is linear in |W|^2,
+    so the best weight is one of two limits: additive, |L2 - L1| < |1 + L1|, or inverse, |1 - L1/L2| < |1 + L1|. No
+    other scaling certifies more.
 
     Args:
         first: Loop K P1, shape (n,), stable.
         second: Loop K P2, shape (n,).
-        radius: Radius of the confidence disc of the second loop, shape (n,); the worst loop in it is used.
+        radius: Radius of the confidence disc of the second loop, shape (n,); its worst loop counts.
     """
     one, two = np.asarray(first, dtype=np.complex128), np.asarray(second, dtype=np.complex128)
     r = np.broadcast_to(np.asarray(radius, dtype=np.float64), two.shape)
@@ -275,7 +250,7 @@ def loop_distance(first: ArrayLike, second: ArrayLike, radius: ArrayLike = 0.0) 
     size = np.abs(two) ** 2 - r**2
     outside = size > 0.0
     safe = np.where(outside, size, 1.0)
-    # The inverse of a disc that leaves out 0 is a disc again.
+    # The inverse of a disc without 0 is a disc.
     centre, spread = np.conj(two) / safe, r / safe
     inverse = np.where(outside, (np.abs(1.0 - one * centre) + np.abs(one) * spread) / room, np.inf)
     return np.asarray(np.minimum(additive, inverse), dtype=np.float64)

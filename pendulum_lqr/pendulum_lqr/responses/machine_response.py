@@ -1,10 +1,8 @@
-"""A measured machine on a dense grid of frequencies: between its lines, and below the lowest of them.
+"""A measured machine on a dense grid of frequencies: between its lines, and below the lowest.
 
-A plant is smooth between two lines where its closed loop need not be: a loop with little damping turns quickly just
-where it is about to fail. So the plant is interpolated, and loops are judged on the interpolated plant. What is
-interpolated is its inverse, torque for an angle: (-stiffness + inertia, damping times frequency) for a joint, which
-hardly bends. Of several joints each output has zeros of its own, and its inverse poles: there it is the ratio to the
-response of a model that is interpolated, 1 where the model is right.
+The plant is smooth between lines, but a lightly damped closed loop is not: so the plant is interpolated, and loops are
+computed from that. One joint is interpolated by its inverse, (-stiffness + inertia, damping times frequency), which is
+nearly polynomial. Outputs of several joints have zeros, so the ratio to a model's response is interpolated instead.
 """
 
 from __future__ import annotations
@@ -23,27 +21,28 @@ from pendulum_lqr.responses.sampled_response import model_response
 __all__ = ["LEAST_DAMPING", "Machine"]
 
 LEAST_DAMPING = 0.001
-"""Damping ratio of the sharpest resonance between two lines that is looked for; a steel frame's is 0.001 to 0.005."""
+"""Damping ratio of the sharpest resonance considered between lines; a steel frame has 0.001 to 0.005."""
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _BELOW = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
-"""Frequencies below the lowest line at which the response is continued, as shares of that line."""
+"""Frequencies of the extrapolation below the lowest line, relative to it."""
 _NEARLY_ZERO = 0.01
 """The lowest of these for several joints: a plant that can roll away has no response at 0."""
 _FIT_UP_TO = 4.0
-"""Lines up to this multiple of the lowest serve the continuation."""
+"""Lines up to this multiple of the lowest are used for the extrapolation."""
 _LEAST_FIT = 4
 _NEAR_NYQUIST = 0.9
-"""Share of the Nyquist frequency above which a highest line counts as reaching it."""
+"""Share of the Nyquist frequency above which the highest line counts as reaching it."""
 _RATIO = 1.012
-"""Largest ratio of neighbouring frequencies of the grid."""
+"""Largest ratio of neighbouring grid frequencies."""
 _NARROW = 0.25
-"""Largest relative distance of two lines between which a resonance is looked for: wider apart, smooth plants bend."""
+"""Largest relative distance of lines between which resonances are considered: smooth plants bend over larger ones."""
 _LEFT_OUT = 0.25
-"""Share of the error at lines left out that is counted at points between lines, half as far from their neighbours: a
-cubic spline errs by the fourth power of the distance, so a sixteenth would do for a smooth plant."""
+"""Share of the leave-one-out error assumed between lines, at half the distance: a cubic spline errs by its fourth
+power, so a sixteenth would suffice for a smooth plant.
+"""
 
 
 @dataclass(frozen=True)
@@ -53,14 +52,13 @@ class Machine:
     Attributes:
         frequency: Shape (n,), from 0 [Hz], or of several joints from nearly 0.
         response: Sampled plant from torque to angle and velocity, shape (outputs, n).
-        radius: Radius of the joint confidence discs, interpolation included, shape (outputs, n).
+        radius: Radius of the joint confidence discs, including interpolation, shape (outputs, n).
         period: Sampling period [s].
         lowest: Lowest measured line [Hz].
         confidence: Of the discs.
-        ringing: How much a resonance of the least damping between two lines may add to the response: by what these
-            lines deviate from a smooth plant in opposite directions, and by what their error may hide, shape
-            (2, outputs, n). In the middle its peak is half the distance of the lines over damping times frequency as
-            large as what it adds to each of them.
+        ringing: Possible contribution of a resonance of the least damping between two lines: visible as deviation of
+            these lines from a smooth plant in opposite directions, and hidden by their error, shape (2, outputs, n).
+            Its peak in the middle is that deviation times half the distance of the lines over damping times frequency.
     """
 
     frequency: Array
@@ -73,12 +71,12 @@ class Machine:
 
     @property
     def up_to_nyquist(self) -> bool:
-        """Whether the highest line lies so near the Nyquist frequency that little can happen beyond it."""
+        """Whether the highest line is so near the Nyquist frequency that little can happen beyond it."""
         return 2.0 * self.period * float(self.frequency[-1]) >= _NEAR_NYQUIST
 
     @classmethod
     def of(cls, measured: MeasuredResponse) -> Machine:
-        """Return the machine of a measurement."""
+        """Return the machine of a measurement of one joint."""
         radius = measured.radius()
         lines = measured.frequency
         inside, response, discs, apart = _between(measured, radius)
@@ -96,7 +94,7 @@ class Machine:
             angle = 1.0 / values
             disc, hold = error * np.abs(angle) ** 2, omega * measured.period * np.abs(angle)
             inside = np.concatenate([low, inside])
-            # At low frequency the measured velocity is the derivative of the angle, but for the hold.
+            # At low frequency the measured velocity is the derivative of the angle, except for the hold.
             response = np.hstack([np.vstack([angle, 1j * omega * angle]), response])
             discs = np.hstack([np.vstack([disc, omega * (disc + hold)]), discs])
             ringing = np.concatenate([np.zeros((*ringing.shape[:2], low.size)), ringing], axis=2)
@@ -104,23 +102,18 @@ class Machine:
 
     @classmethod
     def beside(cls, measured: MeasuredResponse, model: LinearModel) -> Machine:
-        """Return the machine of a measurement of several joints, interpolated relative to a model.
-
-        Args:
-            measured: The measurement.
-            model: A model of the plant, with the same outputs.
-        """
+        """Return the machine of several joints, interpolated relative to a model with the same outputs."""
         lines, period = measured.frequency, measured.period
         own = model_response(model, lines, period)
         ratio, spread = measured.response / own, measured.radius() / np.abs(own)
         below = lines[0] * np.concatenate([[_NEARLY_ZERO], _BELOW[1:]])
         whole = np.concatenate([below, _grid(lines)])
         on_line = np.isin(whole, lines)
-        # A response at -f is the conjugate of that at f: below the lowest line there are lines on either side, too.
+        # The response at -f is the conjugate of that at f: there are lines on both sides of 0.
         mirrored = np.concatenate([-lines[::-1], lines])
-        # What a spline makes of errors within these radii, however they lie.
+        # Largest effect of errors within these radii on the spline.
         weights = np.abs(scipy.interpolate.CubicSpline(mirrored, np.eye(mirrored.size))(whole))
-        # Towards 0, where friction begins to count, half the distance does not make the error that much smaller.
+        # Near 0, where friction matters, half the distance does not reduce the error as much.
         near_zero = np.where(whole < lines[1], 1.0 / _LEFT_OUT, 1.0)
         rows, discs, errors = [], [], []
         for curve, radius in zip(ratio, spread, strict=True):
@@ -139,14 +132,14 @@ class Machine:
 
 
 def _ringing(lines: Array, error: Complex, response: Complex, radius: Array, grid: Array) -> Array:
-    """Return what :attr:`Machine.ringing` is, from relative errors of leaving out each line, in one or several ways."""
+    """Return :attr:`Machine.ringing` from relative leave-one-out errors, computed in one or several ways."""
     if lines.size < 2:
         return np.zeros((2, *response.shape[:1], grid.size))
     right = np.clip(np.searchsorted(lines, grid, side="left"), 1, lines.size - 1)
     a, b = lines[right - 1], lines[right]
     peak = np.where((b - a <= _NARROW * a) & (grid >= lines[0]), 0.5 * (b - a) / np.sqrt(a * b) / LEAST_DAMPING, 0.0)
-    # A resonance pushes the lines on either side of it in opposite directions, a smooth bend in the same one. A value
-    # at a line and that of the spline through the others both have an error.
+    # A resonance moves neighbouring lines in opposite directions, a smooth bend in one. A line and the spline through
+    # the others both have errors.
     size = 0.5 * (np.abs(response[:, right]) + np.abs(response[:, right - 1]))
     apart = 0.5 * np.min(np.abs(error[..., right] - error[..., right - 1]), axis=0) * size
     noise = np.array([_larger_neighbour(lines, row, grid) for row in radius])
@@ -154,9 +147,9 @@ def _ringing(lines: Array, error: Complex, response: Complex, radius: Array, gri
 
 
 def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex, Array, Complex]:
-    """Return grid, response, discs, from the lowest line to the highest, and relative errors of leaving one out.
+    """Return grid, response and discs between lowest and highest line, and relative leave-one-out errors (ways, 2, n).
 
-    The errors have the shape (ways, 2, n): of the response as it is, and without the turn of its delay.
+    The errors are those of the response itself, and without the phase of its delay.
     """
     lines = measured.frequency
     if lines.size < 5:
@@ -170,7 +163,7 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
         spline, error = _splined(lines, curve, grid)
         values.append(spline)
         errors.append(error)
-    # A delay turns the response from line to line, which no spline follows; a resonance shows either way.
+    # A delay rotates the response from line to line, which a spline cannot follow; a resonance shows either way.
     slope = np.diff(np.unwrap(np.angle(inverse))) / np.diff(lines)
     turn = np.exp(-1j * lines * np.median(slope[slope.size // 2 :]))
     still = _splined(lines, inverse * turn, lines)[1]
@@ -186,7 +179,7 @@ def _between(measured: MeasuredResponse, radius: Array) -> tuple[Array, Complex,
 
 
 def _grid(lines: Array) -> Array:
-    """Return the dense grid from the lowest to the highest line; the lines themselves are on it."""
+    """Return the dense grid between lowest and highest line, including the lines."""
     pieces = [
         np.geomspace(a, b, max(2, int(np.ceil(np.log(b / a) / np.log(_RATIO))) + 1))[:-1] for a, b in pairwise(lines)
     ]
@@ -194,9 +187,9 @@ def _grid(lines: Array) -> Array:
 
 
 def _splined(lines: Array, curve: Complex, grid: Array) -> tuple[Complex, Complex]:
-    """Return a curve on the grid, and the relative error of leaving out each line, shape (lines,).
+    """Return a curve on the grid, and the relative leave-one-out error of each line, shape (lines,).
 
-    Of lines that are mirrored at 0 the mirror image is left out with its line: it is no measurement of its own.
+    Mirrored lines are left out with their image, which is no measurement of its own.
     """
     left_out = np.zeros(lines.size, dtype=np.complex128)
     for i in range(1, lines.size - 1):
@@ -213,7 +206,7 @@ def _larger_neighbour(lines: Array, values: Array, grid: Array) -> Array:
 
 
 def _continued(x: Array, inverse: Complex, spread: Array, wanted: Array) -> tuple[Complex, Array] | None:
-    """Continue 1/P = (k + m w^2) + j w (b + c w^2) towards 0 by weighted least squares; values and error radii."""
+    """Extrapolate 1/P = (k + m w^2) + j w (b + c w^2) towards 0 by weighted least squares; values and error radii."""
     if x.size < 3:
         return None
     weight = 1.0 / np.maximum(spread, 1e-9 * float(np.abs(inverse).max()))
@@ -233,6 +226,6 @@ def _continued(x: Array, inverse: Complex, spread: Array, wanted: Array) -> tupl
         coefficients = solver @ (part * weight)
         misfit = float(np.sqrt(np.mean((scaled @ coefficients - part * weight) ** 2)))
         values += unit * (target @ coefficients)
-        # Discs of the lines count as they are, and a misfit beyond them as much more.
+        # Errors from the discs of the lines, increased by the misfit if larger.
         error += np.linalg.norm(target @ solver, axis=1) * max(1.0, misfit)
     return values, error

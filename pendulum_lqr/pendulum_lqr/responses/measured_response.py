@@ -1,4 +1,4 @@
-"""A measured frequency response as a value and as a file, with its error estimate."""
+"""A measured frequency response with its error estimate, as an object and as a file."""
 
 from __future__ import annotations
 
@@ -26,26 +26,25 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class MeasuredResponse:
-    """The sampled plant from torque (held over a period) to angle and velocity, measured in closed loop.
+    """Sampled plant from torque (held over a period) to angle and velocity, measured in closed loop.
 
-    A plant of k joints, one of them driven, has 2 k outputs: all positions, then all velocities.
-
-    The error at a frequency is circular complex: ``|measured - true|^2 / deviation^2`` follows F(2, 2 (blocks - 1)).
+    A plant of k joints, one of them driven, has 2 k outputs: all positions, then all velocities. The error is circular
+    complex: ``|measured - true|^2 / deviation^2`` follows F(2, 2 (blocks - 1)).
 
     Attributes:
         label: Of the plant, such as ``hw``.
         period: Sampling period [s].
         frequency: Shape (n,), increasing [Hz].
-        response: Angle and velocity for one newton metre, shape (2, n) [rad/(N m), rad/s/(N m)].
+        response: Angle and velocity per torque, shape (2, n) [rad/(N m), rad/s/(N m)].
         deviation: Standard deviation of both, shape (2, n), in their units.
-        coherence: Share of the output's power that the excitation explains, shape (2, n), 0 to 1.
-        sensitivity: Torque at the plant for one newton metre of excitation, 1/(1 + K P), shape (n,).
-        blocks: Number of independent periods (or segments) behind it.
-        distortion: Angle and velocity on unexcited lines, relative to those on excited ones, shape (2,); NaN where
-            that was not measured [-].
-        facts: Further facts for a reader: source, excitation, duration, largest angle and torque.
+        coherence: Share of the output's power explained by the excitation, shape (2, n), 0 to 1.
+        sensitivity: Torque at the plant per torque of excitation, 1/(1 + K P), shape (n,).
+        blocks: Number of independent periods (or segments).
+        distortion: Angle and velocity on unexcited lines, relative to excited ones, shape (2,); NaN if not measured
+            [-].
+        facts: Source, excitation, duration, largest angle and torque.
         joints: Names of the k joints; none for a plant of one.
-        driven: Which of them the torque drives.
+        driven: Index of the driven joint.
     """
 
     label: str
@@ -62,7 +61,6 @@ class MeasuredResponse:
     driven: int = 0
 
     def __post_init__(self) -> None:
-        """Check shapes."""
         n = self.frequency.size
         outputs = (self.outputs, n)
         for name, shape in (
@@ -88,23 +86,18 @@ class MeasuredResponse:
 
     @property
     def driven_velocity(self) -> int:
-        """Which output is the velocity of the joint that the torque drives."""
+        """Index of the output that is the driven joint's velocity."""
         return self.outputs // 2 + self.driven
 
     def radius(self, confidence: float = 0.95, *, joint: bool = True) -> Array:
-        """Return the radius of the confidence disc of each value, shape (outputs, n).
-
-        Args:
-            confidence: Probability with which the discs hold the true response.
-            joint: Whether all discs together are meant (Bonferroni), or each for itself.
-        """
+        """Return the radius of each confidence disc, shape (outputs, n); ``joint``: for all together (Bonferroni)."""
         tail = (1.0 - confidence) / (self.response.size if joint else 1)
-        # Of scipy.stats the same number, but it takes a third of a second to import.
+        # scipy.stats gives the same number, but takes a third of a second to import.
         quantile = float(scipy.special.fdtri(2.0, 2.0 * (self.blocks - 1.0), 1.0 - tail))
         return np.sqrt(quantile) * self.deviation
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as JSON values; complex numbers as two lists."""
+        """Return JSON values; complex numbers as two lists."""
         return {
             "format": FORMAT,
             "label": self.label,
@@ -124,11 +117,7 @@ class MeasuredResponse:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> MeasuredResponse:
-        """Return the response that JSON values describe.
-
-        Raises:
-            DataError: They describe none.
-        """
+        """Return the response in JSON values; DataError if there is none."""
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             found = content.get("format") if isinstance(content, Mapping) else type(content).__name__
             raise DataError(f"format is {found!r}; expected {FORMAT!r}")
@@ -157,11 +146,7 @@ def _complex(content: Mapping[str, Any]) -> Complex:
 
 
 def write_response(path: str | os.PathLike[str], response: MeasuredResponse) -> Path:
-    """Write a response to a JSON file and return its path.
-
-    Raises:
-        ParameterError: The file cannot be written.
-    """
+    """Write a response to a JSON file and return its path; ParameterError if it cannot be written."""
     target = Path(path)
     text = json.dumps(response.to_json(), allow_nan=False) + "\n"
     with writing(f"response {target}", ParameterError):
@@ -170,11 +155,7 @@ def write_response(path: str | os.PathLike[str], response: MeasuredResponse) -> 
 
 
 def read_response(path: str | os.PathLike[str]) -> MeasuredResponse:
-    """Read a response from a JSON file, or ``hw_response.json`` from a run folder.
-
-    Raises:
-        DataError: The file cannot be read or holds no response.
-    """
+    """Return the response in a JSON file, or in ``hw_response.json`` of a run folder; DataError if there is none."""
     source = Path(path)
     if source.is_dir():
         source = source / "hw_response.json"

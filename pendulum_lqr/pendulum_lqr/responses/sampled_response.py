@@ -1,9 +1,7 @@
-"""The frequency response of a plant as a sampled controller sees it: torque held over a period, states at its ends.
+"""Frequency response of a plant as a sampled controller sees it: torque held over a period, states at its ends.
 
-With a zero-order hold the sampled plant P(e^{j w h}) is exact up to the Nyquist frequency; hold (half a period of
-delay), the plant's delay and the images that sampling folds back are all in it. The continuous plant differs from it
-by all these, most near the Nyquist frequency, so responses measured at two rates are comparable only after both were
-brought to one rate, or to none (:func:`brought_to`).
+Under zero-order hold P(e^{j w h}) is exact up to the Nyquist frequency, including hold (half a period of delay), the
+plant's delay and aliasing. Responses measured at two rates are comparable only at one rate (:func:`brought_to`).
 """
 
 from __future__ import annotations
@@ -21,10 +19,10 @@ Complex = NDArray[np.complex128]
 
 
 def model_response(model: LinearModel, frequency: ArrayLike, period: float = 0.0) -> Complex:
-    """Return the response from torque to what is measured: angle and velocity, shape (2, n) [rad/(N m), rad/s/(N m)].
+    """Return the response from torque to angle and velocity, shape (2, n) [rad/(N m), rad/s/(N m)].
 
     Args:
-        model: Linear model of one input, its delay included; of k joints the shape is (2 k, n).
+        model: Linear model of one input, with its delay; of k joints the shape is (2 k, n).
         frequency: Shape (n,) [Hz], up to the Nyquist frequency.
         period: Sampling period under zero-order hold [s]; 0 for the continuous plant.
     """
@@ -44,16 +42,16 @@ def model_response(model: LinearModel, frequency: ArrayLike, period: float = 0.0
 def brought_to(
     response: ArrayLike, model: LinearModel, frequency: ArrayLike, *, measured: float, period: float = 0.0
 ) -> Complex:
-    """Return a response that was measured at one sampling period as it would be at another, by a model's ratio.
+    """Convert a response measured at one sampling period to another, by a model's ratio.
 
-    Only the change of hold and folding is the model's; an error of the model enters multiplied by that small change.
+    Only the change of hold and aliasing is the model's, so its error enters multiplied by that small change.
 
     Args:
         response: Measured response, shape (outputs, n).
         model: A model of the plant.
         frequency: Shape (n,) [Hz], below both Nyquist frequencies.
         measured: Sampling period of the measurement [s].
-        period: Sampling period wanted [s]; 0 for the continuous plant.
+        period: Wanted sampling period [s]; 0 for the continuous plant.
     """
     ratio = model_response(model, frequency, period) / model_response(model, frequency, measured)
     return np.asarray(np.asarray(response, dtype=np.complex128) * ratio, dtype=np.complex128)

@@ -1,4 +1,4 @@
-"""How far beyond the energy of upright a swing-up aims: learnt, since the model's friction is never exact."""
+"""Adaptive energy margin of a swing-up beyond upright, because the model's friction is never exact."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ __all__ = ["EnergyMargin"]
 _NEAR = 1.0
 """Angle from upright within which passing and turning back count [rad]."""
 _STEP = 0.005
-"""What a pass takes off at least, beyond 0 too: a plant with less friction than its model spins at a margin of 0."""
+"""Smallest reduction per pass, also below 0: a plant with less friction than its model spins at margin 0."""
 _LEAST, _MOST = -0.2, 1.0
 
 
 class EnergyMargin:
-    """Aims lower after passing upright uncaught, higher after turning back before it.
+    """Reduces the margin after passing upright uncaught, increases it after turning back before.
 
     Args:
-        first: Margin at the start, as a share of the energy of upright [-].
-        rest: Velocity below which noise decides the direction, and the margin stays [rad/s].
+        first: Initial margin, as a share of the energy of upright [-].
+        rest: Velocity below which noise decides the direction, and the margin is constant [rad/s].
 
     Attributes:
-        value: The margin [-].
+        value: Margin [-].
     """
 
     def __init__(self, first: float, rest: float = 0.0) -> None:
@@ -28,12 +28,12 @@ class EnergyMargin:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was learnt."""
+        """Restore the initial margin."""
         self.value = self._first
         self._last: tuple[float, float] | None = None
 
     def learn(self, angle: float, velocity: float) -> None:
-        """Take note of a state: angle from upright, wrapped [rad], and velocity [rad/s]."""
+        """Adapt to a state: angle from upright, wrapped [rad], and velocity [rad/s]."""
         if abs(velocity) < self._rest:
             return
         last, self._last = self._last, (angle, velocity)
@@ -45,5 +45,5 @@ class EnergyMargin:
             self.value = min(self.value + 0.5 * max(self.value, 0.0) + 2.0 * _STEP, _MOST)
 
     def take_over(self, previous: EnergyMargin) -> None:
-        """Take over what another one learnt."""
+        """Take over the margin of another one."""
         self.value, self._last = previous.value, previous._last

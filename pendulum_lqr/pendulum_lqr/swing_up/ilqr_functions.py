@@ -1,6 +1,6 @@
-"""Dynamics and cost of a mechanism for iterative LQR, with their derivatives: compiled, for arrays that are given.
+"""Compiled dynamics and cost of a mechanism for iterative LQR, with derivatives, on given arrays.
 
-Derivatives come by complex step; the Hessian of far(q) by differences of its exact slope.
+Derivatives are by complex step; the Hessian of far(q) is by differences of its exact slope.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pendulum_msgs_py.mechanisms import Mechanism
 __all__ = ["cost_functions", "step_functions"]
 
 _SOFTNESS = 0.1
-"""c: share of the potential energy that may be missing where far(q) is half way."""
+"""c: share of missing potential energy at which far(q) is about one half."""
 _POWER_CORNER = 0.05
 """Rounding of the corner of |power| [W]."""
 _TINY = 2.0**-64
@@ -42,9 +42,8 @@ _TUPLES = {1: _tuple_1, 2: _tuple_2}
 def step_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
     """Return compiled (advance, derive): the next node from z and u, and the derivatives of that step.
 
-    ``advance(z, u, h, p, work, out)`` fills ``out``; ``derive(z, u, h, p, work, zc, A, B)`` fills A, shape
-    (2n + m, 2n + m), and B (2n + m, m), which are zero before. ``work``, shape (3, n), and ``zc`` are scratch; those
-    of ``derive`` are complex.
+    ``advance(z, u, h, p, work, out)`` fills ``out``; ``derive(z, u, h, p, work, zc, A, B)`` fills zeroed A, shape (2n +
+    m, 2n + m), and B (2n + m, m). ``work``, shape (3, n), and ``zc`` are scratch, complex for ``derive``.
     """
     n, m = len(mechanism.joints), len(driven)
     size = 2 * n + m
@@ -111,8 +110,8 @@ def step_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
 def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
     """Return compiled (stage, expand, final, final_slopes): the cost of an interval and of the end, and derivatives.
 
-    Weights ``w`` come in the order of ``IlqrWeights``; ``scale`` is the potential energy hanging, and by how much it is
-    higher upright [J].
+    Weights ``w`` are in the order of ``IlqrWeights``; ``scale`` is the potential energy hanging, and its increase to
+    upright [J].
     """
     n, m = len(mechanism.joints), len(driven)
     turns = np.array([joint.turns for joint in mechanism.joints])
@@ -193,7 +192,7 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
         far_slope(z, p, goal, scale, qc, slopes[0])
         for i in range(n):
             lz[i, 0] = h * w[0] * slopes[0, i]
-        # Hessian of far by differences of its exact slope, then what is concave is left out.
+        # Hessian of far by differences of its exact slope, then its convex part.
         for i in range(n):
             keep = z[i]
             z[i] = keep + 1e-5
@@ -213,7 +212,7 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
             root = np.sqrt(product * product + _POWER_CORNER**2)
             lz[e, 0] = h * w[1] * product / root * z[s] + 2.0 * h * w[2] * z[e] - 2.0 * w[3] * (u[j] - z[e]) / h
             lz[s, 0] += h * w[1] * product / root * z[e]
-            # Of |power| the convex part of the product's square.
+            # For |power|, the convex part of the product's square.
             lzz[e, e] = h * w[1] * z[s] * z[s] / root + 2.0 * h * w[2] + 2.0 * w[3] / h
             lzz[s, s] += h * w[1] * z[e] * z[e] / root
             lzz[e, s] += h * w[1] * product / root

@@ -31,26 +31,24 @@ Array = NDArray[np.float64]
 _STEP = 0.004
 _LONGEST = 8.0
 _FIRST = 0.05
-"""Deviation of the first ellipsoid tried, along the joint that it reaches farthest [rad or m]."""
+"""Largest deviation of the first ellipsoid, along its longest joint axis [rad or m]."""
 _SAMPLES = 200
-"""States tried at each level, half of them on the edge."""
+"""Sampled states per level, half of them on the surface."""
 _SHARE = 0.9
-"""Of the level found that is taken."""
+"""Share of the level found that is used."""
 
 
 class CaughtRegion(NamedTuple):
-    """States x from upright with x' S x <= level, from all samples of which the limited loop came to rest upright.
+    """States x from upright with x' S x <= level, from all ``samples`` of which the limited loop came to rest upright.
 
-    Attributes:
-        level: Of x' S x.
-        samples: States tried on its edge and inside: evidence, no proof.
+    The samples, on the surface and inside, are evidence, not proof.
     """
 
     level: float
     samples: int
 
     def describe(self) -> str:
-        """Return it as a phrase."""
+        """Return a description."""
         return f"x'Sx <= {self.level:.4g} (sampled from {self.samples} states, not proven)"
 
 
@@ -61,15 +59,11 @@ def deviation_of(coordinates: Coordinates, x: Vector) -> Array:
 
 
 def sample_caught_region(plant: PlantParameters, gain: Gain) -> CaughtRegion:
-    """Return the largest ellipsoid x' S x <= level from whose sampled states u = -K x, limited, comes to rest upright.
+    """Return the largest ellipsoid x' S x <= level from whose samples u = -K x, limited, comes to rest upright.
 
-    The level grows until a sampled state is lost, or hits an end stop, and is bisected then; nine tenths of it are
-    returned. Each plant and gain is sampled once in a process: a controller that is redesigned for another
-    parameter has its region at once.
-
-    Args:
-        plant: The plant; dry friction, lag and delay are left out.
-        gain: K and S.
+    The level grows until a sample is lost or hits an end stop, is bisected, and reduced to nine tenths. Results are
+    cached by plant and gain, so a controller redesigned for another parameter has its region at once. Dry friction, lag
+    and delay are neglected.
 
     Raises:
         DesignError: Not even the smallest states are caught.
@@ -98,7 +92,7 @@ def _sampled(plant: PlantParameters, *numbers: tuple[Any, ...]) -> CaughtRegion:
 
 
 def _samples_of_level_1(gain: Gain, n: int) -> Array:
-    """Return deviations on the edge of x' S x <= 1, and as many evenly in its volume, shape (2n, samples)."""
+    """Return deviations on the surface of x' S x <= 1, and as many evenly inside, shape (2n, samples)."""
     rng = np.random.default_rng(0)
     directions = rng.standard_normal((_SAMPLES, 2 * n))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -108,7 +102,7 @@ def _samples_of_level_1(gain: Gain, n: int) -> Array:
 
 
 def _all_caught(plant: PlantParameters, gain: Gain, deviations: Array, known: float) -> bool:
-    """Return whether all deviations, shape (2n, samples), come to rest, or within a level from which others did."""
+    """Return whether all deviations, shape (2n, samples), come to rest, or to within a level known to be caught."""
     n, driven = len(plant.joints), plant.coordinates.driven
     forward = in_arithmetic(plant.mechanism.forward, np)
     along, p, goal = along_functions(n), plant.packed, np.array(plant.coordinates.goal)
@@ -129,7 +123,7 @@ def _all_caught(plant: PlantParameters, gain: Gain, deviations: Array, known: fl
         if not (np.all(x[:n] >= stops[:, :1]) and np.all(x[:n] <= stops[:, 1:])):
             return False
         if k % 25 == 0:
-            # What falls over is lost; a state that grows beyond all bounds ends the trial early.
+            # A fallen state is lost; unbounded growth ends the trial early.
             if not float(np.max(np.abs(x))) < 50.0:
                 return False
             if np.all(_costs(gain, x) <= known):
@@ -148,9 +142,6 @@ class MechanismCatch:
     """u = -K x within a region, with hysteresis.
 
     Attributes:
-        plant: The plant.
-        gain: K and S.
-        region: Where it takes over.
         leave: Multiple of the region's level at which it releases.
         active: Whether it is in charge.
     """
@@ -163,7 +154,7 @@ class MechanismCatch:
 
     @property
     def terminal(self) -> Array:
-        """S of trace 4: the last deviation's share of the cost of a plan, whatever the weights of the LQR."""
+        """S scaled to trace 4: the terminal cost of a plan, independent of the LQR's weights."""
         S: Array = self.gain.S * (4.0 / float(np.trace(self.gain.S)))
         return S
 
@@ -172,7 +163,7 @@ class MechanismCatch:
         return float(deviation @ self.gain.S @ deviation) / self.region.level
 
     def holds(self, deviation: Array) -> bool:
-        """Return whether it is in charge of a deviation from upright; the call may make it take over or release."""
+        """Return whether it is in charge of a deviation from upright; may take over or release."""
         self.active = self.share(deviation) <= (self.leave if self.active else 1.0)
         return self.active
 
@@ -187,11 +178,10 @@ def make_mechanism_catch(
     """Return the LQR of a plant about upright with its sampled region (a second or so).
 
     Args:
-        plant: The plant.
+        plant: Plant.
         q: Weights of deviations, then velocities, shape (2n,).
         r: Weight of the efforts.
-        limits: Largest effort of each driven joint, where less than the plant's is allowed: from fewer states they
-            suffice [N m or N].
+        limits: Largest effort of each driven joint, if below the plant's; they shrink the region [N m or N].
     """
     if limits is not None:
         allowed = zip(plant.coordinates.driven_names, limits, plant.effort_limits, strict=True)

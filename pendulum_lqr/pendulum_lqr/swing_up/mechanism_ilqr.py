@@ -1,14 +1,12 @@
-"""Iterative LQR for any mechanism, compiled: optimises the efforts over a horizon, with limits, in milliseconds.
+"""Compiled iterative LQR for any mechanism: optimises limited efforts over a horizon in milliseconds.
 
-The efforts are linear between nodes h apart, and the effort before is part of the state, so that its changes cost::
+Efforts are linear between nodes h apart, and the previous effort is part of the state, so that its changes cost::
 
     z_k = (q_k, v_k, u_k),   q, v by one step of Runge-Kutta from u_k to u_(k+1),   |u| <= limit
     J   = sum h (w_0 far(q) + w_1 |u . v_driven| + w_2 |u|^2 + w_4 |v|^2) + w_3 |u_(k+1) - u_k|^2 / h  +  w_5 dx' S dx
 
-far(q) rises from 0 at the goal to 1: the potential energy that is missing, e, as (1 + c) e / (e + c); joints that slide
-add their distance. S is the LQR's, dx the last deviation from the goal, wrapped.
-
-Sources: Tassa, Erez and Todorov, Synthesis and stabilization of
+far(q) = (1 + c) e / (e + c), from 0 at the goal to 1, of the missing potential energy e plus squared distances of
+slides; S is the LQR's, dx the last deviation, wrapped. Sources: Tassa, Erez and Todorov, Synthesis and stabilization of
 complex behaviors through online trajectory optimization, IROS 2012; Tassa, Mansard and Todorov, Control-limited
 differential dynamic programming, ICRA 2014.
 """
@@ -43,12 +41,12 @@ class IlqrWeights(NamedTuple):
     """Weights of the cost.
 
     Attributes:
-        far: Of being away from upright [1/s].
-        energy: Of the amount of power [1/J].
-        effort: Of squared efforts [1/(N^2 m^2 s)].
-        rate: Of squared slopes of the efforts [s/(N^2 m^2)].
-        velocity: Of squared velocities [s/rad^2].
-        terminal: Of the LQR's cost of the last deviation.
+        far: Being away from upright [1/s].
+        energy: Absolute power [1/J].
+        effort: Squared efforts [1/(N^2 m^2 s)].
+        rate: Squared slopes of the efforts [s/(N^2 m^2)].
+        velocity: Squared velocities [s/rad^2].
+        terminal: The LQR's cost of the last deviation.
     """
 
     far: float = 1.0
@@ -60,15 +58,15 @@ class IlqrWeights(NamedTuple):
 
 
 class IlqrPlan(NamedTuple):
-    """What iterations made of a guess.
+    """Result of iterations on a guess.
 
     Attributes:
         states: (q, v, u) at the nodes, shape (N + 1, 2n + m).
         efforts: Efforts at the ends of the intervals, shape (N, m).
-        gains: K of the efforts' feedback from (q, v, u), shape (N, m, 2n + m); 0 where nothing was iterated.
-        cost: J; infinite where the plan runs away from all numbers.
-        iterations: Iterations taken.
-        converged: Whether the last of them changed J by less than a share of 1e-6.
+        gains: Feedback gains K on (q, v, u), shape (N, m, 2n + m); 0 without iterations.
+        cost: J; infinite if the plan diverges.
+        iterations: Number of iterations.
+        converged: Whether the last one changed J by less than 1e-6 of it.
     """
 
     states: Array
@@ -81,14 +79,13 @@ class IlqrPlan(NamedTuple):
 
 @dataclass(frozen=True)
 class IlqrProblem:
-    """The problem of one plant.
+    """Problem of one plant; dry friction, stops, lag and delay are neglected.
 
     Attributes:
-        plant: The plant; dry friction, stops, lag and delay are left out.
         step: Length of an interval, h [s].
         weights: Of the cost.
         terminal: S, shape (2n, 2n).
-        limit: Share of the effort limits that may be used.
+        limit: Usable share of the effort limits.
     """
 
     plant: PlantParameters
@@ -103,13 +100,13 @@ class IlqrProblem:
         """Improve a guess.
 
         Args:
-            q: Positions to start from [rad or m].
-            v: Velocities.
-            u: Efforts at the start, m values.
-            efforts: The guess, shape (N, m); not changed.
-            iterations: Largest number of iterations; 0 only follows the guess.
-            around: A plan whose feedback follows the guess, of as many intervals; without it, a guess for an unstable
-                plant that starts slightly off its plan diverges.
+            q: Initial positions [rad or m].
+            v: Initial velocities.
+            u: Initial efforts, m values.
+            efforts: Guess, shape (N, m); not changed.
+            iterations: Largest number of iterations; 0 only simulates the guess.
+            around: Plan of as many intervals whose feedback follows the guess; without it, an unstable plant that
+                starts slightly off the plan diverges.
 
         Raises:
             ParameterError: The start is not finite: limits would turn NaN into efforts.
@@ -137,7 +134,7 @@ class IlqrProblem:
 
 @cache
 def _kernel(name: str, driven: tuple[int, ...]) -> Any:
-    """Return the compiled loop for a mechanism with some joints driven."""
+    """Return the compiled solver for a mechanism and its driven joints."""
     mechanism = MECHANISMS[name]
     n, m = len(mechanism.joints), len(driven)
     size = 2 * n + m
@@ -175,7 +172,7 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
         Z: Any, U: Any, As: Any, Bs: Any, regular: float, p: Any, goal: Any, scale: Any, h: float, w: Any, S: Any,
         limits: Any, K: Any, k_0: Any,
     ) -> float:  # fmt: skip
-        """Fill gains K and steps k_0, from the end to the start; return what the steps promise."""
+        """Fill gains K and steps k_0, from the end to the start; return the predicted decrease."""
         d, qc = np.zeros(2 * n), np.zeros(n, np.complex128)
         lz, lu, slopes = np.zeros((size, 1)), np.zeros((m, 1)), np.zeros((3, n))
         lzz, luu, luz = np.zeros((size, size)), np.zeros((m, m)), np.zeros((m, size))
@@ -188,7 +185,7 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
         for k in range(U.shape[0] - 1, -1, -1):
             A, B = As[k], Bs[k]
             expand(Z[k], U[k], h, p, goal, scale, w, qc, slopes, lz, lu, lzz, luu, luz)
-            # lz, lzz, ... become the derivatives of the cost from here on: Q in the sources.
+            # lz, lzz, ... become the derivatives of the cost to go: Q in the sources.
             product(Vzz, A, VA, False, False)
             product(Vzz, B, VB, False, False)
             product(A, Vz, lz, True, True)
@@ -211,7 +208,7 @@ def _kernel(name: str, driven: tuple[int, ...]) -> Any:
                 promised -= g[j] * k_0[k, j]
                 for i in range(size):
                     K[k, j, i] = wide[j, m + i]
-            # Value of the step taken: V = Q + K' Quu K + K' Quz + Quz' K, of a step that limits may have cut.
+            # Value of the limited step: V = Q + K' Quu K + K' Quz + Quz' K.
             product(luu, K[k], KQ, False, False)
             for i in range(size):
                 Vz[i, 0] = lz[i, 0]

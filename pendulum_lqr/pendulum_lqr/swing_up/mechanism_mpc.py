@@ -1,4 +1,4 @@
-"""Nonlinear MPC for any mechanism by iterative LQR, warm-started, with fresh guesses where the plan leads nowhere."""
+"""Nonlinear MPC for any mechanism by warm-started iterative LQR, with new guesses where the plan fails."""
 
 from __future__ import annotations
 
@@ -19,20 +19,15 @@ __all__ = ["ITERATIONS", "PATIENCE", "PLAN", "RETRIES", "MechanismMpc"]
 Array = NDArray[np.float64]
 _HURRY = IlqrWeights(1.0, 0.0, 0.004, 2e-5, 5e-3, 10.0)
 PLAN = PlanSettings(_HURRY, step=0.02, nodes=70, guesses=32, iterations=20)
-"""Of the plans, and of fresh guesses where there is no plan; its step is also the time from plan to plan."""
+"""Settings of plans and of initial guesses; the step is also the replanning period."""
 ITERATIONS = 3
-"""Of iterative LQR from plan to plan."""
+"""Iterations of iterative LQR per replanning."""
 PATIENCE, RETRIES = 8, 2
 """Plans after which some guesses are tried again where the plan does not end upright, and how many."""
 
 
 class MechanismMpc(Controller):
-    """Follows the first interval of a plan, replans from where it is, and hands over to the LQR near upright.
-
-    Args:
-        period: Sampling period [s].
-        catch: LQR with its region; the plant is its own.
-    """
+    """Follows the first interval of a plan, replans from the state, and hands over to the LQR near upright."""
 
     def __init__(self, period: float, catch: MechanismCatch) -> None:
         super().__init__(catch.plant.effort_limits)
@@ -62,8 +57,8 @@ class MechanismMpc(Controller):
             self._plan = self._best(x, None, PLAN.guesses)
             self._planned, self._age = t, 0
         elif t - self._planned > 2.0 * step:
-            # A plan that was not followed for a while starts elsewhere. In real time its search took too long for its
-            # reply to be applied: it is a better start than none, and another search would be as late.
+            # A plan that was not followed for a while starts elsewhere. In real time its search was too late to be
+            # applied: it is a better start than none, and another search would be as late.
             late = self.search.solve(x, self._before, self._plan.efforts, PLAN.iterations)
             self._plan = self._best(x, late, RETRIES)
             self._planned, self._age = t, 0
@@ -71,7 +66,7 @@ class MechanismMpc(Controller):
             self._plan_again(t, x)
         plan = self._plan
         if not math.isfinite(plan.cost):
-            # From far beyond a machine's speeds every plan runs away from all numbers: there is none to follow.
+            # Far beyond a machine's speeds every plan diverges: there is none to follow.
             self._plan, self._before = None, (0.0,) * len(self.effort_limits)
             return self._before
         share = min(1.0, (t + 0.5 * self.period - self._planned) / step)
@@ -90,16 +85,16 @@ class MechanismMpc(Controller):
             plan = self._best(x, plan, RETRIES)
         if math.isfinite(plan.cost):
             self._plan, self._planned = plan, t
-        # Else a single wild state, such as an encoder's glitch: the plan before it is the better one.
+        # Else it is a single wild state, such as an encoder glitch: the previous plan is better.
 
     def _best(self, x: Vector, plan: IlqrPlan | None, count: int) -> IlqrPlan:
-        """Return the cheapest of a plan and what fresh guesses become."""
+        """Return the cheapest of a plan and optimised new guesses."""
         found = self.search.guessed(x, self._before, count)
         return min(found if plan is None else [plan, *found], key=lambda each: each.cost)
 
 
 def _shifted(plan: IlqrPlan) -> tuple[Array, IlqrPlan]:
-    """Return the efforts of a plan one interval later, ended by none, and the plan that its feedback follows there."""
+    """Return the efforts of a plan one interval later, with zero at the end, and the plan that its feedback follows."""
     states = np.vstack([plan.states[1:], plan.states[-1:]])
     efforts = np.vstack([plan.efforts[1:], np.zeros((1, plan.efforts.shape[1]))])
     gains = np.concatenate([plan.gains[1:], np.zeros((1, *plan.gains.shape[1:]))])

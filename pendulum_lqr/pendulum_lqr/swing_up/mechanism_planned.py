@@ -1,4 +1,4 @@
-"""Iterative LQR as a controller: plan from where it is, follow the plan, hand over to the LQR about upright."""
+"""Iterative LQR as a controller: plan, follow the plan, hand over to the LQR about upright."""
 
 from __future__ import annotations
 
@@ -17,23 +17,18 @@ from pendulum_msgs_py.contract.joints import Vector
 __all__ = ["PlannedSwingUp"]
 
 _SPRINT = IlqrWeights(1.0, 0.0, 0.0005, 2e-6, 1e-4, 3.0)
-"""Hardly anything but the time away from upright costs."""
+"""Hardly any cost except the time away from upright."""
 _PLAN = PlanSettings(_SPRINT, step=0.01, nodes=100, guesses=200, iterations=40)
 _REFINED = 100
-"""Largest number of iterations of the plan that is taken."""
+"""Largest number of iterations on the chosen plan."""
 _TUBE = 10.0
-"""Width of the tube about a plan, as a multiple of the caught region's level; beyond it, it replans."""
+"""Width of the tube about a plan, as a multiple of the caught region's level; outside, it replans."""
 
 
 class PlannedSwingUp(Controller):
     """Plans to the end, follows the plan by time-varying LQR, and replans only where tracking fails.
 
-    A search takes about a second: simulated time waits for it, a real plant does not.
-
-    Args:
-        period: Sampling period [s].
-        catch: LQR with its region; the plant is its own, and plans leave its dry friction out.
-        settings: Horizon, weights, guesses.
+    A search takes about a second: simulated time waits for it, a real plant does not. Plans neglect dry friction.
     """
 
     def __init__(self, period: float, catch: MechanismCatch, settings: PlanSettings = _PLAN) -> None:
@@ -60,14 +55,14 @@ class PlannedSwingUp(Controller):
         effort = None if self._followed is None else self._followed.followed(t, x)
         if effort is None:
             plan = self._plan(x)
-            # From far beyond a machine's speeds every plan runs away from all numbers: there is none to follow.
+            # Far beyond a machine's speeds every plan diverges: there is none to follow.
             self._followed = self._follow(plan) if math.isfinite(plan.cost) else None
             effort = None if self._followed is None else self._followed.followed(t, x)
         self._before = (0.0,) * len(self._before) if effort is None else effort
         return self._before
 
     def _plan(self, x: Vector) -> IlqrPlan:
-        """Return the cheapest plan that ends where the LQR catches; the cheapest at all where none does."""
+        """Return the cheapest plan that ends where the LQR catches, or else the cheapest."""
         start = tuple(float(value) for value in np.array(x) - whole_turns(self.plant, x))
         found = self.search.guessed(start, self._before, self.search.settings.guesses)
         best = min(found, key=self._rank)

@@ -1,17 +1,16 @@
-"""Swing-up by energy for plants whose one motor moves the hinge of a pendulum that has none.
+"""Swing-up by energy for plants whose one motor moves the hinge of an undriven pendulum.
 
 ::
 
-    M_aa q_a'' + M_ap q_p'' + ... = u          a: the driven joint (cart, arm, shoulder), at q_a = q_a* to be
-    M_pa q_a'' + M_pp q_p'' + ... = 0          p: the pendulum
+    M_aa q_a'' + M_ap q_p'' + ... = u            a: the driven joint (cart, arm, shoulder), with goal q_a*
+    M_pa q_a'' + M_pp q_p'' + ... = 0            p: the pendulum
 
-With the driven joint at its goal, E = M_pp v_p^2 / 2 + U(q_a*, q_p) is the pendulum's energy, and what is done to it is
-E' = -M_pa q_a'' v_p. So the driven joint is accelerated by
+With the driven joint at its goal, the pendulum's energy E = M_pp v_p^2 / 2 + U(q_a*, q_p) has E' = -M_pa q_a'' v_p. So
 
     q_a'' = k (E / E* - 1) M_pa v_p - w^2 (q_a - q_a*) - 2 d w q_a'
 
-where E* is the energy of upright: the first part pumps, the rest brings the joint back. The motor's effort for this
-acceleration follows from the mechanism's own equations, which are affine in it.
+pumps towards the energy E* of upright, and returns the joint. The effort follows from the mechanism's equations, which
+are affine in it.
 """
 
 from __future__ import annotations
@@ -28,33 +27,35 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["PUMPS", "EnergyPump", "PumpGains", "pump_gains"]
 
 _BRAKES = 0.6
-"""Share of the motor's limit that is counted on to stop before the end of the way; the rest holds the pendulum."""
+"""Share of the motor's limit assumed for braking before the end of the way; the rest holds the pendulum."""
 _AT_STOPS = 0.9
-"""Share of the way to an end stop that is used."""
+"""Usable share of the way to an end stop."""
 _HANGING = 0.05
 """Share of E* below which a pendulum at rest hangs, and is pushed whatever its velocity."""
 _PUSH = 0.05
-"""That push, as a share of the acceleration w_0^2 of the pendulum's own frequency."""
+"""That push, relative to the acceleration w_0^2 of the pendulum's own frequency."""
 _LEAST_COUPLING = 0.3
-"""Share of the coupling of hanging below which friction is not compensated: a cart does not act on a level pole."""
+"""Share of the hanging coupling below which friction is not compensated: a cart cannot act on a level pole."""
 _MOST_FRICTION = 0.015
-"""Largest dry friction of the pendulum, by the torque of its level weight. The LQR's model has none, and with
-more it does not bring every mechanism to rest (pendubot: 5 of 5 at 0.015, none at 0.02)."""
+"""Largest dry friction of the pendulum, relative to the torque of its level weight. The LQR's model has none, and more
+of it keeps some mechanisms from rest (pendubot: 5 of 5 at 0.015, none at 0.02).
+"""
 _ANGLES = 32
 
 
 @dataclass(frozen=True)
 class PumpGains:
-    """Gains without units: one set suits all sizes of a mechanism.
+    """Dimensionless gains: one set suits all sizes of a mechanism.
 
     Attributes:
         gain: k, by the pendulum's frequency and by M_pp / M_pa of hanging [-].
-        servo: Frequency at which the driven joint comes back, as a multiple of the pendulum's [-].
+        servo: Frequency of the driven joint's return, as a multiple of the pendulum's [-].
         damping: Its damping ratio [-].
-        margin: Energy aimed at beyond that of upright, relative [-].
-        reach: Farthest that the driven joint may go from its goal [rad or m], at most nine tenths of the way to its
-            stops; 0 for these.
-        carried: Turn of the pendulum per turn of the driven joint, where it carries the pendulum's frame along [-].
+        margin: Target energy beyond that of upright, relative [-].
+        reach: Largest distance of the driven joint from its goal [rad or m], at most nine tenths of the way to its
+            stops;
+            0 for these.
+        carried: Turn of the pendulum's frame per turn of the driven joint that carries it [-].
     """
 
     gain: float
@@ -70,15 +71,11 @@ PUMPS: dict[tuple[str, str], PumpGains] = {
     ("furuta", "arm"): PumpGains(3.0, 0.3, 0.8, reach=2.0),
     ("double_pendulum", "shoulder"): PumpGains(0.5, 0.5, 0.5, reach=1.2, carried=1.0),
 }
-"""Which mechanisms can be swung up so, with which joint driven, and by which gains."""
+"""Supported mechanisms and driven joints, with their gains."""
 
 
 def pump_gains(plant: PlantParameters) -> PumpGains:
-    """Return the default gains of a plant.
-
-    Raises:
-        DesignError: The plant is none of those that can be swung up so.
-    """
+    """Return the default gains of a plant; DesignError if it is not supported."""
     driven = plant.coordinates.driven_names
     key = (plant.mechanism.name, driven[0] if len(driven) == 1 else "")
     if key not in PUMPS:
@@ -95,17 +92,16 @@ class EnergyPump:
     """The law above, for one plant.
 
     Args:
-        plant: The plant.
+        plant: Plant.
         gains: Its gains.
         limit: Largest effort of the motor [N m or N].
 
     Attributes:
-        limit: Largest effort of the motor [N m or N].
-        reach: Farthest that the driven joint may go from its goal, infinite where nothing bounds it [rad or m].
+        reach: Largest distance of the driven joint from its goal, infinite if unbounded [rad or m].
 
     Raises:
-        DesignError: The plant cannot be swung up so: no gravity, the driven joint does not move the pendulum, or dry
-            friction would keep the LQR from holding it.
+        DesignError: No gravity, the driven joint does not move the pendulum, or dry friction would keep the LQR from
+            holding it.
 
     Source:
         Astrom and Furuta, Swinging up a pendulum by energy control, Automatica 36(2), 2000; Spong, Energy based control
@@ -175,13 +171,7 @@ class EnergyPump:
         return float((kinetic + self._potential(q, self._packed) - self._lowest) / self._top)
 
     def effort(self, position: Vector, velocity: Vector, margin: float) -> float:
-        """Return the limited effort that pumps [N m or N].
-
-        Args:
-            position: Both positions [rad or m].
-            velocity: Both velocities.
-            margin: Energy aimed at beyond that of upright, as a share of it [-].
-        """
+        """Return the limited pumping effort [N m or N]; ``margin`` beyond upright's energy, as a share of it [-]."""
         a, p = self._a, self._p
         error, speed = self._deviation(position)[a], velocity[a]
         rows = self._mass(position, self._packed)
@@ -191,7 +181,7 @@ class EnergyPump:
         wanted = self._gain * (share - 1.0 - margin) * coupling * swing
         wanted -= self._friction(velocity[p]) * coupling / max(coupling**2, self._least_coupling**2)
         if share < _HANGING and abs(swing) < self._rest:
-            # Hanging at rest it may be pushed either way.
+            # Hanging at rest, either direction is suitable.
             wanted -= math.copysign(self._push, coupling * swing)
         wanted -= self._stiffness * error + self._damping * speed
         wanted = self._within_reach(wanted, error, speed)
@@ -199,17 +189,17 @@ class EnergyPump:
         pushed = self._forward(position, velocity, (1.0, 0.0) if a == 0 else (0.0, 1.0), self._packed)[a]
         effort = (wanted - still) / (pushed - still)
         if self._coulomb:
-            # In the direction of motion, or, at rest, in the desired direction.
+            # In the direction of motion, or at rest in the desired one.
             effort += math.copysign(self._coulomb, speed if abs(speed) > 1e-3 else wanted)
         return self.limit if effort > self.limit else max(effort, -self.limit)
 
     def _friction(self, speed: float) -> float:
-        """Return what friction takes from the pendulum, smooth about rest [N m]."""
+        """Return the pendulum's friction, smooth about rest [N m]."""
         damping, coulomb = self._lost
         return damping * speed + coulomb * max(-1.0, min(1.0, speed / self._slow))
 
     def _within_reach(self, wanted: float, error: float, speed: float) -> float:
-        """Return an acceleration that does not lead beyond the reach: it brakes as soon as it must."""
+        """Return an acceleration that stays within the reach: it brakes as soon as necessary."""
         room = self.reach - (error if speed > 0.0 else -error)
         if 0.5 * speed * speed < self._brakes * room:
             return wanted
@@ -221,7 +211,7 @@ class EnergyPump:
         return (self._goal[0], position) if self._a == 0 else (position, self._goal[1])
 
     def _least_answer(self) -> float:
-        """Return the smallest acceleration of the driven joint by one unit of effort."""
+        """Return the smallest acceleration of the driven joint per unit of effort."""
         smallest = math.inf
         for index in range(_ANGLES):
             rows = self._mass(self._at(2.0 * math.pi * index / _ANGLES), self._packed)

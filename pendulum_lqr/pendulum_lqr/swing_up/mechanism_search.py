@@ -1,4 +1,4 @@
-"""Plans from anywhere to upright: what iterative LQR makes of random guesses."""
+"""Plans from any state to upright by iterative LQR on random guesses."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class PlanSettings:
     """Settings of a search.
 
     Attributes:
-        weights: Of the cost; dominated by being away from upright, so that it hurries.
+        weights: Of the cost; dominated by being away from upright, so that plans are fast.
         step: Distance of the plan's nodes [s].
         nodes: Intervals of the horizon.
-        guesses: Random guesses.
+        guesses: Number of random guesses.
         iterations: Largest number of iterations for each of them.
     """
 
@@ -38,12 +38,7 @@ class PlanSettings:
 
 
 class PlanSearch:
-    """Searches plans for one plant.
-
-    Args:
-        catch: LQR with its region, where a plan should end; the plant is its own.
-        settings: Horizon, weights, guesses.
-    """
+    """Searches plans for the plant of a catch, to end in its region."""
 
     def __init__(self, catch: MechanismCatch, settings: PlanSettings) -> None:
         self.catch, self.settings = catch, settings
@@ -57,20 +52,20 @@ class PlanSearch:
     def solve(
         self, x: Vector, before: Vector, guess: Array, iterations: int, around: IlqrPlan | None = None
     ) -> IlqrPlan:
-        """Return what iterations make of a guess.
+        """Return the result of iterations on a guess.
 
         Args:
-            x: State to start from, [q, v].
+            x: Initial state, [q, v].
             before: Efforts until then, m values.
             guess: Efforts, shape (nodes, m).
-            iterations: Largest number of them.
-            around: A plan whose feedback follows the guess.
+            iterations: Largest number of iterations.
+            around: Plan whose feedback follows the guess.
         """
         n = len(x) // 2
         return self._problem.solve(x[:n], x[n:], before, guess, iterations, around)
 
     def guessed(self, x: Vector, before: Vector, count: int) -> list[IlqrPlan]:
-        """Return what becomes of fresh guesses; the first one is no effort at all."""
+        """Return plans from new guesses, the first with zero effort."""
         return [self.solve(x, before, guess, self.settings.iterations) for guess in self._guesses(count)]
 
     def arrives(self, plan: IlqrPlan) -> bool:
@@ -86,7 +81,7 @@ class PlanSearch:
         guesses = [np.zeros((nodes, m))]
         for index in range(count - 1):
             if index % 2:
-                # Full effort one way, then another: what hurries.
+                # Full effort one way, then another, for fast plans.
                 switches = np.cumsum(self._rng.uniform(0.05, 0.5, 6))
                 levels = limits * self._rng.uniform(-0.8, 0.8, (7, m))
                 levels[3:] *= 0.2
@@ -94,7 +89,7 @@ class PlanSearch:
                 continue
             phase, period = self._rng.random(m), self._rng.uniform(0.3, 1.6, m)
             height = 0.7 * limits * self._rng.random(m)
-            # It dies away: what is pumped to the end spins.
+            # Decaying, because pumping to the end would spin.
             fade = np.exp(-2.0 * t / t[-1])[:, None]
             guesses.append(fade * height * np.sin(2.0 * math.pi * (t[:, None] / period + phase)))
         return guesses

@@ -1,4 +1,4 @@
-"""Swing-up trajectories of a mechanism: from random guesses by iterative LQR, as small files, and from them again."""
+"""Swing-up trajectories of a mechanism, by iterative LQR from random guesses, and their files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FORMAT = "pendulum_trajectory/1"
 _LARGEST_FILE = 50_000_000
 _FIND = IlqrWeights(1.0, 0.05, 0.13, 1e-3, 0.007, 10.0)
 _NEAR = 0.3
-"""Largest deviation at which a guess's end counts as upright, in shares of the caught region's level."""
+"""Largest final deviation of a guess that counts as upright, in shares of the caught region's level."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,10 @@ class MechanismTrajectory:
     Attributes:
         plant: Name of the plant.
         joints: Names of its joints.
-        times: Of the nodes, equidistant, shape (N + 1,) [s].
+        times: Equidistant nodes, shape (N + 1,) [s].
         states: [q, v] there, q not wrapped, shape (N + 1, 2n).
         efforts: Of the m motors there, linear between nodes, shape (N + 1, m) [N m or N].
-        how: What made it: settings, seed, cost.
+        how: Its origin: settings, seed, cost.
     """
 
     plant: str
@@ -64,7 +64,7 @@ class MechanismTrajectory:
 
     @property
     def duration(self) -> float:
-        """Its length [s]."""
+        """[s]."""
         return float(self.times[-1])
 
     def at(self, times: Array) -> tuple[Array, Array]:
@@ -73,7 +73,7 @@ class MechanismTrajectory:
 
         n = self.states.shape[1] // 2
         clipped = np.clip(times, 0.0, self.duration)
-        # The velocities are the slopes of the positions; those of the velocities come from their neighbours.
+        # Velocities are the slopes of positions; slopes of velocities come from their neighbours.
         slopes = np.column_stack([self.states[:, n:], np.gradient(self.states[:, n:], self.times, axis=0)])
         states = CubicHermiteSpline(self.times, self.states, slopes)(clipped)
         efforts = np.column_stack([np.interp(clipped, self.times, column) for column in self.efforts.T])
@@ -88,8 +88,8 @@ class SwingUpSearch:
         weights: Of the cost.
         duration: Length of the trajectory [s].
         step: Distance of its nodes [s].
-        shortest: Shortest horizon of a guess [s]; the rest of ``duration`` is the LQR's.
-        find: Weights with which a random guess is brought upright first.
+        shortest: Shortest horizon of a guess [s]; the LQR holds for the rest of ``duration``.
+        find: Weights of the first optimisation, from a random guess to upright.
         iterations: Largest number of iterations of each solution.
     """
 
@@ -102,18 +102,13 @@ class SwingUpSearch:
 
 
 def search_swing_up(catch: MechanismCatch, search: SwingUpSearch, seed: int) -> MechanismTrajectory:
-    """Return what one random guess becomes: a locally optimal swing-up.
+    """Return the locally optimal swing-up from the random guess of a seed.
 
-    The guess is a sine of random height, period and phase over a horizon of random length. Iterative LQR brings it
-    upright, the LQR holds it there for the rest of the duration, and the whole is optimised again.
-
-    Args:
-        catch: LQR with its caught region; the plant is its own.
-        search: Settings.
-        seed: Of the guess.
+    The guess is a sine of random height, period and horizon. Iterative LQR brings it upright, the LQR holds it there
+    for the rest of the duration, and the whole is optimised again.
 
     Raises:
-        DesignError: The guess does not end upright, or runs into an end stop on its way.
+        DesignError: The guess does not end upright, or runs into an end stop.
     """
     rng = np.random.default_rng(seed)
     plant = catch.plant
@@ -146,7 +141,7 @@ def search_swing_up(catch: MechanismCatch, search: SwingUpSearch, seed: int) -> 
 def trajectory_of(
     plant: PlantParameters, plan: IlqrPlan, step: float, how: dict[str, Any] | None = None
 ) -> MechanismTrajectory:
-    """Return a plan whose nodes lie a step apart [s] as a trajectory, with what made it."""
+    """Return a plan with nodes a step apart [s] as a trajectory."""
     names = plant.coordinates.names
     q_v, u = np.hsplit(plan.states, [2 * len(names)])
     return MechanismTrajectory(
@@ -157,16 +152,7 @@ def trajectory_of(
 def cheapest_swing_up(
     catch: MechanismCatch, search: SwingUpSearch, seeds: Iterable[int]
 ) -> tuple[MechanismTrajectory, int]:
-    """Return the cheapest swing-up of several guesses, and how many of them became one.
-
-    Args:
-        catch: LQR with its caught region; the plant is its own.
-        search: Settings.
-        seeds: Of the guesses.
-
-    Raises:
-        DesignError: None became one.
-    """
+    """Return the cheapest swing-up of several seeds, and the number of successes; DesignError if none."""
     found = []
     tried = 0
     for seed in seeds:
@@ -198,11 +184,7 @@ def _held(catch: MechanismCatch, z: Vector, count: int, search: SwingUpSearch) -
 
 
 def write_trajectory(path: Path, trajectory: MechanismTrajectory) -> None:
-    """Write a trajectory as JSON, with six digits behind the point; the file appears whole or not at all.
-
-    Raises:
-        ParameterError: The file cannot be written.
-    """
+    """Write a trajectory as JSON with six decimals, atomically; ParameterError if it cannot be written."""
 
     def rows(values: Array) -> list[list[float]]:
         return [[round(float(value), 6) for value in row] for row in values]
@@ -218,16 +200,12 @@ def write_trajectory(path: Path, trajectory: MechanismTrajectory) -> None:
     }
     text = json.dumps(document)
     with writing(f"trajectory {path}", ParameterError):
-        # One node a line, so that a change shows as one.
+        # One node per line, for readable differences.
         write_whole(path, text.replace("], [", "],\n[") + "\n")
 
 
 def load_trajectory(path: Path) -> MechanismTrajectory:
-    """Read a trajectory.
-
-    Raises:
-        ParameterError: It is none, has values that are not finite, or its arrays do not go together.
-    """
+    """Read a trajectory; ParameterError if it is none, has values that are not finite, or shapes differ."""
     text = read_text(path, "trajectory", limit=_LARGEST_FILE)
     try:
         document = json.loads(text)

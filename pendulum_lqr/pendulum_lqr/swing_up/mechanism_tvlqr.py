@@ -1,4 +1,4 @@
-"""Follow a swing-up with time-varying LQR and hand over to the LQR about upright."""
+"""Time-varying LQR along a swing-up, and handover to the LQR about upright."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Array = NDArray[np.float64]
 def tracking_gains(
     plant: PlantParameters, states: Array, efforts: Array, period: float, q: ArrayLike, r: float, terminal: Array
 ) -> tuple[Array, Array]:
-    """Return K (N, m, 2n) and the cost matrices P (N + 1, 2n, 2n) of u = u0 - K (x - x0) along N samples.
+    """Return K (N, m, 2n) and cost matrices P (N + 1, 2n, 2n) of u = u0 - K (x - x0) along N samples.
 
     Args:
-        plant: The plant.
+        plant: Plant.
         states: x0 at the samples, shape (N + 1, 2n).
         efforts: u0, held over a period, shape (N, m).
         period: Sampling period [s].
@@ -67,7 +67,7 @@ def tracking_gains(
 
 
 def whole_turns(plant: PlantParameters, x: Vector) -> Array:
-    """Return what a state [q, v] has of whole turns about hanging, shape (2n,): no motion depends on it [rad]."""
+    """Return the whole turns about hanging of a state [q, v], shape (2n,), on which no motion depends [rad]."""
     turns = np.array([joint.turns for joint in plant.mechanism.joints] + [False] * len(plant.joints))
     return np.where(turns, 2.0 * math.pi * np.rint(np.array(x) / (2.0 * math.pi)), 0.0)
 
@@ -75,20 +75,19 @@ def whole_turns(plant: PlantParameters, x: Vector) -> Array:
 class MechanismTvlqr(Controller):
     """u = u0(t) - K(t) (x - x0(t)) along a swing-up, then LQR; another controller where both are far.
 
-    It starts the trajectory at hanging. A state off it, beyond ``tube`` in the tracking's own cost, is caught
-    by the LQR where that can, and else left to ``recover``.
+    The trajectory starts hanging. Where the tracking cost leaves ``tube``, the LQR catches if it can, else ``recover``.
 
     Args:
         period: Sampling period [s].
-        trajectory: The swing-up.
-        catch: LQR with its region; the plant is its own.
+        trajectory: Swing-up.
+        catch: LQR with its region and plant.
         q: Weights of the deviation along the trajectory, shape (2n,).
         r: Weight of the efforts' deviation.
-        recover: What brings it up from anywhere else; None for no effort at all.
+        recover: Controller from anywhere else; None for no effort.
         tube: Largest cost x' P x of a deviation from the trajectory, as a multiple of the caught region's level.
 
     Raises:
-        ParameterError: The trajectory is that of another mechanism.
+        ParameterError: The trajectory is for another mechanism.
     """
 
     def __init__(
@@ -131,9 +130,9 @@ class MechanismTvlqr(Controller):
             self.recover.reset()
 
     def followed(self, t: float, x: Vector) -> Vector | None:
-        """Return the efforts that follow the trajectory; None where it has ended, or from where it was left once."""
+        """Return the efforts that follow the trajectory; None after its end, and once it was left."""
         if self._began is None:
-            # The trajectory starts on turn 0, so the turns made before are subtracted.
+            # The trajectory starts on turn 0: subtract earlier turns.
             self._began, self._turned = t, whole_turns(self.plant, x)
         k = round((t - self._began) / self.period)
         if self._following and k < len(self.planned):

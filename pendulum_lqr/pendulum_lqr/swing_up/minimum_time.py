@@ -1,17 +1,13 @@
-"""Minimum time to a target set, as a feedback: dynamic programming on a grid of states.
+"""Minimum time to a target set as a feedback, by dynamic programming on a grid of states.
 
-Semi-Lagrangian value iteration of W = 1 - exp(-T), Kruzkov's transform of the time to go T, which keeps states that
-cannot reach the target finite (W = 1):
+Semi-Lagrangian value iteration of W = 1 - exp(-T), Kruzkov's transform of the time to go T, finite (W = 1) for states
+that cannot reach the target; u in {-limit, 0, limit} suffices because the minimiser is bang-bang:
 
     W(x) = min over u of (1 - exp(-h)) + exp(-h) W(x(h; u)),   W = 0 in the target
 
-With a torque limit the minimiser is bang-bang, so that u in {-limit, 0, limit} is enough.
-
-For the preset ``dfki`` (1.5 N m, Coulomb friction 0.093 N m) it comes down from 2.43 to 2.33 s on grids of 120 to 560,
-and direct collocation finds 2.39 s. The 2.04 s of the public benchmark belong to a plant without dry friction and with
-up to 2.5 N m.
-
-Source: Falcone and Ferretti, Semi-Lagrangian Approximation Schemes, SIAM, 2014, section 8.2.
+For ``dfki`` (1.5 N m, Coulomb friction 0.093 N m): 2.43 to 2.33 s on grids of 120 to 560, and 2.39 s by direct
+collocation. The public benchmark's 2.04 s are without dry friction and with up to 2.5 N m. Source: Falcone and
+Ferretti, Semi-Lagrangian Approximation Schemes, SIAM, 2014, section 8.2.
 """
 
 from __future__ import annotations
@@ -31,7 +27,7 @@ __all__ = ["SIGN_VELOCITY", "TimeToGo", "minimum_time"]
 Array = NDArray[np.float64]
 
 SIGN_VELOCITY = 0.05
-"""Velocity over which the model of dry friction changes sign [rad/s]; grid cells are about as large."""
+"""Width of the smoothed sign of dry friction [rad/s], about a grid cell."""
 _STEP = 0.02
 """Time step [s]; long enough to leave a cell."""
 _TOLERANCE = 1e-5
@@ -53,16 +49,11 @@ class TimeToGo:
     step: float
 
     def __post_init__(self) -> None:
-        """Keep the table as lists: a lookup of four neighbours from an array of numpy costs ten times as much."""
+        """Store the table as lists: looking up four neighbours in a numpy array takes ten times as long."""
         object.__setattr__(self, "_rows", self.W.tolist())
 
     def lookup(self, angle: float, velocity: float) -> float:
-        """Return W at a state by bilinear interpolation; velocities beyond the grid count as its rim.
-
-        Args:
-            angle: From upright, any turn [rad].
-            velocity: [rad/s].
-        """
+        """Return W at a state [rad from upright, rad/s] by bilinear interpolation, clamped in velocity."""
         rows: list[list[float]] = self._rows  # type: ignore[attr-defined]
         n, m = len(rows), len(rows[0])
         a = (angle + math.pi) / (2.0 * math.pi) * n
@@ -78,7 +69,7 @@ class TimeToGo:
         )
 
     def time(self, angle: float, velocity: float) -> float:
-        """Return the time to go at a state, inf where the target is out of reach [s]."""
+        """Return the time to go at a state, inf if the target cannot be reached [s]."""
         w = self.lookup(angle, velocity)
         return -math.log1p(-w) if w < 1.0 - 1e-9 else math.inf
 
@@ -95,10 +86,10 @@ def minimum_time(
     """Return the time to go from every state of a grid to an ellipse around a set-point.
 
     Args:
-        plant: Plant parameters; damping, gravity, dry friction and offsets are in the model.
-        effort_limit: Torque limit [N m].
+        plant: Plant parameters, with damping, gravity, dry friction and offsets.
+        effort_limit: [N m].
         target: (S, c) of the set x' S x <= c.
-        centre: Where the set lies, from upright [rad].
+        centre: Of the set, from upright [rad].
         angles: Grid points of a full turn.
         velocities: Grid points in velocity, odd so that rest is one of them.
     """
@@ -113,7 +104,7 @@ def minimum_time(
     successors = [_successors(plant, x, v, u, span) for u in (-effort_limit, 0.0, effort_limit)]
     discount = math.exp(-_STEP)
     W = np.where(inside, 0.0, 1.0)
-    # Information travels one step a sweep: ten seconds of motion are more than any swing-up needs.
+    # Information travels one step per sweep: ten seconds of motion exceed any swing-up.
     for _ in range(math.ceil(10.0 / _STEP)):
         new = np.ones_like(W)
         padded = W.ravel()

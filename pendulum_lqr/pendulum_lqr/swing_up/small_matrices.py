@@ -1,4 +1,4 @@
-"""Compiled algebra of matrices of a few rows, without the price of a call to a library."""
+"""Compiled algebra of matrices of a few rows, without the overhead of library calls."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["copy", "eliminate", "keep_convex", "newton", "product"]
 
 @numba.njit(error_model="numpy", fastmath={"contract"}, **WITHIN)
 def product(a: Any, b: Any, out: Any, transposed: bool, add: bool) -> None:
-    """Fill ``out`` with a b, or a' b, or add it: small matrices, without the price of a call to a library."""
+    """Fill ``out`` with a b or a' b, or add it."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             total = out[i, j] if add else 0.0
@@ -25,7 +25,7 @@ def product(a: Any, b: Any, out: Any, transposed: bool, add: bool) -> None:
 
 @numba.njit(error_model="numpy", **WITHIN)
 def copy(source: Any, target: Any) -> None:
-    """Copy a matrix, without numpy's words about shapes that do not fit, which take seconds to compile."""
+    """Copy a matrix, without numpy's shape messages, which take seconds to compile."""
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -33,9 +33,9 @@ def copy(source: Any, target: Any) -> None:
 
 @numba.njit(error_model="numpy", fastmath={"contract"}, **WITHIN)
 def newton(H: Any, g: Any, low: Any, high: Any, step: Any, free: Any, work: Any) -> None:
-    """Fill ``step`` with what minimises g' s + s' H s / 2 between limits, and which entries are free of them.
+    """Fill ``step`` with the minimiser of g' s + s' H s / 2 within limits, and ``free`` with its free entries.
 
-    Entries that Newton's step drives beyond a limit stay there, and the others follow; exact for one effort.
+    Entries that Newton's step drives beyond a limit are fixed there, and the others re-solved; exact for one effort.
     """
     m = g.shape[0]
     free[:] = True
@@ -67,7 +67,7 @@ def newton(H: Any, g: Any, low: Any, high: Any, step: Any, free: Any, work: Any)
 
 @numba.njit(error_model="numpy", fastmath={"contract"}, **WITHIN)
 def eliminate(work: Any, m: int) -> None:
-    """Solve the positive definite system whose right-hand sides stand in the columns from m on, in place."""
+    """Solve a positive definite system, with right-hand sides in the columns from m on, in place."""
     for j in range(m):
         for i in range(m):
             if i != j:
@@ -82,7 +82,7 @@ def eliminate(work: Any, m: int) -> None:
 
 @numba.njit(error_model="numpy", **WITHIN)
 def keep_convex(M: Any, n: int) -> None:
-    """Leave out of the symmetric part of the first n (1 or 2) rows and columns what is concave, in place."""
+    """Replace the first n (1 or 2) rows and columns by the convex part of their symmetric part, in place."""
     if n == 1:
         M[0, 0] = max(M[0, 0], 0.0)
     else:

@@ -1,4 +1,4 @@
-"""What follows a stored swing-up of several joints, and the LQR that catches it: made for a plant."""
+"""Controllers that follow a stored swing-up of several joints, with the LQR that catches it."""
 
 from __future__ import annotations
 
@@ -21,17 +21,13 @@ __all__ = [
 ]
 
 CALM_WEIGHTS = ((1.0, 1.0, 1.0, 1.0), 10.0)
-"""Weights of catch and tracking behind a swing-up, for two joints: of gains as low as still catch from far."""
+"""Weights of catch and tracking for two joints: the lowest gains that still catch from far."""
 _TUBE = 10.0
-"""Width of the tube about a swing-up: beyond it, replanning is better than tracking."""
+"""Width of the tube about a swing-up: outside, replanning is better than tracking."""
 
 
 def stored_trajectory(plant: PlantParameters) -> MechanismTrajectory:
-    """Return the swing-up that comes with the project for a preset.
-
-    Raises:
-        ParameterError: There is none for this plant.
-    """
+    """Return the project's swing-up for a preset; ParameterError if there is none."""
     folder = Path(str(resources.files("pendulum_lqr"))) / "trajectories"
     path = folder / f"{plant.name}.json"
     if not path.is_file():
@@ -46,11 +42,7 @@ def default_catch(plant: PlantParameters) -> MechanismCatch:
 
 
 def refuse_passive_friction(controller: str, plant: PlantParameters) -> None:
-    """Refuse a plant for a controller that plans without dry friction, if no effort can make up for it where it is.
-
-    Raises:
-        ParameterError: A passive joint has some.
-    """
+    """Raise ParameterError if a passive joint has dry friction, which no effort of a plan can compensate."""
     coordinates = plant.coordinates
     for index, (name, joint) in enumerate(zip(coordinates.names, plant.joints, strict=True)):
         if index not in coordinates.driven and joint.breakaway > 0.0:
@@ -65,14 +57,14 @@ def tracked_swing_up(plant: PlantParameters, period: float, *, recovers: bool = 
     """Return the controller that follows the stored swing-up of a plant by time-varying LQR.
 
     Args:
-        plant: The plant.
+        plant: Plant.
         period: Sampling period [s].
-        recovers: Whether it replans where it leaves the tube; otherwise it continues to follow.
+        recovers: Whether it replans outside the tube; otherwise it continues to follow.
 
     Raises:
         ParameterError: There is none for this plant.
     """
-    # Without a swing-up no region need be sampled, which takes a second.
+    # First, because sampling a region takes a second.
     swing_up = stored_trajectory(plant)
     q, r = CALM_WEIGHTS
     catch = make_mechanism_catch(plant, q, r)

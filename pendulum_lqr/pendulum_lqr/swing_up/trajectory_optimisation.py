@@ -44,13 +44,7 @@ class OptimisedTrajectory:
 
 
 def rigid_flow(plant: PlantParameters, x: Any, effort: Any) -> Any:
-    """Return velocity and acceleration as a CasADi expression; dry friction with a smooth sign, offsets included.
-
-    Args:
-        plant: Plant parameters.
-        x: Angle from upright [rad] and velocity [rad/s].
-        effort: [N m].
-    """
+    """Return velocity and acceleration as a CasADi expression; dry friction with a smooth sign, with offsets."""
     return casadi.vertcat(x[1], acceleration_from_upright(plant, x[0], x[1], effort, casadi, _SIGN_VELOCITY))
 
 
@@ -58,15 +52,15 @@ def rigid_flow(plant: PlantParameters, x: Any, effort: Any) -> Any:
 def swing_up_trajectory(
     plant: PlantParameters, effort_limit: float, nodes: int = 100, set_point: float = 0.0
 ) -> OptimisedTrajectory:
-    """Return the fastest of the locally optimal swing-ups from several guesses, with a light price on torque changes.
+    """Return the fastest of the locally optimal swing-ups from several guesses, with a small cost of torque changes.
 
-    Hermite-Simpson collocation with the torque linear between nodes; the guesses swing more or less often.
+    Hermite-Simpson collocation with the torque linear between nodes; the guesses have different numbers of swings.
 
     Args:
         plant: Plant parameters.
-        effort_limit: Torque limit of the trajectory [N m]; leave a reserve for the feedback.
+        effort_limit: Torque limit of the trajectory [N m], with a reserve for the feedback.
         nodes: Number of intervals.
-        set_point: Where it ends, from upright [rad].
+        set_point: End, from upright [rad].
 
     Raises:
         DesignError: No guess leads there.
@@ -106,7 +100,7 @@ def swing_up_trajectory(
     )
     best: OptimisedTrajectory | None = None
     s = np.linspace(0.0, 1.0, nodes + 1)
-    # Time scale of the plant: its small oscillation, or where damping rules, its slow decay.
+    # Time scale of the plant: its small oscillation, or its slow decay if overdamped.
     scale = max(
         2.0 * math.pi * math.sqrt(plant.inertia / max(plant.gravity, 1e-6)),
         4.0 * plant.damping / max(effort_limit, 1e-6),
