@@ -154,6 +154,12 @@ def test_layers_say_yes_for_the_same_plant_and_name_the_designs_that_do_not_carr
     assert other.layers[0].mark is Mark.NO
     assert [design.certificate.certified for design in other.designs] == [True, False, True]
     assert "not row 2" in other.layers[1].sentence
+    # A design that the simulation itself rejects carries nothing over, wrong or right.
+    for designs, mark in ((["q=100,0.01 r=0.1", "k=-1,0"], Mark.YES), (["k=-1,0"], Mark.UNDECIDED)):
+        layer = analyse_responses([measured["sim"], measured["hw"]], "thesis", designs).layers[1]
+        assert layer.mark is mark
+        assert f"unstable on the model already: row {len(designs)};" in layer.sentence
+        assert any("--design" in step for step in layer.next_steps) is (mark is Mark.UNDECIDED)
     page = write_analysis(tmp_path, same, formats=("png",))
     text = page.read_text(encoding="utf-8")
     assert "Which designs carry over" in text

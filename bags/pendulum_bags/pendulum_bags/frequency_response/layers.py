@@ -106,7 +106,9 @@ def same_plant(
 
 
 def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, longer: str = LONGER) -> LayerResult:
-    """Return layer 3: yes where all given designs carry over, no where one does not.
+    """Return layer 3: yes where all designs that the model stabilises carry over, no where one does not.
+
+    A design that is unstable on the model is one that the simulation itself rejects: it carries nothing over.
 
     Args:
         certifier: Of the model and the measured hardware.
@@ -117,23 +119,26 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
     unstable = int(np.sum(np.linalg.eigvals(certifier.plant.A).real > _UNSTABLE))
     good = [design for design in designs if design.certified]
     damping = max(LEAST_DAMPING, *(design.certificate.hidden_damping for design in good), 0.0)
-    bad = [design for design in designs if not design.certified]
-    unsure = bool(bad) and all(design.undecided for design in bad)
-    mark = Mark.YES if designs and not bad else Mark.UNDECIDED if unsure else Mark.NO
+    rejected = [design for design in designs if not (design.unknown or design.certificate.stable_on_model)]
+    bad = [design for design in designs if not (design.certified or design in rejected)]
+    mark = Mark.YES if good and not bad else Mark.UNDECIDED if all(design.undecided for design in bad) else Mark.NO
     count = len(designs)
-    rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if d.certified)
-    not_rows = ", ".join(f"row {i}" for i, d in enumerate(designs, 1) if not d.certified)
+    rows, not_rows, own_rows = (
+        ", ".join(f"row {i}" for i, design in enumerate(designs, 1) if design in some) for some in (good, bad, rejected)
+    )
     limit = (
         f"designs with a margin b above {profile.value_upper:.2f} stabilise the hardware too"
         if profile.value_upper < 1.0
         else "the gap certifies no design by its margin alone"
     )
-    if good and bad:
-        verdict = f"of {count} designs {rows}; not {not_rows}"
+    if good and (bad or rejected):
+        verdict = f"of {count} designs {rows}" + (f"; not {not_rows}" if bad else "")
     elif good:
         verdict = f"all {count} designs" if count > 1 else "the design"
     else:
         verdict = f"none of {count} designs"
+    if rejected:
+        verdict += f"; unstable on the model already: {own_rows}"
     evidence = [
         Evidence(
             "nu-gap of model and hardware",
@@ -175,6 +180,8 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
     if far:
         nothing = f"measuring longer decides nothing about {', '.join(far)}: the error would have to be a tenth at most"
         steps += (f"{nothing}; identify the hardware, and design with more margin",)
+    if len(rejected) == count:
+        steps += ("certify a design that the model stabilises: --design",)
     if slow:
         steps += (f"measure from lower frequencies: {longer} --signal-period {math.ceil(1.0 / min(slow))}",)
     return LayerResult(
@@ -185,7 +192,7 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
         f"{math.ceil(1e3 * damping) / 10.0:g} %; torque limits and friction at rest are outside it.",
         tuple(evidence),
         steps,
-        limit if mark is Mark.YES else f"{_named(bad, count)} not certified for the hardware",
+        limit if mark is Mark.YES else f"{_named(bad or rejected, count)} not certified for the hardware",
         f"{limit}; {', '.join(d.name for d in good)} certified to be stable there, which tells nothing of how "
         "closely it moves as simulated"
         if good
