@@ -25,14 +25,10 @@ LOCKSTEP_EPOCH_NS = NANOSECONDS
 """Stamp of the first state in lockstep [ns]; a stamp of zero means "no time" to ROS tools."""
 
 REALTIME_PRIORITY = ParameterSpec(
-    "realtime_priority",
-    0,
-    "-",
+    "realtime_priority", 0, "-",
     "Real-time priority (SCHED_FIFO), 1 to 99; 0 for an ordinary process; -1 for 50 if permitted and in wall time.",
-    minimum=-1,
-    maximum=99,
-    read_only=True,
-)
+    minimum=-1, maximum=99, read_only=True,
+)  # fmt: skip
 """Of all programs that run at a plant's rate."""
 
 COMPILED = ParameterSpec(
@@ -41,39 +37,26 @@ COMPILED = ParameterSpec(
 
 LOOP_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
-        "clock",
-        "realtime",
-        "",
+        "clock", "realtime", "",
         "Absolute deadlines of wall time, or step only when all expected answers to a state have come.",
-        choices=("realtime", "lockstep"),
+        choices=("realtime", "lockstep"), read_only=True,
+    ),
+    ParameterSpec(
+        "lockstep_inputs", ["effort_command"], "", "Inputs that must answer a state before the next step, in lockstep.",
+        choices=tuple(kind.value for kind in Input), read_only=True,
+    ),
+    ParameterSpec(
+        "lockstep_subscribers", 1, "-",
+        "Subscriptions to joint_states that must be there before the first state, in lockstep.", minimum=0,
         read_only=True,
     ),
     ParameterSpec(
-        "lockstep_inputs",
-        ["effort_command"],
-        "",
-        "Inputs that must answer a state before the next step, in lockstep.",
-        choices=tuple(kind.value for kind in Input),
-        read_only=True,
-    ),
-    ParameterSpec(
-        "lockstep_subscribers",
-        1,
-        "-",
-        "Subscriptions to joint_states that must be there before the first state, in lockstep.",
-        minimum=0,
-        read_only=True,
-    ),
-    ParameterSpec(
-        "lockstep_duration",
-        0.0,
-        "s",
+        "lockstep_duration", 0.0, "s",
         "Simulated time after which the plant stops stepping and publishes `lockstep_finished`; 0 for never.",
-        minimum=0.0,
-        read_only=True,
+        minimum=0.0, read_only=True,
     ),
     REALTIME_PRIORITY,
-)
+)  # fmt: skip
 
 LIMIT_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
@@ -86,68 +69,41 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         read_only=True,
     ),
     ParameterSpec(
-        "command_timeout",
-        0.05,
-        "s",
-        "Age at which a command expires and the torque goes to zero.",
-        minimum=0.0,
-        exclusive_minimum=True,
+        "command_timeout", 0.05, "s", "Age at which a command expires and the torque goes to zero.", minimum=0.0,
+        exclusive_minimum=True, read_only=True,
+    ),
+    ParameterSpec(
+        "velocity_limit", 0.0, "rad/s",
+        "Speed at which the armed plant faults, and the largest of a trajectory; 0 for none.", minimum=0.0,
         read_only=True,
     ),
     ParameterSpec(
-        "velocity_limit",
-        0.0,
-        "rad/s",
-        "Speed at which the armed plant faults, and the largest of a trajectory; 0 for none.",
-        minimum=0.0,
-        read_only=True,
-    ),
-    ParameterSpec(
-        "position_window",
-        [0.0, 0.0],
-        "rad",
+        "position_window", [0.0, 0.0], "rad",
         "Angles between which the armed plant must stay, [low, high] of each joint; equal for no window.",
         read_only=True,
     ),
     ParameterSpec(
-        "effort_slew_limit",
-        0.0,
-        "N m/s",
-        "Largest rate at which the torque rises, away from zero; it falls at once. 0 for none.",
-        minimum=0.0,
+        "effort_slew_limit", 0.0, "N m/s",
+        "Largest rate at which the torque rises, away from zero; it falls at once. 0 for none.", minimum=0.0,
         read_only=True,
     ),
     ParameterSpec(
-        "handover_time",
-        0.1,
-        "s",
-        "Time over which torque passes between position and effort control.",
-        minimum=0.0,
+        "handover_time", 0.1, "s", "Time over which torque passes between position and effort control.", minimum=0.0,
         read_only=True,
     ),
     ParameterSpec(
-        "handover_effort_limit",
-        2.0,
-        "N m",
-        "A command takes over from position control only if it is this close to the torque that holds.",
-        minimum=0.0,
-        exclusive_minimum=True,
-        read_only=True,
+        "handover_effort_limit", 2.0, "N m",
+        "A command takes over from position control only if it is this close to the torque that holds.", minimum=0.0,
+        exclusive_minimum=True, read_only=True,
     ),
     ParameterSpec(
-        "start_effort_limit",
-        2.0,
-        "N m",
+        "start_effort_limit", 2.0, "N m",
         "Largest torque of each joint with which a commander begins; 0 for none, which the plant logs and reports.",
-        minimum=0.0,
-        read_only=True,
+        minimum=0.0, read_only=True,
     ),
     ParameterSpec(
-        "starvation_limit",
-        0.0,
-        "s",
-        "Time without a command after which a plant that is armed for effort disarms; 0 for never.",
-        minimum=0.0,
+        "starvation_limit", 0.0, "s",
+        "Time without a command after which a plant that is armed for effort disarms; 0 for never.", minimum=0.0,
         read_only=True,
     ),
     ParameterSpec(
@@ -161,24 +117,15 @@ LIMIT_SPECS: tuple[ParameterSpec, ...] = (
         read_only=True,
     ),
     ParameterSpec(
-        "enable_timeout",
-        0.0,
-        "s",
+        "enable_timeout", 0.0, "s",
         "With a hold-to-run switch: silence of `enable_input` that disarms, as its release does; 0 for no such switch.",
-        minimum=0.0,
-        maximum=1.0,
-        read_only=True,
+        minimum=0.0, maximum=1.0, read_only=True,
     ),
     ParameterSpec(
-        "tracking_error_limit",
-        0.3,
-        "rad",
-        "Distance from a trajectory at which the plant faults.",
-        minimum=0.0,
-        exclusive_minimum=True,
-        read_only=True,
+        "tracking_error_limit", 0.3, "rad", "Distance from a trajectory at which the plant faults.", minimum=0.0,
+        exclusive_minimum=True, read_only=True,
     ),
-)
+)  # fmt: skip
 
 
 def in_units_of(specs: Iterable[ParameterSpec], coordinates: Coordinates) -> tuple[ParameterSpec, ...]:

@@ -39,25 +39,17 @@ def winding_resistance_at(temperature: float, resistance: float, coefficient: fl
 
 
 def winding_current(
-    pwm: float,
-    motor_velocity: float,
-    supply_voltage: float,
-    back_emf_constant: float,
-    gear_ratio: float,
+    pwm: float, motor_velocity: float, supply_voltage: float, back_emf_constant: float, gear_ratio: float,
     resistance: float,
-) -> float:
+) -> float:  # fmt: skip
     """Return i = (u V - K_e N q_m') / R [A]; the electrical time constant is far below the step."""
     return (pwm * supply_voltage - back_emf_constant * gear_ratio * motor_velocity) / resistance
 
 
 def feedforward_pwm(
-    torque: float,
-    supply_voltage: float,
-    torque_constant: float,
-    gear_ratio: float,
-    efficiency: float,
+    torque: float, supply_voltage: float, torque_constant: float, gear_ratio: float, efficiency: float,
     nominal_resistance: float,
-) -> float:
+) -> float:  # fmt: skip
     """Return the duty for a torque at the output without an effort loop, u = tau R / (N V K_t eta) [-].
 
     It assumes a stalled motor with its winding at 20 degC, and counts on a share eta of the motor's torque.
@@ -108,14 +100,9 @@ def dahl_step(hysteresis_state: float, deflection_change: float, hysteresis_defl
 
 
 def motor_acceleration(
-    current: float,
-    motor_velocity: float,
-    spring: float,
-    torque_constant: float,
-    gear_ratio: float,
-    motor_damping: float,
-    reflected_inertia: float,
-) -> float:
+    current: float, motor_velocity: float, spring: float, torque_constant: float, gear_ratio: float,
+    motor_damping: float, reflected_inertia: float,
+) -> float:  # fmt: skip
     """Return q_m'' = (K_t N i - b_v q_m' - tau_s) / J [rad/s^2]; :func:`dry_friction_step` adds dry friction."""
     return (torque_constant * gear_ratio * current - motor_damping * motor_velocity - spring) / reflected_inertia
 

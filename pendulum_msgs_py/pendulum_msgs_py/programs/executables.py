@@ -301,13 +301,9 @@ def report_missing(error: BaseException) -> int:
 _OF_A_PATH = (errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS,
               errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG, errno.ELOOP)  # fmt: skip
 _SIGNS_OF_EXHAUSTION = (
-    "failed to map segment",
-    "annot allocate memory",
-    "bad_alloc",
-    "ould not allocate",
-    "pthread_create failed",
+    "failed to map segment", "annot allocate memory", "bad_alloc", "ould not allocate", "pthread_create failed",
     "can't start new thread",
-)
+)  # fmt: skip
 
 
 _DOCSTRING = re.compile(r'(?:\s*#.*\n)*\s*"""(.*?)(?:"""|\n)')

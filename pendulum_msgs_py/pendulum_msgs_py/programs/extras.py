@@ -8,13 +8,8 @@ from pathlib import Path
 __all__ = ["extra_of", "how_to_install"]
 
 _PACKAGES = (
-    "pendulum_msgs_py",
-    "pendulum_rosbag",
-    "pendulum_sim",
-    "pendulum_lqr",
-    "pendulum_hw_bridge",
-    "pendulum_bags",
-)
+    "pendulum_msgs_py", "pendulum_rosbag", "pendulum_sim", "pendulum_lqr", "pendulum_hw_bridge", "pendulum_bags",
+)  # fmt: skip
 _DISTRIBUTIONS = {"foxglove": "foxglove-sdk", "hebi": "hebi-py", "PIL": "pillow", "dask": "distributed"}
 """Distributions whose name differs from the module's."""
 _REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)[^;]*(?:;.*extra\s*==\s*[\"']([\w-]+)[\"'])?")

@@ -18,22 +18,13 @@ from pendulum_msgs_py.errors import ParameterError
 __all__ = ["BESIDE_PLANTS", "NODES", "PLANTS", "Permissions", "enclaves", "granted", "policy"]
 
 _PARAMETERS = (
-    "~/describe_parameters",
-    "~/get_parameter_types",
-    "~/get_parameters",
-    "~/get_type_description",
-    "~/list_parameters",
-    "~/set_parameters",
-    "~/set_parameters_atomically",
-)
+    "~/describe_parameters", "~/get_parameter_types", "~/get_parameters", "~/get_type_description", "~/list_parameters",
+    "~/set_parameters", "~/set_parameters_atomically",
+)  # fmt: skip
 _NO_PARAMETERS = ("~/get_type_description",)
 _LIFECYCLE = (
-    "~/change_state",
-    "~/get_available_states",
-    "~/get_available_transitions",
-    "~/get_state",
-    "~/get_transition_graph",
-)
+    "~/change_state", "~/get_available_states", "~/get_available_transitions", "~/get_state", "~/get_transition_graph",
+)  # fmt: skip
 _LOGGER = ("~/get_logger_levels", "~/set_logger_levels")
 _SILENT_PUBLISHER = ("/parameter_events",)
 _EVERY_PUBLISHER = (*_SILENT_PUBLISHER, "/rosout")

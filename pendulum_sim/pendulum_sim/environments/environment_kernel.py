@@ -63,16 +63,9 @@ def step_kernel(method: str, lanes: int) -> Any:
 
     @numba.njit(fastmath={"contract"}, error_model="numpy")
     def run(
-        w: Any,
-        keys: Any,
-        counts: Any,
-        hold: int,
-        h: float,
-        substeps: int,
-        actions: Any,
-        observations: Any,
+        w: Any, keys: Any, counts: Any, hold: int, h: float, substeps: int, actions: Any, observations: Any,
         rewards: Any,
-    ) -> None:
+    ) -> None:  # fmt: skip
         for j in range(lanes):
             index = np.uint64(counts[j] // hold)
             w[o_disturbance + j] = w[o_amplitude + j] * unit(scramble(keys[j], index))
@@ -91,17 +84,9 @@ def step_kernel(method: str, lanes: int) -> Any:
             for j in range(lanes):
                 torque = w[o_torque + j]
                 w[j], w[o_v + j] = step(
-                    acceleration,
-                    w[j],
-                    w[o_v + j],
-                    torque,
-                    torque,
-                    torque,
-                    0.0,
-                    h,
-                    load_coefficients(w, o_coefficients + j),
-                    load_plant(w, o_plant + j),
-                )
+                    acceleration, w[j], w[o_v + j], torque, torque, torque, 0.0, h,
+                    load_coefficients(w, o_coefficients + j), load_plant(w, o_plant + j),
+                )  # fmt: skip
         for j in range(lanes):
             observations[2 * j] = wrap(w[j] - UPRIGHT)
             observations[2 * j + 1] = w[o_v + j]

@@ -75,17 +75,10 @@ _OWN = ("another scale of the effort", "another damping", "another weight")
 _FEW = 4
 """Too few runs for a conclusion."""
 _TERMS = (
-    "another scale of the effort",
-    "another damping",
-    "quadratic damping",
-    "dry friction",
-    "a spring",
-    "a constant torque",
-    "another weight",
-    "another zero of the angle",
+    "another scale of the effort", "another damping", "quadratic damping", "dry friction", "a spring",
+    "a constant torque", "another weight", "another zero of the angle", "a weight that is no sine of the angle",
     "a weight that is no sine of the angle",
-    "a weight that is no sine of the angle",
-)
+)  # fmt: skip
 """Terms of an acceleration: u, v, v |v|, sign v, q, 1, sin q, cos q, sin 2 q, cos 2 q."""
 
 
@@ -627,17 +620,9 @@ def _shape(case: _Case) -> str:
         q, v = float(np.mean(theirs.position[: w + 1, j])), float(np.mean(theirs.velocity[: w + 1, j]))
         u = probe.effort[driven.index(j)] if j in driven else 0.0
         terms = (
-            u,
-            v,
-            v * abs(v),
-            math.copysign(1.0, v) if v else 0.0,
-            q,
-            1.0,
-            math.sin(q),
-            math.cos(q),
-            math.sin(2 * q),
+            u, v, v * abs(v), math.copysign(1.0, v) if v else 0.0, q, 1.0, math.sin(q), math.cos(q), math.sin(2 * q),
             math.cos(2 * q),
-        )
+        )  # fmt: skip
         rows.append(np.array(terms) / scale)
         left.append((theirs.velocity[w, j] - mine.velocity[w, j]) / (w * dt) / scale)
     table, over = np.array(rows), np.array(left)

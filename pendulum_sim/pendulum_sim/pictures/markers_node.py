@@ -36,16 +36,13 @@ __all__ = ["SPECS", "MarkersNode", "arc_points", "arrow_points", "joint_marker",
 SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("frame", "base_link", "", "Frame of the first joint, with its plant's prefix.", read_only=True),
     ParameterSpec(
-        "effort_scale",
-        13.0,
-        "N m",
-        "Torque whose arc is three quarters of a turn; with several joints it is each motor's limit.",
-        minimum=0.0,
+        "effort_scale", 13.0, "N m",
+        "Torque whose arc is three quarters of a turn; with several joints it is each motor's limit.", minimum=0.0,
         exclusive_minimum=True,
     ),
     ParameterSpec("radius", 0.12, "m", "Radius of the torque's arc.", minimum=0.0, exclusive_minimum=True),
     ParameterSpec("rate", 30.0, "Hz", "Arrays published per second.", minimum=1.0, maximum=120.0, read_only=True),
-)
+)  # fmt: skip
 
 _FULL_ARC = 1.5 * math.pi
 _STEPS = 48

@@ -43,13 +43,8 @@ SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("height", 600, "px", "Height of the picture.", minimum=120, maximum=4096, read_only=True),
     ParameterSpec("fps", 30.0, "Hz", "Pictures per second.", minimum=1.0, maximum=120.0, read_only=True),
     ParameterSpec(
-        "effort_scale",
-        13.0,
-        "N m",
-        "Torque at which the arc is full; with several joints it is each motor's limit.",
-        minimum=0.0,
-        exclusive_minimum=True,
-        read_only=True,
+        "effort_scale", 13.0, "N m", "Torque at which the arc is full; with several joints it is each motor's limit.",
+        minimum=0.0, exclusive_minimum=True, read_only=True,
     ),
     ParameterSpec("trail", 60, "-", "Positions that the trail shows.", minimum=1, maximum=1000, read_only=True),
     ParameterSpec("png", "", "", "File for a picture at the end and on ~/snapshot; empty for none.", read_only=True),
@@ -61,7 +56,7 @@ SPECS: tuple[ParameterSpec, ...] = (
     ),
     ParameterSpec("gif_duration", 8.0, "s", "Length of the animation.", minimum=0.1, maximum=60.0, read_only=True),
     ParameterSpec("duration", 0.0, "s", "Time after which to end; 0 for never.", minimum=0.0, read_only=True),
-)
+)  # fmt: skip
 _DISTURBING = (names.DISTURBANCE, names.PUSH)
 
 

@@ -44,26 +44,19 @@ SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("sign", 1, "-", "Sign of its angle in ours, 1 or -1.", minimum=-1, maximum=1, read_only=True),
     ParameterSpec("zero", 0.0, "rad", "Its angle when the link hangs.", read_only=True),
     ParameterSpec(
-        "plant",
-        "thesis",
-        "",
+        "plant", "thesis", "",
         f"Preset ({PRESET_NAMES}) or plant file that describes it: limit of torque, and position control.",
         read_only=True,
     ),
     ParameterSpec(
-        "state_timeout",
-        0.1,
-        "s",
-        "Time without a state after which the armed plant faults.",
-        minimum=0.0,
-        exclusive_minimum=True,
-        read_only=True,
+        "state_timeout", 0.1, "s", "Time without a state after which the armed plant faults.", minimum=0.0,
+        exclusive_minimum=True, read_only=True,
     ),
     ParameterSpec(
         "period", 0.01, "s", "Time between two of its states.", minimum=0.0, exclusive_minimum=True, read_only=True
     ),
     *LIMIT_SPECS,
-)
+)  # fmt: skip
 _LATENESS = 2.0
 """Most periods between a state and the first effect of its command, on a graph."""
 _HEARD = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)

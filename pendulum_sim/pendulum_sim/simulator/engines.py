@@ -86,14 +86,11 @@ _EXACT_STEP = 1e-3
 """Longest step of the equation that a third-party simulation is checked against [s]."""
 _FOREIGN_SPECS = (
     ParameterSpec(
-        "step_timeout",
-        2.0,
-        "s",
-        "Time that one step of the simulation may take; one that takes longer ends the program.",
-        minimum=0.1,
+        "step_timeout", 2.0, "s",
+        "Time that one step of the simulation may take; one that takes longer ends the program.", minimum=0.1,
         read_only=True,
     ),
-)
+)  # fmt: skip
 
 
 def _make_own(values: Mapping[str, Any]) -> Simulation:
@@ -158,9 +155,7 @@ OWN = Engine(
     description="Simulated pendulum behind the interface that simulator and hardware share.",
     specs=(
         ParameterSpec(
-            "plant",
-            "thesis",
-            "",
+            "plant", "thesis", "",
             f"Preset ({PRESET_NAMES}; of several joints: {', '.join(MECHANISM_PRESETS)}) or path of a plant file.",
             read_only=True,
         ),
@@ -181,7 +176,7 @@ OWN = Engine(
     make=_make_own,
     foreign=False,
     example="python -m pendulum_sim simulator --ros-args -r __ns:=/sim -p plant:=x5_9",
-)
+)  # fmt: skip
 
 MUJOCO = Engine(
     program="mujoco",
@@ -192,9 +187,7 @@ MUJOCO = Engine(
             "mapping", "", "", "Mapping file: joint, actuator, sign, zero, limit; empty for none.", read_only=True
         ),
         replace(
-            _RATE,
-            default=0.0,
-            minimum=0.0,
+            _RATE, default=0.0, minimum=0.0,
             description="Rate of states and commands; 0 for 500, or one of the file's timestep where that is longer.",
         ),
         *_FOREIGN_SPECS,
@@ -202,7 +195,7 @@ MUJOCO = Engine(
     make=_make_mujoco,
     foreign=True,
     example="python -m pendulum_sim mujoco --ros-args -r __ns:=/sim -p model:=pendulum.xml",
-)
+)  # fmt: skip
 
 GYMNASIUM = Engine(
     program="gymnasium",
@@ -210,10 +203,7 @@ GYMNASIUM = Engine(
     specs=(
         ParameterSpec("env", "", "", "Identifier, such as Pendulum-v1 or my_module:MyPendulum-v0.", read_only=True),
         ParameterSpec(
-            "mapping",
-            "",
-            "",
-            "Adapter file: what is angle, velocity, torque, start; empty for a known environment.",
+            "mapping", "", "", "Adapter file: what is angle, velocity, torque, start; empty for a known environment.",
             read_only=True,
         ),
         *_FOREIGN_SPECS,
@@ -221,7 +211,7 @@ GYMNASIUM = Engine(
     make=_make_gymnasium,
     foreign=True,
     example="python -m pendulum_sim gymnasium --ros-args -r __ns:=/sim -p env:=Pendulum-v1",
-)
+)  # fmt: skip
 GYMNASIUM_PREFIX = "gymnasium:"
 
 

@@ -37,19 +37,10 @@ def rigid_loop(method: str) -> Any:
         theta, theta_dot, torque = p.theta, p.theta_dot, p.torque
         for index in range(p.segments):
             theta, theta_dot, torque = advance(
-                step,
-                coefficients_of,
-                acceleration,
-                theta,
-                theta_dot,
-                torque,
-                p.line[1] if p.newer[index] else p.line[0],
-                0.0,
-                p.length[index],
-                load_coefficients(p.coefficients, index * MOST_COEFFICIENTS),
-                plant,
-                p.dry != 0,
-            )
+                step, coefficients_of, acceleration, theta, theta_dot, torque,
+                p.line[1] if p.newer[index] else p.line[0], 0.0, p.length[index],
+                load_coefficients(p.coefficients, index * MOST_COEFFICIENTS), plant, p.dry != 0,
+            )  # fmt: skip
         p.theta, p.theta_dot, p.torque = theta, theta_dot, torque
         p.steps += 1
 

@@ -56,16 +56,11 @@ _LEAST_PERIODS = 2.0
 
 _SHARED_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
-        "start",
-        "given",
-        "",
-        "Where the pendulum starts, and restarts on reset.",
+        "start", "given", "", "Where the pendulum starts, and restarts on reset.",
         choices=("given", "bottom", "top", "random"),
     ),
     ParameterSpec(
-        "initial_position",
-        [0.0],
-        "rad or m",
+        "initial_position", [0.0], "rad or m",
         "Where each joint is at a given start; 0 hangs down, pi is upright; one value stands for all.",
     ),
     ParameterSpec("initial_velocity", [0.0], "rad/s or m/s", "How fast each joint is at a given start."),
@@ -78,7 +73,7 @@ _SHARED_SPECS: tuple[ParameterSpec, ...] = (
     COMPILED,
     *LIMIT_SPECS,
     *(replace(spec, name=_SENSOR_PREFIX + spec.name, read_only=True) for spec in SENSOR_SPECS),
-)
+)  # fmt: skip
 
 SPECS: tuple[ParameterSpec, ...] = (*OWN.specs, *_SHARED_SPECS)
 

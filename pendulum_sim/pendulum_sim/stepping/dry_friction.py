@@ -67,18 +67,9 @@ def is_dry(plant: PlantTuple) -> bool:
 
 
 def advance_dry(
-    step: Step,
-    coefficients_of: object,
-    acceleration: Acceleration,
-    theta: float,
-    theta_dot: float,
-    torque: float,
-    command: float,
-    push: float,
-    h: float,
-    c: Coefficients,
-    plant: PlantTuple,
-) -> tuple[float, float]:
+    step: Step, coefficients_of: object, acceleration: Acceleration, theta: float, theta_dot: float, torque: float,
+    command: float, push: float, h: float, c: Coefficients, plant: PlantTuple,
+) -> tuple[float, float]:  # fmt: skip
     """Return (theta, theta_dot) after h [s], with as many events as occur.
 
     Args:
@@ -112,17 +103,10 @@ def advance_dry(
         if start > 0.0:
             c = coefficients_of(rate, left)  # type: ignore[operator]
         theta_1, v_1 = step(
-            acceleration,
-            theta,
-            theta_dot,
-            actuator_torque(torque, command, start, time_constant) + push,
+            acceleration, theta, theta_dot, actuator_torque(torque, command, start, time_constant) + push,
             actuator_torque(torque, command, start + 0.5 * left, time_constant) + push,
-            actuator_torque(torque, command, h, time_constant) + push,
-            direction,
-            left,
-            c,
-            plant,
-        )
+            actuator_torque(torque, command, h, time_constant) + push, direction, left, c, plant,
+        )  # fmt: skip
         if v_1 * direction >= 0.0:
             return theta_1, v_1
         if theta_dot == 0.0:

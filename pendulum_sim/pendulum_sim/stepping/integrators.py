@@ -84,34 +84,18 @@ def no_coefficients(damping_rate: float, h: float) -> Coefficients:
 
 
 def euler_step(
-    acceleration: Acceleration,
-    theta: float,
-    theta_dot: float,
-    torque_0: float,
-    torque_mid: float,
-    torque_1: float,
-    direction: float,
-    h: float,
-    c: Coefficients,
-    plant: PlantTuple,
-) -> tuple[float, float]:
+    acceleration: Acceleration, theta: float, theta_dot: float, torque_0: float, torque_mid: float, torque_1: float,
+    direction: float, h: float, c: Coefficients, plant: PlantTuple,
+) -> tuple[float, float]:  # fmt: skip
     """Explicit Euler, as the thesis integrates: both derivatives at the start of the step."""
     slope = acceleration(theta, theta_dot, torque_0, direction, plant)
     return theta + h * theta_dot, theta_dot + h * slope
 
 
 def semi_implicit_step(
-    acceleration: Acceleration,
-    theta: float,
-    theta_dot: float,
-    torque_0: float,
-    torque_mid: float,
-    torque_1: float,
-    direction: float,
-    h: float,
-    c: Coefficients,
-    plant: PlantTuple,
-) -> tuple[float, float]:
+    acceleration: Acceleration, theta: float, theta_dot: float, torque_0: float, torque_mid: float, torque_1: float,
+    direction: float, h: float, c: Coefficients, plant: PlantTuple,
+) -> tuple[float, float]:  # fmt: skip
     """Semi-implicit Euler with implicit damping: stable at any h, and symplectic without friction."""
     damping_rate = c[0]
     undamped = acceleration(theta, theta_dot, torque_0, direction, plant) + damping_rate * theta_dot
@@ -120,17 +104,9 @@ def semi_implicit_step(
 
 
 def rk4_step(
-    acceleration: Acceleration,
-    theta: float,
-    theta_dot: float,
-    torque_0: float,
-    torque_mid: float,
-    torque_1: float,
-    direction: float,
-    h: float,
-    c: Coefficients,
-    plant: PlantTuple,
-) -> tuple[float, float]:
+    acceleration: Acceleration, theta: float, theta_dot: float, torque_0: float, torque_mid: float, torque_1: float,
+    direction: float, h: float, c: Coefficients, plant: PlantTuple,
+) -> tuple[float, float]:  # fmt: skip
     """Classical Runge-Kutta of order four."""
     half = 0.5 * h
     a_1 = acceleration(theta, theta_dot, torque_0, direction, plant)
@@ -153,17 +129,9 @@ def etd2_coefficients(damping_rate: float, h: float) -> Coefficients:
 
 
 def etd2_step(
-    acceleration: Acceleration,
-    theta: float,
-    theta_dot: float,
-    torque_0: float,
-    torque_mid: float,
-    torque_1: float,
-    direction: float,
-    h: float,
-    c: Coefficients,
-    plant: PlantTuple,
-) -> tuple[float, float]:
+    acceleration: Acceleration, theta: float, theta_dot: float, torque_0: float, torque_mid: float, torque_1: float,
+    direction: float, h: float, c: Coefficients, plant: PlantTuple,
+) -> tuple[float, float]:  # fmt: skip
     """Exponential midpoint rule: exact linear part, N taken in the middle of the step."""
     rate, e_half, p1_half, p2_half, e_full, p1_full, p2_full = c
     n_0 = acceleration(theta, theta_dot, torque_0, direction, plant) + rate * theta_dot
@@ -198,17 +166,9 @@ def etd4_coefficients(damping_rate: float, h: float) -> Coefficients:
 
 
 def etd4_step(
-    acceleration: Acceleration,
-    theta: float,
-    theta_dot: float,
-    torque_0: float,
-    torque_mid: float,
-    torque_1: float,
-    direction: float,
-    h: float,
-    c: Coefficients,
-    plant: PlantTuple,
-) -> tuple[float, float]:
+    acceleration: Acceleration, theta: float, theta_dot: float, torque_0: float, torque_mid: float, torque_1: float,
+    direction: float, h: float, c: Coefficients, plant: PlantTuple,
+) -> tuple[float, float]:  # fmt: skip
     """Exponential Runge-Kutta of order four (ETDRK4)."""
     rate, e_half, p1_half, p2_half, e_full, p1_full, w_0, w_m, w_1, s_0, s_m, s_1 = c
     n_0 = acceleration(theta, theta_dot, torque_0, direction, plant) + rate * theta_dot
@@ -231,17 +191,9 @@ def etd4_step(
 
 
 def adaptive_step(
-    acceleration: Acceleration,
-    theta: float,
-    theta_dot: float,
-    torque_0: float,
-    torque_mid: float,
-    torque_1: float,
-    direction: float,
-    h: float,
-    c: Coefficients,
-    plant: PlantTuple,
-) -> tuple[float, float]:
+    acceleration: Acceleration, theta: float, theta_dot: float, torque_0: float, torque_mid: float, torque_1: float,
+    direction: float, h: float, c: Coefficients, plant: PlantTuple,
+) -> tuple[float, float]:  # fmt: skip
     """Adaptive Runge-Kutta of order eight (DOP853) at a relative tolerance of 1e-12; the reference."""
     # Imported late: real-time stepping does not need scipy.
     from scipy.integrate import solve_ivp

@@ -118,19 +118,9 @@ def pack(parameters: PlantParameters) -> PlantTuple:
 
 
 def advance_rigid(
-    step: Step,
-    coefficients_of: object,
-    acceleration: Acceleration,
-    theta: float,
-    theta_dot: float,
-    torque: float,
-    command: float,
-    push: float,
-    h: float,
-    c: Coefficients,
-    plant: PlantTuple,
-    dry: bool,
-) -> tuple[float, float, float]:
+    step: Step, coefficients_of: object, acceleration: Acceleration, theta: float, theta_dot: float, torque: float,
+    command: float, push: float, h: float, c: Coefficients, plant: PlantTuple, dry: bool,
+) -> tuple[float, float, float]:  # fmt: skip
     """Return (theta, theta_dot, torque of the actuator) of a rigid link after h [s]; arguments as :func:`advance_dry`.
 
     ``dry`` is :func:`pendulum_sim.stepping.dry_friction.is_dry`.
@@ -211,19 +201,9 @@ class RigidPlant:
         theta, theta_dot, torque = self.theta, self.theta_dot, self.effort
         for is_newer, h, c in self.segments:
             theta, theta_dot, torque = advance_rigid(
-                self._step,
-                self._coefficients_of,
-                acceleration_with_friction,
-                theta,
-                theta_dot,
-                torque,
-                newer if is_newer else older,
-                push,
-                h,
-                c,
-                self.packed,
-                self.dry,
-            )
+                self._step, self._coefficients_of, acceleration_with_friction, theta, theta_dot, torque,
+                newer if is_newer else older, push, h, c, self.packed, self.dry,
+            )  # fmt: skip
         self.theta, self.theta_dot, self.effort = theta, theta_dot, torque
         self.steps += 1
         return PlantState(self.steps * self.dt, theta, theta_dot, torque)

@@ -60,16 +60,9 @@ def pack_series_elastic(parameters: PlantParameters) -> SeriesElasticTuple:
 
 
 def series_elastic_step(
-    q_m: float,
-    v_m: float,
-    q: float,
-    v: float,
-    z: float,
-    pwm: float,
-    disturbance: float,
-    h: float,
+    q_m: float, v_m: float, q: float, v: float, z: float, pwm: float, disturbance: float, h: float,
     plant: SeriesElasticTuple,
-) -> tuple[float, float, float, float, float]:
+) -> tuple[float, float, float, float, float]:  # fmt: skip
     """Return motor angle and velocity, link angle and velocity, and Dahl state after h [s].
 
     Angles in [rad], the motor's at the output side; ``pwm`` in [-1, 1]; ``disturbance`` on the link, offset included [N
