@@ -84,16 +84,8 @@ def encode_joints(
 ) -> bytes:
     """Return the CDR bytes of a JointState; padding is zero, so that equal messages are equal bytes.
 
-    Args:
-        stamp_ns: Stamp, 0 to ``MAX_SECONDS`` seconds [ns].
-        frame_id: Name of the sender.
-        joints: Joint names.
-        position: One for each joint, or empty [rad or m].
-        velocity: Likewise [rad/s or m/s].
-        effort: Likewise [N m or N].
-
-    Raises:
-        struct.error: The stamp does not fit a ROS time.
+    The stamp is 0 to ``MAX_SECONDS`` s [ns], else a ``struct.error``. Each quantity has one value per joint, or none:
+    positions [rad or m], velocities [rad/s or m/s], efforts [N m or N].
     """
     n_position, n_velocity, n_effort = len(position), len(velocity), len(effort)
     layout, words = _layout(frame_id, joints, n_position, n_velocity, n_effort)
@@ -187,7 +179,6 @@ def decode_joint_state(data: bytes) -> JointStateFields | None:
 
 
 def _decode_unknown(data: bytes) -> JointStateFields | None:
-    """Return the fields of a message of unknown layout, with all lengths checked."""
     size = len(data)
     try:
         sec, nanosec, frame_length = _PREFIX.unpack_from(data)
@@ -221,7 +212,6 @@ def _decode_unknown(data: bytes) -> JointStateFields | None:
 
 
 def _decode_names(data: bytes, offset: int) -> tuple[tuple[str, ...], int]:
-    """Return the names at an offset, empty if malformed, and the offset behind them."""
     (count,) = _COUNT.unpack_from(data, offset)
     offset += 4
     names = []

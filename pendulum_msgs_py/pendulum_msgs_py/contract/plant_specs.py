@@ -149,8 +149,7 @@ def limits_from_parameters(
 
     Args:
         values: Parameter values by name.
-        plant_effort_limits: Effort limits of the driven joints in the plant file [N m or N]; parameters only lower
-            them.
+        plant_effort_limits: Of the driven joints, in the plant file [N m or N]; parameters only lower them.
         coordinates: Joints of the plant.
         lockstep: Simulated time, in which noise starts with the controller: their sum is not limited.
         feedback_timeout: Age of a measurement that faults an armed plant [s].

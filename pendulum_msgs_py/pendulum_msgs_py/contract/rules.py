@@ -45,13 +45,8 @@ _HOLD_NS = round(COMMANDER_HOLD * NANOSECONDS)
 def judge_stamp(stamp_ns: int, now_ns: int, timeout_ns: int, newest_ns: int, heard_ns: int, other: bool) -> int:
     """Return ``ACCEPTED`` or the first reason to refuse a command.
 
-    Args:
-        stamp_ns: Stamp of the command [ns].
-        now_ns: The plant's clock [ns].
-        timeout_ns: Age at which a command is ignored [ns].
-        newest_ns: Stamp of the newest accepted command [ns], or ``NEVER``.
-        heard_ns: Its arrival on the plant's clock [ns].
-        other: Whether this one comes from another sender.
+    ``newest_ns`` is the stamp of the newest accepted command or ``NEVER``, ``heard_ns`` its arrival on the plant's
+    clock [ns]; ``other`` says whether this command comes from another sender.
     """
     if now_ns - stamp_ns > timeout_ns:
         return TOO_OLD

@@ -30,8 +30,8 @@ class SharedSupervisor(PlantSupervisor):
         withdraw: Called if the plant was prepared but not armed.
         measure: Returns time [ns] and newest measurement after the preparation, which may take long; None if it does
             not.
-        coordinates: The plant's joints, and which of them are driven.
-        follows: Whether the plant can follow trajectories.
+        coordinates: As for :class:`PlantSupervisor`.
+        follows: Likewise.
     """
 
     def __init__(

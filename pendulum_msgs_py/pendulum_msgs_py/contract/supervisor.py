@@ -38,14 +38,9 @@ _LONGEST_STEP_NS = NANOSECONDS // 10
 class PlantSupervisor:
     """State machine, command gates, trajectory and handover of one plant.
 
-    Args:
-        limits: The limits.
-        preflight: Called on arming; returns why the plant is not ready, or an empty string.
-        coordinates: The plant's joints, and which of them are driven.
-        follows: Whether the plant can follow trajectories; with several joints it cannot.
-
-    Raises:
-        ParameterError: The limits are for another number of joints.
+    ``preflight`` is called on arming and returns why the plant is not ready, or an empty string. ``follows`` says
+    whether the plant can follow trajectories; with several joints it cannot. Limits for another number of joints are a
+    ParameterError.
     """
 
     limits: PlantLimits
@@ -245,7 +240,6 @@ class PlantSupervisor:
             self.disarm(now_ns, f"disarmed: {refusal}")
 
     def _enable_refusal(self, now_ns: int) -> str:
-        """Return why the hold-to-run switch forbids arming, or an empty string."""
         timeout = self.limits.enable_timeout
         if math.isinf(timeout):
             return ""
@@ -310,7 +304,6 @@ class PlantSupervisor:
         return self._hold(handover, remaining, position, velocity, push)
 
     def _take_over_refusal(self, command: JointCommand, now_ns: int) -> str:
-        """Return why a command may not take over from position control, or an empty string."""
         # Before the limit: with a low limit every command would look near.
         unit = self.coordinates.drive_unit
         largest, asked = self.limits.handover_effort, f"{command.effort[0]:.2f} {unit}"
@@ -337,7 +330,7 @@ class PlantSupervisor:
         return Drive(DriveKind.OFF, self._nothing, self._nothing, self._nothing, self._nothing, self._nothing, push)
 
     def _stop_drive(self, mode: Mode, reason: str, now_ns: int) -> None:
-        """Release the drive; with stop category 1 the acting torque fades first, in one fade."""
+        """Release the drive; with stop category 1 the acting torque fades first."""
         stop, applied = self._stop, self._applied
         if self.mode.armed:
             # Without torque nothing fades: a zero torque would wake the torque loop of a module.

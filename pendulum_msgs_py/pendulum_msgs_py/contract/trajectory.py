@@ -47,14 +47,8 @@ class TrajectoryPoint:
 class Trajectory:
     """Points at increasing times, with linear interpolation of position and velocity.
 
-    Linear, not cubic: the thesis commands a linear ramp and a half sine that is not its derivative, and a spline
-    through both would be neither.
-
-    Attributes:
-        points: The points.
-        lowest: Smallest position [rad].
-        highest: Largest position [rad].
-        max_speed: Largest speed, as commanded or as the positions imply [rad/s].
+    Linear, not cubic: the thesis commands a linear ramp and a half sine that is not its derivative. ``lowest`` and
+    ``highest`` are positions [rad]; ``max_speed`` is the largest, as commanded or as the positions imply [rad/s].
     """
 
     points: tuple[TrajectoryPoint, ...]
@@ -150,12 +144,8 @@ def thesis_ramp(
 ) -> Trajectory:
     """Return the thesis's smooth move: positions in steps of 0.002 rad at 100 Hz, velocity half a sine.
 
-    Args:
-        start: First position [rad].
-        goal: Last position [rad].
-        increment: Position step [rad], > 0.
-        period: Time between two steps [s], > 0.
-        max_velocity: Amplitude of the half sine [rad/s], >= 0; smaller for a short move.
+    Positions and ``increment`` > 0 in [rad], ``period`` > 0 between two steps in [s]; ``max_velocity`` >= 0 is the
+    amplitude of the sine [rad/s], smaller for a short move.
 
     Raises:
         ParameterError: A value is outside its domain, or the ramp has more than ``MAX_RAMP_STEPS`` steps.

@@ -81,7 +81,6 @@ def joint_functions(count: int) -> tuple[Callable[..., Any], ...]:
 
 
 def _loaded(put: Any, v: Any, torque: Any, direction: Any, table: Any) -> Any:
-    """Return the efforts less the dry friction of sliding joints."""
     for i in range(len(torque)):
         if direction[i] != 0.0:
             friction = friction_magnitude(v[i], table[COULOMB][i], table[STATIC][i], table[STRIBECK][i])
@@ -192,19 +191,10 @@ def advance_joints(
 ) -> Any:  # fmt: skip
     """Return (q, v) after h [s], with as many events as occur.
 
-    Args:
-        forward: The mechanism's equation, of parameters ``p``.
-        along: As ``put`` and ``lag`` from :func:`joint_functions`.
-        put: Likewise.
-        lag: Likewise.
-        q: Positions [rad or m].
-        v: Velocities [rad/s or m/s].
-        torque: Actuator efforts at the start, 0 at passive joints [N m or N].
-        command: Commanded efforts.
-        push: Efforts on the joints themselves.
-        h: Step [s].
-        p: The mechanism's parameters.
-        table: From :func:`pendulum_msgs_py.plants.plant_parameters.pack_joints`.
+    ``along``, ``put`` and ``lag`` are from :func:`joint_functions`, ``table`` from
+    :func:`pendulum_msgs_py.plants.plant_parameters.pack_joints`. Efforts [N m or N]: of the actuators at the start, 0
+    at passive joints; commanded; and on the joints themselves. ``forward`` is the mechanism's equation with parameters
+    ``p``.
     """
     left = h
     n = len(q)

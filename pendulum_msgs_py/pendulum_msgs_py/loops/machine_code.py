@@ -51,10 +51,8 @@ class NoMachineCodeError(PendulumError):
 def load_loop(builder: str, *choice: str, symbols: Mapping[str, int]) -> Loop:
     """Return a loop; the first time on a computer, or after a change of its source, compiling takes seconds.
 
-    Args:
-        builder: ``module:function``; called with the choice, it returns the loop compiled by numba for one record.
-        choice: Arguments of the builder, such as a method.
-        symbols: Addresses of the functions that it calls, by name.
+    ``builder`` is ``module:function``, which returns the loop compiled by numba for one record and the given choice;
+    ``symbols`` are addresses of the functions that it calls.
 
     Raises:
         NoMachineCodeError: It cannot be compiled here.
@@ -89,8 +87,6 @@ def keep_loop(builder: str, *choice: str) -> tuple[dict[str, Any], bytes]:
 
 
 class _LoadedLoop:
-    """Machine code in this process, and the addresses of what it calls."""
-
     def __init__(self, name: str, code: bytes, symbols: Mapping[str, int]) -> None:
         known = {**_addresses(), **symbols}
         try:
@@ -152,7 +148,6 @@ def _path(builder: str, choice: tuple[str, ...]) -> Path:
 
 @cache
 def _processor() -> str:
-    """Return model and instruction sets of the first processor."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").partition("\n\n")[0].splitlines()
         return "\n".join(line for line in lines if line.startswith(("model name", "flags")))
@@ -189,7 +184,6 @@ def _folder(package: str) -> Path:
 
 
 def _compile_apart(path: Path, builder: str, choice: tuple[str, ...]) -> None:
-    """Compile in another process; one of several waiting programs compiles."""
     with _alone(path):
         if _read(path) is not None:
             return

@@ -52,7 +52,6 @@ def _somebody_waits(s: Any) -> Any:
 
 @compiled
 def _is_answer(s: Any, stamp_ns: Any) -> Any:
-    """Return whether a stamp is that of an own state; nearly always the newest."""
     for back in range(OWN_STAMPS):  # noqa: SIM110  (compiled code has no any())
         if s.own_stamp_ns[(s.own_newest - back) % OWN_STAMPS] == stamp_ns:
             return True

@@ -32,10 +32,10 @@ def compile_tree(
     substitutes: Mapping[ModuleType, ModuleType] = _NO_SUBSTITUTES,
     within: bool = False,
 ) -> Any:
-    """Return a plain function of scalars, tuples and ``math``, and all that it calls, compiled.
+    """Return a plain function of scalars, tuples and ``math``, and all of this project's that it calls, compiled.
 
     Args:
-        function: A function of this project.
+        function: The function.
         exact: Give the bits that Python gives; else a fused multiply-add may change the last one.
         inline: Inline each function: machine code without function arguments can be cached on disk.
         substitutes: Replacements of modules that the functions use.

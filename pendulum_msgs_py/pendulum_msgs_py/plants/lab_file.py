@@ -127,7 +127,7 @@ class LabFile:
         values: Given values by parameter of the bridge.
         name: Name of the bench.
         notes: Free text.
-        proofs: Date and result of each guided procedure, by its name.
+        proofs: Date and result of each guided procedure.
         folder: Folder of the file, where relative paths start.
     """
 
@@ -257,7 +257,6 @@ def _number(value: object, where: str) -> float:
 
 
 def _limiting(value: Any, entry: LabEntry, where: str) -> Any:
-    """Return a value, unless it means no limit or a default."""
     if entry.left_out:
         good, expected = (value[0] < value[1], "low < high") if entry.kind is list else (value > 0.0, "> 0")
         if not good:
@@ -275,7 +274,6 @@ def _written(value: Any, entry: LabEntry, folder: Path, where: str) -> Any:
 
 
 def _absolute(text: str, folder: Path) -> str:
-    """Return a path as absolute; names of presets stay."""
     is_path = "/" in text or Path(text).suffix != ""
     return str((folder / Path(text).expanduser()).resolve()) if text and is_path else text
 

@@ -114,15 +114,7 @@ _ANGLES = 16
 
 
 class _Place(NamedTuple):
-    """Place of a number in a plant.
-
-    Attributes:
-        spec: Its spec.
-        part: ``values``, ``joint`` or ``actuator``.
-        number: Index of the value or of the joint.
-        key: Field of the joint or the actuator.
-        where: Prefix of messages.
-    """
+    """A number of a plant: in ``values``, or in a ``joint`` or its ``actuator`` (the part), by index and field."""
 
     spec: ParameterSpec
     part: str
@@ -162,7 +154,6 @@ def _name(mechanism: Mechanism, joint: Joint, key: str) -> str:
 
 
 def _format_2(joint: Joint) -> tuple[ParameterSpec, ...]:
-    """Return a joint's quantities in format 2."""
     return tuple(spec for spec in joint_specs(joint) if spec.name not in OF_A_PENDULUM)
 
 
@@ -196,13 +187,7 @@ class _Pendulum:
 
 @dataclass(frozen=True)
 class PlantParameters(_Pendulum):
-    """A plant of n joints: a mechanism with numbers.
-
-    Attributes:
-        mechanism: Equations and joints.
-        values: Values of ``mechanism.parameters``, in order.
-        joints: Parameters of each joint, in order.
-        name: Name of the plant.
+    """A plant of n joints: a mechanism, the values of its parameters in order, and the parameters of each joint.
 
     Raises:
         ParameterError: A value is outside its domain, or the mass matrix is not positive definite at some position.
@@ -657,7 +642,6 @@ def require_one_joint(preset_or_path: str | Path, instead: str) -> None:
 
 
 def _positive_definite(rows: Sequence[Sequence[float]]) -> bool:
-    """Return whether a small symmetric matrix is positive definite, by Gaussian elimination."""
     matrix = [list(row) for row in rows]
     for k, pivot_row in enumerate(matrix):
         pivot = pivot_row[k]

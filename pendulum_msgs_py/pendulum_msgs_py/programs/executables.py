@@ -240,7 +240,6 @@ def _complete_help(command: Any) -> None:
 
 
 def _one_name(name: str) -> str:
-    """Accept ``--output``, as in ROS 2's own tools, for ``--out``."""
     return "out" if name == "output" else name
 
 
@@ -253,7 +252,6 @@ def print_text(text: str) -> None:
 
 
 def _discard_output() -> None:
-    """Redirect buffered output: its reader has gone."""
     with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 

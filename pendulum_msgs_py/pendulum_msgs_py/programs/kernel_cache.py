@@ -165,7 +165,6 @@ def _reached(function: FunctionType) -> list[Any]:
 
 
 def _ours(module: str) -> bool:
-    """Return whether a module's source counts: Python's and that of versions in the key do not."""
     return module.partition(".")[0] not in {*sys.stdlib_module_names, "numba", "numpy", "llvmlite"}
 
 

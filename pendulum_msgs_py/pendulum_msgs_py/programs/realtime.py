@@ -118,7 +118,6 @@ def priority_kept() -> Iterator[None]:
 
 
 def _is_known() -> bool:
-    """Return whether this system has real-time priorities and lists threads."""
     return hasattr(os, "sched_setscheduler") and _TASKS.is_dir()
 
 

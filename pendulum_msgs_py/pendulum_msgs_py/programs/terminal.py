@@ -44,7 +44,6 @@ class WholeTable(Table):
             yield self._part(block, widths, with_title=number == 0)
 
     def _part(self, block: Sequence[int], widths: Sequence[int], *, with_title: bool) -> Table:
-        """Return a table of some columns with these widths."""
         part = Table(
             title=self.title if with_title else None,
             box=self.box,
@@ -63,7 +62,6 @@ class WholeTable(Table):
 
 
 def _measure(column: Column, console: Console, options: ConsoleOptions) -> Measurement:
-    """Return the longest word and line of a column [columns]."""
     free = options.update(max_width=_NO_BOUND)
     found = [Measurement.get(console, free, cell) for cell in (column.header, *column.cells)]
     longest = max(size.maximum for size in found)

@@ -120,5 +120,5 @@ class _Answers:
 
 
 def _guid(header: Any) -> bytes:
-    """Return the client's identity; empty for requests taken by rclpy, which hides it."""
+    # Empty for requests taken by rclpy, which hides it.
     return bytes(getattr(header.request_id, "writer_guid", b""))

@@ -95,7 +95,6 @@ class ArrivalSignal:
 
 
 def _count(entity: Service | Subscription, counter: int) -> bool:
-    """Make the middleware increment a counter on arrivals; return whether it will."""
     name = "service_set_on_new_request" if isinstance(entity, Service) else "subscription_set_on_new_message"
     try:
         # The library that rclpy has loaded, or none.

@@ -32,12 +32,8 @@ _EVENTS_AFTER_SLICE = 3
 class AnsweredInput:
     """An input whose messages get replies one by one, from compiled code if available.
 
-    Args:
-        source: The input.
-        receive: Handles the messages that are left to Python.
-        answerer: The node's logic.
-        called: Returns the event counter that ends a slice, such as
-            :attr:`pendulum_msgs_py.ros.polled.PollingNode.request_descriptor`; -1 for none.
+    ``receive`` handles the messages left to Python; ``called`` returns the event counter that ends a slice, such as
+    :attr:`pendulum_msgs_py.ros.polled.PollingNode.request_descriptor`, or -1.
     """
 
     def __init__(
@@ -58,11 +54,8 @@ class AnsweredInput:
     def compile(self, publisher: Publisher, *, sender: str, joint: str, ahead_ns: int) -> None:
         """Load the answerer's loop, if it has one; compiling it the first time takes seconds.
 
-        Args:
-            publisher: Publishes the replies.
-            sender: Their ``frame_id``.
-            joint: Joint of states and replies.
-            ahead_ns: Lead of the stamps' clock over the monotonic one, in real time [ns].
+        ``sender`` is the replies' ``frame_id``; ``ahead_ns`` is the lead of the stamps' clock over the monotonic one
+        [ns].
         """
         kind = self._answerer.kind
         if kind is None:

@@ -86,7 +86,7 @@ class CompiledPlant(Protocol):
 
 
 class CompiledPeriods:
-    """The loop of one plant.
+    """The loop of one plant; raises a NoMachineCodeError if unavailable.
 
     Args:
         interface: The plant on the graph, with polled inputs.
@@ -95,12 +95,6 @@ class CompiledPeriods:
         clock: Wall time in real time; None in lockstep.
         clock_publisher: Publishes ``/clock``, or None.
         done: Called after periods with the stamp of the newest state [ns].
-
-    Attributes:
-        periods: Number of periods so far.
-
-    Raises:
-        NoMachineCodeError: The loop is not available.
     """
 
     def __init__(
@@ -198,7 +192,6 @@ class CompiledPeriods:
         return Slice(record.now_ns, record.periods, newest, message, why == ENDED)
 
     def _expect_messages(self) -> None:
-        """Expect messages like those that Python accepted last."""
         for kind, data in self._interface.pop_accepted().items():
             fields = fields_from_bytes(data)
             template = None if fields is None else template_of(fields, len(data))

@@ -42,13 +42,8 @@ _PAUSE = 0.01
 class EStopThread:
     """A node alongside another one, served by its own thread.
 
-    Args:
-        owner: The node whose e-stop it serves.
-        suffix: Of the node's and the thread's name.
-        press: Latches the e-stop with the reason; called in the thread, must not wait.
-
-    Attributes:
-        node: The node; create its services, then :meth:`start`.
+    ``press`` latches the owner's e-stop with a reason; it is called in the thread and must not wait. Create the
+    services of ``node``, then :meth:`start`.
     """
 
     def __init__(self, owner: Node, suffix: str, press: Callable[[str], None]) -> None:
@@ -100,7 +95,6 @@ class EStopThread:
             rclpy.try_shutdown(context=self._context)
 
     def _entities_of_owner(self, seen_by: Node) -> list[Any]:
-        """Return the owner's discovered publishers, subscriptions and services, or nothing."""
         try:
             owner = (self._owner.get_name(), self._owner.get_namespace())
             return [
@@ -136,17 +130,10 @@ class EStopThread:
 
 
 class EStopServer:
-    """Serves ``~/e_stop`` of a node from its own thread.
+    """Serves ``~/e_stop`` of a node from its own thread, as :class:`EStopThread`.
 
-    The middleware's thread counts requests without the GIL. The plant reads that counter before each decision, and so
-    stops before this thread has run.
-
-    Args:
-        owner: The node whose service it is.
-        press: Latches the e-stop with the reason; called in the server's thread, must not wait.
-
-    Attributes:
-        arrivals: Counts requests that this thread has not handled.
+    The middleware's thread counts requests in ``arrivals`` without the GIL. The plant reads that counter before each
+    decision, and so stops before this thread has run.
     """
 
     def __init__(self, owner: Node, press: Callable[[str], None]) -> None:

@@ -130,7 +130,6 @@ def _most_participants() -> int:
 
 
 def _open_sockets() -> set[str]:
-    """Return the inodes of this process's sockets."""
     found = set()
     for descriptor in Path("/proc/self/fd").iterdir():
         try:

@@ -129,7 +129,6 @@ def _refuse_unknown(node: Node, specs: Mapping[str, ParameterSpec]) -> None:
 
 
 def _plain(value: Any) -> object:
-    """Return rclpy's arrays as lists."""
     return value if isinstance(value, (bool, int, float, str)) or value is None else list(value)
 
 

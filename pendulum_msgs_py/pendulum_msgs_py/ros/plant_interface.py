@@ -72,13 +72,7 @@ class PlantInterface:
     Attributes:
         sample: Newest published state.
         published_ns: Its system time, the clock of DDS's arrival stamps [ns].
-        hardware_id: The device, for diagnostics.
         arrived_ns: Arrival of the message being handled, in system time, for polled inputs [ns].
-        polled: As above.
-        inputs: Subscription of each input.
-        commander_watch: Conflicts on the graph.
-        state_publisher: Publishes states.
-        applied_publisher: Publishes applied efforts.
     """
 
     def __init__(
@@ -169,7 +163,7 @@ class PlantInterface:
         return self._torques
 
     def wait_for_inputs(self, timeout: float) -> None:
-        """Take new torques, or wait for one at most a time [s]; after :meth:`watch_inputs`."""
+        """Take new torques, or wait at most a time [s]; after :meth:`watch_inputs`."""
         assert self._torques is not None, "inputs are not watched"
         if self._torques.wait(timeout):
             self.take_inputs()
@@ -402,7 +396,7 @@ class PlantInterface:
                     self._on_enable(data, info)
 
     def _on_enable(self, data: bytes, info: Mapping[str, int]) -> None:
-        """Read the hold-to-run switch as of the time of its message: what waited for a stalled process is old.
+        """Read the hold-to-run switch as of its message's time: what waited for a stalled process is old.
 
         A message has no stamp, and hosts' clocks differ; but a message that waited is later than those before it.
         """

@@ -27,10 +27,7 @@ class Stepper(Protocol):
     """Steps a plant."""
 
     def __call__(self, drive: Drive, stamp_ns: int) -> tuple[JointSample | None, Vector]:
-        """Step one period until a stamp [ns] under a decision; return the state there and the applied efforts.
-
-        A lost measurement is None: nothing is published, time goes on.
-        """
+        """Step one period until a stamp [ns]; return the state (None: lost measurement) and the applied efforts."""
 
 
 class RealtimeLoop:
@@ -39,12 +36,6 @@ class RealtimeLoop:
     A plant that is late by a period or more is stepped through the missed periods, and only the newest state is
     published: one overrun. The runner calls :meth:`run_due`: rclpy's timer would wake two more threads per period, and
     skip missed ones.
-
-    Args:
-        interface: The plant on the graph, with polled inputs.
-        step: Steps the plant.
-        statistics: Receives the loop's figures.
-        clock: Wall time.
 
     Attributes:
         paused: Time stands still.
@@ -113,8 +104,8 @@ class RealtimeLoop:
 class LockstepLoop:
     """Publishes a state and steps once every expected reply to it has arrived, as fast as they come.
 
-    The plant's time is simulated, published on ``/clock``, and depends on the number of steps alone: two runs with one
-    seed publish the same messages.
+    The plant's time is simulated and depends on the number of steps alone: two runs with one seed publish the same
+    messages.
 
     Args:
         interface: The plant on the graph.
@@ -124,12 +115,6 @@ class LockstepLoop:
         subscribers: Subscriptions to states required before the first one.
         duration: Simulated time after which to stop [s]; 0 for never.
         publish_clock: Whether this plant owns ``/clock``.
-
-    Attributes:
-        paused: Time stands still.
-        halted: The plant, in a step, reported that it has no next state.
-        compiled: Runs nominal steps, or None.
-        clock_publisher: Publishes ``/clock``, or None.
     """
 
     def __init__(
@@ -195,7 +180,6 @@ class LockstepLoop:
         return 0.0 if waits else self._next_look - now
 
     def _wait_for_answers(self, longest: float) -> bool:
-        """Take replies and step, at most a time [s]; return whether a step was taken."""
         before, compiled = self.steps, self.compiled
         end = time.monotonic() + (longest if compiled is not None else INTERPRETED_SLICE)
         while (left := end - time.monotonic()) > 0.0 and self._must_wait() and not self.finished:
@@ -212,7 +196,6 @@ class LockstepLoop:
         return self.steps > before
 
     def _run_compiled(self, compiled: CompiledPeriods, longest: float) -> Slice:
-        """Take nominal steps at most a time [s], and handle what ended them."""
         done = compiled.run(
             self.now_ns, longest=longest, expected=self._inputs, answered=self._answered, last_ns=self._last_ns
         )

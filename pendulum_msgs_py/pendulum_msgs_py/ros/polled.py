@@ -74,11 +74,7 @@ class PolledInput:
 class WaitedInput(PolledInput):
     """A raw subscription that its owner waits for if the middleware signals arrivals; otherwise an executor serves it.
 
-    Args:
-        subscription: Of a :class:`PollingNode`, with ``receive`` as callback.
-        depth: Its depth, which also bounds the messages of one poll.
-        receive: Gets each message, serialised, in the node's thread.
-        signal: Of this subscription alone.
+    ``receive`` is the subscription's callback and gets each message, serialised, in the node's thread.
     """
 
     def __init__(
@@ -188,7 +184,6 @@ class PollingNode(Node):
             self._next_look = time.monotonic() + min(_LONGEST_REST, REST_AFTER_READING * spent)
 
     def _answer_one(self, service: Service) -> bool:
-        """Answer the oldest request; return whether there was one."""
         request, header = take_request(service)
         if header is None:
             return False

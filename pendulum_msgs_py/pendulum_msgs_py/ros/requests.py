@@ -134,7 +134,6 @@ def _address(capsule: Any) -> int:
 
 @functools.cache
 def _rcl() -> Any:
-    """Return the library that rclpy has loaded, or None if a function is missing."""
     rcl = loaded_rcl()
     try:
         for name in ("rcl_take_request_with_info", "rcl_send_response", "rmw_serialize", "rmw_deserialize"):

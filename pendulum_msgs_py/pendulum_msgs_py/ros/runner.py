@@ -87,13 +87,8 @@ def run_node(
     rclpy's signal handlers would invalidate the context before the last zero torque is sent, so a thread here handles
     signals: the node is closed first, then the context. A second signal ends the process at once.
 
-    Args:
-        make_node: Makes the node, given a function that stops the runner.
-        argv: Arguments of the process, ROS arguments included.
-        program: ``PACKAGE EXECUTABLE``, for help.
-        description: What the node does, one sentence.
-        specs: Its parameters, for help.
-        example: A command line for help.
+    ``make_node`` makes the node, given a function that stops the runner. ``program`` (``PACKAGE EXECUTABLE``),
+    ``description``, ``specs`` and ``example`` are shown in help.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if completion.asked():
@@ -276,7 +271,6 @@ def _watch_signals(signals: socket.socket, stop: Callable[[], None]) -> None:
 
 
 def _next_stop_signal(signals: socket.socket) -> int:
-    """Return the next stop signal, or 0 once the node has ended."""
     while number := signals.recv(1):
         if number[0] in _STOP_SIGNALS:
             return number[0]

@@ -19,16 +19,9 @@ _SAYS_NOTHING = len(describe_plants([]))
 
 
 class RunningPlant:
-    """The plant behind a node's ``joint_states``.
+    """The plant behind a node's ``joint_states``; ``mismatch`` is its difference as text, empty if none or unknown.
 
     Diagnostics are polled, so that no message wakes the node, and parsed only if they are new.
-
-    Args:
-        node: The node; the plant is in the namespace of its states.
-        designed: The plant it was designed for.
-
-    Attributes:
-        mismatch: The difference as text; empty if none or unknown.
     """
 
     def __init__(self, node: PollingNode, designed: PlantParameters) -> None:

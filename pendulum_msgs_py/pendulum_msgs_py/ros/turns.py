@@ -17,10 +17,8 @@ WHILE_CALLED = 0.005
 class Turns:
     """Lets an input and an executor take turns, for :class:`pendulum_msgs_py.ros.runner.Paced`.
 
-    Args:
-        serve: Serves the input at most a time [s]; returns whether anything came.
-        events: Executor events after each slice, >= 1, enough for the node's own; each poll for one delays the input 50
-            us.
+    ``serve`` serves the input at most a time [s] and returns whether anything came. After each slice the executor
+    handles ``events`` >= 1, enough for the node's own; each poll for one delays the input by 50 us.
     """
 
     def __init__(self, serve: Callable[[float], bool], events: int) -> None:

@@ -21,12 +21,8 @@ _LANES = 256
 class Lanes:
     """``count`` smooth pendulums in one compiled step, noise, reward and observation included.
 
-    Attributes:
-        w: Rows of the kernel, one block of lanes after another.
-        keys: Keys of the noise.
-        counts: Steps since the start.
-        h: Integration step [s].
-        kernel: :func:`~pendulum_sim.environments.environment_kernel.step_kernel`.
+    ``w`` holds the kernel's rows, one block of lanes after another, ``keys`` those of the noise, ``counts`` the steps
+    since the start; ``h`` is the integration step [s].
     """
 
     def __init__(self, task: EnvironmentTask, count: int) -> None:

@@ -108,7 +108,6 @@ class EnvironmentTask:
         return x, [noise.stream_key(int(seed)) for seed in generator.integers(2**63, size=count)]
 
     def _draw(self, start: object, generator: np.random.Generator, count: int) -> Array:
-        """Return starts: hanging, upright, or anywhere with up to 1 rad/s or m/s."""
         _check_start_name(start)
         if start == "random":
             return generator.uniform(self._low, self._high, (count, 2 * self.joints))

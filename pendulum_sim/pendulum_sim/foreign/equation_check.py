@@ -280,7 +280,6 @@ def _add(runs: _Runs, equation: JointPlant, coarse: JointPlant | None, probes: S
 
 
 def _run(plant: JointPlant, probe: _Probe, count: int) -> _Trace:
-    """Run a probe; a fault shortens the trace."""
     none = (0.0,) * len(probe.position)
     rows = [(probe.position, probe.velocity)]
     fault = ""
@@ -331,13 +330,7 @@ def _describe(probe: _Probe, plant: JointPlant) -> str:
 
 @dataclass
 class _Case:
-    """A plant that differs from its equation, with all runs.
-
-    Attributes:
-        errors: Largest error of each run [-].
-        joint: The joint with the largest error.
-        count: Periods of a run.
-    """
+    """A plant that differs from its equation; ``errors`` is the largest of each run, ``joint`` the worst."""
 
     plant: JointPlant
     equation: JointPlant
@@ -405,8 +398,6 @@ def _size(errors: Array) -> float:
 
 
 def _noise(case: _Case, reseeded: JointPlant, worst: Sequence[int]) -> str:
-    """Name random numbers if another seed changes a run, or state that a reset leaves behind."""
-
     def differs(plant: JointPlant) -> float:
         largest = 0.0
         for i in worst:
@@ -463,7 +454,6 @@ def _reset(case: _Case) -> str:
 
 
 def _wrap(case: _Case) -> str:
-    """Name jumps of the angle that no velocity explains."""
     dt, j = case.plant.dt, case.joint
     found = []
     for _, theirs, _ in case.whole():
@@ -478,7 +468,6 @@ def _wrap(case: _Case) -> str:
 
 
 def _period(case: _Case) -> str:
-    """Name a period or a unit by which angle and velocity do not match."""
     dt, j = case.plant.dt, case.joint
     ratios = []
     for _, theirs, _ in case.whole(_MOVING):
@@ -582,7 +571,6 @@ def _late(case: _Case) -> str:
 
 
 def _unlike(theirs: Array, mine: Array) -> float:
-    """Return the relative residual of one curve after scaling another to it [-]."""
     power = float(np.dot(mine, mine))
     if power == 0.0:
         return 1.0

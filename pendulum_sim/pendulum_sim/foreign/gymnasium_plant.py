@@ -109,11 +109,8 @@ def load_gymnasium_plant(
 ) -> GymnasiumPlant:
     """Return an environment as a plant.
 
-    Args:
-        env_id: Identifier for ``gymnasium.make``; ``module:ID`` imports the module first.
-        adapter: What the environment does not define.
-        seed: Seed of every reset.
-        effort_limit: Largest torque if nothing else sets one; 0 for none [N m].
+    ``env_id`` is that of ``gymnasium.make``; ``module:ID`` imports the module first. ``seed`` is used by every reset;
+    ``effort_limit`` is the largest torque if nothing else sets one, 0 for none [N m].
 
     Raises:
         ParameterError: Gymnasium is missing, or environment and adapter do not fit.
@@ -136,10 +133,7 @@ def load_gymnasium_plant(
 class GymnasiumPlant:
     """An environment as a plant; see :func:`load_gymnasium_plant`. A push adds to the action, its only input.
 
-    Attributes:
-        parameters: The closest equation of a pendulum.
-        dt: Time between two states [s].
-        remarks: Automatic choices, as text.
+    ``parameters`` are the closest equation of a pendulum, ``remarks`` the automatic choices as text.
     """
 
     description = "gymnasium"

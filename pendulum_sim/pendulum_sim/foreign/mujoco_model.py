@@ -51,7 +51,6 @@ def _find(name: str, path: Path) -> Path | None:
 
 
 def _problem(mujoco: Any, mesh: Path) -> str:
-    """Return why MuJoCo cannot read a mesh, or an empty string."""
     spec = mujoco.MjSpec()
     spec.add_mesh(name="mesh", file=str(mesh))
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")

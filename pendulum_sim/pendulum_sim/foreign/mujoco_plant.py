@@ -38,13 +38,10 @@ _BISECTIONS = 60
 def load_mujoco_plant(
     path: str | Path, mapping: MujocoMapping | None = None, *, rate_hz: float = 0.0, effort_limit: float = 0.0
 ) -> MujocoPlant:
-    """Return the plant of a model file.
+    """Return the plant of an MJCF or URDF file.
 
-    Args:
-        path: MJCF or URDF.
-        mapping: What the file does not define.
-        rate_hz: Rate of states; 0 for 500 Hz, or that of a longer timestep [Hz].
-        effort_limit: Largest torque if neither file nor mapping has one; 0 for none [N m].
+    ``rate_hz`` 0 is 500 Hz, or that of a longer timestep; ``effort_limit`` is the largest torque if neither file nor
+    mapping has one, 0 for none [N m].
 
     Raises:
         ParameterError: MuJoCo is missing or refuses the file, or the file has no hinge that can be driven.
@@ -73,10 +70,8 @@ def _import_mujoco() -> Any:
 class MujocoPlant:
     """A hinge of a MuJoCo model as a plant; see :func:`load_mujoco_plant`.
 
-    Attributes:
-        parameters: The closest equation of a pendulum, read off the model in commanded torque.
-        dt: Time between two states [s].
-        remarks: Automatic choices, as text.
+    ``parameters`` are the closest equation of a pendulum, in commanded torque; ``remarks`` the automatic choices as
+    text.
     """
 
     def __init__(

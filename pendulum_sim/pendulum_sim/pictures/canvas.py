@@ -33,17 +33,10 @@ _MIN_SIZE, _MAX_SIZE = 120, 4096
 
 
 class Picture:
-    """A canvas, and the parts of a plant's picture.
+    """A canvas of a size, 120 to 4096 [px] or a ParameterError, and the parts of a plant's picture.
 
-    Args:
-        size: Width and height, 120 to 4096 [px]; others are a ParameterError.
-        trail: Positions of the trail.
-        lines: Lines of text that fill its height.
-
-    Attributes:
-        size: Width and height [px].
-        canvas: Drawing surface, ``OVERSAMPLING`` times as large.
-        surface: The picture.
+    ``trail`` is its number of positions; ``lines`` of text fill the height; ``canvas`` is ``OVERSAMPLING`` times as
+    large as the picture, ``surface``.
     """
 
     def __init__(self, size: tuple[int, int], *, trail: int, lines: int = 20) -> None:

@@ -97,7 +97,6 @@ class PlantPicture(Picture):
     # --- parts ---------------------------------------------------------------------------------------------
 
     def _draw_rail(self) -> None:
-        """Draw the rail of a cart with its stops."""
         line, thick = self.pygame.draw.line, 0.022 * self._length
         left, right = (self._pixel((end, 0.0, 0.0)) for end in self._ends)
         line(self.canvas, GREY, left, right, max(2, round(thick)))

@@ -158,7 +158,6 @@ class AdoptNode(PollingNode):
         self._commands.publish(Float64MultiArray(data=self._efforts))
 
     def _sample(self, message: JointState, now_ns: int) -> JointSample | None:
-        """Return the contract's state, or None without such a joint or finite numbers."""
         if self._joint not in message.name:
             self._refuse(f"a state of {', '.join(message.name) or 'no joint'}; expected {self._joint!r}")
             return None

@@ -228,7 +228,6 @@ class SimulatorNode(PollingNode):
         return self._measure(), effort
 
     def _step(self, effort: Vector, push: Vector, stamp_ns: int) -> str:
-        """Step the plant; return why it cannot continue, or an empty string."""
         pace = self._pace
         if pace is None:
             with self._stall:
@@ -240,7 +239,6 @@ class SimulatorNode(PollingNode):
         return pace.problem(time.monotonic() - begun, (self._wall() - stamp_ns) / NANOSECONDS)
 
     def _fail(self, reason: str) -> None:
-        """Stop a failed simulation until a reset."""
         self._failure = reason
         self._loop.halted = True
         self._supervisor.fault(reason, self._interface.clock())

@@ -72,18 +72,9 @@ def advance_dry(
 ) -> tuple[float, float]:  # fmt: skip
     """Return (theta, theta_dot) after h [s], with as many events as occur.
 
-    Args:
-        step: Step function of the integrator.
-        coefficients_of: Its coefficient function, for steps cut short by an event.
-        acceleration: :func:`acceleration_with_friction`, compiled or not.
-        theta: Angle [rad].
-        theta_dot: Velocity [rad/s].
-        torque: Actuator torque at the start [N m].
-        command: Commanded torque [N m].
-        push: Torque on the link itself [N m].
-        h: Step [s].
-        c: Coefficients for h.
-        plant: Parameters, packed.
+    ``coefficients_of`` serves steps cut short by an event; ``acceleration`` is :func:`acceleration_with_friction`,
+    compiled or not; ``c`` are the coefficients for h. Torques [N m]: the actuator's at the start, the command, and a
+    push on the link.
     """
     time_constant = plant[LAG]
     rate = plant[_DAMPING] / plant[_INERTIA]

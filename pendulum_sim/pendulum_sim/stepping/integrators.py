@@ -37,15 +37,10 @@ Step = Callable[
 
 @dataclass(frozen=True)
 class Integrator:
-    """One method.
+    """One method, with the order of its global error and one sentence of description.
 
-    Attributes:
-        name: Its name.
-        order: Order of the global error.
-        step: ``step(acceleration, theta, theta_dot, torque_0, torque_mid, torque_1, direction, h, c, plant)`` returns
-            (theta, theta_dot) after h.
-        coefficients: ``coefficients(damping_rate, h)`` returns ``c``, which depends on the step only.
-        description: One sentence.
+    ``step(acceleration, theta, theta_dot, torque_0, torque_mid, torque_1, direction, h, c, plant)`` returns (theta,
+    theta_dot) after h, ``coefficients(damping_rate, h)`` the numbers ``c``, which depend on the step only.
     """
 
     name: str

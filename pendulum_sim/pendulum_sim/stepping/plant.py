@@ -143,14 +143,10 @@ def advance_rigid(
 class RigidPlant:
     """One rigid link: the thesis's equation, with dry friction, lag and delay.
 
-    Args:
-        parameters: The plant, without drivetrain.
-        dt: Period over which a command is held [s], > 0.
-        method: Integrator, one of ``integrators.METHODS``.
-        substeps: Integration steps in a period, >= 1.
+    Commands are held over dt > 0 [s], with ``substeps`` >= 1 of a method of ``integrators.METHODS``.
 
     Raises:
-        ParameterError: An argument is outside its domain, or the method is unstable on this plant at that step.
+        ParameterError: An argument is outside its domain, the plant has a drivetrain, or the method is unstable on it.
     """
 
     def __init__(self, parameters: PlantParameters, dt: float, *, method: str = "etd4", substeps: int = 1) -> None:

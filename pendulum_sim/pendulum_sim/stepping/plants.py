@@ -11,14 +11,10 @@ __all__ = ["make_plant"]
 
 
 def make_plant(parameters: PlantParameters, dt: float, *, method: str = "auto", substeps: int | None = None) -> Plant:
-    """Return the plant that the parameters describe.
+    """Return the plant that the parameters describe, with commands held over dt [s].
 
-    Args:
-        parameters: Parameters, with a drivetrain for a series-elastic plant.
-        dt: Period over which a command is held [s].
-        method: One of ``integrators.METHODS``; ``auto`` is ``etd4``, or for a series-elastic plant ``semi_implicit``,
-            its only one.
-        substeps: Integration steps in a period; None for 1 (rigid), or steps of at most 0.25 ms.
+    ``method`` is one of ``integrators.METHODS``; ``auto`` is ``etd4``, or for a series-elastic plant ``semi_implicit``,
+    its only one. ``substeps`` None is 1, or for a series-elastic plant steps of at most 0.25 ms.
 
     Raises:
         ParameterError: The method does not fit the plant, or an argument is outside its domain.

@@ -37,14 +37,9 @@ def growth_rate(
     h: float,
     coefficients: Sequence[Array],
 ) -> Array:
-    """Return the growth of a decaying motion when integrated [1/s], below 0 if stable.
+    """Return the growth of a decaying motion when integrated [1/s], below 0 if stable; not for ``adaptive``.
 
-    Args:
-        integrator: The method; not ``adaptive``, which chooses its steps itself.
-        damping_rates: lambda, scalar or (B,) [1/s].
-        stiffness_rates: omega^2, scalar or (B,) [1/s^2].
-        h: Step [s].
-        coefficients: The method's coefficients for that step, each scalar or (B,).
+    lambda [1/s], omega^2 [1/s^2] and the method's coefficients for step h [s] are scalars or have shape (B,).
     """
     rates = np.asarray(damping_rates, dtype=np.float64)
     stiffness = np.abs(np.asarray(stiffness_rates, dtype=np.float64))
@@ -68,8 +63,6 @@ def growth_rate(
 def _eigenvalue_sizes(
     integrator: Integrator, rates: Array, stiffness: Array, h: float, coefficients: Sequence[Array]
 ) -> tuple[Array, Array]:
-    """Return the absolute eigenvalues of one step, the smaller first."""
-
     def linear(theta: float, theta_dot: float, torque: float, direction: float, plant: PlantTuple) -> float:  # noqa: ARG001
         return -rates * theta_dot - stiffness * theta  # type: ignore[return-value]  # whole arrays at once
 
