@@ -19,10 +19,8 @@ from pathlib import Path
 
 from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
 from pendulum_bags.studies.chunks import cluster_client
-from pendulum_bags.studies.monte_carlo import MonteCarlo
-from pendulum_bags.studies.random_runs import run_chunk, run_monte_carlo
-from pendulum_bags.studies.region_map import RegionMap
-from pendulum_bags.studies.start_grid import run_map
+from pendulum_bags.studies.monte_carlo import MonteCarlo, run_chunk, run_monte_carlo
+from pendulum_bags.studies.region_map import RegionMap, run_map
 from tests.benchmarks import Row, measured, peer
 from tests.benchmarks.bench_sim import _mujoco_rollout, _numpy_speed
 from tests.tools.faults.delay_margin import find_delay_margin
@@ -194,7 +192,7 @@ def _region(folder: Path) -> Iterator[Row]:
     began = time.perf_counter()
     result = run_map(folder / "region", settings)
     wall = time.perf_counter() - began
-    if result.counterexamples or result.share_in_ellipse < 1.0:
+    if result.counterexamples or result.share_inside < 1.0:
         raise AssertionError("a start of the proven ellipse does not reach upright")
     yield measured(
         "region of attraction: 61 x 61 starts, 100 plants each, 8 s at 2 ms, written to Parquet",

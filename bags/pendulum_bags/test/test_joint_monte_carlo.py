@@ -12,17 +12,14 @@ import numpy as np
 import pytest
 
 from pendulum_bags.commands.experiment_cli import main
-from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo, joint_shares
-from pendulum_bags.studies.joint_region import JointRegion
-from pendulum_bags.studies.monte_carlo import MonteCarlo
-from pendulum_bags.studies.random_runs import replay, run_chunk, run_monte_carlo
-from pendulum_bags.studies.region_map import RegionMap
-from pendulum_bags.studies.start_grid import run_map
+from pendulum_bags.studies.monte_carlo import MonteCarlo, replay, run_chunk, run_monte_carlo
+from pendulum_bags.studies.region_map import RegionMap, run_map
+from pendulum_bags.studies.uncertain import Uncertainty, parse_uncertainty
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant, write_plant
 
 SHARES = {"cart_mass": 0.1, "pole.damping": 0.5}
-SMALL = JointMonteCarlo("cart_pole", runs=250, chunk=100, duration=0.5, shares=SHARES, start=0.02)
+SMALL = MonteCarlo.of("cart_pole", runs=250, chunk=100, duration=0.5, uncertainty=Uncertainty(SHARES), start=0.02)
 
 
 def test_a_chunk_depends_on_settings_and_index_alone() -> None:
@@ -54,10 +51,10 @@ def test_studies_of_one_joint_and_of_several_refuse_a_gain_whose_sampled_loop_gr
     one = load_plant("dfki").with_values(transport_delay=0.15, actuator_time_constant=0.05)
     files = [str(write_plant(tmp_path / "several.yaml", several)), str(write_plant(tmp_path / "one.yaml", one))]
     runs: list[Callable[[], object]] = [
-        lambda: run_chunk(replace(SMALL, plant=files[0], shares={}), 0),
+        lambda: run_chunk(replace(SMALL, plant=files[0], uncertainty=Uncertainty()), 0),
         lambda: run_chunk(MonteCarlo(plant=files[1], runs=10, chunk=10), 0),
-        lambda: JointRegion(plant=files[0]).gain(several),
-        lambda: RegionMap(plant=files[1]).gain(),
+        lambda: RegionMap.of(files[0]).gain,
+        lambda: RegionMap(plant=files[1]).gain,
     ]
     for run in runs:
         with pytest.raises(
@@ -70,15 +67,15 @@ def test_studies_of_one_joint_and_of_several_refuse_a_gain_whose_sampled_loop_gr
 def test_maps_and_runs_of_a_lagging_plant_are_those_of_the_gain_that_knows_the_lag(tmp_path: Path, lag: float) -> None:
     several = load_mechanism("cart_pole").with_values({"cart.time_constant": lag})
     file = str(write_plant(tmp_path / "several.yaml", several))
-    columns = run_chunk(replace(SMALL, plant=file, shares={}, amplitude=0.0, duration=8.0, runs=20), 0)
+    columns = run_chunk(replace(SMALL, plant=file, uncertainty=Uncertainty(), amplitude=0.0, duration=8.0, runs=20), 0)
     assert np.abs(columns["end_pole"] - np.pi).max() < 1e-3
-    region = JointRegion(plant=file, plants=1, points=5, spans=(0.05, 0.02))
+    region = RegionMap.of(file, plants=1, points=5, spans=(0.05, 0.02))
     assert run_map(tmp_path / "several", region).share.all()
     one = write_plant(tmp_path / "one.yaml", load_plant("thesis").with_values(actuator_time_constant=lag))
     assert run_map(tmp_path / "one", RegionMap(str(one), plants=1, points=5, angle_span=0.1)).share[2].all()
 
 
-@pytest.mark.parametrize("change", [{"shares": {}}, {"amplitude": 0.0}, {"start": 0.0}])
+@pytest.mark.parametrize("change", [{"uncertainty": Uncertainty()}, {"amplitude": 0.0}, {"start": 0.0}])
 def test_plants_noise_and_starts_each_make_a_difference(change: dict[str, object]) -> None:
     without = run_chunk(replace(SMALL, **change), 0)  # type: ignore[arg-type]
     assert not np.allclose(run_chunk(SMALL, 0)["std_pole"], without["std_pole"], rtol=1e-6)
@@ -124,15 +121,15 @@ def test_runs_are_summed_up_gone_on_with_and_added_to(tmp_path: Path) -> None:
 
 def test_shares_are_read_by_name_for_all_or_from_intervals(tmp_path: Path) -> None:
     plant = load_mechanism("cart_pole")
-    every = joint_shares("0.05", "cart_pole")
+    every = parse_uncertainty("0.05", "cart_pole").shares
     assert set(every.values()) == {0.05}
     assert {"cart_mass", "pole_length", "pole.damping"} <= set(every)
     # Nobody identifies gravity, limits or delays; and what is nothing has no share.
     assert not [name for name in every if "gravity" in name or "effort_limit" in name or "delay" in name]
     assert all(plant.value(name) for name in every)
-    assert joint_shares("cart_mass=0.1, pole.damping=0.5", "cart_pole") == SHARES
+    assert parse_uncertainty("cart_mass=0.1, pole.damping=0.5", "cart_pole").shares == SHARES
     file = write_plant(tmp_path / "found.yaml", plant, intervals={"cart_mass": [0.902, 1.098]})
-    assert joint_shares("identified", str(file)) == {"cart_mass": pytest.approx(0.05, rel=1e-3)}
+    assert parse_uncertainty("identified", str(file)).shares == {"cart_mass": pytest.approx(0.05, rel=1e-3)}
 
 
 @pytest.mark.parametrize(
@@ -148,7 +145,7 @@ def test_shares_are_read_by_name_for_all_or_from_intervals(tmp_path: Path) -> No
 )
 def test_what_is_no_share_is_refused(text: str, words: str) -> None:
     with pytest.raises(ParameterError) as refused:
-        joint_shares(text, "cart_pole")
+        parse_uncertainty(text, "cart_pole")
     assert words in str(refused.value)
 
 

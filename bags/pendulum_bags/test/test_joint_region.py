@@ -11,34 +11,36 @@ import pytest
 
 from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.studies.chunks import chunk_path, read_columns
-from pendulum_bags.studies.joint_region import JointRegion, JointRegionResult
-from pendulum_bags.studies.start_grid import run_map
+from pendulum_bags.studies.region_map import RegionMap, RegionResult, run_map
+from pendulum_bags.studies.uncertain import Uncertainty
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
 pytest.importorskip("pyarrow")
 
-SMALL = JointRegion("cart_pole", plants=3, points=9, spans=(0.4, 1.2), duration=6.0, shares={"cart_mass": 0.3})
+SMALL = RegionMap.of(
+    "cart_pole", plants=3, points=9, spans=(0.4, 1.2), duration=6.0, uncertainty=Uncertainty({"cart_mass": 0.3})
+)
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, JointRegionResult]:
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RegionResult]:
     """Return the small map and its folder, for tests that read it."""
     folder = tmp_path_factory.mktemp("small")
     return folder, run_map(folder, SMALL)
 
 
 def test_near_starts_are_caught_far_ones_are_not_and_the_sampled_region_is_inside(
-    small: tuple[Path, JointRegionResult],
+    small: tuple[Path, RegionResult],
 ) -> None:
     _, result = small
     assert result.share.shape == (9, 9)
     assert result.share[4, 4] == 1.0
     # A pole that leans by 1.2 rad is lost, whichever way.
     assert not result.share[[0, -1]].any()
-    assert result.caught is not None
-    assert result.share_in_section == 1.0
+    assert result.level is not None
+    assert result.share_inside == 1.0
     # A mirror image of a start ends as its mirror image.
     assert np.array_equal(result.believed, result.believed[::-1, ::-1])
 
@@ -55,7 +57,7 @@ def test_axes_are_the_ones_that_were_asked_for(tmp_path: Path) -> None:
     assert fast.believed[(x * v) < 0].mean() > fast.believed[(x * v) > 0].mean() + 0.1
 
 
-def test_plant_0_is_the_believed_one_and_the_others_differ(small: tuple[Path, JointRegionResult]) -> None:
+def test_plant_0_is_the_believed_one_and_the_others_differ(small: tuple[Path, RegionResult]) -> None:
     columns = read_columns(chunk_path(small[0], 0), ("plant", "cart_mass", "end_pole", "attracted"))
     mass = load_mechanism("cart_pole").value("cart_mass")
     drawn = [np.unique(columns["cart_mass"][columns["plant"] == i]) for i in range(3)]
@@ -65,7 +67,7 @@ def test_plant_0_is_the_believed_one_and_the_others_differ(small: tuple[Path, Jo
     assert np.abs(wrap(columns["end_pole"][columns["attracted"]])).max() < SMALL.tolerance[0]
 
 
-def test_a_map_is_gone_on_with_and_others_are_refused(small: tuple[Path, JointRegionResult]) -> None:
+def test_a_map_is_gone_on_with_and_others_are_refused(small: tuple[Path, RegionResult]) -> None:
     folder, first = small
     before = chunk_path(folder, 0).stat().st_mtime_ns
     assert np.array_equal(run_map(folder, SMALL).share, first.share)

@@ -18,8 +18,7 @@ import pytest
 from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
 from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.studies.chunks import chunk_path, cluster_client, read_columns
-from pendulum_bags.studies.monte_carlo import MonteCarlo, sobol
-from pendulum_bags.studies.random_runs import draw_chunk, replay, run_chunk, run_monte_carlo
+from pendulum_bags.studies.monte_carlo import MonteCarlo, draw_chunk, replay, run_chunk, run_monte_carlo, sobol
 from pendulum_bags.studies.uncertain import Uncertainty, parse_uncertainty, uncertainty_of
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_testing.fixtures import PROJECT, in_repository, wait_for
@@ -202,7 +201,7 @@ def test_uncertainty_comes_from_the_intervals_where_an_identification_left_no_co
     found = uncertainty_of(str(file))
     assert found.shares == {"inertia": pytest.approx(0.1, rel=1e-4), "damping": pytest.approx(0.0102, rel=1e-3)}
     assert not found.correlation
-    with pytest.raises(ParameterError, match="preset"):
+    with pytest.raises(ParameterError, match="plant thesis has no intervals"):
         uncertainty_of("thesis")
 
 
@@ -226,7 +225,7 @@ def test_plants_are_drawn_with_the_covariance_of_the_identification(tmp_path: Pa
 
 def test_an_uncertainty_that_makes_no_distribution_is_refused() -> None:
     with pytest.raises(ParameterError, match="expected one of inertia, damping, gravity"):
-        Uncertainty({"mass": 0.1})
+        parse_uncertainty("mass=0.1", "thesis")
     with pytest.raises(ParameterError, match="not positive definite"):
         Uncertainty({"inertia": 0.1, "damping": 0.1}, [[1.0, 1.5], [1.5, 1.0]])
     with pytest.raises(ParameterError, match="'damping'; expected identified"):

@@ -1,12 +1,14 @@
 """``experiment monte_carlo``: how sure is the regulation, given what is not known about the plant?"""
 
+# ruff: noqa: ARG001 (`settings_of` reads the options from the context)
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from rich.console import Console
@@ -21,10 +23,12 @@ from pendulum_msgs_py.programs.terminal import make_console
 from pendulum_sim.batches.devices import DEVICES, resolve_device
 
 if TYPE_CHECKING:
-    from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo
+    from pendulum_bags.studies.closed_loops import ClosedLoops
     from pendulum_bags.studies.monte_carlo import MonteCarlo
 
-__all__ = ["monte_carlo", "options_of_several"]
+    Study = TypeVar("Study", bound=ClosedLoops)
+
+__all__ = ["monte_carlo", "settings_of"]
 
 Plant = Annotated[str, typer.Option(help="Preset or plant file; the controller is designed on it.")]
 Uncertain = Annotated[
@@ -45,9 +49,6 @@ Device = Annotated[
     ),
 ]
 Workers = Annotated[int, typer.Option(help="Processes of a local Dask cluster; 0 for none.", min=0)]
-
-_OF_ONE_JOINT = {"q", "r", "sobol"}
-"""Options that plants of several joints do not have."""
 
 
 def monte_carlo(
@@ -88,32 +89,12 @@ def monte_carlo(
     Example: python -m pendulum_bags experiment monte_carlo --runs 100000 --out /tmp/mc
     """
     from pendulum_bags.studies.chunks import cluster_client
-    from pendulum_bags.studies.monte_carlo import MonteCarlo
+    from pendulum_bags.studies.monte_carlo import MonteCarlo, run_monte_carlo
     from pendulum_bags.studies.monte_carlo import sobol as sobol_indices
-    from pendulum_bags.studies.random_runs import run_monte_carlo
-    from pendulum_bags.studies.uncertain import parse_uncertainty
-    from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 
     folder = out or Path("bags", "runs", "monte_carlo")
     console = make_console(stderr=json_output, highlight=False)
-    settings: MonteCarlo | JointMonteCarlo
-    if is_mechanism(plant):
-        settings = _joints(context)
-    else:
-        settings = MonteCarlo(
-            plant=plant,
-            runs=runs,
-            seed=seed,
-            uncertainty=parse_uncertainty(uncertainty, plant),
-            q=q,
-            r=r,
-            amplitude=amplitude,
-            hold_time=hold_time,
-            start=start,
-            duration=duration,
-            bound=bound,
-            device=device,
-        )
+    settings = settings_of(context, MonteCarlo, one_only={"sobol"})
     if replay >= 0:
         _replay(console, settings, replay, folder)
         return
@@ -121,63 +102,55 @@ def monte_carlo(
     with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
         connect = partial(cluster_client, scheduler, workers)
         result = run_monte_carlo(folder, settings, connect=connect, on_progress=on_progress)
-    if sobol and isinstance(settings, MonteCarlo):
+    if sobol and settings.nominal.is_pendulum:
         result["sobol"] = sobol_indices(settings, base=sobol)
     elapsed = time.monotonic() - started
     if json_output:
         print(json_text(result))
         return
-    if isinstance(settings, MonteCarlo):
-        _print_one(console, result)
-    else:
-        _print_several(console, result)
+    _print(console, settings, result)
     console.print(f"replay  add --replay {result['worst'][0]['run']}\nruns    {folder}")
     console.print(f"({elapsed:.0f} s)")
 
 
-def options_of_several(
-    context: typer.Context, of_one_joint: Collection[str], shared: Collection[str]
-) -> tuple[str, dict[str, Any]]:
-    """Return the uncertainty, and the other options that were typed, of a command on a plant of several joints.
+def settings_of(context: typer.Context, kind: type[Study], one_only: Collection[str] = (), **others: Any) -> Study:
+    """Return the settings that the options of a command make.
+
+    Of a plant of several joints those count that were typed: the defaults of the options are those of one joint.
 
     Args:
-        context: Of the command; the defaults of its options are those of one joint.
-        of_one_joint: Options that plants of several joints do not have.
-        shared: Those that they have.
+        context: Of the command.
+        kind: Of the study; its options have the names of its settings.
+        one_only: Further options that plants of several joints do not have.
+        **others: Settings whose options have another form.
 
     Raises:
-        ParameterError: One was typed that is not for several joints.
+        ParameterError: An option was typed that is not for this plant.
     """
-    given = context.params
-    if typed := typed_options(context, of_one_joint):
-        raise ParameterError(
-            f"{typed[0]} is for a plant of one joint, and {given['plant']} has several: its own LQR holds it"
-        )
-    uncertainty = given["uncertainty"] if typed_options(context, {"uncertainty"}) else "0.05"
-    return uncertainty, {name: given[name] for name in shared if typed_options(context, {name})}
+    from pendulum_bags.studies.uncertain import parse_uncertainty
+    from pendulum_msgs_py.plants.plant_parameters import is_mechanism
+
+    given, plant = context.params, context.params["plant"]
+    several = is_mechanism(plant)
+    if several and (typed := typed_options(context, kind.ONE_ONLY.union(one_only))):
+        raise ParameterError(f"{typed[0]} is for a plant of one joint, and {plant} has several: its own LQR holds it")
+    if not several and (typed := typed_options(context, kind.SEVERAL_ONLY)):
+        raise ParameterError(f"{typed[0]} is for a plant of several joints, and {plant} has one")
+    names = {each.name for each in fields(kind)}.intersection(given) - {"plant", "uncertainty", *others}
+    chosen = {name: given[name] for name in names if not several or typed_options(context, {name})}
+    text = given["uncertainty"] if not several or typed_options(context, {"uncertainty"}) else "0.05"
+    return kind.of(plant, uncertainty=parse_uncertainty(text, plant), **{**chosen, **others})
 
 
-def _joints(context: typer.Context) -> JointMonteCarlo:
-    """Return the settings for a plant of several joints, of the options that were typed."""
-    from pendulum_bags.studies.joint_monte_carlo import JointMonteCarlo, joint_shares
-
-    plant = context.params["plant"]
-    shared = ("runs", "seed", "bound", "start", "amplitude", "hold_time", "duration", "device")
-    uncertainty, chosen = options_of_several(context, _OF_ONE_JOINT, shared)
-    return JointMonteCarlo(plant=plant, shares=joint_shares(uncertainty, plant), **chosen)
-
-
-def _replay(console: Console, settings: MonteCarlo | JointMonteCarlo, number: int, folder: Path) -> None:
+def _replay(console: Console, settings: MonteCarlo, number: int, folder: Path) -> None:
     """Write the motion of a run as CSV, and print what was drawn for it."""
     import numpy as np
 
-    from pendulum_bags.studies.monte_carlo import MonteCarlo
-    from pendulum_bags.studies.random_runs import replay
+    from pendulum_bags.studies.monte_carlo import replay
 
-    if isinstance(settings, MonteCarlo):
-        header = ["theta_rad", "theta_dot_rad_s", "effort_n_m"]
-    else:
-        joints = settings.load().coordinates.joints
+    header = ["theta_rad", "theta_dot_rad_s", "effort_n_m"]
+    if not settings.nominal.is_pendulum:
+        joints = settings.nominal.coordinates.joints
         header = [f"{joint.name}_{joint.unit}" for joint in joints]
         header += [f"{joint.name}_{joint.velocity_unit.replace('/', '_')}" for joint in joints]
         header += [f"{joint.name}_effort_{joint.effort_unit.replace(' ', '_').lower()}" for joint in joints]
@@ -191,63 +164,38 @@ def _replay(console: Console, settings: MonteCarlo | JointMonteCarlo, number: in
     console.print(f"motion  {path}")
 
 
-def _print_result(
-    console: Console,
-    result: dict[str, Any],
-    stays: str,
-    shares: Mapping[str, float],
-    source: str,
-    units: Mapping[str, str],
-) -> None:
-    """Print the probability, what is uncertain, and the quantiles."""
+def _print(console: Console, settings: MonteCarlo, result: dict[str, Any]) -> None:
+    """Print the probability, what is uncertain, the quantiles, the worst runs, and the indices where there are some."""
+    from pendulum_bags.identification.model import UNITS
+
+    uncertainty, joints = settings.uncertainty, result["joints"]
+    one, unit = settings.nominal.is_pendulum, settings.nominal.coordinates.units[0]
     low, high = result["probability_interval"]
     console.print(
-        f"{result['runs']} runs: {stays} of upright with probability {result['probability_inside']:.5f} "
+        f"{result['runs']} runs: {' and '.join(joints)} {'stays' if len(joints) == 1 else 'stay'} within "
+        f"{settings.bound:g} {unit} of upright with probability {result['probability_inside']:.5f} "
         f"(95 % interval {low:.5f} to {high:.5f})"
     )
-    uncertain = ", ".join(f"{name} {100.0 * share:.2g} %" for name, share in shares.items()) or "nothing"
+    uncertain = ", ".join(f"{name} {100.0 * share:.2g} %" for name, share in uncertainty.shares.items()) or "nothing"
+    source = f"{', correlated' if uncertainty.correlation else ''} ({uncertainty.source})" if one else ""
     console.print(f"uncertain: {uncertain}{source}")
+    units = {**UNITS, **result["units"]}
+
+    def with_unit(name: str) -> str:
+        return f"{name} \\[{units[name]}]" if name in units else name
+
     quantiles = result["quantiles"]
     table = number_table("Quantiles", "", *next(iter(quantiles.values())), left=0)
     for name, values in quantiles.items():
-        table.add_row(_with_unit(name, units), *(f"{value:.5g}" for value in values.values()))
+        table.add_row(with_unit(name), *(f"{value:.5g}" for value in values.values()))
     console.print(table)
-
-
-def _with_unit(name: str, units: Mapping[str, str]) -> str:
-    """Return the name of a parameter or an outcome with its unit, as a cell of a table."""
-    return f"{name} \\[{units[name]}]" if name in units else name
-
-
-def _print_several(console: Console, result: dict[str, Any]) -> None:
-    settings, units = result["settings"], result["units"]
-    stays = f"{' and '.join(result['joints'])} stay within {settings['bound']:g} rad or m"
-    _print_result(console, result, stays, settings["shares"], "", units)
-    names = [f"max_{joint}" for joint in result["joints"]]
-    table = number_table("Worst runs", "run", "noise seed", *(_with_unit(name, units) for name in names), left=0)
+    # Of several joints too many parameters are uncertain for a row.
+    names = [*(uncertainty.shares if one else ()), "noise_seed", *(f"max_{joint}" for joint in joints)]
+    formats = {"noise_seed": ".0f", **{f"max_{joint}": ".5f" for joint in joints}}
+    headings = ("noise seed" if name == "noise_seed" else with_unit(name) for name in names)
+    table = number_table("Worst runs", "run", *headings, left=0)
     for row in result["worst"][:5]:
-        table.add_row(str(row["run"]), f"{row['noise_seed']:.0f}", *(f"{row[name]:.5f}" for name in names))
-    console.print(table)
-
-
-def _print_one(console: Console, result: dict[str, Any]) -> None:
-    from pendulum_bags.identification.model import UNITS
-
-    settings, units = result["settings"], {**UNITS, "max_theta": "rad", "std_theta": "rad", "max_effort": "N m"}
-    uncertain = settings["uncertainty"]
-    names = list(uncertain["shares"])
-    source = f"{', correlated' if uncertain['correlation'] else ''} ({uncertain['source']})"
-    stays = f"theta stays within {settings['bound']:g} rad"
-    _print_result(console, result, stays, uncertain["shares"], source, units)
-    headings = ("run", *(_with_unit(name, units) for name in names), "noise seed", "max theta \\[rad]")
-    table = number_table("Worst runs", *headings, left=0)
-    for row in result["worst"][:5]:
-        table.add_row(
-            str(row["run"]),
-            *(f"{row[name]:.4g}" for name in names),
-            f"{row['noise_seed']:.0f}",
-            f"{row['max_theta']:.5f}",
-        )
+        table.add_row(str(row["run"]), *(format(row[name], formats.get(name, ".4g")) for name in names))
     console.print(table)
     if "sobol" in result:
         table = number_table(f"Sobol indices of {result['sobol']['output']}", "factor", "first order", "total", left=0)

@@ -1,38 +1,22 @@
 """``experiment region_of_attraction``: from which starts does the loop reach upright, under the torque limit?"""
 
+# ruff: noqa: ARG001 (`settings_of` reads the options from the context)
 from __future__ import annotations
 
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from pendulum_bags.commands.monte_carlo_cli import (
-    Device,
-    Plant,
-    Q,
-    R,
-    Scheduler,
-    Uncertain,
-    Workers,
-    options_of_several,
-)
-from pendulum_msgs_py.errors import ParameterError
+from pendulum_bags.commands.monte_carlo_cli import Device, Plant, Q, R, Scheduler, Uncertain, Workers, settings_of
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counted_progress
-from pendulum_msgs_py.programs.executables import typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
-if TYPE_CHECKING:
-    from pendulum_bags.studies.joint_region import JointRegion
-
 __all__ = ["region_of_attraction"]
-
-_OF_ONE_JOINT = {"q", "r", "effort_limit", "angle_span", "velocity_span"}
-"""Options that plants of several joints do not have."""
 
 
 def region_of_attraction(
@@ -74,33 +58,12 @@ def region_of_attraction(
     """
     from pendulum_bags.studies.chunks import cluster_client
     from pendulum_bags.studies.region_figure import region_sentence, write_region_figure
-    from pendulum_bags.studies.region_map import RegionMap
-    from pendulum_bags.studies.start_grid import run_map
-    from pendulum_bags.studies.uncertain import parse_uncertainty
-    from pendulum_msgs_py.plants.plant_parameters import is_mechanism
+    from pendulum_bags.studies.region_map import RegionMap, run_map
 
     folder = out or Path("bags", "runs", "region_of_attraction")
     console = make_console(stderr=json_output, highlight=False)
-    settings: RegionMap | JointRegion
-    if is_mechanism(plant):
-        settings = _joints(context, axes, spans)
-    elif typed := typed_options(context, {"axes", "spans"}):
-        raise ParameterError(f"{typed[0]} is for a plant of several joints, and {plant} has one")
-    else:
-        settings = RegionMap(
-            plant=plant,
-            uncertainty=parse_uncertainty(uncertainty, plant),
-            plants=plants,
-            q=q,
-            r=r,
-            effort_limit=effort_limit,
-            points=points,
-            angle_span=angle_span,
-            velocity_span=velocity_span,
-            duration=duration,
-            seed=seed,
-            device=device,
-        )
+    both = tuple(part.strip() for part in axes.split(",") if part.strip())
+    settings = settings_of(context, RegionMap, axes=both)
     started = time.monotonic()
     with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
         connect = partial(cluster_client, scheduler, workers)
@@ -112,14 +75,3 @@ def region_of_attraction(
     console.print(region_sentence(result))
     elapsed = time.monotonic() - started
     console.print(f"\npicture {picture}\nmap     {folder / 'map.parquet'}\n({elapsed:.0f} s)", soft_wrap=True)
-
-
-def _joints(context: typer.Context, axes: str, spans: tuple[float, float]) -> JointRegion:
-    """Return the settings for a plant of several joints, of the options that were typed."""
-    from pendulum_bags.studies.joint_monte_carlo import joint_shares
-    from pendulum_bags.studies.joint_region import JointRegion
-
-    plant = context.params["plant"]
-    uncertainty, chosen = options_of_several(context, _OF_ONE_JOINT, ("plants", "points", "duration", "seed", "device"))
-    both = tuple(part.strip() for part in axes.split(",") if part.strip())
-    return JointRegion(plant=plant, axes=both, spans=spans, shares=joint_shares(uncertainty, plant), **chosen)

@@ -1,121 +1,266 @@
 """A million closed-loop runs over uncertain parameters, noise and starts; chunked, restartable, distributed.
 
-Chunk c draws its plants from the stream (seed, c) and its noise from seeds of its own, so a result depends neither on
-the number of workers nor on the order in which they finish, bit for bit.
+The noise of each run has a seed of its own. Runs can be added: a chunk is drawn whole, however many runs follow.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.studies.random_runs import Columns, RandomRuns, figures_of_runs, replay
-from pendulum_bags.studies.uncertain import THESIS_UNCERTAINTY, VARIED, Uncertainty, batch_variations
-from pendulum_lqr.controller_interface.loop_check import settling_lqr
-from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
-from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
+from pendulum_bags.distributions import share_interval
+from pendulum_bags.experiments.joint_run import LIMIT_PER_NOISE
+from pendulum_bags.runs.run_folder import write_json
+from pendulum_bags.studies.chunks import (
+    Connect,
+    chunk_path,
+    kept_settings,
+    open_results,
+    read_columns,
+    run_chunks,
+    write_results_marker,
+)
+from pendulum_bags.studies.closed_loops import ClosedLoops, Columns
+from pendulum_bags.studies.uncertain import VARIED
+from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.errors import BagError, ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.batches.batch import simulate_batch
 
-__all__ = ["COLUMNS", "MonteCarlo", "sobol"]
+__all__ = ["COLUMNS", "MonteCarlo", "draw_chunk", "replay", "run_chunk", "run_monte_carlo", "sobol"]
 
 COLUMNS = (*VARIED, "noise_seed", "theta_0", "max_theta", "max_effort", "std_theta", "theta_end", "theta_dot_end")
-"""Columns of the Parquet files; SI units."""
+"""Columns of the Parquet files of one joint; SI units."""
+
+_SEEDS_OF_ONE = 10_000_000_000
+"""Distance between the noise seeds of two Monte Carlos."""
+_SEEDS = 2**63 // _SEEDS_OF_ONE
+"""Number of seeds that a Monte Carlo may have."""
+_QUANTILES = (0.05, 0.5, 0.95, 0.999)
+_WORST = 10
+_UPRIGHT = 0.1
+"""Largest deviation of a joint at the end of a run that has converged [rad or m]."""
 
 
 @dataclass(frozen=True)
-class MonteCarlo(RandomRuns):
-    """What to draw and to run, of a pendulum; see :class:`RandomRuns`.
+class MonteCarlo(ClosedLoops):
+    """What to draw and to run.
 
     Attributes:
-        uncertainty: Of its parameters.
-        q: Diagonal of Q.
-        r: R.
-        amplitude: Largest noise torque [N m].
-        method: Integrator.
+        runs: Number of closed-loop runs.
+        amplitude: Largest noise on each driven joint; None for a tenth of its effort limit [N m or N].
+        hold_time: Time for which a noise sample is held [s].
+        start: Largest distance of each joint's start from upright, uniform [rad or m].
+        bound: Distance from upright that a run should not leave [rad or m].
+        chunk: Runs in a chunk; part of the result's definition.
     """
 
-    UNITS: ClassVar[tuple[str, str]] = ("rad", "N m")
+    OF_SEVERAL: ClassVar[Mapping[str, Any]] = {"runs": 100_000, "amplitude": None, "bound": 0.2, "chunk": 10_000}
+    NO_RESULT: ClassVar[frozenset[str]] = frozenset({"runs"})
 
-    plant: str = "thesis"
     runs: int = 1_000_000
-    uncertainty: Uncertainty = THESIS_UNCERTAINTY
-    q: tuple[float, float] = (100.0, 0.01)
-    r: float = 0.1
-    amplitude: float = 2.5
-    method: str = "etd2"
+    amplitude: float | None = 2.5
+    hold_time: float = 0.01
+    start: float = 0.0
     bound: float = 0.02
     chunk: int = 50_000
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
-        super().__post_init__()
-        if self.start > math.pi:
+        if self.runs < 1 or self.chunk < 1:
+            raise ParameterError(f"runs is {self.runs} and chunk {self.chunk}; expected both >= 1")
+        if not 0 <= self.seed < _SEEDS:
+            raise ParameterError(f"seed is {self.seed}; expected 0 to {_SEEDS - 1}")
+        one = self.nominal.is_pendulum
+        distance, _, effort = self.nominal.coordinates.units
+        for name, value, unit, least in (
+            ("dt", self.dt, "s", 1e-9),
+            ("bound", self.bound, distance, 1e-9),
+            ("start", self.start, distance, 0.0),
+            ("duration", self.duration, "s", self.dt),
+            ("hold_time", self.hold_time, "s", self.dt),
+            ("amplitude", self.amplitude or 0.0, effort, 0.0),
+        ):
+            if not (math.isfinite(value) and value >= least):
+                raise ParameterError(f"{name} is {value} {unit}; expected a finite number >= {least:g}")
+        if one and self.start > math.pi:
             raise ParameterError(f"start is {self.start} rad; expected 0 to pi")
 
-    def load(self) -> PlantParameters:
-        """Return the nominal plant."""
-        return load_plant(self.plant)
+    @property
+    def chunks(self) -> int:
+        """How many chunks there are."""
+        return -(-self.runs // self.chunk)
 
-    def draw(self, plant: PlantParameters, count: int, generator: np.random.Generator) -> Columns:
-        """Return parameters and starts of a number of runs."""
-        values = self.uncertainty.draw(plant, count, generator)
-        return {**values, "theta_0": UPRIGHT + self.start * generator.uniform(-1.0, 1.0, count)}
 
-    def simulate(
-        self, plant: PlantParameters, drawn: Columns, threads: int | None = None, *, record: bool = False
-    ) -> tuple[Columns, Array | None]:
-        """Run what was drawn; see :class:`RandomRuns`."""
-        if plant.drivetrain is not None:
-            raise ParameterError(
-                f"plant {plant.name!r} is series elastic; expected a rigid one: the batch has no motor"
-            )
-        result = simulate_batch(
-            plant,
-            variations=batch_variations(plant, drawn),
-            steps=self.steps,
-            dt=self.dt,
-            method=self.method,
-            position=drawn["theta_0"],
-            gain=settling_lqr(plant, self.q, self.r, self.dt).K,
-            seeds=drawn["noise_seed"],
-            amplitude=self.amplitude,
-            hold=max(1, round(self.hold_time / self.dt)),
-            record=record,
-            threads=threads,
-            device=self.device,
+class _Names(NamedTuple):
+    """Names of the columns of a plant: of each joint, and ``effort`` of each driven one."""
+
+    start: tuple[str, ...]
+    farthest: tuple[str, ...]
+    spread: tuple[str, ...]
+    end: tuple[str, ...]
+    end_velocity: tuple[str, ...]
+    effort: tuple[str, ...]
+
+
+def _names(plant: PlantParameters) -> _Names:
+    if plant.is_pendulum:
+        return _Names(("theta_0",), ("max_theta",), ("std_theta",), ("theta_end",), ("theta_dot_end",), ("max_effort",))
+    joints, driven = plant.coordinates.names, plant.coordinates.driven_names
+    of_joints = [[f"{what}_{name}" for name in joints] for what in ("start", "max", "std", "end", "end_velocity")]
+    return _Names._make(map(tuple, [*of_joints, [f"max_effort_{name}" for name in driven]]))
+
+
+def draw_chunk(settings: MonteCarlo, index: int) -> Columns:
+    """Return what is drawn for a chunk: plants, starts and noise seeds.
+
+    A chunk is drawn whole and then cut, so that a run is the same however many follow it.
+    """
+    plant, generator = settings.nominal, settings.generator(index)
+    first = index * settings.chunk
+    count = min(settings.chunk, settings.runs - first)
+    drawn: Columns = {**settings.uncertainty.draw(plant, settings.chunk, generator)}
+    for name, goal in zip(_names(plant).start, plant.coordinates.goal, strict=True):
+        drawn[name] = goal + settings.start * generator.uniform(-1.0, 1.0, settings.chunk)
+    seeds = settings.seed * _SEEDS_OF_ONE + first + np.arange(count, dtype=np.int64)
+    return {**{name: values[:count] for name, values in drawn.items()}, "noise_seed": seeds}
+
+
+def run_chunk(settings: MonteCarlo, index: int, threads: int | None = None) -> Columns:
+    """Run a chunk and return its columns; a pure function of settings and index."""
+    return _simulate(settings, draw_chunk(settings, index), threads)[0]
+
+
+def _simulate(
+    settings: MonteCarlo, drawn: Columns, threads: int | None = None, *, record: bool = False
+) -> tuple[Columns, Array | None]:
+    """Run what was drawn; return all columns, and where it is to be recorded the motion, shape (steps, k, n)."""
+    plant, names = settings.nominal, _names(settings.nominal)
+    result = simulate_batch(
+        plant,
+        variations=settings.uncertainty.variations(plant, drawn),
+        steps=settings.steps,
+        dt=settings.dt,
+        method=settings.method,
+        position=np.stack([drawn[name] for name in names.start], axis=1),
+        gain=settings.gain.rows,
+        seeds=drawn["noise_seed"],
+        amplitude=np.array(plant.effort_limits) / LIMIT_PER_NOISE if settings.amplitude is None else settings.amplitude,
+        hold=max(1, round(settings.hold_time / settings.dt)),
+        record=record,
+        threads=threads,
+        device=settings.device,
+    )
+    columns = dict(drawn)
+    ends = (result.max_deviation, result.std_deviation, result.position, result.velocity)
+    for i, own in enumerate(zip(*names[1:5], strict=True)):
+        columns |= {name: values[:, i] for name, values in zip(own, ends, strict=True)}
+    columns |= {name: result.max_effort[:, i] for i, name in enumerate(names.effort)}
+    return {name: columns[name] for name in (COLUMNS if plant.is_pendulum else columns)}, result.trajectories
+
+
+def replay(settings: MonteCarlo, number: int) -> tuple[dict[str, float], Array]:
+    """Run one run again, alone, and return what was drawn for it and its motion.
+
+    Args:
+        settings: As of the Monte Carlo.
+        number: Of the run, from 0.
+
+    Returns:
+        The row of the table, and positions, velocities and efforts of all n joints at each step, shape (steps, 3 n).
+    """
+    if not 0 <= number < settings.runs:
+        raise ParameterError(f"run is {number}; expected 0 to {settings.runs - 1}")
+    index, place = divmod(number, settings.chunk)
+    drawn = {name: values[place : place + 1] for name, values in draw_chunk(settings, index).items()}
+    columns, motion = _simulate(settings, drawn, record=True)
+    assert motion is not None
+    return {name: float(values[0]) for name, values in columns.items()}, motion[:, :, 0]
+
+
+def run_monte_carlo(
+    folder: Path,
+    settings: MonteCarlo,
+    *,
+    connect: Connect = nullcontext,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """Run all chunks that are not on disk yet, one Parquet file each, sum up and write that next to them.
+
+    Args:
+        folder: Where the files go; a folder of the same settings is continued, one of fewer runs is added to.
+        settings: What to run.
+        connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
+        on_progress: Called with chunks done and in all.
+
+    Raises:
+        BagError: The folder holds something else, or more runs.
+        ParameterError: A drawn plant has no positive inertia.
+    """
+    fingerprint, content = settings.fingerprint(), settings.content()
+    before = int(kept_settings(folder, fingerprint).get("runs", settings.runs))
+    if before > settings.runs:
+        raise BagError(
+            f"folder {folder} holds a Monte Carlo of {before} runs; expected at most the {settings.runs} of this one"
         )
-        columns = {
-            **drawn,
-            "max_theta": result.max_deviation[:, 0],
-            "max_effort": result.max_effort[:, 0],
-            "std_theta": result.std_deviation[:, 0],
-            "theta_end": result.position[:, 0],
-            "theta_dot_end": result.velocity[:, 0],
-        }
-        return {name: columns[name] for name in COLUMNS}, result.trajectories
+    if before < settings.runs:
+        # Only a last chunk that was not full has to be carried out again.
+        if before % settings.chunk:
+            chunk_path(folder, before // settings.chunk).unlink(missing_ok=True)
+        write_results_marker(folder, fingerprint, content)
+    open_results(folder, "Monte Carlo", fingerprint, content)
+    run_chunks(folder, run_chunk, settings, settings.chunks, connect=connect, on_progress=on_progress)
+    result = _figures(folder, settings)
+    write_json(folder / "monte_carlo.json", result)
+    return result
 
-    def summarise(self, folder: Path) -> dict[str, Any]:
-        """Return the probability of staying inside the bound, quantiles and the worst runs, from the Parquet files."""
-        figures, values = figures_of_runs(
-            folder,
-            self,
-            ("max_theta", "max_effort", "std_theta", "theta_end"),
-            lambda columns: columns["max_theta"],
-            lambda run, _: replay(self, run)[0],
-        )
-        del figures["quantiles"]["theta_end"]
-        return {**figures, "converged": float(np.mean(np.abs(wrap(values["theta_end"] - UPRIGHT)) < 0.1))}
+
+def _figures(folder: Path, settings: MonteCarlo) -> dict[str, Any]:
+    """Return the probability of staying inside the bound, quantiles and the worst runs, from the Parquet files."""
+    coordinates, names = settings.nominal.coordinates, _names(settings.nominal)
+    joints = [joint.unit for joint in coordinates.joints]
+    units = dict(zip((*names.farthest, *names.spread), 2 * joints, strict=True))
+    units |= {name: coordinates.joints[i].effort_unit for name, i in zip(names.effort, coordinates.driven, strict=True)}
+    parts: dict[str, list[Array]] = {name: [] for name in (*units, *names.end)}
+    for index in range(settings.chunks):
+        for name, column in read_columns(chunk_path(folder, index), parts).items():
+            parts[name].append(column)
+    values = {name: np.concatenate(pieces) for name, pieces in parts.items()}
+    farthest = np.max([values[name] for name in names.farthest], axis=0)
+    # What is not a number is not inside, and worse than any number.
+    inside = int((farthest <= settings.bound).sum())
+    worst = np.argsort(farthest, kind="stable")[::-1][:_WORST]
+    ends: Any = [values[name] for name in names.end]
+    off = np.abs(coordinates.deviation(ends))
+    return {
+        "settings": settings.content(),
+        "runs": settings.runs,
+        "not_finite": int((~np.isfinite(farthest)).sum()),
+        "probability_inside": inside / settings.runs,
+        "probability_interval": list(share_interval(inside, settings.runs)),
+        "quantiles": {
+            name: dict(zip(map(str, _QUANTILES), np.quantile(values[name], _QUANTILES).tolist(), strict=True))
+            for name in units
+        },
+        "worst": [
+            {"run": int(run), "max_deviation": float(farthest[run]), **replay(settings, int(run))[0]} for run in worst
+        ],
+        "converged": float(np.mean((off < _UPRIGHT).all(axis=0))),
+        "joints": ["theta"] if settings.nominal.is_pendulum else list(coordinates.names),
+        "units": units,
+    }
 
 
 def sobol(settings: MonteCarlo, *, base: int = 4096) -> dict[str, Any]:
-    """Return first-order and total Sobol indices of the spread of theta over parameters, noise and start.
+    """Return first-order and total Sobol indices of the spread of one joint over parameters, noise and start.
 
     The indices are those of independent factors: a correlation of the parameters is left out here.
 
@@ -134,7 +279,7 @@ def sobol(settings: MonteCarlo, *, base: int = 4096) -> dict[str, Any]:
     problem = {"num_vars": len(factors), "names": factors, "bounds": [[0.0, 1.0]] * len(factors)}
     unit = np.clip(_sample(problem, base, settings.seed), 1e-9, 1.0 - 1e-9)
     count = len(unit)
-    plant = load_plant(settings.plant)
+    plant = settings.nominal
     normals = np.zeros((len(VARIED), count))
     for row, name in enumerate(VARIED):
         if name in factors:
@@ -144,7 +289,7 @@ def sobol(settings: MonteCarlo, *, base: int = 4096) -> dict[str, Any]:
     drawn["theta_0"] = UPRIGHT + settings.start * start
     # The noise as one factor: which of a thousand million signals.
     drawn["noise_seed"] = (unit[:, factors.index("noise")] * 1e9).astype(np.int64)
-    columns, _ = settings.simulate(plant, drawn)
+    columns, _ = _simulate(settings, drawn)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # SALib's own use of pandas
         warnings.simplefilter("ignore", RuntimeWarning)  # what does not vary has no shares: they are NaN

@@ -2,60 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pendulum_bags.studies.joint_region import JointRegionResult
 from pendulum_bags.studies.region_map import RegionResult
-from pendulum_msgs_py.contract.angles import UPRIGHT
 
 __all__ = ["region_sentence", "write_region_figure"]
 
 
-@dataclass(frozen=True)
-class _Picture:
-    """What a picture of a map of starts shows besides its shares.
-
-    Attributes:
-        x, y: Deviations from upright along both axes, shape (n,) each.
-        labels: Of both axes.
-        curve: Edge of a region from another source, shape (k, 2).
-        label: Its text in the legend.
-        title: Above all.
-    """
-
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    labels: tuple[str, str]
-    curve: NDArray[np.float64]
-    label: str
-    title: str
-
-
-def _picture(result: RegionResult | JointRegionResult) -> _Picture:
-    if isinstance(result, RegionResult):
-        return _Picture(
-            result.theta - UPRIGHT,
-            result.theta_dot,
-            ("theta - pi at the start [rad]", "theta' at the start [rad/s]"),
-            result.ellipse,
-            f"proven: $x^T S x \\leq$ {result.level:.3g}",
-            f"Starts from which LQR at {result.limit:g} N m reaches upright",
-        )
-    first, second = (f"{axis.name} from upright at the start [{axis.unit}]" for axis in result.settings.both)
-    return _Picture(
-        *result.settings.starts(),
-        (first, second),
-        result.section,
-        "" if result.caught is None else f"sampled, without dry friction: $x^T S x \\leq$ {result.caught.level:.3g}",
-        f"Starts from which the LQR of {result.settings.plant} reaches upright",
-    )
-
-
-def write_region_figure(path: Path, result: RegionResult | JointRegionResult) -> Path:
+def write_region_figure(path: Path, result: RegionResult) -> Path:
     """Draw the map and return the path.
 
     Args:
@@ -68,13 +24,19 @@ def write_region_figure(path: Path, result: RegionResult | JointRegionResult) ->
 
     figure = Figure(figsize=(7.2, 5.8), dpi=150, layout="constrained")
     ax = figure.subplots()
-    picture = _picture(result)
-    x, y = picture.x, picture.y
+    settings = result.settings
+    x, y = settings.starts()
+    labels = [f"{axis.name} from upright at the start [{axis.unit}]" for axis in settings.both]
+    title, source = f"Starts from which the LQR of {settings.plant} reaches upright", "sampled, without dry friction"
+    if settings.is_of_one:
+        labels = ["theta - pi at the start [rad]", "theta' at the start [rad/s]"]
+        limit = settings.nominal.effort_limit
+        title, source = f"Starts from which LQR at {limit:g} N m reaches upright", "proven"
     shades = ax.pcolormesh(x, y, 100.0 * result.share, cmap="Greys", vmin=0.0, vmax=100.0, shading="nearest")
     # Full black would hide the curves.
     shades.set_clim(0.0, 150.0)
     bar = figure.colorbar(shades, ax=ax, boundaries=np.linspace(0.0, 100.0, 101), ticks=[0, 25, 50, 75, 100])
-    plants = result.settings.plants
+    plants = settings.plants
     bar.set_label("plants that reach upright [%]" if plants > 1 else "reaches upright [%]")
     halo = [patheffects.withStroke(linewidth=3.5, foreground="white")]
     legend = []
@@ -82,42 +44,44 @@ def write_region_figure(path: Path, result: RegionResult | JointRegionResult) ->
         edge = result.believed.astype(float)
         ax.contour(x, y, edge, levels=[0.5], colors="black", linestyles="dashed", linewidths=1.4)
         legend.append(Line2D([], [], color="black", ls="--", lw=1.4, label="edge for the believed plant"))
-    if picture.label:
-        ax.plot(*picture.curve.T, color="black", lw=1.8, path_effects=halo)
-        legend.append(Line2D([], [], color="black", lw=1.8, label=picture.label))
+    if result.level is not None:
+        ax.plot(*result.section.T, color="black", lw=1.8, path_effects=halo)
+        label = f"{source}: $x^T S x \\leq$ {result.level:.3g}"
+        legend.append(Line2D([], [], color="black", lw=1.8, label=label))
     ax.plot([0.0], [0.0], "o", mfc="white", mec="black", ms=6)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[0], y[-1])
-    ax.set_xlabel(picture.labels[0])
-    ax.set_ylabel(picture.labels[1])
-    ax.set_title(picture.title + (f", {plants} plants" if plants > 1 else ""), loc="left", fontsize=11)
+    ax.set_xlabel(labels[0])
+    ax.set_ylabel(labels[1])
+    ax.set_title(title + (f", {plants} plants" if plants > 1 else ""), loc="left", fontsize=11)
     figure.legend(handles=legend, loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(path)
     return path
 
 
-def region_sentence(result: RegionResult | JointRegionResult) -> str:
+def region_sentence(result: RegionResult) -> str:
     """Return the map's result as a sentence."""
     plants = result.settings.plants
     runs, reached = plants * result.share.size, 100.0 * float(result.share.mean())
     sure, never = (100.0 * float(np.mean(result.share == share)) for share in (1.0, 0.0))
     parts = f"; from {sure:.1f} % of the starts every plant does, from {never:.1f} % none" if plants > 1 else ""
-    if isinstance(result, JointRegionResult):
+    if not result.settings.is_of_one:
         first, second = (f"{axis.name} within {axis.span:g} {axis.unit}" for axis in result.settings.both)
         text = f"{runs} runs, {first} and {second} of upright at rest: {reached:.1f} % come to rest upright{parts}"
-        if result.caught is None:
+        if result.level is None:
             return f"{text}. No state was found that the LQR surely catches."
-        if not np.isfinite(result.share_in_section):
+        if not np.isfinite(result.share_inside):
             return f"{text}. The states that the LQR catches, by sampling, hold no start of this grid."
-        inside = 100.0 * result.share_in_section
+        inside = 100.0 * result.share_inside
         return f"{text}. Of the starts that the LQR catches, by sampling without dry friction, {inside:.2f} % do."
-    grid = (result.theta[-1] - result.theta[0]) * (result.theta_dot[-1] - result.theta_dot[0])
+    grid = float(np.prod([axis[-1] - axis[0] for axis in result.axes]))
+    limit = result.settings.nominal.effort_limit
     text = (
-        f"{runs} runs, {result.limit:g} N m at most: {reached:.1f} % of them reach upright from a grid of {grid:.3g} "
+        f"{runs} runs, {limit:g} N m at most: {reached:.1f} % of them reach upright from a grid of {grid:.3g} "
         f"rad^2/s{parts}. "
     )
-    if np.isfinite(result.share_in_ellipse):
-        text += f"Inside the ellipse of the linear analysis {100.0 * result.share_in_ellipse:.2f} % reach it"
+    if np.isfinite(result.share_inside):
+        text += f"Inside the ellipse of the linear analysis {100.0 * result.share_inside:.2f} % reach it"
         text += (
             ", the believed plant from every start."
             if not result.counterexamples

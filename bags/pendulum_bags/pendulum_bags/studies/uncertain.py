@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,22 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.experiments.joint_run import identified_names
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import load_yaml
-from pendulum_msgs_py.plants.plant_parameters import PRESETS, PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism, load_plant_file
 
 __all__ = [
     "THESIS_UNCERTAINTY",
     "VARIED",
     "Uncertainty",
-    "batch_variations",
     "parse_uncertainty",
-    "share_of_interval",
+    "uncertain_names",
     "uncertainty_of",
 ]
 
 VARIED = ("inertia", "damping", "gravity", "coulomb_friction")
-"""Parameters that may be uncertain."""
+"""Parameters of one joint that may be uncertain."""
 
 _NORMAL_95 = 1.959963984540054
 
@@ -50,20 +50,48 @@ class Uncertainty:
     def __post_init__(self) -> None:
         """Refuse what makes no distribution."""
         for name, value in self.shares.items():
-            if name not in VARIED:
-                raise ParameterError(f"uncertainty of {name!r} is unknown; expected one of {', '.join(VARIED)}")
             if not (math.isfinite(value) and 0.0 <= value <= 1.0):
                 raise ParameterError(f"uncertainty of {name} is {value}; expected a share from 0 to 1")
         self._factor()
 
+    def check(self, plant: PlantParameters) -> None:
+        """Refuse names that are none of a plant's uncertain parameters."""
+        names = uncertain_names(plant)
+        for name in self.shares:
+            if name not in names:
+                raise ParameterError(f"uncertainty of {name!r} is unknown; expected one of {', '.join(names)}")
+
     def draw(self, plant: PlantParameters, count: int, generator: np.random.Generator) -> dict[str, Array]:
-        """Return values of every parameter of ``VARIED``, shape (count,) each; reproducible by the generator."""
-        return self.scatter(plant, generator.standard_normal((len(VARIED), count)), correlated=True)
+        """Return values of all uncertain parameters, shape (count,) each; reproducible by the generator.
+
+        They are log-normal, for no mass is negative. Of one joint all of ``VARIED`` are drawn, so that a parameter more
+        leaves the others as they are; those of several joints are independent.
+        """
+        self.check(plant)
+        if plant.is_pendulum:
+            return self.scatter(plant, generator.standard_normal((len(VARIED), count)), correlated=True)
+        drawn = {}
+        for name, share in self.shares.items():
+            # Mean and deviation are those of the value, not of its logarithm.
+            spread = math.sqrt(math.log1p(share**2))
+            drawn[name] = plant.value(name) * np.exp(spread * generator.standard_normal(count) - 0.5 * spread**2)
+        return drawn
+
+    def variations(self, plant: PlantParameters, drawn: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
+        """Return what the batch engine varies: static friction of one joint follows its Coulomb friction."""
+        if not plant.is_pendulum:
+            return {name: drawn[name] for name in self.shares}
+        found = {name: drawn[name] for name in VARIED}
+        ratio = (plant.static_friction or 0.0) / plant.coulomb_friction if plant.coulomb_friction > 0.0 else 0.0
+        if ratio > 0.0:
+            found["static_friction"] = ratio * drawn["coulomb_friction"]
+        else:
+            # Nothing varies; the plant's own static friction stays.
+            del found["coulomb_friction"]
+        return found
 
     def scatter(self, plant: PlantParameters, normals: Array, *, correlated: bool) -> dict[str, Array]:
-        """Return plants for standard normal numbers of shape (len(VARIED), n): log-normal about the plant's values.
-
-        A plant of negative inertia is no plant. Mean and deviation are those of the value, not of its logarithm.
+        """Return pendulums for standard normal numbers of shape (len(VARIED), n): log-normal about the plant's values.
 
         Args:
             plant: The nominal plant.
@@ -112,70 +140,76 @@ THESIS_UNCERTAINTY = Uncertainty({"inertia": 0.3, "damping": 0.05, "gravity": 0.
 """Approximate uncertainty of the plant of the thesis."""
 
 
-def batch_variations(plant: PlantParameters, drawn: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
-    """Return what the batch engine varies: static friction follows Coulomb friction in its proportion."""
-    found = {name: drawn[name] for name in VARIED}
-    ratio = (plant.static_friction or 0.0) / plant.coulomb_friction if plant.coulomb_friction > 0.0 else 0.0
-    if ratio > 0.0:
-        found["static_friction"] = ratio * drawn["coulomb_friction"]
-    else:
-        # Nothing varies; the plant's own static friction stays.
-        del found["coulomb_friction"]
-    return found
+def uncertain_names(plant: PlantParameters) -> Sequence[str]:
+    """Return the names of the parameters that may be uncertain: of one joint ``VARIED``, else what is identified."""
+    return VARIED if plant.is_pendulum else identified_names(plant)
 
 
-def share_of_interval(interval: Sequence[float], value: float) -> float:
+def _share_of_interval(interval: Sequence[float], value: float) -> float:
     """Return the standard deviation that a 95 % interval stands for, as a share of the value, 1 at most."""
     low, high = interval
     return float(min(1.0, abs((high - low) / (2.0 * _NORMAL_95 * value)))) if value else 0.0
 
 
 def parse_uncertainty(text: str, plant: str) -> Uncertainty:
-    """Return the uncertainty that a text names: ``identified``, or shares such as ``inertia=0.3,damping=0.05``.
+    """Return the uncertainty that a text names.
 
     Args:
-        text: The text; empty for none.
-        plant: Preset or plant file, for ``identified``.
+        text: ``identified`` for what an identification left in the plant file; one share for all parameters, such as
+            ``0.05``; or ``NAME=SHARE,...``, such as ``inertia=0.3`` or ``cart_mass=0.1,pole.damping=0.5``. Empty for
+            none.
+        plant: Preset or plant file.
+
+    Raises:
+        ParameterError: A name is none of the plant, a share is none, or the file has no intervals.
     """
     if text.strip() == "identified":
         return uncertainty_of(plant)
+    parameters = load_mechanism(plant)
+    names = uncertain_names(parameters)
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    if len(parts) == 1:
+        with suppress(ValueError):
+            share = float(parts[0])
+            parts = [f"{name}={share}" for name in names if parameters.value(name) != 0.0]
     shares: dict[str, float] = {}
-    for part in filter(None, (part.strip() for part in text.split(","))):
-        name, _, value = part.partition("=")
+    for part in parts:
+        name, _, value = (piece.strip() for piece in part.partition("="))
         try:
-            shares[name.strip()] = float(value)
+            shares[name] = float(value)
         except ValueError:
             raise ParameterError(
-                f"uncertainty has {part!r}; expected identified, or NAME=SHARE, such as damping=0.05"
+                f"uncertainty has {part!r}; expected identified, one share, or NAME=SHARE, such as {names[0]}=0.05"
             ) from None
-    return Uncertainty(shares)
+    found = Uncertainty(shares)
+    found.check(parameters)
+    return found
 
 
 def uncertainty_of(plant_file: str) -> Uncertainty:
-    """Return an identification's uncertainty: its covariance, from the JSON next to the plant file, else its intervals.
+    """Return an identification's uncertainty, by the intervals of its plant file.
+
+    Of one joint it is the covariance instead, where the JSON that ``identify --out`` wrote lies next to the file.
 
     Raises:
         ParameterError: The file has no intervals.
     """
-    if plant_file in PRESETS:
-        raise ParameterError(f"plant {plant_file!r} is a preset; expected the file of an identification")
-    entries = load_yaml(plant_file, "plant file").get("parameters", {})
-    shares: dict[str, float] = {}
-    for name in VARIED:
-        entry = entries.get(name)
-        if isinstance(entry, dict) and "interval" in entry and entry.get("value"):
-            shares[name] = share_of_interval(entry["interval"], entry["value"])
+    plant, provenance = load_plant_file(plant_file)
+    intervals = provenance.get("intervals", {}) if Path(plant_file).suffix else {}
+    names = VARIED if plant.is_pendulum else intervals
+    known = {name: _share_of_interval(intervals[name], plant.value(name)) for name in names if name in intervals}
+    shares = {name: share for name, share in known.items() if share > 0.0}
     if not shares:
-        raise ParameterError(f"plant file {plant_file} has no intervals; expected those of an identification")
+        raise ParameterError(f"plant {plant_file} has no intervals; expected the file of an identification")
     beside = Path(plant_file).with_suffix(".json")
-    if not beside.is_file():
+    if not plant.is_pendulum or not beside.is_file():
         return Uncertainty(shares, source=f"intervals of {plant_file}, taken for independent")
     try:
         covariance = json.loads(beside.read_text(encoding="utf-8"))["covariance"]
-        names, matrix = list(covariance["names"]), np.array(covariance["matrix"], dtype=np.float64)
-        rows = [names.index(name) for name in shares]
+        order, matrix = list(covariance["names"]), np.array(covariance["matrix"], dtype=np.float64)
+        rows = [order.index(name) for name in shares]
         found = matrix[np.ix_(rows, rows)]
-        values = np.array([float(entries[name]["value"]) for name in shares])
+        values = np.array([plant.value(name) for name in shares])
         deviations = np.sqrt(np.diag(found))
         correlation = found / np.outer(deviations, deviations)
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
