@@ -28,6 +28,7 @@ __all__ = [
     "load_yaml",
     "markdown_table",
     "parameter_sections",
+    "parse_yaml",
     "read_text",
     "reject_unknown",
     "require_mapping",
@@ -296,7 +297,11 @@ def load_yaml(path: str | Path, what: str = "file") -> dict[str, Any]:
     Raises:
         ParameterError: The file is missing, not text, not YAML (with line and column), or no mapping.
     """
-    text = read_text(path, what)
+    return parse_yaml(read_text(path, what), path, what)
+
+
+def parse_yaml(text: str, path: str | Path, what: str = "file") -> dict[str, Any]:
+    """Return the mapping of the text of a file; arguments and errors as of :func:`load_yaml`."""
     if text.lstrip().startswith(("<?xml", "<!--", "<robot", "<mujoco")):
         way = xacro_hint(path, text) or "`pendulum experiment --simulation FILE` takes a URDF or MJCF model"
         raise ParameterError(f"{what} {path} is XML; expected YAML ({way})")

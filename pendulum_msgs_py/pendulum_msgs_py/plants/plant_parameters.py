@@ -30,8 +30,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from importlib import resources
 from itertools import product
 from pathlib import Path
@@ -41,7 +42,15 @@ from pendulum_msgs_py.contract.joints import Coordinates, Joint, Vector
 from pendulum_msgs_py.dynamics.joint_steps import FAR, JointTable
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
-from pendulum_msgs_py.parameters import ParameterSpec, dump_yaml, load_yaml, reject_unknown, require_mapping, suggestion
+from pendulum_msgs_py.parameters import (
+    ParameterSpec,
+    dump_yaml,
+    parse_yaml,
+    read_text,
+    reject_unknown,
+    require_mapping,
+    suggestion,
+)
 from pendulum_msgs_py.plants.friction_terms import STRENGTHS, TERM_PARAMETERS
 from pendulum_msgs_py.plants.joint_parameters import (
     DRIVETRAIN_SPECS,
@@ -451,7 +460,14 @@ def load_mechanism(preset_or_path: str | Path) -> PlantParameters:
 def load_plant_file(preset_or_path: str | Path) -> tuple[PlantParameters, dict[str, Any]]:
     """Return the plant and its provenance, with ``intervals``; errors as :func:`load_mechanism`."""
     path = resolve_plant(preset_or_path)
-    document = load_yaml(path, "plant file")
+    plant, provenance = _read_file(path, read_text(path, "plant file"))
+    return plant, deepcopy(provenance)
+
+
+@lru_cache(maxsize=64)
+def _read_file(path: Path, text: str) -> tuple[PlantParameters, dict[str, Any]]:
+    """Return plant and provenance of a file with this text; a command loads its plant many times."""
+    document = parse_yaml(text, path, "plant file")
     if document.get("format") == SEALED_FORMAT:
         raise ParameterError(
             f"plant file {path} is sealed for an exercise, and only a simulator runs it; "
@@ -629,8 +645,13 @@ def resolve_plant(preset_or_path: str | Path) -> Path:
 def is_mechanism(preset_or_path: str | Path) -> bool:
     """Return whether a preset or plant file is no pendulum; a sealed one is a pendulum."""
     path = resolve_plant(preset_or_path)
-    document = load_yaml(path, "plant file")
-    return document.get("format") == MECHANISM_FORMAT and not read_plant_document(document, path)[0].is_pendulum
+    return _is_mechanism(path, read_text(path, "plant file"))
+
+
+@lru_cache(maxsize=64)
+def _is_mechanism(path: Path, text: str) -> bool:
+    document = parse_yaml(text, path, "plant file")
+    return document.get("format") == MECHANISM_FORMAT and not _read_file(path, text)[0].is_pendulum
 
 
 def require_one_joint(preset_or_path: str | Path, instead: str) -> None:

@@ -16,6 +16,7 @@ from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown, re
 from pendulum_msgs_py.plants.plant_parameters import (
     SEALED_FORMAT,
     PlantParameters,
+    load_mechanism,
     plant_document,
     read_plant_document,
     resolve_plant,
@@ -40,7 +41,7 @@ def load_plant_to_run(preset_or_path: str | Path) -> tuple[PlantParameters, bool
     path = resolve_plant(preset_or_path)
     document = load_yaml(path, "plant file")
     if document.get("format") != SEALED_FORMAT:
-        return read_plant_document(document, path)[0], False
+        return load_mechanism(path), False
     reject_unknown(document, ("format", "name", "sealed"), where=str(path))
     try:
         packed = base64.b64decode(str(document.get("sealed")), validate=True)
