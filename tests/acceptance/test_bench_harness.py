@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.learning.task import VARIED, value_of
+from pendulum_bags.learning.task import VARIED
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from tests.benchmarks import Peer, Row, bench_learn, measured, peer, run
 from tests.benchmarks.limit_loop import build_limit
@@ -106,8 +106,6 @@ def test_a_stand_in_of_a_machine_is_late_and_a_little_off_and_its_equal_friction
         assert isinstance(each, PlantParameters)
         assert each.transport_delay == 0.004
         assert each.static_friction == each.coulomb_friction
-    shares = [
-        value_of(each, name) / value_of(plant, name) for each in found for name in VARIED if value_of(plant, name)
-    ]
+    shares = [each.value(name) / plant.value(name) for each in found for name in VARIED if plant.value(name)]
     assert 0.95 <= min(shares) < 0.96
     assert 1.04 < max(shares) <= 1.05

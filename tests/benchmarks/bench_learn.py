@@ -25,7 +25,7 @@ import numpy as np
 
 from pendulum_bags.experiments.joint_run import stand_in_for
 from pendulum_bags.learning.evaluation import Trial, is_up, measured_success, run_trial, trials_of
-from pendulum_bags.learning.task import VARIED, SwingUpTask, value_of
+from pendulum_bags.learning.task import VARIED, SwingUpTask
 from pendulum_bags.studies.leaderboard import evaluate
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_lqr.controllers.policy import START_TIME, LearnedPolicy
@@ -201,7 +201,7 @@ def _stand_in(plant: PlantParameters, seed: int) -> PlantParameters:
     if not plant.is_pendulum:
         return stand_in_for(plant, share=_OFF, delay=_LATE, seed=seed)
     drawn = np.random.default_rng(seed)
-    values = {name: value_of(plant, name) * (1.0 + float(drawn.uniform(-_OFF, _OFF))) for name in VARIED}
+    values = {name: plant.value(name) * (1.0 + float(drawn.uniform(-_OFF, _OFF))) for name in VARIED}
     if plant.coulomb_friction:
         # The ratio first: rounded, equal frictions must stay equal.
         values["static_friction"] = plant.static_friction / plant.coulomb_friction * values["coulomb_friction"]

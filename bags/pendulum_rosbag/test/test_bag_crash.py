@@ -15,12 +15,7 @@ import pytest
 from mcap.reader import McapReader, NonSeekingReader, SeekingReader, make_reader
 
 from pendulum_rosbag.reader import read_bag
-from pendulum_rosbag.storage import (
-    BagWriter,
-    mcap_layout,
-    sealed_mcap,
-    storage_file,
-)
+from pendulum_rosbag.storage import BagWriter, mcap_layout, sealed_mcap, storage_file
 from pendulum_testing.bag_readers import (
     ENDLESS_WRITER,
     JOINT_STATE,
@@ -304,11 +299,7 @@ def test_a_full_disk_keeps_what_was_sealed(tmp_path: Path, storage: str) -> None
     """The limit of the file size makes writes fail as a full disk does, without being root."""
     bag = tmp_path / "bag"
     done = subprocess.run(
-        [sys.executable, "-c", FULL, str(bag), storage],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
+        [sys.executable, "-c", FULL, str(bag), storage], capture_output=True, text=True, timeout=60, check=True
     )
     sealed, reason = done.stdout.split(maxsplit=1)
     assert reason.strip() == "File too large"

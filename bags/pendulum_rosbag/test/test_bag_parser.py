@@ -17,12 +17,7 @@ from pendulum_rosbag.reader import Bag, canonical, read_bag, same_messages
 from pendulum_rosbag.reader.batches import Batch
 from pendulum_rosbag.reader.joint_state import JointStateParser, layout_of
 from pendulum_rosbag.storage import BagWriter
-from pendulum_testing.bag_messages import (
-    JOINT_STATE,
-    STORE,
-    as_rclpy_leaves_it,
-    joint_state,
-)
+from pendulum_testing.bag_messages import JOINT_STATE, STORE, as_rclpy_leaves_it, joint_state
 
 text = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
 value = st.lists(st.floats(width=64), max_size=1)

@@ -20,13 +20,7 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state, encode_joints
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_rosbag.reader import read_bag, read_bags, same_messages
 from pendulum_rosbag.storage import BagWriter
-from pendulum_testing.bag_messages import (
-    JOINT_STATE,
-    STORE,
-    assert_equals_rosbags,
-    joint_state,
-    mixed_messages,
-)
+from pendulum_testing.bag_messages import JOINT_STATE, STORE, assert_equals_rosbags, joint_state, mixed_messages
 
 
 @pytest.mark.parametrize(("storage", "compression"), [("mcap", None), ("mcap", "zstd"), ("sqlite3", None)])
@@ -201,11 +195,7 @@ def test_bytes_behind_the_message_are_passed_over(tmp_path: Path) -> None:
 
 def test_events_come_as_dictionaries_in_order_of_time(tmp_path: Path) -> None:
     path = tmp_path / "bag"
-    texts = [
-        '{"stamp_ns": 30, "name": "hold"}',
-        '{"stamp_ns": 10, "name": "ramp_up", "target": 3.14}',
-        "plain",
-    ]
+    texts = ['{"stamp_ns": 30, "name": "hold"}', '{"stamp_ns": 10, "name": "ramp_up", "target": 3.14}', "plain"]
     with BagWriter(path) as writer:
         writer.add_topic("/sim/events", "std_msgs/msg/String")
         writer.add_topic("/chatter", "std_msgs/msg/String")

@@ -120,13 +120,7 @@ def test_a_recording_holds_everything_and_says_so(tmp_path: Path, node: Node, pr
     wait_for(lambda: "/source" in read_bag(bag).metadata.get("pendulum.parameters", {}), 60.0, "the values of before")
     node.set_parameters([Parameter("gain", value=[3.0, 4.0])])
     status = wait_until_received(
-        node,
-        sim_joint_states=400,
-        sim_effort_command=400,
-        sloppy=400,
-        shared=400,
-        sim_events=2,
-        recorder_events=1,
+        node, sim_joint_states=400, sim_effort_command=400, sloppy=400, shared=400, sim_events=2, recorder_events=1
     )
     assert status["topics"]["/sim/joint_states"]["received"] == 400
     assert call(node, "/recorder/annotate").success

@@ -19,13 +19,7 @@ from rosbags.highlevel import AnyReader
 
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_rosbag.reader import read_bag
-from pendulum_rosbag.storage import (
-    BagWriter,
-    QosProfile,
-    exchange,
-    message_type,
-    metadata_file,
-)
+from pendulum_rosbag.storage import BagWriter, QosProfile, exchange, message_type, metadata_file
 from pendulum_testing.bag_readers import JOINT_STATE, STRING, count_everywhere, count_in_order, state, text_message
 
 JOINT_STATE_HASH = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"

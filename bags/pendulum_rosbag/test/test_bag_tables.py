@@ -17,11 +17,7 @@ from pendulum_rosbag.reader.info_cli import main as info_main
 from pendulum_rosbag.reader.statistics import bag_statistics, clock_jumps, time_statistics
 from pendulum_rosbag.reader.tables import export_bag, to_pandas
 from pendulum_rosbag.storage import BagWriter
-from pendulum_testing.bag_messages import (
-    JOINT_STATE,
-    STORE,
-    joint_state,
-)
+from pendulum_testing.bag_messages import JOINT_STATE, STORE, joint_state
 
 
 def test_timing_finds_gaps_duplicates_and_clock_jumps() -> None:
@@ -187,9 +183,7 @@ def test_lists_that_are_all_empty_keep_their_type_in_parquet(tmp_path: Path) -> 
     assert {"level", "name", "values"} <= {field.name for field in status.value_type}
 
 
-def test_tables_leave_out_the_constants_of_a_type_and_keep_times_whole_without_messages(
-    tmp_path: Path,
-) -> None:
+def test_tables_leave_out_the_constants_of_a_type_and_keep_times_whole_without_messages(tmp_path: Path) -> None:
     path = tmp_path / "bag"
     status = STORE.types["diagnostic_msgs/msg/DiagnosticStatus"]
     message = status(level=1, name="n", message="m", hardware_id="h", values=[])

@@ -1,4 +1,4 @@
-"""The console's pictures of the designs that carry over to the machine that was measured last."""
+"""The console's pictures of the designs that carry over to the machine measured last."""
 
 from __future__ import annotations
 
@@ -22,17 +22,13 @@ PICTURES = {
 
 
 class CertifiedDesigns:
-    """Maps of certified LQR weights and gains, with the layer's sentence and a link to the page.
-
-    Args:
-        jobs: Provides the folder of runs.
-    """
+    """Maps of certified LQR weights and gains, with the layer's sentence and a link to the page."""
 
     def __init__(self, jobs: Jobs) -> None:
         self._newest = NewestPage(jobs, PAGE)
 
     def build(self) -> None:
-        """Lay it out, without pictures as long as nothing was measured."""
+        """Build the card, hidden until there is a measurement."""
         with ui.element("div").classes("certified") as self._place:
             ui.html("<h3>Designs that carry over</h3>", sanitize=False)
             self._sentence = ui.label().classes("small")
@@ -41,7 +37,7 @@ class CertifiedDesigns:
         self._place.set_visibility(False)
 
     def refresh(self) -> None:
-        """Show what was measured last."""
+        """Show the newest measurement."""
         if not self._newest.changed():
             return
         folder = self._newest.folder
@@ -54,13 +50,12 @@ class CertifiedDesigns:
         with self._row:
             for name, text in PICTURES.items():
                 if (folder / "figures" / name).is_file():
-                    # The time prevents a browser from showing a cached older measurement.
+                    # The time stamp keeps browsers from showing a cached older measurement.
                     source = f"/runs/{folder.name}/figures/{name}?{self._newest.written:.0f}"
                     ui.element("img").props(f'src="{source}" alt="{text}" loading="lazy"')
 
 
 def _sentence(folder: Path) -> str:
-    """Return the layer's sentence, empty where the folder has none."""
     try:
         found = read_layers(folder)
     except DataError as error:

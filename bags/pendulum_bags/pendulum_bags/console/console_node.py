@@ -53,22 +53,18 @@ _LOOK_PERIOD = 0.3
 _SLICE = 0.2
 _TIMEOUT = 3.0
 """Longest wait for a response of a node [s]."""
-_TORQUES = {
-    "command": names.EFFORT_COMMAND,
-    "disturbance": names.DISTURBANCE,
-    "applied": names.APPLIED_EFFORT,
-}
+_TORQUES = {"command": names.EFFORT_COMMAND, "disturbance": names.DISTURBANCE, "applied": names.APPLIED_EFFORT}
 _SILENT = 2.0
 """Age at which a node's diagnostics are ignored [s]; nodes publish them twice a second."""
 _STOP_SERVICE = "/e_stop"
 _STOP_TICK = 0.02
 _STOP_WAIT = 0.4
-"""How long a stop request waits for the plants before the ones without response are reported [s]."""
+"""Longest wait for the plants' responses to a stop before silent plants are reported [s]."""
 
 
 @dataclass
 class _Plant:
-    """State of one plant; ``taps`` are read by the drawing code, not by an executor."""
+    """State of one plant; the drawing code, not an executor, reads ``taps``."""
 
     namespace: str
     node: str
@@ -82,10 +78,10 @@ class _Plant:
 
 
 class Hub:
-    """The console's end of the graph.
+    """The console's end of the graph; requests raise FaultError with the reason of a refusal.
 
-    States and torques come at up to 2 kHz and are drawn 60 times a second. Their inputs hold one message and are polled
-    when a picture is due: what is not drawn costs no Python at all.
+    States and torques come at up to 2 kHz and are drawn at 60 Hz. Their inputs hold one message and are polled per
+    frame, so messages that are not drawn cost no Python.
     """
 
     def __init__(self) -> None:
@@ -131,20 +127,18 @@ class Hub:
 
     @property
     def parameters(self) -> dict[str, dict[str, Any]]:
-        """Parameters of all nodes, kept up to date: node -> name -> value."""
+        """Current parameters of all nodes: node -> name -> value."""
         return self._reader.values
 
     def frame(self) -> dict[str, Any]:
-        """Return the newest of everything that is drawn, by namespace."""
+        """Return the newest values to draw, by namespace."""
         with self._lock:
             return {plant.namespace: self._read(plant) for plant in self._plants.values()}
 
     def plants(self) -> dict[str, str]:
-        """Return the plants that are on the graph: namespace -> full node name."""
+        """Return the plants on the graph: namespace -> full node name."""
         with self._lock:
             return {plant.namespace: plant.node for plant in self._plants.values()}
-
-    # --- requests of the operator --------------------------------------------------------------------------
 
     async def e_stop(self, nodes: Sequence[str] = ()) -> dict[str, Any] | None:
         """Order these plants, or all, to stop until the operator acknowledges it; return the order's state."""
@@ -163,24 +157,24 @@ class Hub:
         return self.stop_state()
 
     def stop_state(self) -> dict[str, Any] | None:
-        """Return each plant's response to the stop in force; None where none is."""
+        """Return each plant's response to the stop in force; None without one."""
         with self._order_lock:
             return self._order.state(time.monotonic())
 
     def acknowledge_stop(self) -> list[str]:
-        """End the order for the plants that are stopped; return those without response, for which it stays."""
+        """End the order for stopped plants; return those without response, for which it stays."""
         with self._order_lock:
             return self._order.acknowledge(time.monotonic())
 
     def release_stop(self, node: str) -> None:
-        """Stop asking one plant: its e-stop is reset, or it is given up."""
+        """End the requests to one plant: its e-stop is reset, or it is given up."""
         with self._order_lock:
             self._order.release(node)
 
     async def reset(self, node: str) -> str:
-        """Reset the e-stop of a plant, which ends the order for it; raise a FaultError where a stop came after it."""
+        """Reset a plant's e-stop and end the order for it; a FaultError if another stop came later."""
         self.release_stop(node)
-        # What is on its way would stop the plant again behind its reset.
+        # A pending request would stop the plant again after its reset.
         deadline = time.monotonic() + _TIMEOUT
         while self._is_asked_to_stop(node) and time.monotonic() < deadline:
             await asyncio.sleep(0.01)
@@ -190,7 +184,7 @@ class Hub:
         return await self.trigger(f"{node}/e_stop_reset")
 
     def _keep_stopping(self) -> None:
-        """Repeat requests on a thread of its own: neither the page nor its server's loop can delay a stop."""
+        """Repeat requests in a thread of its own, so that neither page nor server delays a stop."""
         while not self._leaving.is_set():
             with self._order_lock:
                 now = time.monotonic()
@@ -199,7 +193,7 @@ class Hub:
             for node in due:
                 try:
                     self._ask_to_stop(node, now)
-                # What is wrong with one plant's service must not end the stop of all others.
+                # One plant's service must not end the stop of all others.
                 except Exception as error:  # noqa: BLE001
                     with self._order_lock:
                         self._order.problem(node, f"cannot be asked: {type(error).__name__}: {error}")
@@ -219,7 +213,7 @@ class Hub:
 
     def _ask_to_stop(self, node: str, now: float) -> None:
         client = self._stop_client(node)
-        # A later response is of a plant that was blocked; the request has been repeated since.
+        # A later response is from a blocked plant; the request has been repeated since.
         calls = self._stop_calls.setdefault(node, [])
         for _, call in [entry for entry in calls if now - entry[0] > _TIMEOUT]:
             client.remove_pending_request(call)
@@ -251,11 +245,11 @@ class Hub:
             return any(asked > since and not call.done() for asked, call in self._stop_calls.get(node, ()))
 
     async def trigger(self, service: str) -> str:
-        """Call a service without arguments; raise a FaultError with its reason where it refuses."""
+        """Call a service without arguments."""
         return _accepted(service, await self._call(Trigger, service, Trigger.Request()))
 
     async def arm(self, node: str, *, on: bool) -> str:
-        """Arm or disarm a plant; raise a FaultError with its reason where it refuses."""
+        """Arm or disarm a plant."""
         return _accepted(node, await self._call(SetBool, f"{node}/arm", SetBool.Request(data=on)))
 
     def has_node(self, node: str) -> bool:
@@ -270,7 +264,7 @@ class Hub:
         return text if time.monotonic() - heard < _SILENT else ""
 
     async def activate(self, node: str, *, on: bool) -> str:
-        """Activate or deactivate a controller; raise a FaultError where its state does not allow it."""
+        """Activate or deactivate a controller."""
         label, number = (
             ("activate", Transition.TRANSITION_ACTIVATE) if on else ("deactivate", Transition.TRANSITION_DEACTIVATE)
         )
@@ -280,7 +274,7 @@ class Hub:
         return f"{node}: {label}d"
 
     async def set_parameter(self, node: str, name: str, value: Any) -> None:
-        """Set a parameter; raise a FaultError with the node's reason where it refuses."""
+        """Set a parameter."""
         message: ParameterMessage = Parameter(name, value=value).to_parameter_msg()
         request = SetParameters.Request(parameters=[message])
         result = (await self._call(SetParameters, f"{node}/set_parameters", request)).results[0]
@@ -325,8 +319,6 @@ class Hub:
             return await asyncio.wait_for(answered, _TIMEOUT)
         except asyncio.TimeoutError:
             raise FaultError(f"{service} does not answer within {_TIMEOUT:g} s") from None
-
-    # --- the graph -----------------------------------------------------------------------------------------
 
     def _spin(self) -> None:
         while not self._done.done():
@@ -389,7 +381,7 @@ class Hub:
                 plant = self._plants.get(status.name.partition(":")[0])
                 if plant is not None:
                     plant.figures = {pair.key: pair.value for pair in status.values}
-                    # For a late joiner; a mode older than the newest event would revert it.
+                    # For late joiners; a mode older than the newest event would revert it.
                     if stamp_from_message(message.header.stamp) > plant.mode_stamp_ns:
                         plant.mode, plant.reason = plant.figures.get("mode", plant.mode), status.message
 
@@ -448,19 +440,12 @@ def console(
     token = "" if is_loopback(host) else secrets.token_urlsafe(16)
     if runs.exists() and not runs.is_dir():
         raise ParameterError(f"runs is {runs}, a file; expected a folder")
-    # An address that is not available is refused before anything starts.
+    # Refuse an unavailable address before anything starts.
     listen(host, port).close()
     hub, jobs = Hub(), Jobs(runs.resolve())
     address = f"http://{'localhost' if is_loopback(host) else host}:{port}/" + (f"?token={token}" if token else "")
     try:
-        serve(
-            hub,
-            jobs,
-            host=host,
-            port=port,
-            token=token,
-            ready=lambda: print(f"console at {address}", flush=True),
-        )
+        serve(hub, jobs, host=host, port=port, token=token, ready=lambda: print(f"console at {address}", flush=True))
     finally:
         jobs.close()
         hub.close()

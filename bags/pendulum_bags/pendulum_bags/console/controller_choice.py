@@ -1,4 +1,4 @@
-"""The choice of a plant's controller: which one, started to wait inactive, activated, ended."""
+"""The choice of a plant's controller: start (inactive), activate, deactivate, end."""
 
 from __future__ import annotations
 
@@ -18,16 +18,12 @@ from pendulum_msgs_py.plants.plant_parameters import is_mechanism
 __all__ = ["ControllerChoice", "offered"]
 
 _NEED_A_FILE = frozenset({"playback", "policy"})
-"""Controllers that cannot start without a file, and are started from a terminal."""
+"""Controllers that need a file, and are started from a terminal."""
 
 
 def offered(plant: str) -> list[str]:
-    """Return the controllers that can start for a plant with nothing but their defaults.
-
-    Args:
-        plant: Preset or plant file; empty where unknown.
-    """
-    # A file of another machine, or an emulator's, is no reason to offer nothing: the controller reports refusals.
+    """Return the controllers that can start with defaults for a preset or plant file, empty if unknown."""
+    # The file of another machine or of an emulator may be unreadable here: the controller reports refusals.
     several = False
     with contextlib.suppress(PendulumError):
         several = bool(plant) and is_mechanism(plant)
@@ -38,12 +34,8 @@ class ControllerChoice:
     """One plant's choice.
 
     Args:
-        graph: The ROS graph.
-        jobs: Starts the controller.
-        space: Namespace of the plant.
-        node: The plant's full name.
-        carefully: Awaits work and shows what refuses it.
-        button: Makes a button with a text, what it does, and whose it is.
+        carefully: Awaits work and shows its refusal.
+        button: Makes a button from a text, its action, and the plant's name.
     """
 
     def __init__(
@@ -68,7 +60,7 @@ class ControllerChoice:
         return str(self._graph.parameters.get(self._node, {}).get("plant", ""))
 
     def build(self) -> None:
-        """Lay it out."""
+        """Build the controls."""
         with ui.row():
             self._offered_for = self._plant
             kinds = offered(self._plant)
@@ -84,7 +76,7 @@ class ControllerChoice:
         self._state = ui.label().classes("small").props('role="status"')
 
     def refresh(self) -> None:
-        """Show the controller's diagnostics; offer those that fit, once the plant's description is known."""
+        """Show the controller's diagnostics, and the suitable controllers once the plant is known."""
         if self._plant != self._offered_for:
             self._offered_for = self._plant
             kinds = offered(self._plant)
@@ -104,7 +96,7 @@ class ControllerChoice:
         await self._carefully(work())
 
     async def _start(self) -> str:
-        # On the graph before its parameters are known: two controllers of one name would end all torque.
+        # On the graph, because parameters may be unknown yet: two controllers of one name would end all torque.
         if self._graph.has_node(self._controller):
             kind = self._graph.parameters.get(self._controller, {}).get("controller", "of a kind that is not known yet")
             raise FaultError(

@@ -1,4 +1,4 @@
-"""Programs that the console starts: a recorder, an experiment, a controller. They end with it."""
+"""Programs that the console starts, and that end with it: a recorder, an experiment, a controller."""
 
 from __future__ import annotations
 
@@ -24,11 +24,9 @@ class Job:
 
     Attributes:
         kind: ``record`` or ``experiment``.
-        folder: What it writes.
-        process: The process.
-        log: Its output.
-        started: When [s of the monotonic clock].
-        ended: When it was first seen ended; None while it runs.
+        folder: Folder of its output.
+        started: Start [s of the monotonic clock].
+        ended: When its end was first seen; None while it runs.
     """
 
     kind: str
@@ -44,7 +42,7 @@ class Job:
         return self.process.poll() is None
 
     def describe(self) -> str:
-        """Return its status: state, time, size of its output, its last lines."""
+        """Return its status: state, time, size of its files, its last line."""
         running = self.running
         if not running and self.ended is None:
             self.ended = time.monotonic()
@@ -65,11 +63,7 @@ class Job:
 
 
 class Jobs:
-    """At most one program of each kind at a time.
-
-    Args:
-        runs: Folder in which each gets a folder of its own.
-    """
+    """At most one program of each kind at a time, each with a folder of its own in ``runs``."""
 
     def __init__(self, runs: Path) -> None:
         self.runs = runs
@@ -80,53 +74,34 @@ class Jobs:
         return self._jobs.get(kind)
 
     def newest(self, page: str) -> Path | None:
-        """Return the run folder with the newest page of a name; None where none has one."""
+        """Return the run folder with the newest page of a name; None if there is none."""
         found = [path for path in self.runs.glob(f"*/{page}") if path.is_file()]
         return max(found, key=lambda path: path.stat().st_mtime).parent if found else None
 
     def record(self) -> Job:
-        """Start recording all plants, and what belongs to them, into one bag."""
+        """Record all plants and their nodes into one bag."""
         arguments = ["record", "--exclude", "^/(parameter_events|rosout)$"]
         return self._start("record", arguments, "-o", os.environ)
 
     def experiment(self, seed: int) -> Job:
-        """Run the thesis's experiment in a ROS domain of its own; its folder gets a report.
-
-        Args:
-            seed: Seed of the noise.
-        """
+        """Run the thesis's experiment in a ROS domain of its own; its folder gets a report."""
         # Not in this domain: its plants have the names of those that are shown here.
         environment = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
         return self._start("experiment", ["experiment", "thesis", "--seed", str(seed)], "--out", environment)
 
     def move(self, namespace: str, goal: str) -> Job:
-        """Bring a plant upright or down.
-
-        Args:
-            namespace: Of the plant.
-            goal: ``upright`` or ``down``.
-        """
+        """Bring the plant of a namespace ``upright`` or ``down``."""
         return self._start(f"move{namespace}", ["move", goal, "--namespace", namespace], "", os.environ)
 
     def control(self, namespace: str, kind: str, plant: str) -> Job:
-        """Start a plant's controller; it waits inactive.
-
-        Args:
-            namespace: Of the plant.
-            kind: Name of the controller.
-            plant: Preset or plant file to design for; empty for the controller's own default.
-        """
+        """Start a plant's controller, inactive, for a preset or plant file (empty for the controller's default)."""
         given = {"controller": kind, **({"plant": plant} if plant else {}), "autoactivate": "false"}
         arguments = ["controller", "--ros-args", "-r", f"__ns:={namespace or '/'}"]
         arguments += [item for name, value in given.items() for item in ("-p", f"{name}:={value}")]
         return self._start(f"control{namespace}", arguments, "", os.environ, package="pendulum_lqr")
 
     def disturb(self, namespace: str) -> Job:
-        """Start a plant's disturbance node; it waits to be started.
-
-        Args:
-            namespace: Of the plant.
-        """
+        """Start a plant's disturbance node, inactive."""
         arguments = ["disturbance", "--ros-args", "-r", f"__ns:={namespace or '/'}"]
         return self._start(f"disturb{namespace}", arguments, "", os.environ, package="pendulum_lqr")
 
@@ -151,7 +126,7 @@ class Jobs:
         return self._jobs[kind]
 
     def stop(self, kind: str) -> str:
-        """End a program as Ctrl-C does and return its last words."""
+        """End a program as Ctrl-C does and return its last line."""
         job = self._jobs.get(kind)
         if job is None:
             return f"no {kind} was started here"
@@ -165,21 +140,17 @@ class Jobs:
         return job.last_line()
 
     def close(self) -> None:
-        """End everything."""
+        """End all programs."""
         for kind in list(self._jobs):
             self.stop(kind)
 
 
 class NewestPage:
-    """The newest page of a name, to be shown again only where it changed.
-
-    Args:
-        jobs: Provides the folder of runs.
-        page: Its file name.
+    """The newest page of a name, which is shown again only when it changed.
 
     Attributes:
-        folder: The run folder that holds it; None where none does.
-        written: When [s of the system clock].
+        folder: The run folder that holds it; None if there is none.
+        written: Time of writing [s of the system clock].
     """
 
     def __init__(self, jobs: Jobs, page: str) -> None:
@@ -189,7 +160,7 @@ class NewestPage:
         self.written = 0.0
 
     def changed(self) -> bool:
-        """Poll the folder; return whether the page is another one, or was rewritten, since the last poll."""
+        """Poll the folder; return whether the page changed since the last poll."""
         before = self.folder, self.written
         self.folder = self._jobs.newest(self._page)
         self.written = (self.folder / self._page).stat().st_mtime if self.folder is not None else 0.0

@@ -1,4 +1,4 @@
-"""The newest of what is drawn of each joint of a plant."""
+"""The newest values to draw of each joint of a plant."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pendulum_msgs_py.mechanisms import MECHANISMS
 __all__ = ["JointValues"]
 
 _FRESH = 0.3
-"""Age at which a torque counts as no longer sent [s]; plants take none that is older than 0.05 s."""
+"""Age at which a torque counts as ended [s]; plants accept none older than 0.05 s."""
 _CHAIN = MECHANISMS["double_pendulum"]
 _CART = MECHANISMS["cart_pole"]
 _ROTARY = MECHANISMS["furuta"]
 
 
 class JointValues:
-    """Positions, velocities and efforts of a plant's joints, each as it came last, by the joints' names."""
+    """The latest positions, velocities and efforts of a plant's joints, by name."""
 
     def __init__(self) -> None:
         self.stamp_ns = 0
@@ -28,7 +28,7 @@ class JointValues:
         self._efforts: dict[tuple[str, str], tuple[float, float]] = {}
 
     def take_state(self, fields: JointStateFields) -> None:
-        """Take a state; one without a position and a velocity for each joint is ignored."""
+        """Store a state; one without position and velocity for each joint is ignored."""
         if not fields.joints or not len(fields.joints) == len(fields.position) == len(fields.velocity):
             return
         if fields.joints != tuple(joint.name for joint in self._joints):
@@ -41,38 +41,27 @@ class JointValues:
             self._states[name] = {"theta": theta, "theta_dot": theta_dot, "measured": measured}
 
     def take_effort(self, kind: str, fields: JointStateFields, now: float) -> None:
-        """Take efforts of some joints.
-
-        Args:
-            kind: Their source: ``command``, ``disturbance`` or ``applied``.
-            fields: The message.
-            now: When it arrived [s].
-        """
-        # One effort without a name is for the one joint there is.
+        """Store efforts that arrived at ``now`` [s] as ``command``, ``disturbance`` or ``applied``."""
+        # One effort without a name is for the only joint.
         names = fields.joints or tuple(joint.name for joint in self._joints)
         for name, effort in zip(names, fields.effort, strict=False):
             self._efforts[name, kind] = (effort, now)
 
     def picture(self, now: float) -> dict[str, Any]:
-        """Return what a page draws: each joint with unit, upright position and values; an old torque is none.
-
-        Args:
-            now: The time [s].
-        """
+        """Return each joint with unit, upright position and values at time ``now`` [s], without old torques."""
         self._efforts = {key: known for key, known in self._efforts.items() if now - known[1] <= _FRESH}
         joints = []
         for joint in self._joints:
             efforts = {kind: effort for (name, kind), (effort, _) in self._efforts.items() if name == joint.name}
-            # JSON has no word for what is not finite: a page could read nothing more of the plant, nor of any other.
+            # JSON has no infinities or NaN: the page could read nothing more, of any plant.
             values = {key: value for key, value in {**self._states[joint.name], **efforts}.items() if isfinite(value)}
             joints.append({"name": joint.name, "unit": joint.unit, "goal": joint.goal, **values})
-        # Links that hang on each other, each angle from the link before, a pole on a cart, or a pendulum across the end
-        # of an arm: these are drawn whole.
+        # Drawn as a whole: links hanging on each other, a pole on a cart, a pendulum at the end of an arm.
         whole = {"chain": _CHAIN, "cart": _CART, "rotary": _ROTARY}
         return {"joints": joints, **{name: self._joints == plant.joints for name, plant in whole.items()}}
 
 
 def _joints(names: tuple[str, ...]) -> tuple[Joint, ...]:
-    """Return the joints of the mechanism that has joints of these names; of none that is known, hinges from 0."""
+    """Return the joints of the mechanism with these names, or hinges from 0 if none is known."""
     known = {tuple(joint.name for joint in one.joints): one.joints for one in MECHANISMS.values()}
     return known.get(names) or tuple(Joint(name) for name in names)

@@ -1,4 +1,4 @@
-"""The console's card of the last comparison: the answer in one sentence, and each layer's result."""
+"""The console's card of the last comparison: the verdict in one sentence, and each layer's result."""
 
 from __future__ import annotations
 
@@ -18,28 +18,24 @@ SUMMARY = "summary.json"
 
 
 def read_answer(folder: Path) -> dict[str, Any]:
-    """Return the answer that a run's summary holds, with ``sentence`` and ``layers``; empty where it holds none."""
+    """Return the verdict in a run's summary with ``sentence`` and ``layers``; empty if there is none."""
     try:
         answer = json.loads((folder / SUMMARY).read_text(encoding="utf-8")).get("answer", {})
         layers = [(one["name"], SIGNS[Mark(one["mark"])], one["sentence"]) for one in answer["layers"]]
         return {"sentence": str(answer["sentence"]), "layers": layers}
-    # A summary of an older version, or of something else that was put here, is none to show.
+    # A summary of another version, or another file, is not shown.
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
 
 
 class LayersCard:
-    """The answer, the four layers with their marks and reasons, and which run they are of.
-
-    Args:
-        jobs: Provides the folder of runs.
-    """
+    """The verdict and the four layers with marks and reasons of the run compared last."""
 
     def __init__(self, jobs: Jobs) -> None:
         self._newest = NewestPage(jobs, SUMMARY)
 
     def build(self) -> None:
-        """Lay it out, empty as long as no run was compared."""
+        """Build the card, hidden until a run was compared."""
         with ui.element("div").classes("certified") as self._place:
             ui.html("<h3>Is the simulation good enough to design a controller on?</h3>", sanitize=False)
             self._sentence = ui.label().props('role="status"')

@@ -1,4 +1,4 @@
-"""The console's page: what is seen, and what its buttons do. One object a client."""
+"""The console's page, one object per client."""
 
 from __future__ import annotations
 
@@ -26,24 +26,17 @@ python -m pendulum_sim simulator --ros-args -r __ns:=/sim
 python -m pendulum_hw_bridge bridge --ros-args -r __ns:=/hw -p backend:=emulator"""
 """Commands that start plants."""
 REFRESH_PERIOD = 0.5
-"""Time between two polls of what changes by itself [s]."""
+"""Period of polls of everything that changes [s]."""
 
 
 class _Card(NamedTuple):
-    """The elements of the page for one plant."""
-
     node: str
     section: ui.element
     choice: ControllerChoice
 
 
 class Layout:
-    """The page as one client sees it.
-
-    Args:
-        graph: The ROS graph.
-        jobs: Programs that the page may start.
-    """
+    """The page as one client sees it."""
 
     def __init__(self, graph: Graph, jobs: Jobs) -> None:
         self._graph = graph
@@ -59,7 +52,7 @@ class Layout:
         self._cards: dict[str, _Card] = {}
 
     def build(self) -> None:
-        """Lay the page out."""
+        """Build the page."""
         ui.add_head_html('<link rel="stylesheet" href="/console/console.css">')
         ui.add_body_html('<script src="/console/console.js"></script>')
         with ui.element("header").classes("bar"):
@@ -105,13 +98,8 @@ class Layout:
                 self._job_buttons()
         ui.timer(REFRESH_PERIOD, self._refresh)
 
-    # --- pieces --------------------------------------------------------------------------------------------
-
     def _show_plants(self, plants: Mapping[str, str]) -> None:
-        """Give each plant a card, the newest last; the card of a vanished plant stays.
-
-        No button may move by itself: a click while a plant appears or vanishes would hit another plant's button.
-        """
+        """Give each plant a card, the newest last; cards stay in place, so that no click hits another button."""
         for space, node in sorted(plants.items()):
             card = self._cards.get(space)
             if card is None:
@@ -132,12 +120,12 @@ class Layout:
                 card.section.classes(add="gone")
 
     def _plant_card(self, space: str, node: str) -> ControllerChoice:
-        """Make the buttons for one plant alone; return the choice of its controller."""
+        """Make one plant's buttons; return the choice of its controller."""
         _heading(space)
         with ui.row():
             _button("Arm", lambda: self._carefully(self._graph.arm(node, on=True)), filled=True, of=space)
             _button("Disarm", lambda: self._carefully(self._graph.arm(node, on=False)), of=space)
-            # The page's script sends it, as it does the e-stop of all: repeated until there is a response.
+            # The page's script sends it, like the e-stop of all: repeated until there is a response.
             _button("Stop", lambda: None, of=space, danger=True).props(f'data-stop="{node}"')
             _button("Reset e-stop", lambda: self._carefully(self._graph.reset(node)), of=space)
         with ui.row():
@@ -172,8 +160,6 @@ class Layout:
         link.set_visibility(False)
         self._job_labels[kind] = (label, link)
 
-    # --- actions -------------------------------------------------------------------------------------------
-
     async def _carefully(self, work: Awaitable[Any]) -> bool:
         try:
             answer = await work
@@ -189,7 +175,7 @@ class Layout:
             await self._carefully(self._graph.trigger(f"{space}/{service}"))
 
     async def _add_disturbances(self) -> None:
-        """Start a disturbance for each plant that has none; it adds no torque until it is started."""
+        """Start a disturbance node for each plant without one; it adds no torque until it is started."""
         spaces = [space for space in self._graph.plants() if not self._graph.has_node(f"{space}/disturbance")]
         if not spaces:
             self._notices.say("each plant has a disturbance already" if self._graph.plants() else "there is no plant")
@@ -197,7 +183,7 @@ class Layout:
             self._try(partial(self._jobs.disturb, space))
 
     def _ask_to_move(self, space: str, goal: str) -> None:
-        """Show what a plant will do, and start it on confirmation."""
+        """Describe a plant's motion, and start it on confirmation."""
         end = "the controller takes over" if goal == "upright" else "the plant is disarmed"
         with ui.dialog() as dialog, ui.card():
             ui.label(
@@ -223,10 +209,7 @@ class Layout:
     async def _finish(self, kind: str) -> None:
         self._notices.say(await asyncio.to_thread(self._jobs.stop, kind))
 
-    # --- what changes by itself ----------------------------------------------------------------------------
-
     async def _refresh(self) -> None:
-        """Show the plants that are there, the values in force, and the jobs."""
         plants = self._graph.plants()
         self._hint.set_visibility(not self._cards and not plants)
         self._show_plants(plants)
@@ -250,7 +233,7 @@ def _heading(text: str) -> None:
 def _button(
     text: str, work: Callable[[], Any], *, filled: bool = False, danger: bool = False, of: str = ""
 ) -> ui.button:
-    """Make a button with the contrast that WCAG AA requires, and the plant that it moves in its name."""
+    """Make a button with the contrast of WCAG AA and its plant in the accessible name."""
     button = ui.button(text, on_click=work, color=None).props("unelevated no-caps")
     button.classes("filled" if filled else "danger" if danger else "plain")
     return button.props(f'aria-label="{text} {of}"') if of else button

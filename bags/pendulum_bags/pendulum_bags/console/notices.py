@@ -1,4 +1,4 @@
-"""Notices of the page in reply to a click: text in its header, where it covers and moves no control."""
+"""Notices in reply to a click, in the page's header, where they cover and move no control."""
 
 from __future__ import annotations
 
@@ -9,32 +9,27 @@ from nicegui import ui
 __all__ = ["Notices"]
 
 _NEWEST = 3
-"""Notices that stand at once."""
+"""Notices visible at once."""
 _STAYS = {"bad": 15.0, "good": 4.0}
-"""How long a notice stays [s]: a refusal long enough to be read, acted on and read again."""
+"""Time for which a notice stays [s]: a refusal long enough to be read, acted on and read again."""
 
 _LONG_WORD = re.compile(r"(\S{60})\S{61,}(\S{60})")
-"""What was typed may be of any length; the words of a refusal, and the remedy in it, are shown whole."""
+"""Very long input is cut; the words of a refusal and its remedy are shown whole."""
 
 
 class Notices:
-    """The newest few notices, newest first; equal texts once, with their count."""
+    """The newest notices, newest first; equal texts once, with their count."""
 
     def __init__(self) -> None:
         self._said: dict[str, tuple[ui.element, int]] = {}
 
     def build(self) -> None:
-        """Make their place."""
-        # Longer ones scroll, also by keyboard; a screen reader reads them after its present text.
+        """Build the element."""
+        # Long notices scroll, also by keyboard; a screen reader reads them after its present text.
         self._place = ui.element("div").classes("notices").props('role="status" tabindex="0" aria-label="Notices"')
 
     def say(self, text: str, *, bad: bool = False) -> None:
-        """Show a notice.
-
-        Args:
-            text: One sentence.
-            bad: It is the reason of a refusal.
-        """
+        """Show a notice of one sentence; ``bad`` marks the reason of a refusal."""
         text = _LONG_WORD.sub(r"\1…\2", text)
         count = self._said[text][1] + 1 if text in self._said else 1
         self._forget(text)

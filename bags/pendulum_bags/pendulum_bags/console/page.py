@@ -30,23 +30,11 @@ _STATIC = Path(__file__).parent / "static"
 
 
 def serve(
-    graph: Graph,
-    jobs: Jobs,
-    *,
-    host: str,
-    port: int,
-    token: str = "",
-    ready: Callable[[], None] = lambda: None,
+    graph: Graph, jobs: Jobs, *, host: str, port: int, token: str = "", ready: Callable[[], None] = lambda: None
 ) -> None:
-    """Serve the page until SIGINT or SIGTERM.
+    """Serve the page until SIGINT or SIGTERM; ``ready`` is called when it can be opened.
 
-    Args:
-        graph: The ROS graph.
-        jobs: Programs that the page may start.
-        host: Address to listen on.
-        port: Port to listen on.
-        token: Token that every request needs; empty on loopback.
-        ready: Called when the page can be opened.
+    Every request needs the ``token``, which is empty on loopback. ``jobs`` are the programs that the page may start.
     """
 
     @asynccontextmanager
@@ -83,7 +71,7 @@ def serve(
                 now = time.monotonic()
                 picture = {"t": now, "server": server, "plants": graph.frame(), "stop": graph.stop_state()}
                 await socket.send_text(json.dumps(picture, separators=(",", ":")))
-                # Counted from the last due time: the work does not add to the period, and what was missed is missed.
+                # Counted from the last due time: the work does not add to the period, missed frames are skipped.
                 due = max(due + FRAME_PERIOD, now)
                 await asyncio.sleep(due - time.monotonic())
         except (WebSocketDisconnect, RuntimeError):
@@ -94,13 +82,8 @@ def serve(
         Layout(graph, jobs).build()
 
     ui.run_with(app, dark=None, show_welcome_message=False)
-    # Quasar's bar for requests has no name for a screen reader, and adds nothing to the page.
+    # Quasar's request bar has no name for a screen reader, and adds nothing to the page.
     pages.config.quasar_config["loadingBar"]["skipHijack"] = True
     uvicorn.run(
-        Guard(app, token),
-        host=host,
-        port=port,
-        log_level="warning",
-        timeout_graceful_shutdown=1,
-        ws_max_size=65536,
+        Guard(app, token), host=host, port=port, log_level="warning", timeout_graceful_shutdown=1, ws_max_size=65536
     )

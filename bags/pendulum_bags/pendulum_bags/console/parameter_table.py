@@ -1,4 +1,4 @@
-"""Parameters of the same kind of node of every plant: a row a parameter, a column a plant, differences marked."""
+"""Parameters of one kind of node: a row per parameter, a column per plant, differences marked."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from pendulum_msgs_py.errors import FaultError, PendulumError
 __all__ = ["ParameterTable", "parse_value", "show_value"]
 
 _HIDDEN = frozenset({"start_type_description_service", "use_sim_time", "autostart", "autoactivate", "command_type"})
-"""Parameters that are no matter of the running experiment."""
+"""Parameters that do not concern the running experiment."""
 _ALL = "all plants"
 _SMALLEST, _LARGEST = -(2**63), 2**63 - 1
-"""What a parameter of ROS holds as a whole number."""
+"""Range of ROS's integer parameters."""
 _UNIT = re.compile(r"\[[^]]+\]$")
 
 
@@ -31,11 +31,7 @@ def show_value(value: Any) -> str:
 
 
 def parse_value(text: str, like: Any) -> Any:
-    """Return the input, as the type of the value in force.
-
-    Raises:
-        FaultError: It is none of that type.
-    """
+    """Return the input as the type of the present value; a FaultError if it is not one."""
     text = text.strip()
     try:
         if isinstance(like, bool):
@@ -53,13 +49,7 @@ def parse_value(text: str, like: Any) -> Any:
 
 
 class ParameterTable:
-    """The table for one kind of node, such as ``controller``.
-
-    Args:
-        graph: The ROS graph.
-        kind: Name of the node of each plant.
-        carefully: Awaits work and shows its errors.
-    """
+    """The table for one kind of node, such as ``controller``; ``carefully`` awaits work and shows its errors."""
 
     def __init__(self, graph: Graph, kind: str, carefully: Callable[[Awaitable[Any]], Awaitable[bool]]) -> None:
         self._graph = graph
@@ -71,11 +61,11 @@ class ParameterTable:
         self._drawn: Any = None
 
     def build(self) -> None:
-        """Make the place of the table."""
+        """Build the table's element."""
         self._place = ui.element("div").classes("parameters")
 
     async def refresh(self, spaces: Sequence[str]) -> None:
-        """Show the values in force, whichever client set them; redraw when nodes appear or vanish."""
+        """Show the present values, whichever client set them; redraw when nodes appear or vanish."""
         known = {space: values for space in spaces if (values := self._graph.parameters.get(f"{space}/{self._kind}"))}
         drawn = {space: sorted(values) for space, values in known.items()}
         if drawn != self._drawn:
@@ -154,7 +144,7 @@ class ParameterTable:
             self._fields[space, name] = field
 
     async def _set(self, space: str, name: str, text: str) -> None:
-        """Set a parameter; what the node refuses is shown with its reason, and the value in force comes back."""
+        """Set a parameter; after a refusal its reason is shown and the present value returns."""
         node = f"{space}/{self._kind}"
         values = self._graph.parameters.get(node, {})
         if name in values and text:
@@ -164,7 +154,7 @@ class ParameterTable:
                 await self._carefully(_raise(error))
             else:
                 await self._carefully(self._graph.set_parameter(node, name, value))
-        # Dropped, so that the next poll shows the value in force: also after an emptied field or a refusal.
+        # Dropped, so that the next poll shows the present value, also after an emptied field or a refusal.
         self._shown.pop((space, name), None)
 
 

@@ -28,16 +28,7 @@ def is_loopback(host: str) -> bool:
 
 
 def listen(host: str, port: int, backlog: int = 1) -> socket.socket:
-    """Return a socket that listens.
-
-    Args:
-        host: Address of this machine.
-        port: Port; 0 for any.
-        backlog: How many may wait to be accepted.
-
-    Raises:
-        ParameterError: The address or the port is not available.
-    """
+    """Return a listening socket, port 0 for any; a ParameterError if address or port are not available."""
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address[:2], family=family, backlog=backlog)
@@ -54,15 +45,10 @@ def listen(host: str, port: int, backlog: int = 1) -> socket.socket:
 
 
 def refusal(headers: dict[str, str], query: str, token: str) -> str:
-    """Return why a request is refused, or an empty text.
+    """Return why a request is refused, or an empty text; ``headers`` are by lower-case name.
 
     A page of another site in the same browser could otherwise send requests (with its own ``Origin``), or impersonate
-    the console under a name that it resolves to this machine (``Host``).
-
-    Args:
-        headers: Headers by their names in lower case.
-        query: Query of the address.
-        token: Token of a request from another machine; empty where only loopback is served.
+    the console under a name that it resolves to this machine (``Host``). ``token`` is empty if only loopback is served.
     """
     host = headers.get("host", "")
     name = urlsplit(f"//{host}").hostname or ""
@@ -79,12 +65,7 @@ def refusal(headers: dict[str, str], query: str, token: str) -> str:
 
 
 class Guard:
-    """ASGI middleware that calls :func:`refusal` before every request and every websocket.
-
-    Args:
-        app: The application behind it.
-        token: Token that other machines need; empty for loopback only.
-    """
+    """ASGI middleware that calls :func:`refusal` before every request and websocket."""
 
     def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], token: str = "") -> None:
         self._app = app
@@ -108,7 +89,7 @@ class Guard:
             await send({"type": "http.response.body", "body": reason.encode()})
 
     def _keep(self, send: Send) -> Send:
-        """Return the token as a cookie, so that the page's own requests carry it."""
+        """Return a ``send`` with the token as a cookie, so that the page's own requests carry it."""
         if not self._token:
             return send
 

@@ -1,8 +1,7 @@
 """A stop that stays in force: repeated to every plant until each has confirmed and the operator acknowledges.
 
-A plant may be frozen, restarting or unreachable when the stop is pressed. So a press is not a request but an order:
-every plant that is known, or appears while the order stands, gets requests until it confirms, and further ones in case
-it restarts. Each response is shown until the operator acknowledges it.
+A plant may be frozen, restarting or unreachable at the time of the stop. So every plant that is known, or appears
+meanwhile, gets requests until it confirms, and further ones in case it restarts.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ ASK_AGAIN = 0.2
 CONFIRM_AGAIN = 0.5
 """Period of requests to a plant that has confirmed: it may have restarted [s]."""
 SILENT_AFTER = 1.5
-"""Age of the newest response from which on a plant counts as silent [s]."""
+"""Age of the newest response at which a plant counts as silent [s]."""
 
 
 @dataclass
@@ -33,7 +32,7 @@ class _Row:
 
 
 class StopOrder:
-    """The plants to stop, and their responses. Independent of ROS and of a clock."""
+    """The plants to stop, and their responses, independent of ROS. Plants are node names, ``now`` is in [s]."""
 
     def __init__(self) -> None:
         self._rows: dict[str, _Row] = {}
@@ -47,12 +46,7 @@ class StopOrder:
         return self._pressed is not None
 
     def press(self, plants: Iterable[str], now: float) -> None:
-        """Order every plant to stop.
-
-        Args:
-            plants: Node names of the plants on the graph; those of an order in force stay in it.
-            now: Time [s].
-        """
+        """Order the plants on the graph, and those of an order in force, to stop."""
         self._pressed = now
         self._everybody = True
         self._left_alone.clear()
@@ -60,23 +54,13 @@ class StopOrder:
             self._rows[plant] = _Row(now)
 
     def press_one(self, plant: str, now: float) -> None:
-        """Order one plant to stop, whether it is on the graph or not; orders to others stand.
-
-        Args:
-            plant: Its node name.
-            now: Time [s].
-        """
+        """Order one plant to stop, whether it is on the graph or not; orders to others remain."""
         self._pressed = now
         self._left_alone.discard(plant)
         self._rows[plant] = _Row(now)
 
     def due(self, plants: Iterable[str], now: float) -> list[str]:
-        """Return the plants to request a stop of now, and record the requests.
-
-        Args:
-            plants: Node names of the plants on the graph. New ones are stopped too while an order to all stands.
-            now: Time [s].
-        """
+        """Record and return the plants to request a stop of now; an order to all includes new plants."""
         if self._pressed is None:
             return []
         for plant in plants if self._everybody else ():
@@ -122,11 +106,11 @@ class StopOrder:
         return list(self._rows)
 
     def state(self, now: float) -> dict[str, Any] | None:
-        """Return what the operator has to see; None where no stop is in force.
+        """Return the state to show; None without a stop in force.
 
-        That is the time since the press [s], whether it was for all plants, and a row for each plant. A row's
-        ``state`` is ``asked`` (no response yet), ``stopped`` or ``silent`` (once confirmed, no longer), its ``after``
-        the time from the press to the first response and ``silent_for`` the time without one [s].
+        ``since`` is the time since the order [s], ``all`` whether it was for all plants. A row's ``state`` is ``asked``
+        (no response yet), ``stopped`` or ``silent`` (once confirmed, no longer), ``after`` the time to the first
+        response and ``silent_for`` that since the last [s].
         """
         if self._pressed is None:
             return None

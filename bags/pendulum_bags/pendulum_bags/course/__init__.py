@@ -1,1 +1,1 @@
-"""A course in six exercises: hidden plants from a seed, and checks of the answers."""
+"""A course in six exercises: hidden plants from a seed, and checks of the results."""

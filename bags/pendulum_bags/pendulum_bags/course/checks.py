@@ -1,4 +1,4 @@
-"""Judges the answer to each exercise, by the project's own model, analysis and emulator."""
+"""Judges the result of each exercise, by the project's own model, analysis and emulator."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ WEIGHTS = (100.0, 0.01)
 """Q of every loop of which only R is given."""
 PERIOD = {"sim": HOLD_STEP, "hw": 0.01}
 PLANT_TOLERANCES = {"inertia": 0.03, "gravity": 0.03, "damping": 0.15, "coulomb_friction": 0.15}
-"""Share by which each parameter of the hidden plant may be off."""
+"""Relative tolerance of each parameter of the hidden plant."""
 _TIME_TOLERANCE = 0.05
 _DELAY_TOLERANCE = 0.05
 _RATIO_TOLERANCE = 0.2
@@ -50,40 +50,27 @@ _RATIO_TOLERANCE = 0.2
 _STOPPED_WITHIN = 0.06
 """Time from the bridge's fault to zero torque [s], as its README promises."""
 _WATCHED = 0.5
-"""How long the recording must continue after the fault, to show that the torque stays zero [s]."""
+"""Required recording after the fault, to show that the torque stays zero [s]."""
 _LONGEST_GAP = 0.12
-"""Longest time without a torque in the recording around the fault [s].
-
-A bridge at 100 Hz publishes one each 10 ms; on two busy cores gaps of 66 ms occurred.
-"""
+"""Longest time without a torque in the recording around the fault [s].  A bridge at 100 Hz publishes one each 10 ms; on
+two busy cores gaps of 66 ms occurred."""
 _LEAST_RATE = 30.0
-"""Fewest torques a second [Hz]: a third of the bridge's, since a busy computer skips periods."""
+"""Fewest torques per second [Hz]: a third of the bridge's, since a busy computer skips periods."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Whether an answer is right, and a sentence with the reason.
-
-    Attributes:
-        right: Whether it is.
-        reason: A sentence, with numbers and units; it does not give the answer away.
-    """
+    """Whether a result is right, and a sentence with the reason, which does not reveal the solution."""
 
     right: bool
     reason: str
 
     def __str__(self) -> str:
-        """Return the judgement as text."""
         return f"{'right' if self.right else 'wrong'}: {self.reason}"
 
 
 def check_gains(tasks: Tasks, q: Sequence[float], r: float) -> Judgement:
-    """Judge the weights of an LQR on the thesis's plant by the time constant of its loop.
-
-    Args:
-        tasks: The tasks.
-        q: Diagonal of Q [1/rad^2, s^2/rad^2].
-        r: R [1/(N m)^2].
+    """Judge LQR weights, Q's diagonal [1/rad^2, s^2/rad^2] and R [1/(N m)^2], by their loop's time constant.
 
     Raises:
         DesignError: The weights make no design.
@@ -98,12 +85,7 @@ def check_gains(tasks: Tasks, q: Sequence[float], r: float) -> Judgement:
 
 
 def check_plant(truth: PlantParameters, found: PlantParameters) -> Judgement:
-    """Judge an identified plant by the hidden one, without revealing it.
-
-    Args:
-        truth: The hidden plant.
-        found: What the student identified.
-    """
+    """Judge an identified plant by the hidden one, without revealing it."""
     units = {spec.name: spec.unit for spec in PLANT_SPECS}
     off = [
         name
@@ -120,12 +102,7 @@ def check_plant(truth: PlantParameters, found: PlantParameters) -> Judgement:
 
 
 def check_delay(tasks: Tasks, delay: float) -> Judgement:
-    """Judge a delay at which the loop at 100 Hz becomes unstable.
-
-    Args:
-        tasks: The tasks.
-        delay: The answer [s].
-    """
+    """Judge the delay [s] at which the loop at 100 Hz becomes unstable."""
     _require_positive("delay", delay, "s")
     edge = critical_delay(tasks)
     stands = "still stands" if delay < edge else "has fallen"
@@ -136,15 +113,9 @@ def check_delay(tasks: Tasks, delay: float) -> Judgement:
 
 
 def check_noise(tasks: Tasks, ratio: float, cause: str) -> Judgement:
-    """Judge by how much noise that is held longer moves the pendulum more, and the explanation chosen.
+    """Judge the factor by which longer hold times of noise increase theta's standard deviation, and its cause.
 
-    Args:
-        tasks: The tasks.
-        ratio: Standard deviation of theta with the longer hold, over that with 2 ms [-].
-        cause: a, b, c or d.
-
-    Raises:
-        ParameterError: The cause is another letter.
+    The factor is relative to 2 ms [-]; a ParameterError if the cause is not a, b, c or d.
     """
     _require_positive("ratio", ratio, "")
     letters = "abcd"[: len(tasks.causes)]
@@ -160,16 +131,7 @@ def check_noise(tasks: Tasks, ratio: float, cause: str) -> Judgement:
 
 
 def check_fault(tasks: Tasks, bag: Path) -> Judgement:
-    """Judge a recording of the bridge in which it was driven into the required fault.
-
-    Args:
-        tasks: The tasks.
-        bag: The recording.
-
-    Raises:
-        BagError: The recording cannot be read.
-        DataError: It has no plant, or no torque.
-    """
+    """Judge a recording of the bridge's fault; a BagError if unreadable, a DataError without plant or torque."""
     with read_bag(bag) as content:
         space = find_prefix(content)
         events = [event for event in content.events() if event["topic"].startswith(f"{space}/")]
@@ -213,12 +175,10 @@ def _percent(share: float) -> str:
 
 
 def _what_is_missing(since: Any, untold: Any, until: float) -> str:
-    """Return which torques a recording lacks around a fault, empty for none: what it leaves out may have acted.
+    """Return which torques a recording lacks around a fault, empty for none: missing ones may have acted.
 
-    Args:
-        since: Times of the torques after the fault [s].
-        untold: Times of the states that have no torque [s].
-        until: Time at which the bridge was armed again [s].
+    Times of torques (``since``), of states without one (``untold``) and of the next arming (``until``) are [s] after
+    it.
     """
     start, end = -_STOPPED_WITHIN, min(until, _WATCHED)
     watched = np.sort(since[(since > start) & (since <= end)])
@@ -238,12 +198,7 @@ def _what_is_missing(since: Any, untold: Any, until: float) -> str:
 def time_constant(q: Sequence[float], r: float) -> float:
     """Return the time constant of an LQR's loop around the thesis's plant [s].
 
-    Args:
-        q: Diagonal of Q [1/rad^2, s^2/rad^2].
-        r: R [1/(N m)^2].
-
-    Raises:
-        DesignError: The weights make no design.
+    ``q`` is Q's diagonal [1/rad^2, s^2/rad^2], ``r`` R [1/(N m)^2]. Raises a DesignError if they make no design.
     """
     model = _thesis_model()
     return float(-1.0 / closed_loop_poles(model, continuous_lqr(model, list(q), r).K).real.max())
@@ -253,7 +208,7 @@ def time_constant(q: Sequence[float], r: float) -> float:
 def critical_delay(tasks: Tasks) -> float:
     """Return the delay at which the sampled loop at 100 Hz becomes unstable [s]."""
     model, gain = _thesis_model(), _gain(tasks.delay_weight)
-    # Continuous control tolerates a little more; every step costs the eigenvalues of a loop with that many delays.
+    # Continuous control tolerates slightly more; every step costs the eigenvalues of a loop with that many delays.
     low, high = 0.5 * (margin := loop_margins(model, gain).delay), 1.1 * margin
     for _ in range(10):
         middle = 0.5 * (low + high)
@@ -269,16 +224,10 @@ def noise_ratio(tasks: Tasks) -> float:
 
 
 def std_under_held_noise(hold_time: float) -> float:
-    """Return the standard deviation of theta of the thesis's loop under uniform noise of 2.5 N m, for an endless run.
+    """Return the standard deviation of theta of the thesis's loop under endless uniform noise of 2.5 N m [rad].
 
-    The covariance at the moments at which the noise changes solves P = A P A' + B B' var; between them it is carried
-    on, and averaged.
-
-    Args:
-        hold_time: How long each sample of the noise is held, a multiple of 2 ms [s].
-
-    Returns:
-        Standard deviation [rad].
+    The covariance when the noise changes solves P = A P A' + B B' var; in between it is propagated and averaged.
+    ``hold_time`` of a noise sample is a multiple of 2 ms [s].
     """
     import scipy.linalg
 

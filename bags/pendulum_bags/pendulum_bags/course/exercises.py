@@ -1,4 +1,4 @@
-"""The exercises of a course as text, with the numbers of its seed, and their answers."""
+"""The exercises of a course as text, with the numbers of its seed, and their solutions."""
 
 from __future__ import annotations
 
@@ -79,12 +79,7 @@ End the recording with Ctrl-C, a second or more after the fault.
 
 
 def exercises_text(tasks: Tasks, course: str) -> str:
-    """Return the exercises as Markdown.
-
-    Args:
-        tasks: The numbers.
-        course: The course's folder, for the commands.
-    """
+    """Return the exercises as Markdown; ``course`` is the course's folder, for the commands."""
     causes = "\n".join(f"- **{letter}**: {CAUSES[name]}" for letter, name in zip("abcd", tasks.causes, strict=True))
     return _TEXT.format(
         time_constant=tasks.time_constant,
@@ -101,7 +96,7 @@ def exercises_text(tasks: Tasks, course: str) -> str:
 
 
 def answers(tasks: Tasks, plant: PlantParameters) -> dict[str, str]:
-    """Return the answer to each exercise as text, for the teacher."""
+    """Return the solution of each exercise as text, for the teacher."""
     units = {spec.name: spec.unit for spec in PLANT_SPECS}
     named = ("inertia", "damping", "gravity", "coulomb_friction")
     winner = "a" if tasks.controller_a > tasks.controller_b else "b"

@@ -22,10 +22,8 @@ FAULTS = {
     "module_restarted": "module_reboot",
     "motion_disagreement": "position_frozen",
 }
-"""Faults that the last exercise may require, with the emulator's fault that leads to each.
-
-Frozen feedback is none of them: a bridge without measurements publishes no torque, so no recording shows it.
-"""
+"""Faults that the last exercise may require, with the emulator's fault that leads to each.  Frozen feedback is not
+among them: a bridge without measurements publishes no torque, so no recording shows it."""
 CAUSES = {
     "power": "noise that is held longer has more power at low frequencies, and the loop answers to those alone",
     "plant": "the machine is less damped than its model",
@@ -34,7 +32,7 @@ CAUSES = {
 }
 """Explanations that the fourth exercise offers; the first is the right one."""
 _KEPT_FROM_THESIS = 0.05
-"""The first exercise has no time constant this near to that of the thesis, which the documentation has [s]."""
+"""Least distance of the first exercise's time constant from the thesis's, which the documentation has [s]."""
 _THESIS_TIME_CONSTANT = 0.372
 _LIMITS = {
     "time_constant": (0.05, 5.0, "s"),
@@ -44,11 +42,11 @@ _LIMITS = {
     "controller_b": (1e-5, 0.1, "1/(N m)^2"),
     "noise_seed": (1, 10**9, ""),
 }
-"""Range and unit of each number, wider than what is drawn: with these every exercise has an answer."""
+"""Range and unit of each number, wider than the draws: every exercise has a solution within it."""
 HOLD_STEP = 0.002
-"""What a hold time is a multiple of: the period of the simulation [s]."""
+"""A hold time is a multiple of the simulation's period [s]."""
 _HARD = ((5e-5, 8e-5), (8e-4, 2e-3))
-"""Ranges of R of the two controllers of the fifth exercise: one that is too quick for the machine, one that is not."""
+"""Ranges of R of the fifth exercise's controllers: one too quick for the machine, one not."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +57,11 @@ class Tasks:
         time_constant: To design for [s].
         delay_weight: R of the loop whose largest delay is to be found [1/(N m)^2].
         hold_time: Hold time of the noise that is compared with 2 ms [s].
-        causes: Names in ``CAUSES``, in the order in which they are offered as a, b, c, d.
+        causes: Names in ``CAUSES``, in the order of a, b, c, d.
         controller_a: R of controller A [1/(N m)^2].
         controller_b: R of controller B [1/(N m)^2].
-        noise_seed: Noise under which A and B are compared.
-        fault: The fault that the bridge has to report.
+        noise_seed: Seed of the noise under which A and B are compared.
+        fault: The fault that the bridge must report.
     """
 
     time_constant: float
@@ -101,7 +99,7 @@ def draw_plant(seed: int) -> PlantParameters:
     prior = load_plant("dfki")
 
     def far(factor: float) -> float:
-        # Never so near to what the pages print that nothing has to be identified.
+        # Never so near to the published values that nothing has to be identified.
         return float(factor ** (generator.uniform(0.4, 1.0) * generator.choice([-1.0, 1.0])))
 
     factors = {"inertia": far(1.25), "gravity": far(1.25), "damping": far(2.0)}
@@ -118,11 +116,7 @@ def write_tasks(path: Path, tasks: Tasks) -> None:
 
 
 def read_tasks(path: Path) -> Tasks:
-    """Return the tasks of a file that :func:`write_tasks` wrote.
-
-    Raises:
-        ParameterError: There is no such file, or it holds something else.
-    """
+    """Return the tasks of a file of :func:`write_tasks`; a ParameterError if it is missing or another."""
     content = load_yaml(path, "course file")
     names = [field.name for field in fields(Tasks)]
     reject_unknown(content, ("format", *names), where=str(path))

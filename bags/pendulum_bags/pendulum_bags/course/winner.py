@@ -1,4 +1,4 @@
-"""Which of two controllers wins on the emulated machine: both are run there, under one noise, and judged by theta."""
+"""Which of two controllers wins on the emulated machine: both run there under one noise, judged by theta."""
 
 from __future__ import annotations
 
@@ -21,17 +21,10 @@ DURATION = 5.0
 
 
 def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], None] = lambda name: None) -> Judgement:
-    """Run both controllers on the emulated machine, and judge the predicted winner.
+    """Run both controllers on the emulated machine, and judge the predicted winner ``name``, a or b.
 
-    Args:
-        tasks: The tasks.
-        name: a or b.
-        folder: For the recordings.
-        on_run: Called with the name of each controller before it runs.
-
-    Raises:
-        ParameterError: The name is another.
-        FaultError: A program ended or did not respond.
+    ``on_run`` is called with a controller's name before it runs. Raises a ParameterError for another name, a FaultError
+    if a program ended or did not respond.
     """
     weights = {"a": tasks.controller_a, "b": tasks.controller_b}
     if name not in weights:
@@ -50,15 +43,10 @@ def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], 
 
 
 def spread_on_machine(bag: Path, r: float, seed: int, hosts: HostPool | None = None) -> float:
-    """Return the standard deviation of theta that an LQR leaves on the emulated machine under noise of 2.5 N m [rad].
+    """Return the standard deviation of theta of an LQR on the emulated machine under noise of 2.5 N m [rad].
 
-    It is inf where the bridge faults, which counts as a loss.
-
-    Args:
-        bag: Folder of the recording.
-        r: R of the LQR [1/(N m)^2].
-        seed: Of the noise.
-        hosts: As for :func:`pendulum_bags.experiments.lockstep.record_run`.
+    ``r`` is R [1/(N m)^2], ``seed`` of the noise, ``hosts`` as for
+    :func:`pendulum_bags.experiments.lockstep.record_run`. Returns inf if the bridge faults, which counts as a loss.
     """
     spec = RunSpec(
         side="hw",
@@ -71,7 +59,7 @@ def spread_on_machine(bag: Path, r: float, seed: int, hosts: HostPool | None = N
     try:
         recorded = record_run(bag, spec, hosts=hosts)
     except PlantStoppedError as error:
-        # The bridge's own fault is a result; a stop from outside, or a program that did not start, is none.
+        # The bridge's own fault is a result; a stop from outside, or a program that did not start, is not.
         if error.mode == "fault":
             return math.inf
         raise

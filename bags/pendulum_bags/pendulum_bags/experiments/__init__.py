@@ -1,1 +1,1 @@
-"""Experiments: programs started, conducted over DDS, recorded, compared and always put back to rest."""
+"""Experiments: programs started, orchestrated over DDS, recorded, compared and always returned to rest."""

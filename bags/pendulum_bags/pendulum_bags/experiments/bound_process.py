@@ -22,14 +22,10 @@ def start_bound_process(
     niceness: int = 0,
     pass_fds: Sequence[int] = (),
 ) -> subprocess.Popen[bytes]:
-    """Start a program in a process group of its own, so that this process passes Ctrl-C on, in order.
+    """Start a program in a process group of its own, to which this process passes Ctrl-C in order.
 
-    Args:
-        command: Program and arguments.
-        environment: All of its variables.
-        output: Receives its output.
-        niceness: Scheduling priority to give away, or to take where it is negative and permitted.
-        pass_fds: Descriptors that it keeps open.
+    ``environment`` is complete; ``niceness`` is priority to give away, or to take if negative and permitted; the
+    program inherits ``pass_fds``.
     """
     return subprocess.Popen(
         list(command),
@@ -46,10 +42,10 @@ def start_bound_process(
 
 def _set_priority(niceness: int) -> Callable[[], None]:
     def set_priority() -> None:
-        # Taking priority is a privilege; without it the run is as good as the machine is idle.
+        # Raising priority is a privilege; without it the run is as good as the machine is idle.
         with contextlib.suppress(PermissionError):
             os.nice(niceness)
-        # Where Linux shares the cores among sessions first (autogroup), a session goes or stays behind as a whole.
+        # Where Linux shares the cores among sessions first (autogroup), the whole session changes priority.
         if now := os.getpriority(os.PRIO_PROCESS, 0):
             with contextlib.suppress(OSError):
                 Path("/proc/self/autogroup").write_text(str(now), encoding="ascii")

@@ -1,4 +1,4 @@
-"""The node that conducts an experiment: it arms plants, moves them, switches controllers and disturbances."""
+"""The node that orchestrates an experiment: it arms plants, moves them, switches controllers and disturbances."""
 
 from __future__ import annotations
 
@@ -40,20 +40,21 @@ _QUIET_POLLS = 3
 _SILENCE = 5.0
 """Time of listening without a state after which a plant in real time counts as gone [s]."""
 _MATCHING = 1.0
-"""Longest wait for listeners on the graph to match with a publisher [s]."""
+"""Longest wait for subscribers on the graph to match a publisher [s]."""
 _T = TypeVar("_T")
 
 
 class Conductor:
     """An rclpy context and node, spun only while waiting; Ctrl-C ends any wait at once.
 
+    Waiting and calling raise FaultError on a timeout.
+
     Args:
-        domain: ROS domain.
         watch: Called between two slices of waiting; raises to end the experiment (a process has died).
-        on_wait: Called between two slices with nothing to do but show progress.
+        on_wait: Called between two slices, to show progress.
 
     Attributes:
-        listened: For how long it has spun [s]; a pause of this program does not count.
+        listened: Total time of spinning [s], without pauses of this program.
         after_listening: Called after each slice of spinning, for occasional checks.
     """
 
@@ -87,22 +88,15 @@ class Conductor:
             rclpy.try_shutdown(context=self.context)
 
     def spin(self, duration: float) -> None:
-        """Do nothing but listen for a while [s]."""
+        """Only listen for a while [s]."""
         deadline = time.monotonic() + duration
         while (left := deadline - time.monotonic()) > 0:
             self._slice(min(_SLICE, left))
 
     def wait_for(self, what: str, predicate: Callable[[], _T], timeout: float, *, until: Future | None = None) -> _T:
-        """Wait until a predicate holds and return its value.
+        """Wait, at most ``timeout`` [s], until a predicate, evaluated between slices, holds; return its value.
 
-        Args:
-            what: What is waited for, for the message.
-            predicate: Evaluated between slices.
-            timeout: Longest time to wait [s].
-            until: Ends a slice when it is done, so that the predicate is evaluated at once.
-
-        Raises:
-            FaultError: It did not hold in time.
+        ``what`` is named in the error; ``until`` ends a slice when done, so that the predicate is evaluated at once.
         """
         deadline = time.monotonic() + timeout
         while not (value := predicate()):
@@ -112,27 +106,19 @@ class Conductor:
         return value
 
     def call(self, client: Client, request: Any, what: str, timeout: float = 10.0) -> Any:
-        """Call a service and return its response.
-
-        Raises:
-            FaultError: The service is missing or does not respond in time.
-        """
+        """Call a service and return its response."""
         self.wait_for_service(client, timeout)
         future = client.call_async(request)
         self.wait_for(what, future.done, timeout, until=future)
         return future.result()
 
     def wait_for_service(self, client: Client, timeout: float) -> None:
-        """Wait until the program that offers a service is there.
-
-        Raises:
-            FaultError: It does not come in time [s].
-        """
+        """Wait until a service is available, at most ``timeout`` [s]."""
         what = f"service {client.srv_name} (of a program that does not run, or stands still)"
         self.wait_for(what, client.service_is_ready, timeout)
 
     def listen(self, duration: float, until: Future | None = None) -> None:
-        """Handle what arrives within a duration [s], or until a future is done, without asking whether all is well."""
+        """Handle what arrives within a duration [s], or until a future is done, without further checks."""
         began = time.monotonic()
         self._executor.spin_until_future_complete(Future(executor=None) if until is None else until, duration)
         # A pause of this program does not count.
@@ -147,10 +133,11 @@ class Conductor:
 
 
 class PlantClient:
-    """One plant with its controller and its disturbance, as the conductor sees them.
+    """One plant with its controller and its disturbance, as the orchestrator sees them.
+
+    Methods raise FaultError if a service is missing, refuses (with its reason) or does not respond in time.
 
     Args:
-        conductor: The orchestrator.
         namespace: Namespace of the plant's topics, such as ``/sim``.
         plant: Name of the plant's node.
         controller: Name of its controller's node, empty for none.
@@ -170,7 +157,7 @@ class PlantClient:
     ) -> None:
         node = conductor.node
         self.conductor = conductor
-        # The root, too, has names that begin with one slash.
+        # Names in the root namespace begin with one slash, too.
         self.namespace = namespace = namespace.rstrip("/")
         self.sample: JointSample | None = None
         self._foreign_joints: tuple[str, ...] = ()
@@ -193,11 +180,11 @@ class PlantClient:
 
     @property
     def is_heard(self) -> bool:
-        """Whether any of its states has arrived, of whichever joints."""
+        """Whether any of its states has arrived, of any joints."""
         return self.sample is not None or bool(self._foreign_joints)
 
     def watch(self) -> None:
-        """Subscribe to the plant's states, and poll the newest: no callback runs for each of them."""
+        """Subscribe to the plant's states and poll the newest, without a callback for each."""
         self._watching = self.conductor.node.create_polled_input(
             JointState, f"{self.namespace}/{names.JOINT_STATES}", qos.NEWEST_STATE
         )
@@ -215,11 +202,7 @@ class PlantClient:
             self._watching.take(self._on_state)
 
     def wait_until_ready(self, timeout: float, *, controller: bool = True, disturbance: bool = True) -> None:
-        """Wait until states flow and all services and the trajectory topic are there.
-
-        Raises:
-            FaultError: One of them does not come in time, or the states are those of other joints.
-        """
+        """Wait until states of the right joints arrive and all services and the trajectory topic are there."""
         wait = self.conductor.wait_for
         wait(f"states on {self.namespace}/{names.JOINT_STATES}", self._has_state, timeout)
         clients = [self._arm, self._e_stop]
@@ -234,11 +217,7 @@ class PlantClient:
         )
 
     def wait_until_moves_are_recorded(self, timeout: float) -> None:
-        """Wait until a recorder is matched with the trajectory publisher, and the match is known at both ends.
-
-        Raises:
-            FaultError: No recorder appears in time [s].
-        """
+        """Wait until a recorder is matched with the trajectory publisher, at both ends, at most ``timeout`` [s]."""
         topic, node = f"{self.namespace}/{names.JOINT_TRAJECTORY}", self.conductor.node
 
         def listeners() -> list[tuple[str, str]]:
@@ -262,14 +241,7 @@ class PlantClient:
         return self.sample is not None
 
     def arm(self, timeout: float = 10.0) -> None:
-        """Arm the plant.
-
-        Args:
-            timeout: Longest time until it responds [s]; a bridge offers the service before it is connected.
-
-        Raises:
-            FaultError: It refuses, and the message has its reason; or it does not respond in time.
-        """
+        """Arm the plant; a bridge offers the service before it is connected, so ``timeout`` [s] may be long."""
         response = self.conductor.call(self._arm, SetBool.Request(data=True), f"{self.namespace} to arm", timeout)
         if not response.success:
             raise FaultError(f"{self.namespace} does not arm: {response.message}")
@@ -279,22 +251,18 @@ class PlantClient:
         self.conductor.call(self._arm, SetBool.Request(data=False), f"{self.namespace} to disarm")
 
     def call(self, service: str) -> None:
-        """Call a Trigger service of another node in the plant's namespace, such as ``procedure/start``.
-
-        Raises:
-            FaultError: It is missing, or refuses.
-        """
+        """Call a Trigger service of another node in the plant's namespace, such as ``procedure/start``."""
         client = self.conductor.node.create_client(Trigger, f"{self.namespace}/{service}")
         response = self.conductor.call(client, Trigger.Request(), f"{self.namespace}/{service}")
         if not response.success:
             raise FaultError(f"{self.namespace}/{service} refuses: {response.message}")
 
     def resume(self, timeout: float) -> None:
-        """Let a paused plant go."""
+        """Resume a paused plant."""
         self.conductor.call(self._pause, SetBool.Request(data=False), f"{self.namespace} to go on", timeout)
 
     def disarm_quietly(self) -> None:
-        """Disarm on the way out, where a plant without response must not prevent others from being disarmed."""
+        """Disarm on the way out; a plant without response must not prevent others from being disarmed."""
         if not self._arm.service_is_ready():
             return
         future = self._arm.call_async(SetBool.Request(data=False))
@@ -318,9 +286,8 @@ class PlantClient:
     def trajectory_finished(self) -> bool:
         """Return whether the last requested move has ended.
 
-        Raises:
-            PlantStoppedError: The plant faulted, or was stopped or disarmed.
-            FaultError: It refused the move, or is silent.
+        A PlantStoppedError if the plant faulted, was stopped or disarmed; a FaultError if it refused the move or is
+        silent.
         """
         self.check_alive()
         for event in self.events[self._finished_before :]:
@@ -335,7 +302,7 @@ class PlantClient:
         return False
 
     def configure_controller(self) -> None:
-        """Let the controller design itself, so that activating it takes no time."""
+        """Let the controller compute its design, so that activating it takes no time."""
         self._transition(Transition.TRANSITION_CONFIGURE, "configure")
 
     def switch_controller(self, *, on: bool) -> None:
@@ -382,16 +349,13 @@ class PlantClient:
         return bool(state.current_state.id == State.PRIMARY_STATE_ACTIVE)
 
     def check_mode(self) -> None:
-        """Raise a PlantStoppedError where the plant has faulted or been stopped."""
+        """Raise a PlantStoppedError if the plant has faulted or been stopped."""
         mode = self.newest_event(Event.PLANT_MODE)
         if mode is not None and mode.get("mode") in {"fault", "e_stop"}:
             raise PlantStoppedError(self.namespace, str(mode["mode"]), str(mode.get("reason")))
 
     def check_alive(self) -> None:
-        """Raise a FaultError where a plant in real time has sent no state for long.
-
-        A plant that this program did not start can end without a word to it.
-        """
+        """Raise a FaultError if a plant in real time is silent: one that runs already can end without notice."""
         silent = self.conductor.listened - self._heard
         if silent > _SILENCE:
             raise FaultError(
@@ -417,12 +381,7 @@ class PlantClient:
 
 
 class RecorderClient:
-    """The recorder of one plant.
-
-    Args:
-        conductor: The orchestrator.
-        namespace: Namespace of the plant.
-    """
+    """The recorder of the plant in a namespace."""
 
     def __init__(self, conductor: Conductor, namespace: str) -> None:
         self._conductor = conductor
@@ -433,11 +392,7 @@ class RecorderClient:
         return set(self._ask().get("matched", []))
 
     def wait_until_heard(self, topics: Collection[str], timeout: float) -> None:
-        """Wait until it is matched with a publisher of each topic: earlier messages are in no bag.
-
-        Raises:
-            FaultError: It is not matched with one of them in time [s].
-        """
+        """Wait until matched with a publisher of each topic: earlier messages are in no bag; or FaultError."""
         deadline = time.monotonic() + timeout
         while missing := set(topics) - self.heard():
             if time.monotonic() > deadline:
@@ -452,15 +407,7 @@ class RecorderClient:
         return self._counts().get(topic, 0)
 
     def wait_for_all(self, expected: Mapping[str, int], timeout: float = 60.0) -> None:
-        """Wait until the messages of topics have arrived, and no more of any other do: it may be seconds behind.
-
-        Args:
-            expected: How many messages were published on each topic, by its name.
-            timeout: Longest time to wait [s].
-
-        Raises:
-            FaultError: Messages are missing.
-        """
+        """Wait for the expected messages (topic -> number), perhaps seconds late; a FaultError if some are missing."""
         counts: dict[str, int] = {}
         quiet = 0
         deadline = time.monotonic() + timeout

@@ -1,4 +1,4 @@
-"""When a run has to be over: its steps ask before they begin, and while they wait."""
+"""When a run has to be over: its steps check before they begin, and while they wait."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pendulum_msgs_py.errors import PendulumError
 __all__ = ["NEVER", "BudgetSpentError", "Deadline", "slowness"]
 
 _OWN_LOAD = 2.0
-"""Programs of a run that want to run at once: this one, and of the machine's one at a time."""
+"""Programs of a run that run at once: this one, and one at a time of the machine's."""
 
 
 class BudgetSpentError(PendulumError):
-    """The budget of a run is spent, or what is left does not suffice for the next step."""
+    """The budget of a run is spent, or does not suffice for the next step."""
 
 
 def slowness() -> float:
-    """Return how many times longer than alone a computation takes, by the programs that others want to run."""
+    """Return the slowdown of a computation by other runnable programs, 1 when alone."""
     return max(1.0, (os.getloadavg()[0] - _OWN_LOAD) / (os.cpu_count() or 1))
 
 
@@ -29,7 +29,7 @@ class Deadline:
 
     Args:
         seconds: From now on; infinite for never [s].
-        reserve: Processor time that has to be left at the end [s]; at most half of all.
+        reserve: Processor time that must be left at the end [s]; at most half of all.
         clock: Monotonic clock [s].
     """
 
@@ -41,7 +41,7 @@ class Deadline:
 
     @property
     def total_left(self) -> float:
-        """Time left, the reserve included [s]."""
+        """Time left, including the reserve [s]."""
         return self._ends - self._clock()
 
     @property
@@ -52,18 +52,11 @@ class Deadline:
         )
 
     def share(self, share: float) -> Deadline:
-        """Return the deadline of a part that may take a share of what is left now."""
+        """Return the deadline of a part that may take a share of the time left."""
         return Deadline(max(0.0, share * self.left), clock=self._clock)
 
     def require(self, seconds: float = 0.0) -> None:
-        """Refuse a step for which no time is left.
-
-        Args:
-            seconds: Processor time that it takes and cannot be ended in [s].
-
-        Raises:
-            BudgetSpentError: It would end too late.
-        """
+        """Raise BudgetSpentError if a step of ``seconds`` of uninterruptible processor time would end too late."""
         if self.left <= (seconds * slowness() if seconds else 0.0):
             raise BudgetSpentError(f"the budget of {self._seconds:g} s is spent")
 

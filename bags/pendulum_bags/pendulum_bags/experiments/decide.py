@@ -31,18 +31,18 @@ def decide(
 ) -> Mapping[str, Comparison]:
     """Compare a run folder, and record repeats into it until the comparison is decided.
 
-    Only an emulator or a simulation is repeated: a machine moves when its operator wants it to. Each interim analysis
-    costs a share of the error of all, so that stopping as soon as it is decided errs no more often than one analysis.
+    Only an emulator or a simulation is repeated: a real machine moves only on its operator's command. Each interim
+    analysis spends a share of the total error, so stopping at a decision errs no more often than one analysis.
 
     Args:
         folder: Folder of the run, recorded; a repeat whose hardware recording exists already is used at once.
         settings: Settings of the run.
-        margins: What difference does not matter.
-        deadline: Of the repeats; None for one analysis of what is there.
+        margins: Differences that do not matter.
+        deadline: Of the repeats; None for one analysis of the existing recordings.
         joints: Joints of plants of several; else one without a name.
         on_look: Called with the number of a repeat and its duration of noise [s] before it is recorded.
         on_comparison: Called with the comparison of each joint after each analysis.
-        record: Records what a repeat lacks, or raises BudgetSpentError.
+        record: Records the missing parts of a repeat, or raises BudgetSpentError.
     """
     if not settings.can_repeat or deadline is None:
         compared = compare_joints([folder], joints, margin=margins)
@@ -59,7 +59,7 @@ def decide(
         compared = compare_joints([folder], joints, margin=margins, looks=Looks(look))
         on_comparison(compared)
         left = deadline.left
-        # The next repeat has at most twice the noise of the last one.
+        # A repeat has at most twice the noise of the one before.
         if _is_decided(compared) or 1.5 * slowest > left:
             return compared
         number += 1
@@ -74,7 +74,7 @@ def decide(
 
 
 def _is_decided(compared: Mapping[str, Comparison]) -> bool:
-    """Return whether more repeats would change nothing: one joint decides a no, and all of them a yes."""
+    """Return whether more repeats would change nothing: one joint decides a no, all of them a yes."""
     outcomes = [one.verdict.outcome for one in compared.values()]
     decided = Outcome.DIFFERENT in outcomes or Outcome.UNDECIDED not in outcomes
     return decided or any(one.unlike_references for one in compared.values())

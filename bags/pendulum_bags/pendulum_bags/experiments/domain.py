@@ -15,19 +15,14 @@ from pendulum_msgs_py.errors import FaultError, ParameterError
 __all__ = ["MAX_DOMAIN", "check_domain", "is_unused", "reserve_domain"]
 
 MAX_DOMAIN = 100
-"""Beyond 101 the ports of a domain overlap those that Linux hands out to any client."""
+"""Beyond 101 the ports of a domain overlap with Linux's ephemeral ports."""
 
 
 @contextlib.contextmanager
 def reserve_domain(requested: int | None = None) -> Iterator[int]:
-    """Reserve a ROS domain while the context lasts.
+    """Reserve a ROS domain for the context: ``requested``, or else ``ROS_DOMAIN_ID`` or the first free one.
 
-    Args:
-        requested: The domain to use; None takes ``ROS_DOMAIN_ID`` or else the first free one.
-
-    Raises:
-        ParameterError: The requested domain is no domain.
-        FaultError: Another experiment runs in the requested domain, or all domains are in use.
+    A ParameterError for an invalid domain, a FaultError if another experiment uses it or all are in use.
     """
     requested = check_domain(requested)
     folder = Path(tempfile.gettempdir(), f"pendulum_domains_{os.getuid()}")
@@ -58,11 +53,7 @@ def reserve_domain(requested: int | None = None) -> Iterator[int]:
 
 
 def check_domain(requested: int | None) -> int | None:
-    """Return the domain of the user or of ``ROS_DOMAIN_ID``, None for any.
-
-    Raises:
-        ParameterError: It is no domain.
-    """
+    """Return the domain of the user or of ``ROS_DOMAIN_ID``, None for any; a ParameterError if it is invalid."""
     if requested is None and os.environ.get("ROS_DOMAIN_ID"):
         text = os.environ["ROS_DOMAIN_ID"]
         if not text.isdigit():

@@ -1,7 +1,7 @@
 """Play a designed excitation on a plant: torque through the disturbance node, while a controller commands zero.
 
-A plant applies no torque without a controller's replies. Here a playback of zero torque sends them, started and ended
-with the run: whatever ends the run, the replies stop and the plant goes to zero torque by its own rules.
+A plant applies torque only if a controller replies. A playback of zero torque replies during the run: however the run
+ends, the replies stop and the plant goes to zero torque by its own rules.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _REST = 0.5
 _FIND_TIMEOUT = 30.0
 _AT_REST_ANGLE = 0.1
 _AT_REST_SPEED = 0.3
-"""What counts as hanging at rest [rad], [rad/s]; a noisy velocity sensor shows up to 0.2 rad/s."""
+"""Limits of hanging at rest [rad], [rad/s]; a noisy velocity sensor shows up to 0.2 rad/s."""
 _ANGLE_ROOM = 1.2
 _SPEED_ROOM = 1.3
-"""A motion this many times beyond the limits of the design ends the run: the prior plant is not the real one."""
+"""Factor on the design's limits at which the run ends: the prior plant is not the real one."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class ExcitationPlay:
     prediction: Mapping[str, Any] = field(default_factory=dict)
 
     def zero_file(self, folder: Path) -> Path:
-        """Write the playback of the controller that commands nothing, and return its path."""
+        """Write the controller's playback of zero torque, and return its path."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / "zero_torque.csv"
         path.write_text("time,effort\n0,0\n1,0\n", encoding="utf-8")
@@ -97,19 +97,12 @@ def play_in_lockstep(
 ) -> Path:
     """Start a simulator or an emulated actuator, play on it as fast as it replies, and record.
 
-    Args:
-        bag: Folder of the bag.
-        play: What to play.
-        side: ``sim`` or ``hw``.
-        plant: What the simulator or the emulator is.
-        noise: Standard deviation of the simulated angle sensor [rad]; the emulator has its own.
-        seed: Of the sensors.
-        design_plant: What the excitation was designed for.
-        domain: ROS domain, or None for any free one.
+    ``side`` is ``sim`` or ``hw``; ``noise`` is the standard deviation of the simulated angle sensor [rad] (the emulator
+    has its own); ``domain`` is None for any free one.
 
     Raises:
         BagError: The bag exists.
-        FaultError: The plant faulted, beyond its limits for instance, or a program ended.
+        FaultError: The plant faulted, for instance beyond its limits, or a program ended.
     """
     refuse_existing(bag)
     limits: dict[str, Any] = {
@@ -119,7 +112,7 @@ def play_in_lockstep(
     }
     own = {"sensor.position_noise": float(noise)} if side == "sim" else {"feedback_rate": 1.0 / play.period}
     if side == "hw":
-        limits.pop("velocity_limit")  # the actuator's own is lower than most designs
+        limits.pop("velocity_limit")  # the actuator's own is lower than most designs'
     spec = _LockstepRun(
         side=side,
         plant=plant,
@@ -139,26 +132,16 @@ def play_in_lockstep(
 
 
 def play_on_running_plant(
-    bag: Path,
-    play: ExcitationPlay,
-    namespace: str,
-    *,
-    arm: bool,
-    domain: int | None = None,
+    bag: Path, play: ExcitationPlay, namespace: str, *, arm: bool, domain: int | None = None
 ) -> Path:
-    """Play on a plant that runs already, in real time, and record.
+    """Play on a plant that runs already in ``namespace``, in real time, and record.
 
-    Args:
-        bag: Folder of the bag.
-        play: What to play.
-        namespace: Of the plant, such as ``/hw``.
-        arm: Whether to arm a plant that is not; it is disarmed again at the end.
-        domain: ROS domain; by default ``ROS_DOMAIN_ID``, or 0.
+    ``arm`` arms it if necessary and disarms it at the end; the domain is by default ``ROS_DOMAIN_ID``, or 0.
 
     Raises:
         BagError: The bag exists.
-        FaultError: There is no plant, it has another commander, it does not hang at rest, it is not armed, or it left
-            the limits; it is at zero torque when this is raised.
+        FaultError: There is no plant, it has another commander, does not hang at rest, is not armed, or left the
+            limits; it is then at zero torque.
     """
     refuse_existing(bag)
     logs = bag.parent / "logs" / bag.name
@@ -185,7 +168,7 @@ def play_on_running_plant(
         plant.wait_until_ready(START_TIMEOUT)
         wanted = {f"{namespace}/{topic}" for topic in (names.JOINT_STATES, names.APPLIED_EFFORT, names.DISTURBANCE)}
         RecorderClient(conductor, namespace).wait_until_heard(wanted, START_TIMEOUT)
-        # Beyond its limits, or interrupted: the drive is released now, not when the programs have ended.
+        # Beyond its limits, or interrupted: release the drive now, not after the programs have ended.
         session.drives(plant)
         if not armed:
             plant.arm()
@@ -209,7 +192,7 @@ def _find_plant(conductor: Conductor, namespace: str) -> str:
         raise FaultError(
             f"no plant publishes {topic} in ROS domain {conductor.domain}; expected one: start it, or use --on sim"
         ) from None
-    conductor.spin(1.0)  # others on the graph are known a moment later
+    conductor.spin(1.0)  # discovery of other nodes takes a moment longer
     found = sorted({info.node_name for info in node.get_publishers_info_by_topic(topic)})
     if len(found) != 1:
         raise FaultError(f"{topic} is published by {', '.join(found)}; expected one plant")
@@ -235,7 +218,7 @@ def _require_rest(conductor: Conductor, plant: PlantClient) -> None:
         sample = plant.sample
         assert sample is not None
         angle = wrap(sample.position[0])
-        # Negated, so that a state that is not a number is refused too.
+        # Negated, so that NaN is refused too.
         if not (abs(angle) <= _AT_REST_ANGLE and abs(sample.velocity[0]) <= _AT_REST_SPEED):
             raise FaultError(
                 f"{plant.namespace} is at {angle:.3f} rad and {sample.velocity[0]:.3f} rad/s; expected it hanging at "

@@ -18,18 +18,14 @@ _NAMESPACE = re.compile(r"(?:/[A-Za-z][A-Za-z0-9_]*)+")
 _PATIENCE = 20.0
 """Longest wait for a node's response [s]."""
 _HALF_TURN = 3.15
-"""Farthest from hanging at 0 that a ramp to upright starts, with room for noise [rad]."""
+"""Largest distance from hanging at 0 at the start of a ramp to upright, including noise [rad]."""
 _COMMANDS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.JOINT_TRAJECTORY)
 _OURS = ("controller", "disturbance", names.RECORDER)
 """Names of the nodes that an experiment starts with a plant."""
 
 
 def running_namespace(name: str) -> str | None:
-    """Return the namespace of the running plant that ``ros:/namespace`` names; None for other names.
-
-    Raises:
-        ParameterError: What follows is no namespace.
-    """
+    """Return the namespace in ``ros:/namespace``; None for other names, a ParameterError if it is invalid."""
     if not name.startswith(PREFIX):
         return None
     namespace = name.removeprefix(PREFIX)
@@ -39,11 +35,7 @@ def running_namespace(name: str) -> str | None:
 
 
 def find_plant(conductor: Conductor, namespace: str) -> str:
-    """Return the name of the node in a namespace that has an e-stop: that is a plant.
-
-    Raises:
-        FaultError: There is none.
-    """
+    """Return the name of the node with an e-stop in a namespace, the plant; a FaultError if there is none."""
     space = namespace.rstrip("/")
 
     def found() -> list[str]:
@@ -58,16 +50,9 @@ def find_plant(conductor: Conductor, namespace: str) -> str:
 
 
 def join(conductor: Conductor, space: str) -> PlantClient:
-    """Return a client of a running plant that is at rest and has no other commander.
+    """Return a client of a running plant that is at rest and has no other commander; nothing is sent to it.
 
-    Args:
-        conductor: The orchestrator.
-        space: Namespace of a plant behind the contract, its own or that of ``adopt``; whatever is found there, nothing
-            is sent to it.
-
-    Raises:
-        FaultError: There is no such plant, it has another commander, it is armed, has other joints, or does not hang
-            near 0.
+    A FaultError if there is none, or it has another commander, is armed, has other joints, or does not hang near 0.
     """
     from pendulum_bags.experiments.conductor_node import PlantClient
 
@@ -75,7 +60,7 @@ def join(conductor: Conductor, space: str) -> PlantClient:
     _refuse_others(conductor, space)
     client = PlantClient(conductor, space, node)
     client.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
-    # By then discovery is complete: the node information is no older than its services.
+    # Discovery is complete by then: node information is no older than services.
     conductor.spin(0.5)
     # The commander may be discovered later than the plant.
     _refuse_others(conductor, space)

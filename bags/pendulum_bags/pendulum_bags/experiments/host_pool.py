@@ -23,10 +23,10 @@ __all__ = ["AGAIN", "BEGUN", "LAST", "HostPool", "HostedProgram", "keep_pool", "
 BEGUN = "begun"
 """Line that a host sends when its program accepts signals."""
 AGAIN, LAST = "again", "last"
-"""What follows the exit code in the line behind it: whether the host takes another order."""
+"""Follows the exit code in its line: whether the host takes another order."""
 _HOST = "pendulum_bags.experiments.program_host"
 _PATIENCE = 8.0
-"""Time that an idle host has to end [s]."""
+"""Time for an idle host to end [s]."""
 
 
 @dataclass
@@ -39,12 +39,7 @@ class _Host:
 
 
 class HostedProgram:
-    """One program in a host; it has the interface of ``subprocess.Popen``.
-
-    Args:
-        host: The host, which runs nothing else.
-        release: Called with the host when it may run another program.
-    """
+    """A program in a host, like ``subprocess.Popen``; ``release`` is called when the host is free."""
 
     def __init__(self, host: _Host, release: Callable[[_Host], None]) -> None:
         self.pid = host.process.pid
@@ -60,14 +55,7 @@ class HostedProgram:
         return self.returncode
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for the exit code.
-
-        Args:
-            timeout: Longest time to wait [s]; None for ever.
-
-        Raises:
-            subprocess.TimeoutExpired: It has not ended by then.
-        """
+        """Wait for the exit code; raises subprocess.TimeoutExpired after ``timeout`` [s] (None waits for ever)."""
         self._listen(lambda: self.returncode is not None, timeout)
         if self.returncode is None:
             raise subprocess.TimeoutExpired(self._host.process.args, timeout or 0.0)
@@ -75,13 +63,13 @@ class HostedProgram:
 
     def send_signal(self, number: int) -> None:
         """Send a signal to the program, if it still runs."""
-        # Before that its host does not listen, and afterwards it is no longer this program.
+        # The host listens only while this program runs.
         self._listen(lambda: self._begun or self.returncode is not None, _PATIENCE)
         if self.poll() is None:
             self._host.process.send_signal(number)
 
     def _listen(self, enough: Callable[[], bool], timeout: float | None) -> None:
-        """Read the host's lines until they are enough, for a time at most [s]."""
+        """Read the host's lines until they suffice, at most for ``timeout`` [s]."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while not enough():
             left = None if deadline is None else max(0.0, deadline - time.monotonic())
@@ -89,7 +77,7 @@ class HostedProgram:
                 return
             try:
                 heard = self._host.connection.recv(64)
-            except OSError:  # reset: the host has gone with an order unread
+            except OSError:  # reset: the host ended with an order unread
                 heard = b""
             if not heard:
                 self._host.connection.close()
@@ -109,7 +97,7 @@ class HostedProgram:
         if rest == AGAIN:
             self._release(self._host)
         else:
-            # What a program has left behind, on the graph too, is gone when its process is.
+            # Anything that a program leaves behind, on the graph too, ends with its process.
             _end([self._host])
 
 
@@ -121,7 +109,7 @@ class HostPool:
     _all: list[_Host] = field(default_factory=list)
 
     def __enter__(self) -> HostPool:
-        """Nothing is started before it is needed."""
+        """Enter without starting anything."""
         return self
 
     def __exit__(
@@ -133,16 +121,10 @@ class HostPool:
     def start(
         self, command: Sequence[str], *, environment: Mapping[str, str], log: Path, niceness: int = 0
     ) -> HostedProgram | None:
-        """Start a program in a host of its kind, one that waits or a new one.
+        """Start a program of this project in an idle or new host of its kind; None for other commands.
 
-        Args:
-            command: ``[sys.executable, "-m", PACKAGE, EXECUTABLE, ...]`` of a package of this project.
-            environment: All of its variables.
-            log: File that gets what it prints, behind what is there.
-            niceness: Scheduling priority to give away, or to take where it is negative and permitted.
-
-        Returns:
-            The program; None where the command is another one, which no host can run.
+        The command is ``[sys.executable, "-m", PACKAGE, EXECUTABLE, ...]`` with its complete environment. Output is
+        appended to ``log``; ``niceness`` is priority to give away, or to take if negative and permitted.
         """
         interpreter, flag, package, executable = [*command[:4], *[""] * (4 - len(command))]
         if interpreter != sys.executable or flag != "-m" or not package.startswith("pendulum_") or not executable:
@@ -164,7 +146,7 @@ class HostPool:
                 self._idle.remove(host)
             try:
                 host.connection.sendall(text)
-            except OSError:  # it was ended while it waited: try the next one
+            except OSError:  # it ended while it waited: try the next one
                 _end([host])
                 continue
             return HostedProgram(host, self._idle.append)
@@ -210,7 +192,7 @@ _kept: list[HostPool] = []
 
 @contextlib.contextmanager
 def keep_pool(pool: HostPool) -> Iterator[None]:
-    """Let programs that run in this process one after the other share their hosts."""
+    """Let successive programs in this process share their hosts."""
     _kept.append(pool)
     try:
         yield
@@ -219,13 +201,13 @@ def keep_pool(pool: HostPool) -> Iterator[None]:
 
 
 def kept_pool() -> HostPool | None:
-    """Return the hosts that outlive the running program, where another may follow it in this process; else None."""
+    """Return the hosts that outlive the running program, for another one in this process; else None."""
     return _kept[-1] if _kept else None
 
 
 @contextlib.contextmanager
 def open_pool() -> Iterator[HostPool]:
-    """Offer the hosts that outlive the running program, or new ones that end with it."""
+    """Provide the hosts that outlive the running program, or new ones that end with it."""
     if (kept := kept_pool()) is not None:
         yield kept
         return

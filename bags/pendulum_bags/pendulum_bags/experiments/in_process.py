@@ -1,4 +1,4 @@
-"""A lockstep run of the simulator without nodes: the same pieces in one process, the same numbers to the last bit."""
+"""A lockstep run of the simulator without nodes: the same parts in one process, bit for bit the same numbers."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ __all__ = ["RunArrays", "simulate", "simulate_plant"]
 
 @dataclass(frozen=True)
 class RunArrays:
-    """What a bag of the run would hold, n + 1 rows for n steps, but n of ``applied``.
+    """The content of the run's bag: n + 1 rows for n steps, but n of ``applied``.
 
-    A row is a number for a plant of one joint; of several it has the joints, in ``command`` and ``applied`` the driven
-    ones.
+    A row is a number for a plant of one joint, else it has a value per joint, in ``command`` and ``applied`` per driven
+    joint.
 
     Attributes:
         stamp_ns: Of the states [ns].
         position: [rad or m].
         velocity: [rad/s or m/s].
         effort: Measured efforts [N m or N].
-        command: The controller's commands; NaN where it gave none [N m or N].
+        command: The controller's commands; NaN without one [N m or N].
         disturbance: On the joint that has it [N m or N].
         applied: Efforts that acted from each state on [N m or N].
     """
@@ -55,11 +55,7 @@ class RunArrays:
 
 
 def simulate(spec: RunSpec) -> RunArrays:
-    """Run the simulator, the controller and the disturbance of a run in this process.
-
-    Raises:
-        ParameterError: The run is of the emulated hardware, or its plant has parameters beyond the plain ones.
-    """
+    """Run simulator, controller and disturbance in this process; a ParameterError for unsupported runs."""
     if spec.has_bridge or spec.plant_parameters:
         raise ParameterError("a run in one process is of the plain simulator; others run as nodes")
     if (foreign := spec.foreign) is not None:
@@ -70,19 +66,13 @@ def simulate(spec: RunSpec) -> RunArrays:
 
 
 def simulate_plant(spec: RunSpec, parameters: PlantParameters, sensors: Sensors | None = None) -> RunArrays:
-    """Run a run of the simulator on any plant and with any sensors, for what-if questions.
-
-    Args:
-        spec: The run; its ``plant`` is ignored.
-        parameters: The plant.
-        sensors: What the controller sees; None for the truth. They must not drop samples.
-    """
+    """Run another plant than the run's, with any sensors that drop no samples (None for the truth)."""
     plant = make_plant(parameters, _whole(spec.period), method=spec.method)
     return _simulate(spec, OneJoint(plant), sensors or Sensors())
 
 
 def _whole(period: float) -> float:
-    """Return a period of whole nanoseconds [s]."""
+    """Return a period rounded to whole nanoseconds [s]."""
     return round(NANOSECONDS * period) / NANOSECONDS
 
 

@@ -37,18 +37,18 @@ Array = NDArray[Any]
 _UNCHANGED = frozenset(
     {"gravity", "gear_ratio", "stribeck_velocity", "lower_stop", "upper_stop", "effort_limit", "time_constant"}
 )
-"""Values of a plant file that are not identified: constants, limits, and what belongs to a model of friction."""
+"""Values of a plant file that are not identified: constants, limits, and those of a friction model."""
 _DELAY = "transport_delay"
 DURATION = 20.0
-"""Length of the noise by default [s]."""
+"""Default length of the noise [s]."""
 HOLDING = ("lqr", "discrete_lqr", "lqi", "lqg", "mpc")
-"""Controllers that hold a plant upright; ``tvlqr`` and ``ilqr`` begin at hanging, and ``nmpc`` is an LQR there."""
+"""Controllers that hold a plant upright; ``tvlqr`` and ``ilqr`` start hanging, and ``nmpc`` is an LQR there."""
 LIMIT_PER_NOISE = 10.0
-"""Effort limit of the joint per amplitude of the noise [-]: the LQR holds every preset under it on both sides,
-the acrobot and the pendubot with dry friction up to 0.16, and their joints slide in it instead of standing still."""
+"""Effort limit of the joint per amplitude of the noise [-]: the LQR holds every preset under it on both sides, acrobot
+and pendubot with dry friction up to 0.16, and their joints slide instead of standing still."""
 _SLIDING = 0.5
-"""Velocity at which a design takes the dry friction of passive joints [rad/s or m/s]: that of the joints under this
-noise. At 1 the pendubot falls; at 0.25 both plants stay, nearer to the end of what their LQR holds."""
+"""Velocity at which a design linearises the dry friction of passive joints [rad/s or m/s]: that of the joints under
+this noise. At 1 the pendubot falls; at 0.25 both plants stay, nearer to the limit of their LQR."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,7 @@ class JointSettings:
         design: Preset or file that the controller is designed on; empty for the simulated plant.
         joint: Driven joint that has the noise; empty for the first.
         noise: The disturbance, such as one of :func:`default_amplitude`.
-        storage: Storage of the bags.
-        controller: What holds it, one of ``HOLDING``.
+        controller: One of ``HOLDING``.
     """
 
     plant: str = "cart_pole"
@@ -79,7 +78,7 @@ class JointSettings:
     foreign: ClassVar[None] = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be run before anything starts; the joint defaults to the first driven one."""
+        """Validate the settings; the joint defaults to the first driven one."""
         if not is_mechanism(self.plant):
             raise ParameterError(
                 f"plant is {self.plant!r}, which has one joint; expected one of several, such as cart_pole "
@@ -105,7 +104,7 @@ class JointSettings:
         return 6.0 + 0.25 * self.noise.duration
 
     def running(self, side: str) -> None:
-        """Return the namespace of a plant that runs already; there is none."""
+        """Return None: no plant of several joints runs already."""
 
     def run(self, side: str) -> RunSpec:
         """Return one side as a run in lockstep, for as long as the noise lasts."""
@@ -129,11 +128,7 @@ class JointSettings:
 
 
 def driven_joint(plant: str, joint: str = "") -> str:
-    """Return the joint that has the noise: the one that is named, or the first that is driven.
-
-    Raises:
-        ParameterError: It is not driven, or none is.
-    """
+    """Return the joint that has the noise: the named or the first driven one; a ParameterError if there is none."""
     loaded = load_mechanism(plant)
     driven = loaded.coordinates.driven_names
     if not driven:
@@ -144,28 +139,22 @@ def driven_joint(plant: str, joint: str = "") -> str:
 
 
 def default_amplitude(plant: str, joint: str = "") -> float:
-    """Return the largest effort of the noise, as a share of the effort limit of its joint [N m or N]."""
+    """Return the largest effort of the noise, a share of its joint's effort limit [N m or N]."""
     loaded = load_mechanism(plant)
     index = loaded.coordinates.driven_names.index(driven_joint(plant, joint))
     return loaded.effort_limits[index] / LIMIT_PER_NOISE
 
 
 def identified_names(plant: PlantParameters) -> list[str]:
-    """Return the names of the values that an identification finds: masses, lengths, inertias and friction."""
+    """Return the names of identifiable values: masses, lengths, inertias and friction."""
     return [name for name in plant.numbers if name.rpartition(".")[2] not in {*_UNCHANGED, _DELAY}]
 
 
 def stand_in_for(plant: PlantParameters, *, share: float, delay: float, seed: int) -> PlantParameters:
-    """Return another plant in place of a machine: values as far off as an identification may leave them.
+    """Return a surrogate of a machine, with values as far off as an identification may leave them.
 
-    Args:
-        plant: The plant that is simulated.
-        share: Largest share by which a mass, length, inertia or friction is off, drawn uniformly.
-        delay: Transport delay of each motor [s].
-        seed: Of the draw.
-
-    Raises:
-        ParameterError: No plant has such values.
+    ``share`` is the largest relative error of a mass, length, inertia or friction, drawn uniformly; ``delay`` the
+    transport delay of each motor [s]. A ParameterError if no plant has such values.
     """
     if not 0.0 <= share < 1.0:
         raise ParameterError(f"share is {share}; expected 0 to less than 1")
@@ -178,10 +167,10 @@ def stand_in_for(plant: PlantParameters, *, share: float, delay: float, seed: in
 
 
 def design_for(plant: PlantParameters) -> PlantParameters:
-    """Return the plant on which the LQR is designed: dry friction of passive joints as viscous friction.
+    """Return the plant of the LQR's design: dry friction F of passive joints as viscous friction b = F / v.
 
-    A linear model has no dry friction, and no motor can compensate that of a passive joint: an LQR without a model
-    of it loses acrobot and pendubot as soon as they move. b = F / v has the same force at the velocity v.
+    A linear model has no dry friction, and no motor compensates it at a passive joint: an LQR without a model of it
+    loses acrobot and pendubot as soon as they move. At the velocity v both have the same force.
     """
     driven = plant.coordinates.driven_names
     changes = {
@@ -193,7 +182,7 @@ def design_for(plant: PlantParameters) -> PlantParameters:
 
 
 def design_file(folder: Path, plant: str) -> str:
-    """Return the plant on which the controller is designed: the preset or file itself, or one stored in a folder."""
+    """Return the plant of the controller's design: the preset or file itself, or one stored in a folder."""
     loaded = load_mechanism(plant)
     designed = design_for(loaded)
     if designed is loaded:
@@ -203,15 +192,7 @@ def design_file(folder: Path, plant: str) -> str:
 
 
 def load_stand_in(path: str | Path, plant: PlantParameters) -> PlantParameters:
-    """Return the plant of a file that is to stand in for a machine.
-
-    Args:
-        path: The plant file, or a preset.
-        plant: The plant that is simulated.
-
-    Raises:
-        ParameterError: It cannot be read, or has other equations or other joints than the simulated plant.
-    """
+    """Return the surrogate in a file or preset; a ParameterError if its equations or joints differ from ``plant``."""
     found = load_mechanism(path)
     for what, ours, others in (
         ("model", plant.mechanism.name, found.mechanism.name),
@@ -226,13 +207,7 @@ def load_stand_in(path: str | Path, plant: PlantParameters) -> PlantParameters:
 
 
 def fall_time(plant: PlantParameters, stamps_ns: Array, position: Array) -> float | None:
-    """Return when a plant fell, from the first state on [s], or None: half of its height of potential energy is lost.
-
-    Args:
-        plant: The plant.
-        stamps_ns: Times of N states [ns].
-        position: Their positions, shape (N, n).
-    """
+    """Return when a plant had lost half of its potential energy [s], or None; positions (N, n), stamps [ns]."""
     potential, p = plant.mechanism.potential, plant.packed
     half = 0.5 * potential(plant.coordinates.goal, p)
     for stamp_ns, q in zip(stamps_ns, position, strict=True):
@@ -242,15 +217,9 @@ def fall_time(plant: PlantParameters, stamps_ns: Array, position: Array) -> floa
 
 
 def require_upright(folder: Path, settings: JointSettings, stopped: str = "") -> None:
-    """Refuse the recordings ``sim`` and ``hw`` of a folder where a plant fell.
+    """Raise a FaultError on both sides' state if a plant fell in the recordings ``sim`` or ``hw``, or stopped.
 
-    Args:
-        folder: Where they are; a side without states has not fallen.
-        settings: What ran.
-        stopped: Why the machine stopped; empty where it did not.
-
-    Raises:
-        FaultError: One fell or stopped; it reports both sides.
+    ``stopped`` is why the machine stopped, or empty; a side without states has not fallen.
     """
     plant = load_mechanism(settings.plant)
     ends: dict[str, str] = {}

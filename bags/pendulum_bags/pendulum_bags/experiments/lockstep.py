@@ -32,8 +32,8 @@ __all__ = ["lockstep_spec", "longest_run", "record_run", "run_lockstep"]
 _LAST_WORDS = 0.2
 """Time for the recorder to receive the end of a run in real time [s]."""
 _SLOWEST = 60.0
-"""Slowest pace at which a lockstep run is expected to end, wall time per simulated time: 45 were seen on two cores that
-ten other programs wanted."""
+"""Slowest expected pace of a lockstep run, wall time per simulated time: 45 occurred on two cores with ten other
+programs."""
 _PATIENCE = START_TIMEOUT
 """Time between two checks of the progress of a run in lockstep [s]."""
 _ALIVE = 10
@@ -47,7 +47,7 @@ _RUN_LISTENERS = {
     names.APPLIED_EFFORT: 1,
     names.EVENTS: 2,
 }
-"""How many listen to each topic of a run: its reader, the recorder, and to events the conductor."""
+"""Subscribers of each topic of a run: its reader, the recorder, and for events the orchestrator."""
 _TOLD_EACH_STEP = (names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT)
 
 
@@ -60,20 +60,7 @@ def run_lockstep(
     on_wait: Callable[[], None] = lambda: None,
     hosts: HostPool | None = None,
 ) -> Path:
-    """Run one plant of the thesis's experiment under control and noise, as fast as the loop allows, and record it.
-
-    Args:
-        bag: Folder of the bag.
-        settings: What to run.
-        side: ``sim`` for the simulator, ``hw`` for the emulated hardware.
-        domain: ROS domain, or None for any free one.
-        on_wait: Called while waiting.
-        hosts: As of :func:`record_run`.
-
-    Raises:
-        BagError: The bag exists.
-        FaultError: A program ended or did not respond.
-    """
+    """Run and record one side of an experiment in lockstep under noise, as :func:`record_run`."""
     return record_run(bag, lockstep_spec(settings, side=side), domain=domain, on_wait=on_wait, hosts=hosts)
 
 
@@ -105,7 +92,7 @@ def lockstep_spec(settings: RegulationSettings | JointSettings, *, side: str) ->
 
 
 def longest_run(duration: float) -> float:
-    """Return the longest time [s] that a run of a duration [s] may take: starting, discovery, arming, lockstep."""
+    """Return the longest time [s] for a run of a duration [s]: starting, discovery, arming, lockstep."""
     return 4.0 * START_TIMEOUT + _SLOWEST * duration
 
 
@@ -119,12 +106,8 @@ def record_run(
 ) -> Path:
     """Carry out one run over DDS, in lockstep or in real time, and record it.
 
-    Args:
-        bag: Folder of the bag.
-        spec: What to run.
-        domain: ROS domain, or None for any free one.
-        on_wait: Called while waiting.
-        hosts: Run the programs of a run in lockstep, and those of the next; without them each is a process of its own.
+    ``domain`` is None for any free one; ``on_wait`` is called while waiting; ``hosts`` run the programs of lockstep
+    runs one after the other, without them each is a process of its own.
 
     Raises:
         BagError: The bag exists.
@@ -159,7 +142,7 @@ def record_run(
 
 
 def _keep_time(session: Session, plant: PlantClient, spec: RunSpec) -> None:
-    """Let a run in real time go, wait for its length by the plant's clock, and put the plant to rest."""
+    """Start a run in real time, wait for its length by the plant's clock, and put the plant to rest."""
     conductor = session.conductor
     plant.watch()
     if spec.has_bridge:
@@ -184,7 +167,7 @@ def _has_reached(plant: PlantClient, end_ns: int) -> bool:
 
 
 def _wait_for_end(conductor: Conductor, plant: PlantClient, duration: float) -> None:
-    """Wait for the end of a run in lockstep, however slow a busy machine makes it, as long as it proceeds."""
+    """Wait for the end of a run in lockstep, on a busy machine too, as long as it progresses."""
     conductor.wait_for("the first state", lambda: plant.is_heard or _is_finished(plant), START_TIMEOUT)
     plant.look_away()
     recorder, received = RecorderClient(conductor, plant.namespace), 0

@@ -1,4 +1,4 @@
-"""The emulated hardware's recordings in lockstep: one program makes them, one after the other, while others compute."""
+"""The emulated hardware's recordings in lockstep, made one after the other by one program in the background."""
 
 from __future__ import annotations
 
@@ -26,28 +26,23 @@ from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 __all__ = ["Machine", "MachineRun", "record_listed"]
 
 _ENDED = "ended: "
-"""Begins the line that the program prints when a run has ended: its bag, and why it failed, as JSON."""
+"""Start of the program's line at the end of a run: its bag, and why it failed, as JSON."""
 _HOLD, _BUSY = "hold", "busy"
-"""Files that ask the program not to begin a run, and that are there while it records one."""
+"""Files that ask the program not to begin a run, and that exist while it records one."""
 _POLL = 0.05
 _ENDING = 25.0
-"""Time that the program has to end its own, in two waves [s]."""
+"""Time for the program to end its own, in two waves [s]."""
 
 
 class MachineRun(NamedTuple):
-    """One recording: where it goes, and what it is of."""
+    """One recording: its bag and its run."""
 
     bag: Path
     spec: RunSpec
 
 
 class Machine:
-    """The recordings of a machine, in the order in which they are needed; leaving the context ends their program.
-
-    Args:
-        folder: The run's folder.
-        runs: The recordings.
-    """
+    """The recordings of a machine, in the order in which they are needed; leaving the context ends their program."""
 
     def __init__(self, folder: Path, runs: Sequence[MachineRun]) -> None:
         self.runs = runs
@@ -65,7 +60,7 @@ class Machine:
     ) -> None:
         self.interrupt()
         if kind is KeyboardInterrupt and self._child is not None:
-            # Nothing real moves: a second interrupt ends it without further waiting.
+            # No hardware moves: a second interrupt ends it without further waiting.
             with suppress(ProcessLookupError):
                 os.killpg(self._child.process.pid, signal.SIGKILL)
         if self._child is not None:
@@ -82,7 +77,7 @@ class Machine:
             self._child.process.send_signal(signal.SIGINT)
 
     def start(self) -> None:
-        """Start to record, behind all other programs of this computer."""
+        """Start to record at the lowest priority."""
         if not self.runs:
             return
         self._processes.__enter__()
@@ -90,13 +85,13 @@ class Machine:
         self._busy.unlink(missing_ok=True)
         write_json(listed, [{"bag": str(run.bag.resolve()), "spec": run.spec.to_json()} for run in self.runs])
         command = [sys.executable, "-m", "pendulum_bags", "experiment", "run", str(listed)]
-        # In a domain of its own, whichever the experiment has.
+        # In a domain of its own, different from the experiment's.
         self._child = self._processes.start(
             "machine", command, ends_by_itself=True, niceness=5, environment={"ROS_DOMAIN_ID": ""}
         )
 
     def discard(self) -> None:
-        """End the program, and remove what it has recorded."""
+        """End the program, and remove its recordings."""
         self._processes.stop()
         self._child, self._read = None, 0
         self._ends.clear()
@@ -106,7 +101,7 @@ class Machine:
     def rests(self) -> bool:
         """Let no run begin before :meth:`resume`; return whether none is being recorded.
 
-        Not whether the program has stopped at the file: beside a busy computer it may take minutes to start.
+        The program need not have stopped at the file: on a busy computer it may take minutes to start.
         """
         if self._child is None or self._child.process.poll() is not None:
             return True
@@ -114,20 +109,16 @@ class Machine:
         return not self._busy.exists()
 
     def resume(self) -> None:
-        """Record the runs that are left, or begin where nothing was started."""
+        """Record the remaining runs, or start if nothing was started."""
         if self._child is None:
             self.start()
         self._hold.unlink(missing_ok=True)
 
     def wait(self, bag: Path, deadline: Deadline = NEVER) -> None:
-        """Wait until a bag is recorded.
-
-        Args:
-            bag: One of the runs'.
-            deadline: When to stop waiting.
+        """Wait until a bag of the runs is recorded.
 
         Raises:
-            BudgetSpentError: It is not recorded by then.
+            BudgetSpentError: It is not recorded by the deadline.
             PlantStoppedError: The plant stopped, because its controller lost it.
             FaultError: It could not be recorded, or not in time.
         """
@@ -149,11 +140,11 @@ class Machine:
             raise FaultError(reason)
 
     def _ended(self, bag: Path) -> tuple[bool, str] | None:
-        """Return whether the plant stopped and why, with no reason for a bag that is whole; None for none yet."""
+        """Return whether the plant stopped and why, without reason for a complete bag; None before its end."""
         if self._child is not None:
             with self._child.log.open("rb") as log:
                 log.seek(self._read)
-                # A line that is being written is read when it is whole.
+                # A line that is still being written is read later.
                 *lines, rest = log.read().split(b"\n")
                 self._read = log.tell() - len(rest)
             for line in (one.decode(errors="replace") for one in lines):
@@ -164,15 +155,11 @@ class Machine:
 
 
 def record_listed(listed: Path) -> None:
-    """Record the runs of a list one after the other, and print how each has ended.
-
-    Args:
-        listed: JSON file with the bag and the run of each.
-    """
+    """Record the runs of a JSON list (bag and run of each) one after the other, and print how each ended."""
     hold, busy = (listed.with_name(name) for name in (_HOLD, _BUSY))
     with open_pool() as hosts:
         for entry in json.loads(listed.read_text(encoding="utf-8")):
-            # Each side writes its own file before it reads the other's: no run begins beside one that holds it.
+            # Each side writes its own file before it reads the other's: no run begins while it is held.
             busy.touch()
             while hold.exists():
                 busy.unlink(missing_ok=True)

@@ -27,16 +27,8 @@ def new_run(
 ) -> Iterator[Path]:
     """Create the folder of a run, as :func:`create_run_folder` does, and remove it if nothing is recorded into it.
 
-    Args:
-        out: The user's choice; None for ``bags/runs/<UTC>_<experiment>``.
-        experiment: Name of the experiment.
-        console: Where an interruption is reported.
-        ended: What has ended by then, as text.
-        recorded: What the folder holds then, as text.
-
-    Raises:
-        BagError: The folder exists and is not empty, or cannot be written.
-        typer.Exit: The user interrupted the run.
+    An interruption by the user prints the texts ``ended`` (what has ended by then) and ``recorded`` (what the folder
+    holds), and raises typer.Exit. A BagError if the folder is not empty or cannot be written.
     """
     folder = create_run_folder(out, experiment)
     try:

@@ -1,4 +1,4 @@
-"""Before a real machine moves: which one it is, what it will do, a checklist, and an operator's yes."""
+"""Before a real machine moves: identity, plan, checklist, and the operator's confirmation."""
 
 from __future__ import annotations
 
@@ -30,30 +30,20 @@ YES = "yes"
 
 @dataclass(frozen=True)
 class RealMachine:
-    """The machine of a lab file.
-
-    Attributes:
-        path: The lab file.
-        lab: Its content.
-    """
+    """The machine of a lab file at ``path`` with the content ``lab``."""
 
     path: Path
     lab: LabFile
 
     def bridge_program(self, strategy: str, bag: Path | None = None) -> NodeProgram:
-        """Return the bridge to the machine; an emulator gets longer timeouts, unless the lab file sets them.
-
-        Args:
-            strategy: How the actuator turns wanted torque into PWM.
-            bag: A real actuator's own log is written next to it.
-        """
+        """Return the bridge; an emulator's is more patient, a real actuator's own log goes next to ``bag``."""
         patience = EMULATOR_PATIENCE if self.patient else {}
         parameters = {name: value for name, value in patience.items() if name not in self.lab.values}
         parameters |= self.log_parameters(bag)
         return graph.bridge("/hw", lab_file=str(self.path), effort_strategy=strategy, **parameters)
 
     def log_parameters(self, bag: Path | None) -> dict[str, ParameterArgument]:
-        """Return the parameters for hebi-py's own log next to a bag; empty for an emulator, which has none."""
+        """Return the parameters for hebi-py's own log next to a bag; empty for an emulator."""
         if bag is None or self.emulated or self.lab.values["backend"] != "hebi":
             return {}
         return {"hebi_log": str(bag.resolve().with_suffix(".hebilog"))}
@@ -65,7 +55,7 @@ class RealMachine:
 
     @property
     def patient(self) -> bool:
-        """Whether the bridge may wait for a busy computer: not where it enforces a real machine's limits."""
+        """Whether the bridge may wait for a busy computer: not if it enforces a real machine's limits."""
         return self.lab.values["backend"] in EMULATED_BACKENDS
 
     @property
@@ -76,11 +66,7 @@ class RealMachine:
 
 
 def real_machine(hardware: str, lab: str | Path | None) -> RealMachine | None:
-    """Return the machine that ``--hardware hebi --lab FILE`` means; None for the emulator.
-
-    Raises:
-        ParameterError: The lab file is missing, refused, or given for the emulator.
-    """
+    """Return the machine of ``--hardware hebi --lab FILE``, None for the emulator; or a ParameterError."""
     if hardware != "hebi":
         if lab:
             raise ParameterError(f"lab file {lab} is given with hardware {hardware!r}; expected --hardware hebi")
@@ -100,15 +86,9 @@ def confirmed(
 ) -> Iterator[None]:
     """Save the module's settings, run the checklist, ask the operator; restore the settings at the end.
 
-    Args:
-        machine: The machine; None for the emulator, which needs none of this.
-        bridge: The bridge as it will be started.
-        plan: What will happen, one sentence or more.
-        yes: The operator has confirmed on the command line.
-        flat: Whether the pendulum lies flat.
-
-    Raises:
-        FaultError: The settings cannot be read, the checklist fails, or the operator does not confirm.
+    Without a machine (the emulator) it does nothing. ``plan`` is what will happen, in sentences; ``yes`` confirms on
+    the command line; ``flat`` is for a pendulum that lies flat. A FaultError if the settings cannot be read, the
+    checklist fails, or the operator does not confirm.
     """
     if machine is None:
         yield
@@ -122,7 +102,7 @@ def confirmed(
 
 @contextlib.contextmanager
 def _kept_settings(machine: RealMachine, console: Console) -> Iterator[None]:
-    """Keep gains, safety parameters and M-stop action of the module, and give them back on every way out."""
+    """Save gains, safety parameters and M-stop action of the module, and always restore them."""
     folder = Path(tempfile.mkdtemp(prefix="pendulum_module_")) / "before"
     console.print("keeping the module's settings ...", style="dim")
     said = _lab("backup", str(machine.path), "--out", str(folder))
@@ -134,7 +114,7 @@ def _kept_settings(machine: RealMachine, console: Console) -> Iterator[None]:
     finally:
         said = _lab("restore", str(machine.path), str(folder), "--yes")
         if said:
-            # The files stay: they are the only record of how the module was.
+            # The files remain: they are the only record of the module's settings.
             again = f"python -m pendulum_hw_bridge lab restore {machine.path} {folder}"
             words = f"the module's settings were not given back ({said}); again: {again}"
             console.print(words, markup=False, style="red")
@@ -145,7 +125,7 @@ def _kept_settings(machine: RealMachine, console: Console) -> Iterator[None]:
 def _lab(*arguments: str) -> str:
     """Run a procedure of the lab; return why it failed, or an empty string."""
     try:
-        # Ctrl-C is for the experiment: what gives the settings back must not die of it.
+        # Ctrl-C is for the experiment: it must not end the restoring of settings.
         done = run_bridge_program("lab", *arguments, timeout=_CHECK_TIMEOUT, deaf_to_ctrl_c=True)
     except subprocess.TimeoutExpired:
         return f"it did not end within {_CHECK_TIMEOUT:g} s"
@@ -153,11 +133,7 @@ def _lab(*arguments: str) -> str:
 
 
 def run_checklist(bridge: NodeProgram, console: Console, *, flat: bool = False) -> None:
-    """Run ``check`` with the bridge's own options; nothing is started where it is not passed.
-
-    Raises:
-        FaultError: It is not passed.
-    """
+    """Run ``check`` with the bridge's own options; a FaultError if it does not pass."""
     arguments = ["check", "--json", "--no-nudge", *bridge.ros_arguments(), *(["-p", "flat:=true"] if flat else [])]
     console.print("checking the machine ...", style="dim")
     try:
@@ -181,19 +157,8 @@ def _refusals(printed: str, said: str) -> str:
     return "; ".join(f"{item['name']}: {item['seen']} (expected {item['expected']})" for item in wrong)
 
 
-def ask_yes(
-    machine: RealMachine,
-    plan: str,
-    console: Console,
-    *,
-    yes: bool,
-    read: Callable[[], str] = input,
-) -> None:
-    """Print what will move, and wait for the operator's confirmation.
-
-    Raises:
-        FaultError: The answer is another, or there is no terminal for it.
-    """
+def ask_yes(machine: RealMachine, plan: str, console: Console, *, yes: bool, read: Callable[[], str] = input) -> None:
+    """Print what will move, and wait for the operator's confirmation; a FaultError without it."""
     what = "an EMULATED machine (a rehearsal)" if machine.emulated else "a REAL machine"
     moves = f"{what}: {machine.lab.describe()}, lab file {machine.path}"
     _ask(console, moves, plan, f"{machine.effort_limit}. Keep a hand on the motion stop", yes=yes, read=read)
@@ -202,18 +167,7 @@ def ask_yes(
 def ask_for_running(
     places: Sequence[str], domain: int, plan: str, *, yes: bool, read: Callable[[], str] = input
 ) -> None:
-    """Ask before moving plants that run already, of which the hardware is unknown here.
-
-    Args:
-        places: Their namespaces; without any there is no question.
-        domain: ROS domain.
-        plan: What will happen, one sentence or more.
-        yes: The operator has confirmed on the command line.
-        read: Reads the answer.
-
-    Raises:
-        FaultError: The answer is another, or there is no terminal for it.
-    """
+    """Ask before moving running plants, whose hardware is unknown; a FaultError without confirmation."""
     if not places:
         return
     console = make_console(stderr=True, highlight=False)

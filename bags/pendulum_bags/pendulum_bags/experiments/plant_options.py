@@ -36,15 +36,10 @@ Strategy = Annotated[str, typer.Option(help="How the actuator turns wanted torqu
 
 
 def equation_file(foreign: ForeignSimulation | None, target: Path, *, accept_differences: bool) -> str:
-    """Write the equation of a foreign simulation, on which controllers are designed, and return its plant file.
+    """Write the equation of a foreign simulation, for a controller's design, and return its plant file, or "".
 
-    Args:
-        foreign: The simulation; None for the built-in one, which has no such file.
-        target: Folder of the recording, which may have to be new: the file goes next to it, into ``logs``.
-        accept_differences: Whether the simulation may deviate from it.
-
-    Raises:
-        ParameterError: It deviates, or is refused.
+    The file goes into ``logs`` next to ``target``, the recording's folder, which may have to be new. A ParameterError
+    if the simulation is refused, or deviates without ``accept_differences``.
     """
     if foreign is None:
         return ""

@@ -1,4 +1,4 @@
-"""Child processes that never outlive the experiment, whatever ends it."""
+"""Child processes that never outlive the experiment."""
 
 from __future__ import annotations
 
@@ -24,16 +24,14 @@ from pendulum_msgs_py.programs.interrupts import defer_interrupts
 __all__ = ["Child", "ProcessSet", "ros_environment", "start_recorder"]
 
 _RECORDER_NICENESS = -5
-"""Priority of a recorder, where permitted: below the nodes with deadlines, above all else on the machine.
-
-After a wait of seconds, publishers have overwritten messages that it had not taken yet.
-"""
+"""Priority of a recorder, if permitted: below the nodes with deadlines, above everything else.  After a wait of seconds
+publishers have overwritten messages that it had not taken."""
 _PATIENCE = 8.0
-"""Time that a child has to end after SIGINT before it is killed [s]."""
+"""Time for a child to end after SIGINT before it is killed [s]."""
 
 
 _PREFIX = re.compile(r"^(?:\[[A-Z]+\] \[[\d.]+\] \[[^\]]+\]: |error: )")
-"""What rclpy's log, or the end of a program, puts before a sentence."""
+"""Prefix of a sentence in rclpy's log, or at the end of a program."""
 
 
 _TOO_LATE = re.compile(r"\bwithin \d|did not (?:answer|run)")
@@ -41,7 +39,7 @@ _TOO_LATE = re.compile(r"\bwithin \d|did not (?:answer|run)")
 
 
 def _busy_note(words: str) -> str:
-    """Return a remark for last lines whose cause may be other programs, else nothing."""
+    """Return a remark if other programs may have caused the last lines, else nothing."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     if load <= 2.0 * cores or not _TOO_LATE.search(words):
         return ""
@@ -62,7 +60,7 @@ class Child:
     ends_by_itself: bool = False
 
     def last_words(self, lines: int = 3) -> str:
-        """Return the end of its output, for messages; a line that a node logs and then ends with is returned once."""
+        """Return the end of its output, for messages; a line that is logged and raised is returned once."""
         with contextlib.suppress(OSError):
             text: list[str] = []
             for line in self.log.read_text(errors="replace").splitlines():
@@ -79,7 +77,7 @@ class ProcessSet:
     """The programs of one run; leaving the context ends them all.
 
     Args:
-        log_folder: One log file per program goes here.
+        log_folder: Folder of one log file per program.
         environment: Variables to add, such as the ROS domain.
         hosts: Processes that run programs one after the other; without them each has its own.
     """
@@ -90,11 +88,7 @@ class ProcessSet:
     children: list[Child] = field(default_factory=list)
 
     def __enter__(self) -> ProcessSet:
-        """Make the folder of the logs.
-
-        Raises:
-            FaultError: It cannot be made.
-        """
+        """Make the folder of the logs; a FaultError if that fails."""
         try:
             self.log_folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -122,23 +116,23 @@ class ProcessSet:
         environment: Mapping[str, str] | None = None,
         alone: bool = False,
     ) -> Child:
-        """Start a command in a process group of its own, so that this process passes Ctrl-C on, in order.
+        """Start a command in a process group of its own, to which this process passes Ctrl-C in order.
 
-        Where there are hosts and the command is a program of this project, one of them runs it.
+        If there are hosts and the command is a program of this project, one of them runs it.
 
         Args:
             name: For messages and the log file.
             command: Program and arguments.
-            ends_last: Keep it until all others have ended: a recorder that records their last messages.
-            ends_by_itself: Ending with code 0 is what it is for.
-            niceness: Scheduling priority to give away, or to take where it is negative and permitted.
+            ends_last: End it after all others: a recorder records their last messages.
+            ends_by_itself: It is expected to end with code 0.
+            niceness: Scheduling priority to give away, or to take if negative and permitted.
             environment: Variables to add for this one.
-            alone: Give it a process of its own, hosts or not.
+            alone: Give it a process of its own, even with hosts.
         """
         log = self.log_folder / f"{name}.log"
         everything = {**os.environ, **self.environment, **(environment or {})}
         process: subprocess.Popen[bytes] | HostedProgram | None = None
-        # Interrupted before it is on record, a program would not be waited for.
+        # An interrupt before the program is registered would leave it unawaited.
         with log.open("wb") as sink, defer_interrupts():
             if self.hosts is not None and not alone:
                 process = self.hosts.start(command, environment=everything, log=log, niceness=niceness)
@@ -166,15 +160,7 @@ class ProcessSet:
         return code
 
     def wait(self, child: Child, timeout: float) -> None:
-        """Wait for a program that ends by itself.
-
-        Args:
-            child: The program.
-            timeout: Longest time to wait [s].
-
-        Raises:
-            FaultError: It ends with an error, or not in time.
-        """
+        """Wait for a program that ends by itself, at most ``timeout`` [s]; a FaultError if it fails."""
         deadline = time.monotonic() + timeout
         while child.process.poll() is None:
             if time.monotonic() > deadline:
@@ -185,11 +171,7 @@ class ProcessSet:
         self.check()
 
     def stop(self, keep: Collection[Child] = ()) -> None:
-        """End all programs, recorders last: plants publish a last zero torque that should be recorded.
-
-        Args:
-            keep: Those that continue.
-        """
+        """End all programs but ``keep``, recorders last: plants publish a last zero torque that should be recorded."""
         for wave in (False, True):
             children = [child for child in self.children if child.ends_last is wave and child not in keep]
             for child in children:
@@ -203,7 +185,7 @@ class ProcessSet:
         with contextlib.suppress(ProcessLookupError):
             if child.process.poll() is None:
                 child.process.send_signal(signal.SIGINT)
-                # A stopped process would get the signal only after it is continued.
+                # A stopped process gets the signal only after it is continued.
                 child.process.send_signal(signal.SIGCONT)
 
     @staticmethod
@@ -221,12 +203,8 @@ class ProcessSet:
 
 
 def ros_environment(domain: int, log_folder: Path) -> dict[str, str]:
-    """Return the environment of the programs of a run: its domain; the network they close or open by themselves."""
-    return {
-        "ROS_DOMAIN_ID": str(domain),
-        "ROS_LOG_DIR": str(log_folder / "ros"),
-        "PYTHONUNBUFFERED": "1",
-    }
+    """Return the environment of a run's programs: its domain; they open or close the network themselves."""
+    return {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(log_folder / "ros"), "PYTHONUNBUFFERED": "1"}
 
 
 def start_recorder(
@@ -241,14 +219,7 @@ def start_recorder(
 ) -> Child:
     """Start the recorder of all topics of one plant, as the node ``recorder`` in the plant's namespace.
 
-    Args:
-        processes: Where to start it.
-        bag: Folder of the bag.
-        namespace: Namespace of the plant.
-        metadata: JSON file about the run.
-        storage: ``mcap`` or ``sqlite3``.
-        simulated: Whether time is that of the plant and not that of the wall.
-        priority: Its real-time priority; 0 for none.
+    ``metadata`` is a JSON file about the run; ``simulated`` time is the plant's; ``priority`` is real-time, 0 for none.
     """
     command = [sys.executable, "-m", "pendulum_bags", "record", "-o", str(bag)]
     command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]

@@ -1,12 +1,9 @@
 """A process that runs programs one after the other, so that a hundred runs load Python's modules once.
 
-Starting a node takes half a second of processor time, nearly all of it to load numpy, scipy and rclpy; creating and
-destroying the node takes a sixteenth of that. ``python -m pendulum_bags.experiments.program_host DESCRIPTOR`` reads
-orders, a line of JSON each, from the socket with that number, and replies with a line when a program ends. A program
-has what it would have alone: its own variables, folder, output and signals, a fresh ROS context, exit codes. The host
-ends when its socket does.
-
-:mod:`pendulum_bags.experiments.host_pool` is the other side.
+Starting a node takes half a second of processor time, nearly all of it to load numpy, scipy and rclpy. ``python -m
+pendulum_bags.experiments.program_host DESCRIPTOR`` reads orders (JSON lines) from the socket of that number and writes
+a line when a program ends. A program has its own variables, folder, output, signals, ROS context and exit code. The
+host ends when its socket does; :mod:`pendulum_bags.experiments.host_pool` is the other side.
 """
 
 from __future__ import annotations
@@ -37,7 +34,7 @@ _MOST_PROGRAMS = 200
 
 
 def main() -> int:
-    """Take orders until there are none."""
+    """Run orders until the socket ends."""
     if len(sys.argv) != 2 or not sys.argv[1].isdigit():
         print("error: a program host is started by the experiments; expected the number of a socket", file=sys.stderr)
         return EXIT_USAGE
@@ -74,7 +71,7 @@ def _run(order: Mapping[str, Any], on_begin: Callable[[], None]) -> int:
         code = 128 + signal.SIGINT
     except SystemExit as end:
         code = _exit_code(end)
-    except BaseException:  # noqa: BLE001  # an interpreter that ends by it prints it, too
+    except BaseException:  # noqa: BLE001  # printed, as an interpreter that ends by it would
         traceback.print_exc()
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -83,8 +80,8 @@ def _run(order: Mapping[str, Any], on_begin: Callable[[], None]) -> int:
         signal.signal(number, signal.SIG_DFL)
     sys.stdout.flush()
     sys.stderr.flush()
-    # Nodes freeze what is there when they start. What is left of them must go now: a node that only the collector would
-    # destroy stays on the graph, and in that domain the next run would count it.
+    # Nodes freeze existing objects at their start. What is left of this program must go now: a node that only the
+    # collector would destroy stays on the graph, and the next run in that domain would count it.
     gc.unfreeze()
     gc.collect()
     return code
@@ -105,9 +102,9 @@ def _write_to(log: Path) -> None:
 
 
 def _left_behind() -> bool:
-    """Return whether a program has left a thread that must end before the process may, or one of the middleware's.
+    """Return whether a program has left a thread of its own that blocks the process's end, or one of the middleware.
 
-    The middleware names its threads; those of Python have the name of the process.
+    The middleware names its threads; Python's have the name of the process.
     """
     if any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread()):
         return True

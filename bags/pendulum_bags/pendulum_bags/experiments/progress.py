@@ -1,4 +1,4 @@
-"""Progress of a run in the terminal: a bar over all phases, and which one it is in."""
+"""Progress of a run in the terminal: a bar over all phases, and the present one."""
 
 from __future__ import annotations
 
@@ -12,18 +12,13 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 __all__ = ["PhaseProgress"]
 
 _SILENCE = 4.0
-"""Time between two lines of a phase where the output is no terminal [s]."""
+"""Time between two lines of a phase if the output is no terminal [s]."""
 _TICK = 0.25
 """Time between two moves of the bar [s]."""
 
 
 class PhaseProgress:
-    """A bar that moves with time through phases of known length; where the output is no terminal, lines.
-
-    Args:
-        total: Expected length of all phases [s].
-        console: Where to draw.
-    """
+    """A bar that moves with time through phases of ``total`` length [s], or lines if the output is no terminal."""
 
     def __init__(self, total: float, console: Console) -> None:
         self._console = console
@@ -68,7 +63,7 @@ class PhaseProgress:
             self._console.print(f"{name} ({expected:.0f} s)", highlight=False)
 
     def _tick(self) -> None:
-        """Show that a phase goes on, also while nothing else in this process can."""
+        """Show progress while the main thread is busy."""
         while not self._ended.wait(_TICK):
             elapsed = time.monotonic() - self._started
             # Never past the end of the phase.

@@ -1,7 +1,7 @@
-"""Repeats of the thesis's experiment with new noise, in lockstep: more of the same where the first run cannot decide.
+"""Repeats of the thesis's experiment with new noise, in lockstep, if the first run cannot decide.
 
-The emulated hardware runs as nodes over DDS, as ever. The simulation runs in this process, which gives the numbers of
-its nodes to the last bit in a tenth of the time; both are stored as bags.
+The emulated hardware runs as nodes over DDS. The simulation runs in this process, which gives bit for bit its nodes'
+numbers in a tenth of the time; both are stored as bags.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ __all__ = ["SHORTEST", "record_repeat", "record_simulation", "record_spec", "rep
 SEED_STEP = 10_000_000
 """Added to the seed for each repeat, so that the repeats of one seed are not another seed's run."""
 SHORTEST = 20.0
-"""Length of the first repeat, four times the thesis's run: starting the nodes takes longer than the noise [s]."""
+"""Length of the first repeat [s], four times the thesis's run: starting the nodes takes longer than the noise."""
 LONGEST = 60.0
-"""Length that no repeat exceeds, so that a run ends soon after its budget [s]."""
+"""Longest repeat, so that a run ends soon after its budget [s]."""
 _SIMULATING = 0.1
-"""Processor time to simulate a second of noise and write it, on a side [s]."""
+"""Processor time per second of noise to simulate and write one side [s]."""
 _Settings = TypeVar("_Settings", bound=RegulationSettings | JointSettings)
 _STATE = "sensor_msgs/msg/JointState"
 _TEXT = "std_msgs/msg/String"
 
 
 def repeat_folder(folder: Path, number: int) -> Path:
-    """Return the folder of a repeat, 1 for the first, with the bags ``sim`` and ``hw``."""
+    """Return the folder of a repeat, counted from 1, with the bags ``sim`` and ``hw``."""
     return folder / REPEATS / str(number)
 
 
 def repeat_settings(settings: _Settings, number: int) -> _Settings:
-    """Return the settings of a repeat: new noise, and twice as much of it each time."""
+    """Return the settings of a repeat: new noise, twice as much each time."""
     noise = settings.noise
     duration = min(LONGEST, max(SHORTEST, noise.duration) * 2.0 ** (number - 1))
     return replace(settings, noise=replace(noise, seed=noise.seed + SEED_STEP * number, duration=duration))
@@ -58,13 +58,7 @@ def repeat_settings(settings: _Settings, number: int) -> _Settings:
 def record_repeat(
     folder: Path, settings: RegulationSettings | JointSettings, number: int, deadline: Deadline = NEVER
 ) -> None:
-    """Record what a repeat lacks of its two bags.
-
-    Args:
-        folder: Folder of the run.
-        settings: Settings of the run.
-        number: Of the repeat, from 1.
-        deadline: When to be ready; a recording that began ends.
+    """Record the missing bags of a repeat, counted from 1; a recording that began before the deadline ends.
 
     Raises:
         BagError: A bag cannot be written.
@@ -80,24 +74,14 @@ def record_repeat(
 
 
 def record_spec(bag: Path, spec: RunSpec, *, hosts: HostPool | None = None) -> Path:
-    """Record a run in lockstep: a simulation in this process, the emulated hardware over DDS; return the bag.
-
-    Args:
-        bag: Folder of the bag.
-        spec: The run.
-        hosts: As of :func:`record_run`.
-
-    Raises:
-        BagError: The bag exists, or cannot be written.
-        FaultError: A program ended or did not respond, or the plant faulted.
-    """
+    """Record a run in lockstep, a simulation in this process, else as :func:`record_run`; return the bag."""
     if spec.has_bridge:
         return record_run(bag, spec, hosts=hosts)
     return record_simulation(bag, spec)
 
 
 def record_simulation(bag: Path, spec: RunSpec) -> Path:
-    """Simulate a run in this process and write what its recorder would have written; return the bag."""
+    """Simulate a run in this process and write its bag as a recorder would; return the bag."""
     _write(bag, spec, simulate(spec))
     return bag
 
@@ -139,5 +123,4 @@ def _write(bag: Path, spec: RunSpec, run: RunArrays) -> None:
 
 
 def _rows(values: Array) -> list[Vector]:
-    """Return numbers, or rows of numbers, as tuples."""
     return [tuple(row) for row in values.reshape(len(values), -1).tolist()]

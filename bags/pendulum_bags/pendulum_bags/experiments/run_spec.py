@@ -1,4 +1,4 @@
-"""One run as a value: which plant, controller, disturbance, start, seed and clock. Studies are made of these."""
+"""One run as a value: plant, controller, disturbance, start, seed and clock. Studies consist of these."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ __all__ = [
 CLOCKS = ("lockstep", "realtime")
 SIDES = ("sim", "hw")
 EMULATOR_WATCHDOG = 50
-"""Feedback periods that the bridge waits for an emulator, on a machine that does other things too."""
+"""Feedback periods that the bridge waits for an emulator, on a busy machine."""
 EMULATOR_LIFETIME = 0.5
 """Command lifetime of an emulator on such a machine [s]."""
 EMULATOR_PATIENCE: Mapping[str, graph.ParameterArgument] = {
     "feedback_watchdog": EMULATOR_WATCHDOG,
     "command_lifetime": EMULATOR_LIFETIME,
 }
-"""Parameters of the bridge to an emulator in real time: its feedback is as punctual as this machine, which may be busy.
-A real actuator keeps the default."""
+"""Parameters of the bridge to an emulator in real time, whose feedback may be late on a busy machine. A real actuator
+keeps the default."""
 _AT_REST = 1e-9
 BEGINS_ANYWHERE = {"start_effort_limit": 0.0}
-"""Of a simulated plant whose run begins at an angle of its own, with the torque of its controller there."""
+"""Of a simulated plant that starts at its own angle, with its controller's torque there."""
 THESIS_METHOD = "euler"
 """Integrator of the thesis's simulation, for rigid plants."""
 PERIODS = {"sim": 0.002, "hw": 0.01}
@@ -68,19 +68,16 @@ class RunSpec:
 
     Attributes:
         side: ``sim`` for the simulator, ``hw`` for the emulated hardware.
-        plant: Preset or file of what runs: the simulated plant, or the emulated machine.
+        plant: Preset or file of the simulated plant, or of the emulated machine.
         design_plant: Preset or file that the controller is designed on.
-        strategy: How the actuator turns torque into PWM (``hw``).
-        controller: Kind of controller.
-        controller_parameters: Its parameters.
-        disturbance: Parameters of the disturbance; no parameters for none.
+        strategy: The actuator's conversion of torque into PWM (``hw``).
+        disturbance: Parameters of the disturbance; empty for none.
         theta: Initial angle; plants of several joints begin upright [rad].
         set_point: Angle to hold, from upright [rad].
         duration: Length [s].
         seed: Seed of the disturbance, and of the sensors of the emulated hardware.
-        method: Integrator of the simulator; Euler as in the thesis, which a plant with motor and spring has not.
+        method: Integrator of the simulator; Euler as in the thesis, but not for a plant with motor and spring.
         plant_parameters: Further parameters of the plant's node, such as sensor noise.
-        storage: Storage of the bag.
         clock: ``lockstep`` for as fast as the nodes reply, ``realtime`` for wall time.
         simulation: A third-party simulation in place of ``plant``, a model file or ``gymnasium:ID``; empty for none.
         mapping: Its mapping file; empty for none.
@@ -105,7 +102,6 @@ class RunSpec:
     mapping: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be run before anything is started."""
         if self.side not in SIDES:
             raise ParameterError(f"side is {self.side!r}; expected sim or hw")
         if self.clock not in CLOCKS:
@@ -127,7 +123,7 @@ class RunSpec:
             object.__setattr__(self, "method", integrator_of(self.plant, self.method))
         for name, given in self.plant_parameters.items():
             for value in given if isinstance(given, (list, tuple)) else (given,):
-                # The node judges what it has, but what a run is made of is written down before it starts.
+                # The node checks its own parameters, but a run is written down before it starts.
                 if isinstance(value, float) and not math.isfinite(value):
                     raise ParameterError(f"parameter {name} of the plant is {value}; expected a finite number")
         design = load_mechanism(self.design_plant)
@@ -145,11 +141,11 @@ class RunSpec:
 
     @property
     def mechanism(self) -> PlantParameters | None:
-        """The plant that runs, where it has several joints; else None."""
+        """The plant, if it has several joints; else None."""
         return load_mechanism(self.plant) if is_mechanism(self.plant) else None
 
     def law(self, design: PlantParameters) -> dict[str, Any]:
-        """Return the parameters of the controller, with the set-point that those of one joint have."""
+        """Return the parameters of the controller, with the set point of one joint."""
         own = {"set_point": float(self.set_point)} if design.is_pendulum else {}
         return {**self.controller_parameters, **own}
 
@@ -162,12 +158,12 @@ class RunSpec:
 
     @property
     def foreign(self) -> ForeignSimulation | None:
-        """The third-party simulation, in place of either; None where the built-in one or the emulated hardware runs."""
+        """The third-party simulation; None for the built-in one and the emulated hardware."""
         return ForeignSimulation(self.simulation, self.mapping) if self.simulation else None
 
     @property
     def identity(self) -> str:
-        """The plant that runs, by name and values."""
+        """The plant, by name and values."""
         if (foreign := self.foreign) is not None:
             return foreign.identity
         return run_identity(self.plant, self.strategy if self.has_bridge else "")
@@ -179,7 +175,7 @@ class RunSpec:
 
     @property
     def simulated_time(self) -> bool:
-        """Whether time is that of the plant and not that of the wall."""
+        """Whether time is the plant's rather than wall time."""
         return self.clock == "lockstep"
 
     @property
@@ -188,7 +184,7 @@ class RunSpec:
         return round(self.duration / self.period)
 
     def disturbance_parameters(self) -> dict[str, Any]:
-        """Return the parameters of the disturbance, the seed of the run among them, and of several joints which."""
+        """Return the parameters of the disturbance, with the run's seed and, for several joints, its joint."""
         values: dict[str, Any] = {"kind": "uniform", "amplitude": 0.0, "hold_time": 0.01}
         if (mechanism := self.mechanism) is not None:
             values["joints"] = list(mechanism.coordinates.driven_names[:1])
@@ -196,11 +192,7 @@ class RunSpec:
         return {**values, "seed": self.seed}
 
     def plant_program(self, listeners: int) -> NodeProgram:
-        """Return the plant; it takes its first step when the orchestrator has armed or resumed it, and subscribes too.
-
-        Args:
-            listeners: Subscriptions to its states that it waits for.
-        """
+        """Return the plant; it starts once armed or resumed, with ``listeners`` and the orchestrator subscribed."""
         if self.simulated_time:
             loop = lockstep_parameters(listeners, self.duration)
         else:
@@ -211,7 +203,7 @@ class RunSpec:
             loop.setdefault("plant", absolute_plant(self.plant))
         mechanism = self.mechanism
         if self.has_bridge:
-            # No hardware is armed by a parameter: the conductor does it, before it becomes the last listener.
+            # No parameter arms hardware: the orchestrator does, before it becomes the last listener.
             loop["seed"] = self.seed
             if mechanism is not None:
                 goal = list(mechanism.coordinates.goal)
@@ -278,11 +270,7 @@ class RunSpec:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> RunSpec:
-        """Return the run that JSON values describe.
-
-        Raises:
-            ParameterError: A value is unknown or refused.
-        """
+        """Return the run in JSON values; a ParameterError if a value is unknown or refused."""
         reject_unknown(values, cls.__dataclass_fields__, where="run")
         return cls(**values)
 
@@ -300,11 +288,7 @@ def lockstep_parameters(
 
 
 def run_identity(plant: str, strategy: str = "") -> str:
-    """Return the identity of a preset or plant file as the simulator runs it, or with a strategy as the emulator does.
-
-    Raises:
-        ParameterError: The plant is unknown.
-    """
+    """Return a plant's identity in the simulator, or with a strategy in the emulator; or a ParameterError."""
     if is_mechanism(plant):
         return plant_identity(load_mechanism(plant))
     found = plant_identity(load_plant_to_run(plant)[0])
@@ -312,11 +296,7 @@ def run_identity(plant: str, strategy: str = "") -> str:
 
 
 def integrator_of(plant: str, method: str) -> str:
-    """Return the integrator for a preset or plant file: that of the thesis cannot step a motor on a spring.
-
-    Raises:
-        ParameterError: The plant is unknown.
-    """
+    """Return a plant's integrator: that of the thesis cannot step a motor on a spring; or a ParameterError."""
     if is_mechanism(plant):
         return "auto"
     elastic = load_plant_to_run(plant)[0].drivetrain is not None
@@ -324,5 +304,5 @@ def integrator_of(plant: str, method: str) -> str:
 
 
 def absolute_plant(plant: str) -> str:
-    """Return a preset as it is, and a file so that a node started elsewhere finds it."""
+    """Return a preset unchanged, and a file's absolute path."""
     return plant if Path(plant).suffix == "" else str(Path(plant).resolve())

@@ -1,4 +1,4 @@
-"""What every run over DDS has around its phases: its programs, their orchestrator, its recorders, and a safe end."""
+"""The common frame of every run over DDS: its programs, their orchestrator, its recorders, and a safe end."""
 
 from __future__ import annotations
 
@@ -35,26 +35,20 @@ __all__ = [
 ]
 
 START_TIMEOUT = 60.0
-"""Longest time for all programs to be up; the first start on a cold machine compiles code [s]."""
+"""Longest time for all programs to start; the first start on a machine compiles code [s]."""
 PLANT_PRIORITY = 50
-"""Real-time priority of a plant, where permitted, as of ros2_control's controller manager."""
+"""Real-time priority of a plant, if permitted, as of ros2_control's controller manager."""
 ANSWER_PRIORITY = PLANT_PRIORITY - 2
 """Real-time priority of nodes that reply to a plant: below its loop, which is one below its process."""
 RECORDER_PRIORITY = ANSWER_PRIORITY - 2
 """Real-time priority of a recorder: below nodes with deadlines; without one it would lose messages."""
 LOOP_NICENESS = -10
-"""Niceness of nodes with deadlines, where permitted."""
+"""Niceness of nodes with deadlines, if permitted."""
 
 
 @dataclass
 class Session:
-    """The programs of one run and the node that conducts them; :func:`conduct` makes it.
-
-    Attributes:
-        processes: The programs.
-        conductor: The orchestrator.
-        logs: Folder of their logs.
-    """
+    """The programs of one run and their orchestrator; made by :func:`conduct`."""
 
     processes: ProcessSet
     conductor: Conductor
@@ -64,46 +58,25 @@ class Session:
     def record(
         self, bag: Path, namespace: str, metadata: Mapping[str, Any], storage: str, *, simulated: bool = False
     ) -> Child:
-        """Start the recorder of one plant.
-
-        Args:
-            bag: Folder of the bag.
-            namespace: Namespace of the plant.
-            metadata: The bag's metadata of its run.
-            storage: ``mcap`` or ``sqlite3``.
-            simulated: Whether time is the plant's and not wall time.
-        """
+        """Start the recorder of one plant in a namespace; ``simulated`` time is the plant's."""
         file = self.logs / f"{bag.name}_metadata.json"
         write_json(file, dict(metadata))
         priority = 0 if simulated else permitted(RECORDER_PRIORITY)
         return start_recorder(self.processes, bag, namespace, file, storage, simulated=simulated, priority=priority)
 
     def close(self, recorder: Child) -> None:
-        """End a recorder now.
-
-        Raises:
-            FaultError: It could not close its bag.
-        """
+        """End a recorder now; a FaultError if it could not close its bag."""
         if self.processes.finish(recorder) != 0:
             raise FaultError(recorder.last_words(1))
 
     def close_in_lockstep(
         self, recorder: Child, plant: PlantClient, states: int, steps_are_told_on: Collection[str] = ()
     ) -> None:
-        """Close the bag of a run in lockstep when it holds everything.
+        """Close the bag of a run in lockstep when it is complete; a FaultError if messages were lost.
 
-        Simulated time has stopped by then: messages of ending nodes are no part of the run.
-
-        Args:
-            recorder: The recorder.
-            plant: The plant.
-            states: How many states the plant has published.
-            steps_are_told_on: Relative names of the topics that have a message for each step, of which there is one
-                less. A publisher may match the recorder only after the recorder matches it, and what it publishes
-                meanwhile is lost: a short run can be over by then.
-
-        Raises:
-            FaultError: Messages were lost.
+        Messages of ending nodes are no part of the run. ``states`` is the number that the plant has published;
+        ``steps_are_told_on`` are relative names of topics with a message per step, one fewer than states: what a
+        publisher sends before it has matched the recorder is lost, and a short run can be over by then.
         """
         # The clock ticks once for each state, and no topic waits for another.
         expected = {f"{plant.namespace}/{names.JOINT_STATES}": states, names.CLOCK: states}
@@ -127,12 +100,10 @@ class Session:
     def wait_until_all_hear_each_other(
         self, namespace: str, listeners: Mapping[str, int], *, clock: bool = True
     ) -> None:
-        """Wait until every subscription of a run is on the graph, and the recorder's are matched with a publisher.
+        """Wait until every subscription of a run is on the graph, and the recorder's are matched.
 
-        Args:
-            namespace: Namespace of the plant.
-            listeners: How many subscriptions each topic of the plant must have, by relative name.
-            clock: Whether the plant publishes simulated time, which is recorded too.
+        ``listeners`` are the required subscriptions to each of the plant's topics, by relative name; ``clock`` if the
+        plant publishes simulated time, which is recorded too.
         """
         conductor, node = self.conductor, self.conductor.node
 
@@ -155,15 +126,10 @@ class Session:
 def conduct(
     logs: Path, domain: int, on_wait: Callable[[], None] = lambda: None, *, hosts: HostPool | None = None
 ) -> Iterator[Session]:
-    """Join the graph to carry out one run; leaving it ends all its programs, recorders last.
+    """Join the graph for one run, whose phases are the caller's; leaving it ends all programs, recorders last.
 
-    The phases of the run are its caller's. An abort disarms what the session drives, at once.
-
-    Args:
-        logs: Folder of the programs' logs.
-        domain: ROS domain.
-        on_wait: Called while waiting, to show progress.
-        hosts: Run its programs, and those of other runs; without them each is a process of its own.
+    An abort disarms what the session drives, at once. ``on_wait`` is called while waiting; ``hosts`` is as for
+    :func:`pendulum_bags.experiments.lockstep.record_run`.
 
     Raises:
         FaultError: The folder cannot be made; or, out of any wait, a program ended by itself.
@@ -181,13 +147,9 @@ def conduct(
 
 
 def start_loop(processes: ProcessSet, program: NodeProgram, priority: int, *, simulated: bool = False) -> Child:
-    """Start a node with deadlines, at real-time priority where permitted.
+    """Start a node with deadlines, at real-time priority if permitted.
 
-    Args:
-        processes: Of the run.
-        program: The node.
-        priority: Its real-time priority.
-        simulated: Time is the plant's: there are no deadlines, and other programs are not to wait.
+    ``simulated`` time is the plant's: there are no deadlines, and other programs need not wait.
     """
     if simulated:
         return processes.start_node(program)
@@ -195,27 +157,17 @@ def start_loop(processes: ProcessSet, program: NodeProgram, priority: int, *, si
 
 
 def in_real_time(program: NodeProgram, priority: int) -> NodeProgram:
-    """Return a node with its real-time priority, or as it is where that is not permitted.
-
-    Args:
-        program: The node.
-        priority: Its real-time priority, that of a plant at most.
-    """
+    """Return a node with its real-time priority, at most a plant's, or unchanged if that is not permitted."""
     if not permitted(priority):
         return program
     return replace(program, parameters={**program.parameters, REALTIME_PRIORITY.name: priority})
 
 
 def permitted(priority: int) -> int:
-    """Return a real-time priority, or 0 where that of a plant is not permitted.
+    """Return a real-time priority, at most a plant's, or 0 if a plant's is not permitted.
 
-    It is 0 too where ``PENDULUM_NO_REALTIME`` is set: several experiments at once on one computer would block each
-    other, and other programs with deadlines.
-
-    All or none: a controller must not have priority over a plant without it.
-
-    Args:
-        priority: That of a plant at most.
+    All or none: a controller must not have priority over a plant without it. Also 0 if ``PENDULUM_NO_REALTIME`` is set:
+    several experiments on one computer would block each other, and other programs with deadlines.
     """
     if os.environ.get(NO_REALTIME):
         return 0
@@ -223,10 +175,6 @@ def permitted(priority: int) -> int:
 
 
 def refuse_existing(bag: Path) -> None:
-    """Refuse to record where a bag is already.
-
-    Raises:
-        BagError: It exists.
-    """
+    """Raise a BagError if a bag exists already."""
     if bag.exists():
         raise BagError(f"bag {bag} exists; expected a new folder")

@@ -1,4 +1,4 @@
-"""What a run of an experiment is made of."""
+"""Settings of an experiment's run."""
 
 from __future__ import annotations
 
@@ -23,13 +23,7 @@ from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
 from pendulum_lqr.controller_interface.controller import controller_parameters
 from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy, policy_record
 from pendulum_msgs_py.contract.angles import UPRIGHT
-from pendulum_msgs_py.contract.trajectory import (
-    MAX_RAMP_VELOCITY,
-    RAMP_INCREMENT,
-    RAMP_PERIOD,
-    Trajectory,
-    thesis_ramp,
-)
+from pendulum_msgs_py.contract.trajectory import MAX_RAMP_VELOCITY, RAMP_INCREMENT, RAMP_PERIOD, Trajectory, thesis_ramp
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import require_one_joint
 from pendulum_msgs_py.programs import graph
@@ -56,11 +50,11 @@ TIME_BESIDE_NOISE = 47.0
 RAMP_SPEED = RAMP_INCREMENT / RAMP_PERIOD
 """Mean speed of the thesis's ramp [rad/s]."""
 RAMP_SPEEDS = (0.05, 0.8)
-"""Slowest and fastest ramps: as many points as a plant takes, and the most that a bridge with its usual limit of
-1.5 rad/s follows whatever gap to where the pendulum stands it has to close meanwhile, by up to 0.3 rad/s [rad/s]."""
+"""Slowest and fastest ramps [rad/s]: as many points as a plant takes, and the most that a bridge limited to 1.5 rad/s
+follows while it also closes the gap to the pendulum's position at up to 0.3 rad/s."""
 _LARGEST_OF_LIMIT = 0.9
-"""Largest speed of a ramp, as a share of the machine's limit: a pendulum that stands upright is not where the ramp down
-begins, and a refused ramp would release it where it stands."""
+"""Largest speed of a ramp, as a share of the machine's limit: an upright pendulum is not where the ramp down begins,
+and a refused ramp would release it there."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +62,6 @@ class NoiseSettings:
     """Uniform noise on the torque.
 
     Attributes:
-        seed: Seed; one seed is one signal.
         amplitude: Largest torque [N m].
         hold_time: Time for which a sample is held [s].
         duration: Length [s].
@@ -80,7 +73,6 @@ class NoiseSettings:
     duration: float = 5.0
 
     def __post_init__(self) -> None:
-        """Refuse what makes no signal."""
         for name, value, unit in (
             ("noise amplitude", self.amplitude, "N m"),
             ("noise hold time", self.hold_time, "s"),
@@ -99,19 +91,15 @@ class RegulationSettings:
     Attributes:
         plant: Preset or file of the simulated plant.
         design: Preset or file that the controller is designed on; empty for the simulated plant.
-        hardware: ``emulator``, or ``hebi`` for the machine of a lab file; or a second third-party simulation (a model
-            file or ``gymnasium:ID``), or a plant that runs already, ``ros:/namespace``.
+        hardware: ``emulator``, ``hebi`` for the machine of a lab file, a second third-party simulation (a model file or
+            ``gymnasium:ID``), or ``ros:/namespace`` for a plant that runs already.
         lab: The lab file, for ``hebi``.
-        effort_strategy: How the actuator turns wanted torque into PWM; it changes the plant that a controller sees.
-            Empty for that of the lab file, else ``direct_pwm``; read it from :attr:`strategy`.
+        effort_strategy: The actuator's conversion of torque into PWM, which changes the plant. Empty for that of the
+            lab file, else ``direct_pwm``; read it from :attr:`strategy`.
         controller: Kind of controller, or a policy file (.npz).
-        q: Diagonal of Q.
-        r: R.
-        noise: The disturbance.
-        storage: Storage of the bags.
-        method: Integrator of the simulator; Euler as in the thesis, which a plant with motor and spring has not.
-        simulation: A third-party simulation in place of the simulator, a model file, ``gymnasium:ID``, or
-            ``ros:/namespace`` for one that runs already; empty for the simulator.
+        method: Integrator of the simulator; Euler as in the thesis, but not for a plant with motor and spring.
+        simulation: A third-party simulation: a model file, ``gymnasium:ID``, or ``ros:/namespace`` for one that runs
+            already; empty for the simulator.
         mapping: Its mapping file; empty for none.
         hardware_mapping: Mapping file of a simulation in the hardware's place; empty for none.
         ramp_speed: Mean speed of the ramps up and down; the largest is half as much again [rad/s].
@@ -134,7 +122,7 @@ class RegulationSettings:
     design: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse unknown plants and backends, and a policy that cannot be read, before anything is started."""
+        """Validate plants, backends and policy before anything is started."""
         if self.controller == "policy":
             raise ParameterError("controller is 'policy' without a file; expected the path of a policy file (.npz)")
         if self.kind == "policy":
@@ -191,7 +179,7 @@ class RegulationSettings:
 
     @property
     def tuning(self) -> dict[str, list[float] | float | str]:
-        """The weights Q and R or the policy file, as far as the controller has such parameters."""
+        """Weights Q and R or the policy file, as far as the controller has such parameters."""
         known = {spec.name for spec in controller_parameters(self.kind)}
         given: dict[str, list[float] | float | str] = {"q": [float(value) for value in self.q], "r": float(self.r)}
         if self.kind == "policy":
@@ -204,14 +192,14 @@ class RegulationSettings:
         return self.foreign_of("sim")
 
     def foreign_of(self, side: str) -> ForeignSimulation | None:
-        """Return the third-party simulation that is one side, ``sim`` or ``hw``; None where something else is."""
+        """Return the third-party simulation of a side, ``sim`` or ``hw``, or None."""
         name, mapping = (self.simulation, self.mapping) if side == "sim" else (self.hardware, self.hardware_mapping)
         if not name or (side == "hw" and name in HARDWARE) or name.startswith(PREFIX):
             return None
         return ForeignSimulation(name, mapping)
 
     def running(self, side: str) -> str | None:
-        """Return the namespace of the plant that runs already as one side; None where the experiment starts it."""
+        """Return the namespace of a side's running plant; None if the experiment starts it."""
         return running_namespace(self.simulation if side == "sim" else self.hardware)
 
     def namespace(self, side: str) -> str:
@@ -251,13 +239,13 @@ class RegulationSettings:
 
     @property
     def strategy(self) -> str:
-        """How the actuator turns torque into PWM: as given, as in the lab file, or ``direct_pwm``."""
+        """The actuator's conversion of torque into PWM: as given, as in the lab file, or ``direct_pwm``."""
         machine = self.machine
         of_lab = machine.lab.values.get("effort_strategy", "") if machine is not None else ""
         return self.effort_strategy or of_lab or DEFAULT_STRATEGY
 
     def plant_name(self, side: str) -> str:
-        """Return what a bag names as a side's plant: ``emulator``, also for the emulated machine of a lab file."""
+        """Return a side's plant as a bag names it: ``emulator``, also for the emulated machine of a lab file."""
         if side == "sim":
             return self.plant if self.running(side) is None else self.simulation
         if (foreign := self.foreign_of("hw")) is not None:
@@ -265,12 +253,7 @@ class RegulationSettings:
         return "emulator" if self.machine is not None and self.machine.emulated else self.hardware
 
     def plant_program(self, side: str, bag: Path | None = None) -> NodeProgram | None:
-        """Return the plant of one side in real time; None for one that runs already.
-
-        Args:
-            side: ``sim`` or ``hw``.
-            bag: The hardware's bag: a real one's own log is written next to it.
-        """
+        """Return a side's plant in real time, or None if it runs already; a real one's own log goes next to ``bag``."""
         if self.running(side) is not None:
             return None
         return self.simulator_program() if side == "sim" else self.bridge_program(bag)
@@ -282,11 +265,7 @@ class RegulationSettings:
         return graph.simulator("/sim", plant=self.plant, method=self.method, clock="realtime")
 
     def bridge_program(self, bag: Path | None = None) -> NodeProgram:
-        """Return the bridge to the actuator, or the simulation in place of it.
-
-        Args:
-            bag: A real actuator's own log is written next to it.
-        """
+        """Return the bridge to the actuator, whose own log goes next to ``bag``, or the simulation in its place."""
         if (foreign := self.foreign_of("hw")) is not None:
             return foreign.program("/hw", clock="realtime")
         if (machine := self.machine) is not None:
@@ -303,7 +282,7 @@ class RegulationSettings:
         return graph.disturbance(namespace, **{"kind": "uniform", **asdict(self.noise), **changes})
 
     def identity(self, side: str) -> str:
-        """Return the plant of one side, by name and values; of one that runs already by its namespace."""
+        """Return a side's plant by name and values, or by its namespace if it runs already."""
         if (foreign := self.foreign_of(side)) is not None:
             return foreign.identity
         if side == "hw" and (machine := self.machine) is not None:

@@ -27,7 +27,7 @@ __all__ = ["ForeignSimulation", "recorded_difference"]
 
 EQUATION_FILE = "simulation.yaml"
 _PIECES = 0.9
-"""Share of the pieces of a recording that must agree: a state that came late spoils its piece."""
+"""Share of the pieces of a recording that must agree: a late state spoils its piece."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,7 @@ def _facts(name: str, mapping: str) -> _Facts:
 
 @dataclass(frozen=True)
 class ForeignSimulation:
-    """A simulation in place of the simulator.
-
-    Attributes:
-        name: Path of a model file, or ``gymnasium:ID``.
-        mapping: Path of its mapping file; empty for none.
-    """
+    """A simulation in place of the simulator: a model file or ``gymnasium:ID``, and its mapping file or ""."""
 
     name: str
     mapping: str = ""
@@ -65,11 +60,7 @@ class ForeignSimulation:
 
     @property
     def parameters(self) -> PlantParameters:
-        """The nearest equation.
-
-        Raises:
-            ParameterError: The simulation is refused.
-        """
+        """The nearest equation; a ParameterError if the simulation is refused."""
         return _facts(self.name, self.mapping).parameters
 
     @property
@@ -78,14 +69,7 @@ class ForeignSimulation:
         return _facts(self.name, self.mapping).period
 
     def check(self, hold_time: float) -> None:
-        """Refuse a simulation that cannot be regulated upright.
-
-        Args:
-            hold_time: Time for which a sample of the noise is held [s].
-
-        Raises:
-            ParameterError: It is refused, is too weak or too slow.
-        """
+        """Raise a ParameterError if it is too weak or slow to be held upright; noise is held ``hold_time`` [s]."""
         found = self.parameters
         if found.gravity >= found.effort_limit:
             environment = find_engine(self.name)[0].program == "gymnasium"
@@ -101,11 +85,7 @@ class ForeignSimulation:
             )
 
     def require_equation(self) -> None:
-        """Refuse a simulation that deviates from the equation that a controller would be designed on.
-
-        Raises:
-            ParameterError: It deviates; the message has by how much, where, and the cause if it could be tested.
-        """
+        """Raise a ParameterError if the simulation deviates from its equation: how much, where, and a tested cause."""
         if not (check := _facts(self.name, self.mapping).check).agrees:
             raise ParameterError(
                 f"simulation {self.name} {check}; expected one that does, --plant FILE to design on "
@@ -113,7 +93,7 @@ class ForeignSimulation:
             )
 
     def absolute(self) -> dict[str, str]:
-        """Return the entries of a study that name it, so that a program started elsewhere finds its files."""
+        """Return the entries of a study that name it, with absolute paths."""
         given = {"simulation": self.name, "mapping": self.mapping}
         return {key: str(Path(text).resolve()) if Path(text).is_file() else text for key, text in given.items()}
 
@@ -158,16 +138,7 @@ class ForeignSimulation:
 
 
 def recorded_difference(bag: Path, namespace: str, plant: str) -> str:
-    """Return how far a plant that ran already followed the user's equation, as far as it moved at all.
-
-    Args:
-        bag: Its recording.
-        namespace: Its namespace.
-        plant: Preset or file of the equation.
-
-    Raises:
-        DataError: The recording lacks states.
-    """
+    """Return how far a running plant followed its equation, if it moved; a DataError without states."""
     recording = read_recording(bag, namespace=namespace)
     period = float(np.median(np.diff(recording.time)))
     times = np.arange(recording.time[0], recording.time[-1], period)

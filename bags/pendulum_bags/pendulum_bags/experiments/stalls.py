@@ -1,7 +1,7 @@
 """A run that a stalled machine aborted is no result: it is reported, recorded, and repeated a few times.
 
-An emulator is as punctual as its machine. If that stalls for longer than the bridge's timeout, the bridge faults, as
-it must: it cannot rule out real hardware. A real machine is never restarted automatically.
+If the machine stalls an emulator for longer than the bridge's timeout, the bridge must fault: it cannot rule out real
+hardware. A real machine is never restarted automatically.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from pendulum_msgs_py.errors import FaultError, PlantStoppedError
 __all__ = ["ATTEMPTS", "is_stall", "run_undisturbed"]
 
 ATTEMPTS = 3
-"""Times that a run is carried out at most."""
+"""Most attempts of a run."""
 STALLS = ("host_stalled", "feedback_lost", "feedback_late", "motion_disagreement")
-"""Faults of the bridge that an emulator, whose feedback this machine makes, has where the machine stalls: in records
-that are far apart position and velocity disagree."""
+"""Faults of the bridge caused by the machine's stall of an emulator's feedback: position and velocity of distant
+records disagree."""
 SAID = ("is the machine too busy", "no command for", "no fresh command")
 """Reasons of a plant with old states, and of one whose controller stalled."""
 _LOGS = "logs"
@@ -33,18 +33,12 @@ def is_stall(error: FaultError) -> bool:
     return name in STALLS or any(part in error.reason for part in SAID)
 
 
-def run_undisturbed(
-    run: Callable[[], None],
-    folder: Path,
-    *,
-    emulated: bool,
-    tell: Callable[[str], None],
-) -> None:
-    """Carry out a run, and again where the machine stalled.
+def run_undisturbed(run: Callable[[], None], folder: Path, *, emulated: bool, tell: Callable[[str], None]) -> None:
+    """Carry out a run, and repeat it if the machine stalled.
 
     Args:
         run: Records into the folder.
-        folder: The run's folder; of a stalled run its logs and its reason remain, for the result.
+        folder: The run's folder; logs and reason of a stalled run remain, for the result.
         emulated: Whether the hardware is emulated; a real machine moves only on its operator's command.
         tell: Called with a sentence on each stall.
 
@@ -58,7 +52,7 @@ def run_undisturbed(
             if not emulated or not is_stall(error):
                 raise
             last = attempt == ATTEMPTS
-            # Before anything is removed: a fault of the bridge's own that looks like a stall must not be selected away.
+            # Recorded before anything is removed: a fault that only looks like a stall must not be selected away.
             write_stall(folder, str(error), "" if not (folder / _LOGS).is_dir() else _LOGS if last else _kept(attempt))
             if last:
                 raise FaultError(

@@ -1,4 +1,4 @@
-"""The thesis's experiment: upright on simulator and hardware, LQR under one and the same noise, down again."""
+"""The thesis's experiment: upright on simulator and hardware, LQR under the same noise, down again."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from pendulum_msgs_py.errors import FaultError
 __all__ = ["run_thesis"]
 
 _PAUSING = 4.0
-"""Time before the end of the ramp up from which on nothing is begun beside it [s]."""
+"""Time before the end of the ramp up from which nothing is begun in parallel [s]."""
 OWN_PROTOCOL_SEED_STEP = 1_000_000
 """Added to the seed for the unpaired simulation, whose noise must not be that of the hardware."""
 
@@ -54,14 +54,14 @@ def run_thesis(
         folder: The run's folder.
         settings: What to run.
         domain: ROS domain, or None for any free one.
-        progress: Shows where it is.
-        leaving: Leaves the graph of a run that succeeded, in which the middleware can hang for good: close it when
+        progress: Shows the phase.
+        leaving: Leaves the graph of a successful run, in which the middleware can hang for ever: close it when
             everything is written.
         on_idle: Called when a ramp begins, which leaves the computer idle.
-        rests: Called until it returns that what was begun then has paused, before the noise.
+        rests: Called until it returns that the work begun then has paused, before the noise.
 
     Raises:
-        FaultError: A program ended, a plant refused or faulted; everything is at rest again when this is raised.
+        FaultError: A program ended, a plant refused or faulted; everything is at rest again.
     """
     with ExitStack() as stack:
         session = stack.enter_context(conduct(folder / "logs", stack.enter_context(reserve_domain(domain))))
@@ -85,10 +85,7 @@ def run_thesis(
 def _start(
     session: Session, folder: Path, settings: RegulationSettings
 ) -> tuple[tuple[PlantClient, PlantClient], list[Child]]:
-    """Start all programs; return both plants, and their recorders.
-
-    Plants that run already are checked first, without commands.
-    """
+    """Start all programs; return both plants, and their recorders. Running plants are checked without commands."""
     conductor = session.conductor
     joined = {side: join(conductor, running) for side in SIDES if (running := settings.running(side)) is not None}
     recorders = []
@@ -154,14 +151,12 @@ def _regulate(
     conductor.wait_for("the disturbances to start", lambda: all(future.done() for future in started), 5.0)
     for plant in plants:
         conductor.wait_for(
-            f"the end of the noise on {plant.namespace}",
-            partial(_noise_ended, plant),
-            noise.duration + 15.0,
+            f"the end of the noise on {plant.namespace}", partial(_noise_ended, plant), noise.duration + 15.0
         )
 
     durations = _start_move(conductor, plants, settings, 0.0, "ramp_down", progress)
     on_idle()
-    # Before the ramp ends: a controller that is still active then would take over a pendulum half a turn from upright.
+    # Before the ramp ends: an active controller would take over a pendulum half a turn from upright.
     for plant in plants:
         plant.switch_controller(on=False)
     _wait_for_goal(conductor, plants, durations)
@@ -178,7 +173,7 @@ def _noise_ended(plant: PlantClient) -> bool:
 
 
 def _simulate_own_protocol(folder: Path, settings: RegulationSettings) -> None:
-    """Simulate as the thesis did: noise of its own, a new sample every 2 ms; what nodes would record, without them."""
+    """Simulate as the thesis did, with its own noise, a new sample every 2 ms, and without nodes."""
     foreign = settings.foreign
     hold_time = 0.002 if foreign is None else max(0.002, foreign.period)
     noise = replace(settings.noise, seed=settings.noise.seed + OWN_PROTOCOL_SEED_STEP, hold_time=hold_time)

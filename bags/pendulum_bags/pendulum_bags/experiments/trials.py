@@ -40,10 +40,10 @@ class TrialKind:
     Attributes:
         name: As in ``experiment NAME`` and ``identify --experiment NAME``.
         procedure: What the bridge's procedure plays.
-        trials: How many, as in the thesis.
+        trials: Number of trials, as in the thesis.
         flat: Whether the pendulum lies on a table, without gravity.
         inputs: Inputs of the plant with a reply to each state.
-        longest: Time that the simulated hand takes at most [s]; 0 where the settings have it.
+        longest: Longest time of the simulated hand [s]; 0 if the settings have it.
     """
 
     name: str
@@ -63,16 +63,13 @@ class TrialSettings:
     """What to run.
 
     Attributes:
-        kind: Which experiment.
-        trials: Number of trials.
         hardware: ``emulator`` or ``hebi``.
         plant: Plant of the emulator: preset or file with a drivetrain.
-        realtime: Keep the wall's time on the emulator too; a real actuator always does.
+        realtime: Wall time for the emulator too; a real actuator always has it.
         seed: Seed of the simulated hand, and of sensor noise.
         step: Height of a step of the staircase [deg].
         top: Highest angle of the staircase [deg].
         hold: Time at rest on each step [s].
-        storage: Storage of the bags.
         lab: Lab file of the real actuator, for ``hebi``.
     """
 
@@ -89,7 +86,6 @@ class TrialSettings:
     lab: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be run before anything is started."""
         if self.hardware not in HARDWARE:
             raise ParameterError(f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}")
         real_machine(self.hardware, self.lab)
@@ -123,19 +119,19 @@ class TrialSettings:
 
     @property
     def expected_wall_time(self) -> float:
-        """Wall time of one trial, starting its nodes included [s]."""
+        """Wall time of one trial, including the start of its nodes [s]."""
         return 4.0 + self.expected_duration / (10.0 if self.lockstep else 1.0)
 
     def plant_program(self, trial: int, bag: Path | None = None) -> graph.NodeProgram:
-        """Return the bridge; a real actuator's own log is written next to the bag, where there is one."""
+        """Return the bridge; a real actuator's own log is written next to the bag."""
         if (machine := self.machine) is not None:
             return machine.bridge_program("direct_pwm", bag)
         parameters: dict[str, graph.ParameterArgument] = {"plant": self.plant, "effort_strategy": "direct_pwm"}
         if self.hardware == "emulator":
-            # Sensor noise differs from trial to trial, as it would.
+            # Sensor noise differs from trial to trial, as on a real sensor.
             parameters.update(flat=self.kind.flat, seed=1000 * self.seed + trial)
             if self.lockstep:
-                # It ends by simulated time, too: when the conductor sees the end depends on how busy the machine is.
+                # Ends by simulated time, too: a busy machine delays the orchestrator's view of the end.
                 parameters.update(lockstep_parameters(_LISTENERS + 1, self.expected_duration, self.kind.inputs))
             else:
                 parameters.update(EMULATOR_PATIENCE)
@@ -168,17 +164,10 @@ def run_trials(
     progress: PhaseProgress,
     ask: Callable[[str], None] = lambda _: None,
 ) -> list[Path]:
-    """Run all trials, one bag each, and return the bags.
+    """Run all trials, one bag each (``trial_1``, ...), and return the bags.
 
-    Args:
-        folder: Folder of the run; bags are ``trial_1``, ``trial_2``, ...
-        settings: What to run.
-        domain: ROS domain, or None for any free one.
-        progress: Shows where it is.
-        ask: Shows an operator prompt and returns on Enter.
-
-    Raises:
-        FaultError: A program ended, or the plant refused or faulted; the drive is at rest when this is raised.
+    ``domain`` is None for any free one; ``ask`` shows an operator prompt and returns on Enter. A FaultError if a
+    program ended, or the plant refused or faulted; the drive is then at rest.
     """
     bags = []
     with reserve_domain(domain) as reserved, open_pool() as hosts:
@@ -189,12 +178,7 @@ def run_trials(
 
 
 def _run_trial(
-    folder: Path,
-    settings: TrialSettings,
-    trial: int,
-    domain: int,
-    hosts: HostPool | None,
-    ask: Callable[[str], None],
+    folder: Path, settings: TrialSettings, trial: int, domain: int, hosts: HostPool | None, ask: Callable[[str], None]
 ) -> Path:
     bag = folder / f"trial_{trial}"
     lockstep = settings.lockstep
@@ -236,7 +220,7 @@ def _has_ended(plant: PlantClient, *, lockstep: bool) -> bool:
 
 
 def _topics(settings: TrialSettings) -> dict[str, int]:
-    """Return how many listen to each topic of a trial, the conductor not counted."""
+    """Return the number of subscribers of each topic of a trial, without the orchestrator."""
     topics = {
         names.JOINT_STATES: _LISTENERS,
         names.EFFORT_COMMAND: 2,

@@ -1,4 +1,4 @@
-"""A figure as data: what is drawn, with labels and units, defined once and rendered for files and for the page."""
+"""A figure as data with labels and units, defined once and rendered for files and pages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Kind = Literal["line", "step", "points", "interval", "band"]
 
 @dataclass(frozen=True)
 class Style:
-    """Style of a role. Dash and marker differ too, so that a greyscale print can be read.
+    """Style of a role, readable in greyscale too.
 
     Args:
         colour: From the colour-blind safe set of Okabe and Ito.
@@ -58,7 +58,6 @@ ROLES: dict[str, Style] = {
     "stable": Style("#222222", "solid", 1.0, "circle"),
     "unstable": Style("#222222", "solid", 1.0, "cross"),
 }
-"""Role -> style; a new role is one line."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,8 @@ class Trace:
         y: Shape (n,); for ``interval`` the row of each interval.
         label: Legend entry; empty for none.
         role: Key of ``ROLES``.
-        kind: ``line``, ``step`` (held until the next x), ``points``, or ``interval`` (horizontal, from ``low`` to
-            ``high`` through x), or ``band`` (filled between ``low`` and ``high`` above each x).
+        kind: ``line``, ``step`` (held until the next x), ``points``, ``interval`` (horizontal, from ``low`` to ``high``
+            through x), or ``band`` (filled between ``low`` and ``high`` above each x).
         low, high: Ends of intervals or edges of a band, shape (n,).
     """
 
@@ -86,13 +85,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Mark:
-    """A straight line across a panel, such as a margin.
-
-    Args:
-        value: Where.
-        axis: ``x`` for a vertical line at that x, ``y`` for a horizontal one.
-        label: Text next to it.
-    """
+    """A labelled line across a panel at ``value``: vertical for the axis ``x``, horizontal for ``y``."""
 
     value: float
     axis: Literal["x", "y"] = "y"
@@ -105,14 +98,11 @@ class Panel:
 
     Args:
         x_label, y_label: With units.
-        traces: What is drawn.
-        marks: Straight lines.
         title: Above the axes; empty for none.
-        x_log, y_log: Logarithmic axes.
         x_range, y_range: Limits; None to fit the data.
-        y_ticks: Names at 0, 1, 2, ... in place of numbers; empty for numbers.
-        square: Whether a unit is as long on both axes.
-        x_step: Distance of the numbers on the x axis; None to leave it to the renderer.
+        y_ticks: Names at 0, 1, 2, ...; empty for numbers.
+        square: Equal scale on both axes.
+        x_step: Distance of the ticks on the x axis; None for the renderer's choice.
     """
 
     x_label: str
@@ -135,11 +125,10 @@ class Figure:
 
     Args:
         name: File stem and anchor.
-        title: Heading.
-        sentence: What is seen, computed from the data.
+        sentence: Summary, computed from the data.
         panels: One or more.
-        stacked: True for panels above each other on one x axis; False for panels side by side.
-        section: Heading of the section it belongs to.
+        stacked: Panels above each other on one x axis; else side by side.
+        section: Heading of its section.
         panel_height: Height of a panel [px on the page].
     """
 
@@ -153,13 +142,7 @@ class Figure:
 
 
 def thinned(x: ArrayLike, y: ArrayLike, most: int = 1200) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a curve with at most about ``most`` points that plots the same: first, least, greatest of each bin.
-
-    Args:
-        x: Shape (n,), increasing.
-        y: Shape (n,).
-        most: Largest number of points.
-    """
+    """Return about ``most`` points that plot the same, x ascending, shape (n,): first, least, greatest per bin."""
     xs, ys = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if xs.size <= most:
         return xs, ys

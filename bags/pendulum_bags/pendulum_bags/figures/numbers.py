@@ -10,7 +10,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def quantity(value: float, unit: str = "", digits: int = 3) -> str:
-    """Return a number with its unit as text, with ``digits`` significant digits, powers of ten where needed."""
+    """Return a number and its unit with significant digits, as a power of ten if needed."""
     if math.isnan(value):
         return "–"
     magnitude = abs(value)

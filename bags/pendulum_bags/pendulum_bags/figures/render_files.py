@@ -18,12 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["write_figures"]
 
-_DASHES: dict[str, Any] = {
-    "solid": "-",
-    "dash": (0, (5, 2)),
-    "dot": (0, (1, 1.4)),
-    "dashdot": (0, (6, 2, 1, 2)),
-}
+_DASHES: dict[str, Any] = {"solid": "-", "dash": (0, (5, 2)), "dot": (0, (1, 1.4)), "dashdot": (0, (6, 2, 1, 2))}
 _MARKERS = {"circle": "o", "square": "s", "triangle": "^", "cross": "x"}
 _STYLE: dict[Any, Any] = {
     "font.size": 9.0,
@@ -36,7 +31,7 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "legend.fontsize": 8.0,
     "legend.frameon": False,
-    # Text stays text and can be searched. Type 42 fonts would cost as much time again as all the drawing.
+    # Text stays searchable. Type 42 fonts would double the time of drawing.
     "pdf.fonttype": 3,
     "path.simplify": True,
     "path.simplify_threshold": 0.5,
@@ -44,23 +39,11 @@ _STYLE: dict[Any, Any] = {
 _WIDTH = 6.6
 _RESOLUTION = 150
 _MANY = 12
-"""Figures from which on a second process, which takes a second to start, draws half of them."""
+"""Number of figures from which a second process, which takes a second to start, draws half of them."""
 
 
 def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
-    """Draw figures into a folder, which is made; existing files of the same names are replaced.
-
-    Args:
-        figures: What to draw.
-        folder: Where.
-        formats: File suffixes of matplotlib.
-
-    Returns:
-        The files written.
-
-    Raises:
-        BagError: The folder cannot be written.
-    """
+    """Draw figures into a folder, by matplotlib's suffixes; return the files, a BagError if it fails."""
     with writing(f"figures in {folder}", BagError):
         folder.mkdir(parents=True, exist_ok=True)
         if not formats:
@@ -83,7 +66,7 @@ def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str
 
 
 def _write_aside(figures: Sequence[Figure], folder: Path, formats: Sequence[str]) -> None:
-    """Write figures in a process of their own, which its parent ends."""
+    """Write figures in a process of their own; the parent ends it, so it ignores SIGINT."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         _write(figures, folder, formats)
@@ -109,7 +92,7 @@ def _write(figures: Sequence[Figure], folder: Path, formats: Sequence[str]) -> l
 
 
 def _metadata(figure: Figure, suffix: str) -> dict[str, Any] | None:
-    """Name the figure inside the file, and leave out the date, so that equal data give equal files."""
+    """Name the figure inside the file; without the date equal data give equal files."""
     if suffix == "pdf":
         return {"Title": figure.title, "Subject": figure.sentence, "CreationDate": None}
     return {"Title": figure.title, "Description": figure.sentence} if suffix == "png" else None
@@ -164,13 +147,13 @@ def _draw(figure: Figure, canvas_type: Any) -> Any:
     )
     for ax, panel in zip(axes, figure.panels, strict=False):
         if panel.title and not _has_offset(ax):
-            # Where it would come to stand anyway; to find that out takes a seventh of the drawing.
+            # The default position, set explicitly because computing it takes a seventh of the drawing.
             ax.set_title(panel.title, loc="left", y=1.0)
     return canvas
 
 
 def _has_offset(ax: Axes) -> bool:
-    """Return whether a common factor or sum of the numbers stands above the y axis, where a title gives way to it."""
+    """Return whether the y axis has a common factor or offset above it, which the title must avoid."""
     formatter = ax.yaxis.get_major_formatter()
     formatter.format_ticks(ax.yaxis.get_majorticklocs().tolist())
     return bool(formatter.get_offset())

@@ -20,7 +20,7 @@ _FONT = {"family": "system-ui, -apple-system, Segoe UI, Roboto, sans-serif", "si
 
 
 def graphs_of(figure: Figure) -> list[dict[str, Any]]:
-    """Return the plotly graphs (``data``, ``layout``) of a figure: one for stacked panels, else one for each panel."""
+    """Return the plotly graphs (``data``, ``layout``) of a figure: one for stacked panels, else one per panel."""
     if figure.stacked:
         return [_graph(figure, list(figure.panels))]
     return [_graph(figure, [panel]) for panel in figure.panels]
@@ -40,14 +40,7 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "#fff",
         "hovermode": "x" if figure.stacked else "closest",
-        "legend": {
-            "orientation": "h",
-            "x": 0,
-            "y": 1,
-            "yref": "container",
-            "yanchor": "top",
-            "font": {"size": 12},
-        },
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yref": "container", "yanchor": "top", "font": {"size": 12}},
         "dragmode": "zoom",
         "shapes": [],
         "annotations": [],
@@ -56,13 +49,7 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
         suffix = "" if i == 0 else str(i + 1)
         top = 1.0 - i * (share + gap)
         last = i == count - 1
-        axis = {
-            "gridcolor": _GRID,
-            "zeroline": False,
-            "linecolor": "#888",
-            "ticks": "outside",
-            "tickcolor": "#888",
-        }
+        axis = {"gridcolor": _GRID, "zeroline": False, "linecolor": "#888", "ticks": "outside", "tickcolor": "#888"}
         x_axis: dict[str, Any] = {**axis, "anchor": f"y{suffix}", "type": "log" if panel.x_log else "linear"}
         y_axis: dict[str, Any] = {
             **axis,
@@ -104,7 +91,7 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
 
 
 def _log_ticks(values: list[NDArray[np.float64]]) -> dict[str, Any]:
-    """Return ticks at 1, 2, 5 of each decade, or at decades alone where there are many, written as numbers."""
+    """Return ticks at 1, 2, 5 of each decade, or at many decades only, as numbers."""
     joined = np.concatenate(values)
     joined = joined[joined > 0.0]
     if not joined.size:
@@ -134,14 +121,7 @@ def _add_marks(layout: dict[str, Any], panel: Panel, suffix: str) -> None:
 
 
 def _note(
-    text: str,
-    x: float,
-    y: float,
-    x_reference: str,
-    y_reference: str,
-    x_anchor: str,
-    y_anchor: str,
-    size: int = 11,
+    text: str, x: float, y: float, x_reference: str, y_reference: str, x_anchor: str, y_anchor: str, size: int = 11
 ) -> dict[str, Any]:
     return {
         "text": text,
@@ -191,7 +171,7 @@ def _trace(trace: Trace, suffix: str, first: bool) -> dict[str, Any]:
         }
         return {**graph, "mode": "markers", "marker": {**marker, "size": 9}, "error_x": bars}
     if trace.kind == "band" and trace.low is not None and trace.high is not None:
-        # There and back again: one closed outline, filled.
+        # A closed outline, forth and back, filled.
         outline = np.concatenate([trace.x, trace.x[::-1]]), np.concatenate([trace.low, trace.high[::-1]])
         red, green, blue = (int(style.colour[i : i + 2], 16) for i in (1, 3, 5))
         return {
@@ -211,7 +191,7 @@ def _trace(trace: Trace, suffix: str, first: bool) -> dict[str, Any]:
 
 
 def _packed(values: NDArray[np.float64]) -> Any:
-    """Return an array as plotly.js reads it: 32 bit, base64. Short ones stay lists, which a reader can read."""
+    """Return an array in plotly.js's form: 32 bit, base64; short ones stay readable lists."""
     if values.size <= 32 or not np.isfinite(values).all():
         return [float(value) if np.isfinite(value) else None for value in values]
     data = np.ascontiguousarray(values, dtype="<f4")

@@ -16,12 +16,11 @@ class Table:
     """A table.
 
     Args:
-        title: Heading.
         sentence: What it shows.
         head: Column headings; the first column holds row names.
         rows: Cells as text.
-        section: Heading of the section it belongs to; empty on a page without sections.
-        folded: Whether a page folds it for its length; paper shows it always.
+        section: Heading of its section; empty on a page without sections.
+        folded: Folded on a page for its length; paper shows it always.
     """
 
     title: str
@@ -33,10 +32,10 @@ class Table:
 
     @property
     def numeric(self) -> list[bool]:
-        """Return for each column whether it holds numbers only, which then align to the right."""
+        """Whether each column holds numbers only, which then align to the right."""
         return [all(_NUMERIC.match(row[i]) for row in self.rows) for i in range(len(self.head))]
 
     @property
     def is_wide(self) -> bool:
-        """Whether a phone is too narrow for a row, so that its cells stand one below the other there."""
+        """Whether a row is too wide for a phone, which then stacks its cells."""
         return len(self.head) > 4 or (len(self.head) == 4 and not all(self.numeric[1:]))

@@ -13,13 +13,7 @@ __all__ = ["number_table", "plants_table"]
 
 
 def number_table(title: str, *headings: str | Column, left: int = 1) -> WholeTable:
-    """Return a table without rows; after the first columns, which hold names, all columns align to the right.
-
-    Args:
-        title: Above the table.
-        headings: Of the columns; a column that is given as one stays as it is.
-        left: How many columns hold names.
-    """
+    """Return a table without rows; after the first ``left`` columns, which hold names, columns align right."""
     columns = (
         Column(heading, justify="right") if isinstance(heading, str) and i >= left else heading
         for i, heading in enumerate(headings)
@@ -30,14 +24,7 @@ def number_table(title: str, *headings: str | Column, left: int = 1) -> WholeTab
 def plants_table(
     title: str, headings: Sequence[str], plants: Sequence[Mapping[str, Any]], rows: Sequence[tuple[str, str, str]]
 ) -> WholeTable:
-    """Return a table with a column for each plant.
-
-    Args:
-        title: Above the table.
-        headings: Of the plants.
-        plants: Their figures, by key.
-        rows: Label, key and format of each row.
-    """
+    """Return a table with a column per plant and rows of (label, key into ``plants``, format)."""
     table = number_table(title, "", *headings)
     for label, key, form in rows:
         values = (plant.get(key) for plant in plants)

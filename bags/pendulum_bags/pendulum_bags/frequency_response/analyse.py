@@ -26,29 +26,20 @@ from pendulum_lqr.responses.measured_response import MeasuredResponse, read_resp
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism, load_plant
 
-__all__ = [
-    "analyse_machine",
-    "analyse_responses",
-    "find_machine",
-    "read_responses",
-]
+__all__ = ["analyse_machine", "analyse_responses", "find_machine", "read_responses"]
 
 
 MACHINE = "hw_response.json"
-"""File of a run folder with the measured response of its hardware."""
+"""Measured response of the hardware, in a run folder."""
 NUMBERS = "frequency_response.json"
-"""File of it with the results."""
+"""Results, in a run folder."""
 
 
 def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, list[str]]:
-    """Return the measured responses of bags or of a run folder, simulation first, and the plant they were designed on.
+    """Return the measured responses of one or two bags or of a folder with ``sim`` and ``hw``, and their plant.
 
-    Args:
-        paths: One or two bags, or a folder that holds ``sim`` and ``hw``.
-
-    Raises:
-        BagError: A bag cannot be read.
-        DataError: It holds no excited plant, or both are of one side.
+    The simulation comes first; the plant is the one that controllers were designed on. A BagError if a bag cannot be
+    read, a DataError if it holds no excited plant or both are of one side.
     """
     if len(paths) == 1 and (paths[0] / "sim").is_dir() and (paths[0] / "hw").is_dir():
         paths = [paths[0] / "sim", paths[0] / "hw"]
@@ -92,7 +83,7 @@ def _read(path: Path) -> tuple[Record, Mapping[str, Any]]:
 
 
 def _design_plant(bag: Path, facts: Mapping[str, Any]) -> str:
-    """Return the plant on which the controller of a run was designed, which may be next to its bag; empty for none."""
+    """Return the plant file or preset that a run's controller was designed on, perhaps next to its bag; or empty."""
     controller = facts.get("controller")
     linearised = controller.get("linearised") if isinstance(controller, Mapping) else None
     if isinstance(linearised, str) and (bag.parent / linearised).is_file():
@@ -115,10 +106,10 @@ def analyse_responses(
     Args:
         responses: Simulation first.
         plant: Preset or file of the plant that designs are made on.
-        designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them.
-        scaling: Units of the gap; None for the thesis's task, or for those that the LQR weights of several joints are.
-        margin: Gap between the plants that does not matter; None for 0.2, of several joints for the margin of the
-            plant's own LQR: a smaller gap keeps that one stable.
+        designs: As for :func:`pendulum_bags.frequency_response.designs.certify_designs`.
+        scaling: Units of the gap; None for the thesis's task, or for several joints those of the LQR weights.
+        margin: Gap between the plants that does not matter; None for 0.2, or for several joints the margin of the
+            plant's own LQR, which a smaller gap keeps stable.
         recorded: Whether the designs come from a recording, not from the caller.
         longer: The command that measures longer.
 
@@ -148,7 +139,7 @@ def analyse_responses(
     results: list[DesignResult] = []
     layers: list[LayerResult] = []
     if certifier is not None and "sim" in by_label:
-        if margin is None:  # of several joints alone
+        if margin is None:  # several joints only
             margin = certifier.gain(output_lqr(model, q, r).K).margin
         difference = compare_responses(by_label["sim"], by_label["hw"], model, scaling)
         layers.append(same_plant(by_label["sim"], by_label["hw"], difference, margin, longer=longer))
@@ -173,7 +164,7 @@ def _refuse_other_joints(parameters: PlantParameters, measured: MeasuredResponse
 
 
 def find_machine(folders: Sequence[Path]) -> Path | None:
-    """Return the first folder with the measured response of a machine, None where none has one."""
+    """Return the first folder with the measured response of a machine, or None."""
     return next((folder for folder in folders if (folder / MACHINE).is_file()), None)
 
 
@@ -183,9 +174,9 @@ def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = (), ran:
     Args:
         machine: Measured response, or its folder.
         plant: Preset or file of the plant that designs are made on.
-        designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them; by default those that
-            were certified when it was measured, and else the four combinations of the thesis.
-        ran: Policy files that ran in the recording; they are certified too, unless ``designs`` are given.
+        designs: As for :func:`pendulum_bags.frequency_response.designs.certify_designs`; by default those certified
+            with the measurement, or else the thesis's four combinations.
+        ran: Policy files that ran in the recording, certified too unless ``designs`` are given.
 
     Raises:
         DataError: The file holds no response.
@@ -203,14 +194,12 @@ def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = (), ran:
 
 
 class _Kept(NamedTuple):
-    """With what a machine was judged when it was measured."""
-
     designs: Sequence[str] = ()
     scaling: SignalScaling = DEFAULT_SCALING
 
 
 def _kept(machine: Path) -> _Kept:
-    """Return the files next to a measured response; defaults where there are none."""
+    """Return the settings stored with a measured response, or defaults."""
     path = (machine if machine.is_dir() else machine.parent) / NUMBERS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

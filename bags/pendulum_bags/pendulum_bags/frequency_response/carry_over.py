@@ -1,4 +1,4 @@
-"""Which designs carry over to the machine of a comparison, where its frequency response was measured."""
+"""Which designs carry over to the machine of a comparison whose frequency response was measured."""
 
 from __future__ import annotations
 
@@ -20,19 +20,13 @@ __all__ = ["carry_over", "layers_of"]
 def carry_over(
     comparison: Comparison, folders: Sequence[Path], machine: Path | None = None, designs: Sequence[str] = ()
 ) -> Analysis | None:
-    """Return the certificates of designs for the machine of a comparison, made on the simulated plant.
+    """Return the certificates of designs on the simulated plant for a comparison's machine, or None.
 
-    Args:
-        comparison: The comparison.
-        folders: Folders that may have a measured response; the first one is used.
-        machine: Measured response, or its folder, before all others.
-        designs: As :func:`pendulum_bags.frequency_response.designs.certify_designs` reads them.
-
-    Returns:
-        The certificates, None where no response was measured.
+    The measured response is ``machine`` (file or folder), or in the first of ``folders`` that has one; without it the
+    result is None. ``designs`` are as for :func:`pendulum_bags.frequency_response.designs.certify_designs`.
 
     Raises:
-        DataError: Designs are given and no response, it cannot be read, or it is of another machine.
+        DataError: Designs are given without a response, it cannot be read, or it is of another machine.
         ParameterError: A text is no design.
     """
     place = machine or find_machine(folders)
@@ -53,5 +47,5 @@ def carry_over(
 
 
 def layers_of(analysis: Analysis | None) -> list[LayerResult]:
-    """Return the layer of the verdict that certificates give, none without them."""
+    """Return the layer of the verdict from certificates, none without them."""
     return [one for one in (analysis.layers if analysis else ()) if one.layer is Layer.WHICH_CONTROLLERS]

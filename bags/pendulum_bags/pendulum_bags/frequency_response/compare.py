@@ -1,4 +1,4 @@
-"""Two measured plants, or a plant and a model: where in frequency do they differ, by how much, and how surely?"""
+"""The difference of two measured plants, or of a plant and a model, by frequency, with its significance."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ __all__ = ["SMALLEST", "Difference", "compare_responses", "continuous"]
 
 SMALLEST = 0.1
 """Difference that counts, as a share of the response: 0.9 dB, where a sound design has 6 dB of gain margin. Smaller
-ones are often real and never matter: an encoder's step that falls alike in every period, friction under a slightly
-other motion."""
+ones are often real and never matter: an encoder's steps, or friction under a slightly different motion."""
 _LEAST_LINES = 5
 _ERROR = 0.05
 """Probability of an error over all lines together."""
@@ -34,16 +33,15 @@ class Difference:
     Attributes:
         frequency: Shape (n,) [Hz].
         first, second: Responses, shape (outputs, n) [rad/(N m), rad/s/(N m)].
-        ratio: Second over first by the velocity, of several joints that of the driven one, shape (n,).
-        probability: Of a difference at least as large at a line if the plants differed by no more than ``SMALLEST``,
-            shape (outputs, n).
+        ratio: Second over first by the (driven joint's) velocity, shape (n,).
+        probability: Of at least this difference at a line if the plants differed by at most ``SMALLEST``, shape
+            (outputs, n).
         gap: Chordal distance at each frequency, shape (n,).
-        gap_high: Upper joint limit of it, shape (n,).
-        nu_gap: Largest gap with its joint interval; 1 where the winding number condition fails.
+        gap_high: Its upper joint limit, shape (n,).
+        nu_gap: Largest gap with its joint interval; 1 if the winding number condition fails.
         gap_at: Frequency of the largest gap [Hz].
         delay: Of the second's response relative to the first's [s].
         gain: Second's response over the first's, over the octaves [-].
-        scaling: Units of the gap.
     """
 
     frequency: Array
@@ -61,7 +59,7 @@ class Difference:
 
     @property
     def found(self) -> bool:
-        """Whether one that counts was found anywhere, with an error of at most 5 % over all lines (Bonferroni)."""
+        """Whether any relevant difference was found, with an error of at most 5 % over all lines (Bonferroni)."""
         return bool(self.probability.size * float(self.probability.min()) < _ERROR)
 
     @property
@@ -86,29 +84,23 @@ class Difference:
 
 
 def continuous(measured: MeasuredResponse, model: LinearModel) -> Complex:
-    """Return a measured response freed from hold and folding by a model's ratio, shape (outputs, n)."""
+    """Return a measured response without hold and aliasing, by a model's ratio, shape (outputs, n)."""
     return brought_to(measured.response, model, measured.frequency, measured=measured.period)
 
 
 def compare_responses(
     first: MeasuredResponse, second: MeasuredResponse, model: LinearModel, scaling: SignalScaling = DEFAULT_SCALING
 ) -> Difference:
-    """Return the difference of two measured plants, at the sampling period of the second.
+    """Return the difference of simulation and hardware, at the sampling period of the second.
 
-    Args:
-        first: The simulation.
-        second: The hardware.
-        model: A model of either; it brings the first to the second's sampling period.
-        scaling: Units of the gap.
-
-    Raises:
-        DataError: They share too few frequencies.
+    ``model`` of either converts the first to that period; ``scaling`` has the units of the gap. A DataError if they
+    share too few frequencies.
     """
     lines, one, spread_one, two, spread_two = _at_common_lines(first, second)
     moved = brought_to(one, model, lines, measured=first.period, period=second.period)
     spread_one = spread_one * np.abs(moved / one)
     variance = spread_one**2 + spread_two**2
-    # Welch and Satterthwaite: a sum of two estimated variances counts as one with so many degrees of freedom.
+    # Welch and Satterthwaite: effective degrees of freedom of a sum of two estimated variances.
     freedom = variance**2 / (spread_one**4 / (first.blocks - 1.0) + spread_two**4 / (second.blocks - 1.0))
     excess = np.maximum(np.abs(two - moved) - SMALLEST * np.abs(moved), 0.0)
     probability = f_tail(excess**2 / variance, 2.0, 2.0 * freedom)
@@ -179,12 +171,9 @@ def _gain(ratio: Complex, relative: Array) -> Interval:
 
 
 def _slope(x: Array, y: Array, deviation: Array) -> Interval:
-    """Return the weighted slope of y over x through 0; differences of dynamics, which it has not, widen its interval.
+    """Return the weighted slope of y over x through 0, for y with standard deviations ``deviation``, all shape (n,).
 
-    Args:
-        x: Shape (n,).
-        y: Shape (n,).
-        deviation: Standard deviations of y, shape (n,).
+    Differences of dynamics, which it does not model, widen its interval.
     """
     weight = 1.0 / np.maximum(deviation, 1e-6) ** 2
     slope = float(np.sum(weight * x * y) / np.sum(weight * x**2))

@@ -1,4 +1,4 @@
-"""Designs to be certified: as text, and the result of each."""
+"""Designs to be certified, as text, and their results."""
 
 from __future__ import annotations
 
@@ -36,22 +36,16 @@ _NUMBERS = r"[-+0-9.eE]+(?:,[-+0-9.eE]+)*"
 _WEIGHTS = re.compile(rf"q=({_NUMBERS})(?:[ ;]+r=({_NUMBERS}))?")
 _GAIN = re.compile(rf"k=({_NUMBERS})")
 _OTHER_COSTS = (1.0, 0.1, 10.0, 100.0)
-"""Costs of the effort of the default designs of several joints, in units of that of the plant's own LQR."""
+"""Costs of the effort of the default designs of several joints, relative to the plant's own LQR."""
 _LARGER = 10.0
-"""A law is linear near upright if it responds to disturbances of this size as to those of size 1 ..."""
+"""A law is linear near upright if its response to disturbances of this size is that to size 1 ..."""
 _NOT_LINEAR = 0.1
-"""... within this share at each frequency, angle and velocity counted in units of the task."""
+"""... within this share at each frequency, in units of the task."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """A static gain.
-
-    Attributes:
-        name: As in tables.
-        text: As it was given.
-        K: Gain on what is measured, shape (2 k,) for k joints.
-    """
+    """A static gain ``K`` on the measured states, shape (2 k,) for k joints."""
 
     name: str
     text: str
@@ -63,12 +57,9 @@ class DesignResult:
     """One design and its certificate.
 
     Attributes:
-        name: As in tables.
-        K: Gain on [theta, theta_dot] [N m/rad, N m s/rad], or on those of k joints; None for a controller that is no
-            gain.
-        certificate: Its certificate.
-        unknown: Why it has no certificate, as text; empty where there is a certificate.
-        text: What :func:`certify_designs` reads for it, where that is not the name.
+        K: Gain on [theta, theta_dot] [N m/rad, N m s/rad], or on those of k joints; None if the controller is no gain.
+        unknown: Why it has no certificate, as text, or empty.
+        text: Its text for :func:`certify_designs`, if that is not the name.
     """
 
     name: str
@@ -110,16 +101,7 @@ class DesignResult:
 
 
 def read_designs(texts: Sequence[str], plant: PlantParameters, model: LinearModel) -> list[Design]:
-    """Return the designs that texts stand for, made on a plant of several joints, one of them driven.
-
-    Args:
-        texts: As of :func:`certify_designs`, LQR and gains alone.
-        plant: The plant.
-        model: Its linear model.
-
-    Raises:
-        ParameterError: A text is no design of this plant.
-    """
+    """Return LQRs and gains for one driven of several joints; a ParameterError if a text is no design."""
     cost = plant.mechanism.weights[1]
     return [_static(text, cost, model) for text in _asked(texts, plant)]
 
@@ -130,12 +112,12 @@ def certify_designs(
     """Return the certificates of designs that were made on a plant.
 
     Args:
-        texts: ``q=100,0.01 r=0.1`` for LQR, positions before velocities, ``k=33,0.2`` for a gain; of one joint also a
-            controller's name or a policy file. None for the four combinations of the thesis, or for the own LQR of a
-            plant of several joints and three with another cost of the effort.
+        texts: ``q=100,0.01 r=0.1`` for LQR, positions before velocities, ``k=33,0.2`` for a gain; for one joint also a
+            controller's name or a policy file. None for the thesis's four combinations, or for several joints the
+            plant's own LQR and three with another cost of the effort.
         plant: The plant.
         certifier: Of its linear model and the measured machine.
-        recorded: Whether they are from an earlier run: a policy file that cannot be read any more is then unknown.
+        recorded: Whether they are from an earlier run: an unreadable policy file is then unknown.
 
     Raises:
         ParameterError: A text is no design, or a policy is not for the plant.
@@ -166,12 +148,12 @@ def _asked(texts: Sequence[str], plant: PlantParameters) -> list[str]:
 
 
 def lqr_name(weights: Sequence[float], cost: float) -> str:
-    """Return how tables name an LQR."""
+    """Return the name of an LQR in tables."""
     return f"LQR q=({', '.join(f'{value:g}' for value in weights)}) r={cost:g}"
 
 
 def _static(text: str, own_cost: float, model: LinearModel) -> Design:
-    """Return the gain that a text stands for."""
+    """Return the gain of a text."""
     size = len(model.measured)
     if match := _WEIGHTS.fullmatch(text):
         weights, costs = _numbers(match[1]), _numbers(match[2] or f"{own_cost}")
@@ -189,7 +171,7 @@ def _static(text: str, own_cost: float, model: LinearModel) -> Design:
 
 
 def _numbers(text: str) -> list[float]:
-    """Return the numbers that a text lists, none where one of them is no number."""
+    """Return the numbers in a text, none if one of them is not a number."""
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
@@ -234,11 +216,7 @@ def designs_table(designs: Sequence[DesignResult]) -> WholeTable:
 
 
 def policies_of(record: Mapping[str, Any]) -> list[str]:
-    """Return the policy file that ran in a recorded run, as a list; empty for any other controller.
-
-    Args:
-        record: A bag's metadata of its run.
-    """
+    """Return the policy file of a run, from its bag's metadata, as a list; empty for other controllers."""
     controller = record.get("controller")
     file = controller.get("policy") if isinstance(controller, Mapping) else None
     return [file] if isinstance(file, str) and file.endswith(POLICY_SUFFIX) else []

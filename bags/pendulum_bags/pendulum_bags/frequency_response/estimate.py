@@ -1,14 +1,13 @@
 """The frequency response of a plant in closed loop, from a known excitation.
 
-Feedback makes the torque depend on the plant's own noise, so that output over torque is biased towards the inverse of
-the controller. The joint input-output estimate is not: both are measured against the excitation r, which is
-independent of noise,
+Feedback correlates the torque with the plant's own noise, so output over torque is biased towards the inverse of the
+controller. The joint input-output estimate is not: it relates both to the excitation r, which is independent of noise,
 
     G = S_yr / S_ur
 
-A periodic excitation is averaged over its periods, without leakage; any other is cut into windowed segments that
-overlap by half. What the blocks do not share is noise, and gives the confidence: ``|G_hat - G|^2 / deviation^2``
-follows F(2, 2 (blocks - 1)).
+A periodic excitation is averaged over its periods, without leakage; another is cut into windowed segments that overlap
+by half. The spread between blocks is noise and gives the confidence: ``|G_hat - G|^2 / deviation^2`` follows F(2, 2
+(blocks - 1)).
 
 Source: Ljung, System Identification, 2nd ed., 1999, section 13.5; Pintelon and Schoukens, System Identification: A
 Frequency Domain Approach, 2nd ed., 2012, sections 2.5 to 2.7 and 4.3 (distortion on lines that were not excited).
@@ -34,15 +33,15 @@ from pendulum_msgs_py.parameters import validate
 __all__ = ["estimate", "periodic_lines"]
 
 TRANSIENT = 1.0
-"""Time at the beginning that is left out at least; whole periods of a periodic excitation [s]."""
+"""Shortest time left out at the beginning [s]; whole periods of a periodic excitation."""
 SEGMENT = 4.0
-"""Length of the segments of an excitation that is not periodic [s]; shorter where fewer than eight would fit."""
+"""Length of the segments of a non-periodic excitation [s]; shorter if fewer than eight would fit."""
 _LEAST_BLOCKS = 3
 _LEAST_SEGMENTS = 6
 _TOP = 0.96
 """Share of the Nyquist frequency up to which lines are used."""
 _WEAK = 0.02
-"""Lines on which the excitation is weaker than this share of its strongest are left out (not periodic)."""
+"""Least strength of the excitation on a line relative to its strongest (not periodic)."""
 
 
 def periodic_lines(disturbance: Mapping[str, Any]) -> tuple[float, NDArray[np.int64]] | None:
@@ -58,14 +57,7 @@ def periodic_lines(disturbance: Mapping[str, Any]) -> tuple[float, NDArray[np.in
 
 
 def estimate(record: Record) -> MeasuredResponse:
-    """Return the sampled plant's response from torque to angle and velocity.
-
-    Args:
-        record: Samples of a plant under a known excitation.
-
-    Raises:
-        DataError: The record is too short, or its excitation too weak.
-    """
+    """Return the response from torque to angle and velocity; a DataError if the record is short or weak."""
     if float(np.ptp(record.excitation)) <= 0.0:
         raise DataError(
             f"{record.label} was not excited: its disturbance is constant; expected one with many frequencies"
@@ -99,7 +91,7 @@ def _periodic(record: Record, length: float, harmonics: NDArray[np.int64]) -> Me
         # The last whole periods: a run in real time may start late into its first.
         return np.fft.rfft(values[-blocks * size :].reshape(blocks, size), axis=1) / size
 
-    # All ends at one sample, the newest of whole periods since the start.
+    # All end at one sample, the newest of whole periods since the start.
     end = (skip + blocks) * size
     r, u = spectra(record.excitation[:end]), spectra(record.torque[:end])
     y = np.stack([spectra(output[:end]) for output in record.outputs])
@@ -152,7 +144,7 @@ def _joint(record: Record, frequency: Array, r: Complex, u: Complex, y: Complex,
     deviation = np.sqrt(variance * power_r * y.shape[1] / blocks) / np.abs(cross_ur)
     power_y = np.sum(np.abs(y) ** 2, axis=1)
     coherence = np.abs(cross_yr) ** 2 / np.maximum(power_y * power_r, 1e-300)
-    # Rounding of noiseless runs must not claim certainty beyond that of the numbers themselves.
+    # Rounding in noiseless runs must not claim certainty beyond that of the numbers.
     floor = 1e-9 * np.abs(response)
     return MeasuredResponse(
         record.label,
@@ -186,7 +178,7 @@ def _distortion(y: Complex, harmonics: NDArray[np.int64]) -> tuple[float, float]
 
 
 def _facts(record: Record, method: str, blocks: int, length: float) -> dict[str, Any]:
-    """Return how it was measured, how far the plant moved, and how hard it was driven."""
+    """Return the method of measurement, and the amplitudes of motion and torque."""
     deviations = record.outputs - record.outputs.mean(axis=1, keepdims=True)
     largest = np.max(np.abs(deviations), axis=1)
     effort = float(np.max(np.abs(record.torque)))

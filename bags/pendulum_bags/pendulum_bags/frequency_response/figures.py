@@ -37,17 +37,14 @@ def response_figures(analysis: Analysis) -> list[Figure]:
     if certifier is not None:
         figures.append(gap_figure(certifier, analysis.difference, designs))
         figures += [_nyquist(certifier, design) for design in designs[:1] if design.K is not None]
-        # Of several joints there are too many gains for a map.
+        # Several joints have too many gains for a map.
         if not analysis.responses[0].joints:
-            figures += [
-                certified_weights_figure(certifier, analysis.model),
-                certified_gains_figure(certifier, designs),
-            ]
+            figures += [certified_weights_figure(certifier, analysis.model), certified_gains_figure(certifier, designs)]
     return figures
 
 
 def _channels(measured: MeasuredResponse, scaling: SignalScaling) -> list[tuple[int, str, Callable[[Complex], Array]]]:
-    """Return which outputs a Bode plot shows, top to bottom: the output, its label, and what is drawn of it."""
+    """Return the outputs of a Bode plot, top to bottom: index, label, and plotted function."""
     if not isinstance(scaling, JointScaling):
         return [
             (0, "angle per torque\n[rad/(N m)]", np.abs),
@@ -62,7 +59,7 @@ def _channels(measured: MeasuredResponse, scaling: SignalScaling) -> list[tuple[
 
 
 def bode(analysis: Analysis) -> Figure:
-    """Draw the continuous plants: what hold and folding add was taken out, so that rates may differ."""
+    """Draw the continuous plants: hold and aliasing are removed, so that rates may differ."""
     responses, model, difference = analysis.responses, analysis.model, analysis.difference
     channels = _channels(responses[0], analysis.scaling)
     grid = np.geomspace(responses[0].frequency[0], max(r.frequency[-1] for r in responses), 400)
@@ -114,7 +111,7 @@ def difference_sentence(difference: Difference) -> str:
 
 def _phase(values: Complex) -> Array:
     phase = np.degrees(np.unwrap(np.angle(values)))
-    # Torque lifts an upright pendulum away from it at first: the phase of its angle starts near -180 degrees.
+    # Torque first lifts an upright pendulum away from it: the phase of its angle starts near -180 degrees.
     return np.asarray(phase - 360.0 * round((phase[0] + 120.0) / 360.0), dtype=np.float64)
 
 
@@ -153,7 +150,7 @@ def gap_figure(certifier: Certifier, difference: Difference | None, designs: Seq
         for design in designs
         if design.certificate.stable_on_model and not design.unknown
     ]
-    # Overlapping labels are not readable: the smallest and the largest margin suffice.
+    # Overlapping labels are unreadable: the smallest and the largest margin suffice.
     marks = [min(marks, key=lambda m: m.value), max(marks, key=lambda m: m.value)] if len(marks) > 2 else marks
     passing = sum(design.certificate.by_gap and not design.unknown for design in designs)
     sentence = (
@@ -219,7 +216,7 @@ def certified_weights_figure(certifier: Certifier, model: LinearModel) -> Figure
 
 
 def certified_gains_figure(certifier: Certifier, designs: Sequence[DesignResult]) -> Figure:
-    """Draw which gains of u = -kp theta - kd theta_dot are certified, and where the designs lie."""
+    """Draw which gains of u = -kp theta - kd theta_dot are certified, and where the designs are."""
     A, B = certifier.plant.A, certifier.plant.B
     is_rigid = A.shape[0] == 2
     stiffness = max(float(abs(A[1, 0] / B[1, 0])), 1e-3) if is_rigid else 1.0
@@ -239,7 +236,7 @@ def certified_gains_figure(certifier: Certifier, designs: Sequence[DesignResult]
 
 
 def _class(certifier: Certifier, K: Array) -> int:
-    """Return 0 for certified, 1 for stable on the model alone, 2 for not even that."""
+    """Return 0 for certified, 1 for stable on the model only, 2 for neither."""
     found = certifier.gain(K)
     return 0 if found.certified else 1 if found.stable_on_model else 2
 

@@ -17,7 +17,7 @@ from pendulum_lqr.responses.measured_response import MeasuredResponse
 __all__ = ["GAP_MARGIN", "LONGER", "same_plant", "which_controllers"]
 
 GAP_MARGIN = 0.2
-"""Gap that does not matter: a loop with a margin b(P, K) above it, as an LQR on this plant has, stays stable."""
+"""Gap that does not matter: a loop with a larger margin b(P, K), as an LQR on this plant has, stays stable."""
 _CLOSE = {True: "close enough for feedback, not identical", False: "close enough for feedback"}
 """By whether a difference at single frequencies was found."""
 _WEAK_COHERENCE = 0.5
@@ -36,15 +36,7 @@ def same_plant(
     *,
     longer: str = LONGER,
 ) -> LayerResult:
-    """Return layer 2.
-
-    Args:
-        first: The simulation.
-        second: The hardware.
-        difference: Of the two.
-        margin: Gap that does not matter.
-        longer: The command that measures longer.
-    """
+    """Return layer 2; ``margin`` is the gap that does not matter, ``longer`` the command that measures longer."""
     gap = difference.nu_gap
     mark = Mark.YES if gap.high < margin else Mark.NO if gap.low > margin else Mark.UNDECIDED
     where = f"largest at {difference.gap_at:.2g} Hz"
@@ -106,14 +98,10 @@ def same_plant(
 
 
 def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, longer: str = LONGER) -> LayerResult:
-    """Return layer 3: yes where all designs that the model stabilises carry over, no where one does not.
+    """Return layer 3: yes if all designs that the model stabilises carry over, no if one does not.
 
-    A design that is unstable on the model is one that the simulation itself rejects: it carries nothing over.
-
-    Args:
-        certifier: Of the model and the measured hardware.
-        designs: Certified or not.
-        longer: The command that measures longer.
+    The simulation itself rejects a design that is unstable on the model: it carries nothing over. ``longer`` is the
+    command to measure longer.
     """
     profile = certifier.profile
     unstable = int(np.sum(np.linalg.eigvals(certifier.plant.A).real > _UNSTABLE))
@@ -163,7 +151,7 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
         for design in bad
         if design.unknown
     )
-    # Not a matter of the measurement's error, but of where it begins.
+    # Due to the start of the measurement, not to its error.
     slow = [design.certificate.unseen for design in bad if design.certificate.undecided and design.certificate.unseen]
     open_ = [design for design in bad if design.certificate.undecided and not design.unknown]
     if any(not (one.certificate.far or one.certificate.unseen or one.certificate.resonance) for one in open_):
@@ -201,7 +189,7 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
 
 
 def _named(some: Sequence[DesignResult], count: int) -> str:
-    """Return a few designs by name, more by their number: the table has them all."""
+    """Return a few designs by name, or the number of many: the table has them all."""
     return ", ".join(one.name for one in some) if len(some) <= _FEW else f"{len(some)} of {count} designs"
 
 

@@ -9,7 +9,7 @@ from pendulum_bags.experiments.run_spec import RunSpec
 __all__ = ["FOLDER", "Multisine"]
 
 FOLDER = "frequency_response"
-"""Folder within a run folder that holds the recordings under the multisine."""
+"""Folder within a run folder for the recordings under the multisine."""
 _HOLD_TIME = 0.01
 """Both plants hold each sample for the slower one's period: the same torque as a function of time [s]."""
 
@@ -23,10 +23,10 @@ class Multisine:
     Attributes:
         amplitude: Largest torque [N m].
         signal_period: Length of one period [s].
-        periods: Periods that are averaged; one more settles.
+        periods: Averaged periods; one more settles.
         lowest: Lowest frequency [Hz].
         highest: Highest frequency [Hz].
-        lines: Number of frequencies, at most.
+        lines: Largest number of frequencies.
     """
 
     amplitude: float = 2.5
@@ -37,15 +37,7 @@ class Multisine:
     lines: int = 48
 
     def specs(self, sim: RunSpec, hw: RunSpec) -> tuple[RunSpec, RunSpec]:
-        """Return the runs of both sides under the multisine.
-
-        Args:
-            sim: The simulation under any disturbance.
-            hw: The hardware likewise.
-
-        Raises:
-            ParameterError: The simulation is too slow for it.
-        """
+        """Return both sides' runs under the multisine; a ParameterError if the simulation is too slow for it."""
         if (foreign := sim.foreign) is not None:
             foreign.check(_HOLD_TIME)
         if sim.mechanism is not None:
@@ -64,10 +56,9 @@ class Multisine:
         return ours, theirs
 
     def _of_joints(self, spec: RunSpec) -> RunSpec:
-        """Return a run of several joints, with the amplitude of its noise: a tenth of what its motor gives.
+        """Return a run of several joints, with the amplitude of its noise: a tenth of its motor's limit.
 
-        It is under an LQR, since a response is that of a linear loop, and ends at 100 Hz, where the loops of all
-        presets are small.
+        It runs an LQR, since a response is that of a linear loop, up to 100 Hz, where all presets' loops are small.
         """
         disturbance = {
             "kind": "multisine",

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 __all__ = ["Record", "record_of_arrays", "record_of_joints", "record_of_run"]
 
 _EXACT = 1e-6
-"""Largest deviation of a stamp from the raster that counts as none, as a share of the period."""
+"""Largest tolerated deviation of a stamp from the raster, as a share of the period."""
 _LONGEST_GAP = 5.0
-"""Longest hole between states that is bridged, in periods."""
+"""Longest bridged hole between states, in periods."""
 _SHORT_GAP = 0.05
-"""Hole that is always bridged: what it spoils of one period shows as noise [s]."""
+"""Hole that is always bridged: its error in one period shows as noise [s]."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,15 @@ class Record:
     """One plant under one excitation, sampled at equal intervals.
 
     Attributes:
-        label: Of the plant.
         period: Sampling period [s].
         excitation: Known torque that was added, shape (n,) [N m or N].
-        torque: Torque that acted from each sample to the next, the excitation included, shape (n,) [N m or N].
-        outputs: Angle [rad] and velocity [rad/s] at each sample, shape (2, n); of k joints all positions, then all
+        torque: Total torque from each sample to the next, including the excitation, shape (n,) [N m or N].
+        outputs: Angle [rad] and velocity [rad/s] at each sample, shape (2, n); for k joints all positions, then all
             velocities, shape (2 k, n).
-        disturbance: Parameters of the excitation; empty where they are not known.
+        disturbance: Parameters of the excitation; empty if unknown.
         facts: Further facts on the run.
         joints: Names of the k joints; none for a plant of one.
-        driven: Which of them has the excitation.
+        driven: The joint with the excitation.
     """
 
     label: str
@@ -63,13 +62,7 @@ class Record:
 
 
 def record_of_arrays(arrays: RunArrays, label: str, disturbance: Mapping[str, Any]) -> Record:
-    """Return the record of a run in one process.
-
-    Args:
-        arrays: The run.
-        label: Of the plant.
-        disturbance: Its parameters.
-    """
+    """Return the record of a run in one process, with the parameters of its disturbance."""
     period = float(arrays.stamp_ns[1] - arrays.stamp_ns[0]) / NANOSECONDS
     outputs = np.stack([unwrap_near_upright(arrays.position)[:-1], arrays.velocity[:-1]])
     return Record(label, period, arrays.disturbance[:-1], arrays.applied, outputs, dict(disturbance))
@@ -79,32 +72,19 @@ def record_of_run(run: RunData) -> Record:
     """Return the record of a recorded plant while its disturbance acted.
 
     Torques are held from stamp to stamp, so their mean over each interval of the raster is taken; angle and velocity
-    are interpolated where stamps jitter.
-
-    Args:
-        run: The plant's part of a bag.
-
-    Raises:
-        DataError: Disturbance or applied torque were not recorded, or states are missing for long.
+    are interpolated where stamps jitter. A DataError if disturbance or applied torque were not recorded, or states are
+    missing for long.
     """
     return _record(run, [run])
 
 
 def record_of_joints(runs: Mapping[str, RunData], driven: str) -> Record:
-    """Return the record of a recorded plant of several joints while the disturbance of one of them acted.
-
-    Args:
-        runs: The plant's part of a bag for each joint, in order.
-        driven: The joint that was disturbed; the only one with a motor.
-
-    Raises:
-        DataError: As of :func:`record_of_run`.
-    """
+    """Return the record of several joints in order, of which one is driven, as :func:`record_of_run`."""
     return replace(_record(runs[driven], list(runs.values())), joints=tuple(runs), driven=list(runs).index(driven))
 
 
 def _record(run: RunData, motions: Sequence[RunData]) -> Record:
-    """Return the record of motions under the torque of one of them; all were measured in the same messages."""
+    """Return the record of motions under the torque of one of them; all are from the same messages."""
     for signal, what in ((run.disturbance, "disturbance"), (run.applied, "applied torque")):
         if signal is None:
             raise DataError(
@@ -148,7 +128,7 @@ def _record(run: RunData, motions: Sequence[RunData]) -> Record:
 
 
 def _nominal_period(t: Array) -> float:
-    """Return the period of stamps that jitter: their mean step without holes, rounded to 0.1 ms where that is it."""
+    """Return the period of jittering stamps: their mean step without holes, rounded to 0.1 ms if near."""
     steps = np.diff(t)
     mean = float(np.mean(steps[steps < 1.5 * np.median(steps)]))
     nominal = round(mean * 1e4) / 1e4

@@ -24,12 +24,8 @@ class Analysis:
     Attributes:
         responses: Simulation, hardware, or both.
         model: Of the plant that designs were made on.
-        plant: Its name.
         difference: Of simulation and hardware, None for one of them.
         certifier: Of model and hardware, None without hardware.
-        designs: The result of each.
-        layers: Layers of the verdict.
-        scaling: Units of the gap.
     """
 
     responses: Sequence[MeasuredResponse]

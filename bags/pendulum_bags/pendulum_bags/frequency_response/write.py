@@ -45,7 +45,7 @@ def write_numbers(folder: Path, analysis: Analysis) -> None:
 
 
 def designs_tables(analysis: Analysis) -> list[Table]:
-    """Return the table of certified designs; nothing where there are none."""
+    """Return the table of certified designs, or nothing."""
     if not analysis.designs:
         return []
     return [
@@ -65,28 +65,15 @@ def write_analysis(
     formats: Sequence[str] = ("png", "pdf"),
     step: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Write responses, layers, numbers, figures and a page into a folder; return the page.
-
-    Args:
-        folder: Where to.
-        analysis: What to write.
-        formats: Of the figures.
-        step: Called with what is written next.
-    """
+    """Write responses, layers, numbers, figures and a page; ``step`` gets each name; return the page."""
     write_numbers(folder, analysis)
     step("drawing")
-    # Thousands of small matrices: threads of the linear algebra would only get into each other's way.
+    # Thousands of small matrices: more threads of the linear algebra would only slow each other down.
     with threadpool_limits(1):
         figures = name_in(response_figures(analysis), emulated=analysis.is_emulated)
     write_figures(figures, folder / "figures", formats)
     tables = designs_tables(analysis)
     page = folder / "frequency_response.html"
     return write_layer_page(
-        page,
-        "Frequency response",
-        analysis.layers,
-        figures,
-        tables,
-        (_THEOREM, _LIMITS),
-        emulated=analysis.is_emulated,
+        page, "Frequency response", analysis.layers, figures, tables, (_THEOREM, _LIMITS), emulated=analysis.is_emulated
     )

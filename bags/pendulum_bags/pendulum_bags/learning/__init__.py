@@ -1,1 +1,1 @@
-"""Training of policies for a plant, with what makes them hold on a machine."""
+"""Training of policies for a plant, with what makes them transfer to a machine."""

@@ -1,7 +1,7 @@
-"""What moves in a training: its parameters as rows of numbers, and one period of it, compiled.
+"""The plant of a training: its parameters as rows of numbers, and one compiled period.
 
-The equations are the simulator's own: :mod:`pendulum_sim.stepping.dry_friction` for the pendulum, and
-:mod:`pendulum_msgs_py.dynamics.joint_steps` for mechanisms, Runge-Kutta of order four both.
+The equations are the simulator's: :mod:`pendulum_sim.stepping.dry_friction` for the pendulum, and
+:mod:`pendulum_msgs_py.dynamics.joint_steps` for mechanisms, both with Runge-Kutta of order four.
 """
 
 from __future__ import annotations
@@ -41,38 +41,37 @@ from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_frictio
 from pendulum_sim.stepping.integrators import get_integrator
 from pendulum_sim.stepping.plant import pack
 
-__all__ = ["Body", "body_of", "can_exist", "kicks_of", "start_spread", "travel_of", "velocity_scales"]
+__all__ = ["TrainingPlant", "body_of", "can_exist", "kicks_of", "start_spread", "travel_of", "velocity_scales"]
 
 _GROWTH = 0.8
-"""Largest product of the damping rate and the step, far inside of where Runge-Kutta is stable [-]."""
+"""Largest product of the damping rate and the step, well within Runge-Kutta's stability [-]."""
 _LONGEST, _LONGEST_OF_SEVERAL = 0.01, 0.005
 _ANGLES = 32
 BEYOND = 1.25
-"""Where the end stops of a training stand, as a share of the travel that is allowed [-]."""
+"""Position of the end stops in training, as a share of the allowed travel [-]."""
 
 
 @dataclass(frozen=True)
-class Body:
+class TrainingPlant:
     """A plant as a training needs it; n joints, m of them driven.
 
     Attributes:
-        coordinates: Its joints.
         limits: Largest effort of each driven joint, shape (m,) [N m or N].
-        kicks: Largest kick of each joint where the share is 1, shape (n,): the effort limit, or the largest torque of
-            gravity where no motor is [N m or N].
+        kicks: Largest kick of each joint at share 1, shape (n,): its effort limit, or without a motor the largest
+            torque of gravity [N m or N].
         row: Its parameters as the kernel takes them, shape (p,).
-        columns: Which of them a parameter is, by name.
+        columns: Column of each parameter there, by name.
         ratios: Columns of static and Coulomb friction, and their fixed ratio, of each joint that has any.
         offsets: Columns of the constant effort at each driven joint.
         longest: Longest step of the integrator [s].
         advance: Compiled: motion, parameters, efforts, delays, kicks, period and longest step to the next motion.
-        privileged: From parameters (N, p) to what the critic sees of them, shape (N, k).
-        height: From deviations (N, n) to how high it stands, -1 to 1, shape (N,).
-        excess: From deviations (N, n), velocities (N, n) and parameters (N, p) to how much more energy it has
-            than upright at rest, -1 hanging at rest, shape (N,); None where each joint is driven.
+        privileged: From parameters (N, p) to the critic's view of them, shape (N, k).
+        height: From deviations (N, n) to the height, -1 to 1, shape (N,).
+        excess: From deviations (N, n), velocities (N, n) and parameters (N, p) to the energy above rest upright, -1
+            hanging at rest, shape (N,); None if each joint is driven.
         possible: From parameters (N, p) to whether they make a plant, shape (N,).
         held: From parameters (N, p), efforts (N, 1) and whether above the middle (N,) to the deviations at which
-            gravity and these efforts balance, shape (N, 1); None of several joints.
+            gravity and effort balance, shape (N, 1); None for several joints.
     """
 
     coordinates: Coordinates
@@ -91,16 +90,10 @@ class Body:
     held: Callable[[Array, Array, NDArray[np.bool_]], Array] | None
 
 
-def body_of(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]], travel: float) -> Body:
-    """Return what a training needs of a plant.
+def body_of(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]], travel: float) -> TrainingPlant:
+    """Return what a training needs of a plant, with the range of each varied parameter and ``travel`` [m].
 
-    Args:
-        plant: The plant at the centre: rigid, or of several joints.
-        ranges: Lowest and highest value of each parameter that differs.
-        travel: Largest deviation of joints that slide [m].
-
-    Raises:
-        ParameterError: The plant is series elastic, has no motor, or a delay of its own.
+    A ParameterError if it is series elastic, has no motor, or a delay of its own.
     """
     if not plant.is_pendulum:
         return _mechanism(plant, ranges, travel)
@@ -112,12 +105,7 @@ def body_of(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]], t
 
 
 def travel_of(plant: PlantParameters, travel: float) -> tuple[float, ...]:
-    """Return the largest deviation of each joint that a training lets it visit; pi where it turns [rad or m].
-
-    Args:
-        plant: The plant.
-        travel: Largest deviation of joints that slide [m].
-    """
+    """Return each joint's largest deviation in training: pi if it turns, else from ``travel`` [rad or m]."""
     return tuple(
         math.pi if joint.turns else min(BEYOND * travel, joint.goal - low, high - joint.goal)
         for joint, (low, high) in zip(plant.coordinates.joints, plant.stops, strict=True)
@@ -125,34 +113,20 @@ def travel_of(plant: PlantParameters, travel: float) -> tuple[float, ...]:
 
 
 _START_SPEED, _START_SLIDE = 0.7, 0.25
-"""Velocities at a start, as a share of the scale: of what turns, and of what slides [-]."""
+"""Velocities at a start, as a share of the scale, of joints that turn and that slide [-]."""
 _START_TRAVEL = 0.6
-"""Largest deviation at a start of what slides, as a share of the way to its stop [-]."""
+"""Largest deviation at a start of joints that slide, as a share of the way to the stop [-]."""
 
 
 def start_spread(plant: PlantParameters, travel: float, scales: Sequence[float]) -> tuple[Array, Array]:
-    """Return how far from upright joints may start, and how fast [rad or m, rad/s or m/s].
-
-    Args:
-        plant: The plant.
-        travel: Largest deviation of joints that slide [m].
-        scales: Of :func:`velocity_scales`.
-    """
+    """Return the largest start deviations from upright and speeds [rad or m, rad/s or m/s]."""
     turns = np.array([joint.turns for joint in plant.coordinates.joints])
     furthest = np.where(turns, math.pi, _START_TRAVEL * np.array(travel_of(plant, travel)))
     return furthest, np.where(turns, _START_SPEED, _START_SLIDE) * np.array(scales)
 
 
 def can_exist(mechanism: Mechanism, parameters: Array) -> NDArray[np.bool_]:
-    """Return whether each body has an inertia that its mass and centre can have, that about the centre being positive.
-
-    Args:
-        mechanism: Equations and bodies.
-        parameters: The ``p`` of the mechanism's functions, shape (N, p).
-
-    Returns:
-        Shape (N,).
-    """
+    """Return whether each body's inertia about its centre is positive, for parameters of shape (N, p); shape (N,)."""
     good = np.ones(len(parameters), dtype=np.bool_)
     for body in mechanism.bodies(tuple(parameters.T)):
         for value in (body.mass, *body.inertia):
@@ -161,11 +135,7 @@ def can_exist(mechanism: Mechanism, parameters: Array) -> NDArray[np.bool_]:
 
 
 def kicks_of(plant: PlantParameters) -> Array:
-    """Return the largest kick of each joint where the share is 1: its effort limit, or the largest torque of gravity.
-
-    Args:
-        plant: The plant.
-    """
+    """Return the largest kick of each joint at share 1: its effort limit, or the largest torque of gravity."""
     if plant.is_pendulum:
         return np.array([plant.effort_limit])
     limits = dict(zip(plant.coordinates.driven, plant.effort_limits, strict=True))
@@ -173,14 +143,10 @@ def kicks_of(plant: PlantParameters) -> Array:
 
 
 def velocity_scales(plant: PlantParameters, travel: float) -> tuple[float, ...]:
-    """Return the velocity of each joint that is seen as 1 [rad/s or m/s].
+    """Return the velocity of each joint that is scaled to 1 [rad/s or m/s].
 
-    Of a joint on which gravity acts, half of its speed after a fall from upright without friction, 1 at least; of one
-    that slides, half of that which its motor gives it on the way to the end of its travel.
-
-    Args:
-        plant: The plant.
-        travel: Largest deviation of joints that slide [m].
+    If gravity acts on the joint, half of its frictionless speed after a fall from upright, at least 1; if it slides,
+    half of the speed that its motor reaches at the end of its travel ``travel`` [m].
     """
     if plant.is_pendulum:
         return (max(1.0, math.sqrt(plant.gravity / plant.inertia)),)
@@ -197,7 +163,7 @@ def velocity_scales(plant: PlantParameters, travel: float) -> tuple[float, ...]:
 
 
 def _gravity(plant: PlantParameters) -> tuple[float, ...]:
-    """Return the largest torque of gravity on each joint, hanging at the others [N m or N]."""
+    """Return the largest torque of gravity on each joint with the others hanging [N m or N]."""
     n, step = len(plant.joints), 1e-6
     found = []
     for i in range(n):
@@ -210,7 +176,7 @@ def _gravity(plant: PlantParameters) -> tuple[float, ...]:
     return tuple(found)
 
 
-def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]]) -> Body:
+def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]]) -> TrainingPlant:
     columns = {name: k for k, name in enumerate(PACKED)}
     inertia, damping, gravity, coulomb = (columns[each] for each in VARIED)
     limit = plant.effort_limit
@@ -229,7 +195,7 @@ def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]])
         x = np.arcsin(np.clip(-efforts / np.maximum(parameters[:, [gravity]], 1e-9), -1.0, 1.0))
         return np.where(above[:, None], x, math.pi - x)
 
-    return Body(
+    return TrainingPlant(
         coordinates=plant.coordinates,
         limits=np.array([limit]),
         kicks=kicks_of(plant),
@@ -247,7 +213,7 @@ def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]])
     )
 
 
-def _mechanism(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]], travel: float) -> Body:
+def _mechanism(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]], travel: float) -> TrainingPlant:
     coordinates, mechanism = plant.coordinates, plant.mechanism
     n, driven = len(plant.joints), coordinates.driven
     if not driven:
@@ -290,7 +256,7 @@ def _mechanism(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]]
         found: Array = (moving + potential(q, p) - ends[1]) / (ends[1] - ends[0])
         return found
 
-    return Body(
+    return TrainingPlant(
         coordinates=coordinates,
         limits=np.array(plant.effort_limits),
         kicks=kicks_of(plant),
@@ -317,7 +283,7 @@ def _ratio(static: int, coulomb: int, value: float, of: float) -> tuple[tuple[in
 
 
 def _decay(plant: PlantParameters) -> float:
-    """Return the largest rate at which damping slows a joint, with half of its inertia as a margin [1/s]."""
+    """Return the largest damping rate of a joint, with half of its inertia as a margin [1/s]."""
     n = len(plant.joints)
     damping = np.diag([joint.damping for joint in plant.joints])
     rates = [0.0]

@@ -1,6 +1,6 @@
-"""Many plants that a policy learns on, each with parameters, a delay and noise of its own.
+"""Plants on which a policy learns, each with its own parameters, delay and noise.
 
-The effort for a state begins to act after the delay; until then the one before it acts. One joint is n = 1.
+The effort for a state acts after the delay; until then the previous effort acts. One joint is n = 1.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ __all__ = ["SwingUp"]
 
 _KICK_TIME = 0.05
 _EDGE, _END = 0.55, 0.7
-"""Shares of the way to the stop from which on going further costs, and costs most [-]; the travel ends at 0.8."""
+"""Shares of the way to the stop from which moving on costs, and costs most [-]; the travel ends at 0.8."""
 _PRICE, _LAST_PRICE = 2.0, 5.0
-"""The largest cost, in the first third of a training and in the last: a policy that may never go there does not learn
-to swing up; one that has learned it can learn to do without."""
+"""Largest cost in the first and the last third of a training: a policy that may never go there does not learn to swing
+up; one that has learned it can do without."""
 _MIDDLE = 0.5
-"""Share of the way to the stop within which it is near the middle: from rest far from it a joint cannot recover."""
+"""Share of the way to the stop that counts as near the middle: from rest far from it a joint cannot recover."""
 _AGAIN, _UP, _LEARNED = 0.75, 0.3, 0.6
-"""With a passive joint, the chance that the plant of an episode that did not end upright [rad], or left its travel, is
-drawn again, and after which share of the training: plants that are hard to swing up are rare, and else are not
-learned; a policy that cannot swing up any plant yet has to train on all of them."""
+"""With a passive joint: chance that a plant is drawn again after an episode that did not end upright [rad] or left its
+travel, and the share of the training after which: hard plants are rare and else not learned, but a policy that cannot
+swing up yet must train on all."""
 _ENDS = 0.5
-"""Of one joint, the share of parameters that lie at an end of their range: drawn evenly, plants of which several are
-extreme are too rare for a policy to learn to brake them."""
+"""Of one joint, the share of parameters at an end of their range: in even draws, plants with several extremes are too
+rare for a policy to learn to brake them."""
 _SPUN, _FASTEST_SPIN = 0.1, 3.0
-"""Of one joint, the share of episodes that begin with any speed up to so many scales: else no training has plants that
-spin with its torque."""
+"""Of one joint, the share of episodes that begin at any speed up to this many scales: else no plant in training
+spins."""
 _HELD, _FULL = 0.1, 1.5
 """Of one joint, the share of episodes that begin where gravity and effort balance, which dry friction and a constant
-command would hold for ever; efforts are drawn up to so many limits and clipped: most get stuck at the limit."""
+command would hold for ever; efforts are drawn up to this many limits and clipped, as most get stuck at the limit."""
 _MOST_DRAWS = 50
 
 
@@ -49,13 +49,12 @@ class SwingUp:
 
     Args:
         count: N.
-        plant: The plant at the centre; rigid, or of several joints.
-        ranges: Lowest and highest value of each parameter that differs.
-        task: Everything else that differs.
+        plant: The nominal plant; rigid, or of several joints.
+        ranges: Lowest and highest value of each varied parameter.
         generator: Draws plants, starts, delays, noise and kicks.
 
     Attributes:
-        progress: Share of the training that is done, for what the way out costs.
+        progress: Finished share of the training, on which the cost of the travel depends.
 
     Raises:
         ParameterError: The plant is series elastic, has no motor, or a delay of its own.
@@ -86,8 +85,8 @@ class SwingUp:
         self.scale = np.array(velocity_scales(plant, task.travel))
         self._furthest, self._fastest = start_spread(plant, task.travel, self.scale.tolist())
         self.step_limit = 2.0 * self.limit * task.period / task.rate_time
-        # Columns: n positions from upright, n velocities, n efforts of the actuators, n that act, n on their way, when
-        # those arrive.
+        # Columns: n positions from upright, n velocities, n efforts of the actuators, n acting, n pending commands, and
+        # when those arrive.
         self.motion = np.zeros((count, 5 * n + 1))
         self.parameters = np.repeat(body.row[None, :], count, axis=0)
         self.delay, self.effort = np.zeros(count), np.zeros((count, self.action_size))
@@ -100,7 +99,7 @@ class SwingUp:
         self.privileged_size = 0
         self.restart(np.ones(count, dtype=np.bool_))
         self.privileged_size = self.observe()[1].shape[1]
-        # Not all end at once.
+        # Episodes must not all end at once.
         self._left[:] = generator.integers(1, self._steps + 1, count)
 
     def observe(self) -> tuple[Floats, Floats]:
@@ -115,7 +114,7 @@ class SwingUp:
         return self._samples.copy(), np.concatenate(extra, axis=1).astype(np.float32)
 
     def step(self, actions: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Apply efforts, actions times the limit, rate-limited; return rewards and which episodes are over."""
+        """Apply rate-limited efforts, actions times the limit; return rewards and finished episodes."""
         task, draw, n = self.task, self._generator, self._n
         change = self.limit * actions.astype(np.float64) - self.effort
         change = np.clip(change, -self.step_limit, self.step_limit)
@@ -132,10 +131,10 @@ class SwingUp:
         return (0.05 * self._reward(change)).astype(np.float32), self._left <= 0
 
     def _reward(self, change: Array) -> Array:
-        """Return how high it stands and how near to rest upright, less what efforts, haste and the way out cost.
+        """Return the reward for height and nearness to rest upright, less the costs of effort, change and travel.
 
-        Each joint that turns adds as much for rest upright: of two, one that spins with the other upright is near to it
-        in height and energy.
+        Each joint that turns adds as much for rest upright: if one of two spins with the other upright, height and
+        energy are near those of rest.
         """
         n, turns = self._n, self._turns
         x, v = self.motion[:, :n], self.motion[:, n : 2 * n]
@@ -145,7 +144,7 @@ class SwingUp:
         u = self.effort / self.limit
         slid = np.abs(x[:, ~turns]) / self.reach[~turns]
         own = self.body.excess
-        # Without a motor at each joint, pumping and braking are the task: both are rewarded on their way.
+        # Without a motor at each joint, pumping and braking are the task, so both are rewarded.
         lost = 0.5 * np.minimum(1.0, np.abs(own(x, v, self.parameters))) if own is not None else 0.0
         return (
             0.5 * self.body.height(x) + near - np.sum(0.05 * u * u, axis=1)
@@ -158,10 +157,7 @@ class SwingUp:
         return _PRICE + (_LAST_PRICE - _PRICE) * min(1.0, max(0.0, 3.0 * self.progress - 1.0))
 
     def restart(self, which: NDArray[np.bool_]) -> None:
-        """Start new episodes in some of them: half anywhere, a quarter hanging, a quarter near upright.
-
-        Of one joint, some of those that start anywhere spin, and some are held there by their effort.
-        """
+        """Start new episodes: half anywhere (some spinning or held), a quarter hanging, a quarter near upright."""
         rows = np.flatnonzero(which)
         if not rows.size:
             return
@@ -174,7 +170,7 @@ class SwingUp:
         self._astray[rows] = False
         kind = draw.uniform(0.0, 1.0, (size, 1))
         anywhere = draw.uniform(-self._furthest, self._furthest, (size, n))
-        # Hanging is as far from upright one way as the other.
+        # Hanging is equally far from upright in both directions.
         hanging = np.where(self._turns, self._goal, -self._goal)
         position = np.where(kind < 0.5, anywhere, np.where(kind < 0.75, hanging, 0.0))
         self.motion[rows] = 0.0
@@ -195,12 +191,10 @@ class SwingUp:
         return self.motion[:, : 2 * self._n].copy()
 
     def start_at(self, rows: NDArray[np.intp], states: Array, efforts: Array) -> None:
-        """Let episodes that just began start elsewhere.
+        """Move rows of episodes that just began to other starts.
 
-        Args:
-            rows: Their rows.
-            states: Deviations from upright and velocities, shape (k, 2n).
-            efforts: That act already, and equal the last commands, shape (k, m).
+        ``states``: deviations from upright and velocities, shape (k, 2n); ``efforts`` act already and equal the last
+        commands, shape (k, m).
         """
         n = self._n
         self.motion[rows] = 0.0
@@ -211,7 +205,7 @@ class SwingUp:
         self._samples[rows] = np.tile(self._measure(rows), (1, self.task.history))
 
     def _hold(self, rows: NDArray[np.intp], held: Callable[[Array, Array, NDArray[np.bool_]], Array]) -> None:
-        """Let some start at rest where their effort, of the one joint, holds them."""
+        """Start some at rest where the effort of the one joint holds them."""
         draw, n = self._generator, self._n
         efforts = self.limit * np.clip(draw.uniform(-_FULL, _FULL, (rows.size, n)), -1.0, 1.0)
         above = draw.uniform(0.0, 1.0, rows.size) < 0.5
@@ -228,7 +222,7 @@ class SwingUp:
         return found
 
     def _draw_plants(self, rows: NDArray[np.intp]) -> None:
-        """Draw parameters, again where they make no plant: masses and inertias that are drawn each by itself may."""
+        """Draw parameters, again if they make no plant, as independent masses and inertias may."""
         for _ in range(_MOST_DRAWS):
             for name, (low, high) in self._ranges.items():
                 if name.rpartition(".")[2] != "static_friction":
@@ -241,7 +235,6 @@ class SwingUp:
         self.parameters[rows] = self.body.row
 
     def _values(self, low: float, high: float, size: int) -> Array:
-        """Draw values of a parameter."""
         values = self._generator.uniform(low, high, size)
         if self.body.held is None:
             return values

@@ -1,4 +1,4 @@
-"""How a finished policy does: the very controller that will run, on plants drawn from what it was trained for."""
+"""Success of a finished policy: the controller that will run, on plants drawn from its training's ranges."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.learning.body import can_exist, kicks_of, start_spread
-from pendulum_bags.learning.task import SwingUpTask, value_of
+from pendulum_bags.learning.task import SwingUpTask
 from pendulum_lqr.controller_interface.policy_runner import START_TIME
 from pendulum_lqr.controllers.policy import LearnedPolicy
 from pendulum_lqr.policies.policy import Policy
@@ -26,20 +26,19 @@ __all__ = ["HOLD", "UP", "Trial", "gymnasium_return", "is_up", "measured_success
 UP = 0.3
 """Deviation from upright within which a joint that turns is up [rad]."""
 HOLD = 1.0
-"""Time at the end of a trial for which it has to be up [s]."""
+"""Time at the end of a trial during which it must be up [s]."""
 _MOST_DRAWS = 50
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One run of n joints from a start to its end.
+    """One run of n joints.
 
     Attributes:
-        plant: What runs.
         position: Start, hanging at 0 [rad or m].
         velocity: Start [rad/s or m/s].
-        kicks: Efforts on the joints themselves at each step, shape (steps, n) [N m or N].
-        travel: Largest deviation of joints that slide, which is never to be left [m].
+        kicks: Efforts on the joints at each step, shape (steps, n) [N m or N].
+        travel: Largest deviation of joints that slide [m]; leaving it fails the trial.
     """
 
     plant: PlantParameters
@@ -52,18 +51,11 @@ class Trial:
 def trials_of(
     policy: Policy, task: SwingUpTask, count: int, seed: int, duration: float = 10.0, *, hanging: bool = False
 ) -> list[Trial]:
-    """Return trials with start, plant, delay and kicks all drawn again, each from the ranges of training.
+    """Return ``count`` trials with start, plant, delay and kicks drawn from the ranges of training.
 
-    Kicks last 50 ms and come each second, with up to the trained share of the effort limit, or of the largest torque of
-    gravity at a joint without a motor.
-
-    Args:
-        policy: The policy.
-        task: What differed in its training.
-        count: How many.
-        seed: Of what is drawn.
-        duration: Of each [s].
-        hanging: They start hanging at rest without kicks: for a policy of one way up only.
+    They last ``duration`` [s]. Kicks last 50 ms and come each second, with up to the trained share of the effort limit,
+    or of the largest torque of gravity at a joint without a motor. ``hanging`` starts at rest without kicks, for a
+    policy that knows one way up only.
     """
     rng = np.random.default_rng(seed)
     found = []
@@ -77,7 +69,7 @@ def trials_of(
         for second in range(1, math.ceil(duration)):
             first = round(second / policy.period)
             kicks[first : first + width] = rng.uniform(-1.0, 1.0, len(joints)) * task.kick * largest
-        # From hanging where it turns, from the middle where it slides.
+        # From hanging if the joint turns, from the middle if it slides.
         position = tuple(
             float(rng.uniform(-far, far)) + (0.0 if joint.turns else joint.goal)
             for joint, far in zip(joints, furthest, strict=True)
@@ -91,14 +83,14 @@ def trials_of(
 
 
 def _drawn(policy: Policy, task: SwingUpTask, rng: np.random.Generator) -> PlantParameters:
-    """Return a plant from the ranges, drawn again where its masses and inertias make none."""
+    """Return a plant from the ranges, drawn again if its masses and inertias make none."""
     plant = policy.plant
     for _ in range(_MOST_DRAWS):
         drawn = {name: float(rng.uniform(*pair)) for name, pair in policy.ranges.items() if "static" not in name}
         for name in [name for name in policy.ranges if name.endswith("static_friction")]:
             coulomb = name.replace("static", "coulomb")
             if coulomb in drawn:
-                drawn[name] = value_of(plant, name) / value_of(plant, coulomb) * drawn[coulomb]
+                drawn[name] = plant.value(name) / plant.value(coulomb) * drawn[coulomb]
         delay = float(rng.uniform(0.0, task.delay))
         if plant.is_pendulum:
             return plant.with_values(**drawn, transport_delay=delay)
@@ -111,18 +103,14 @@ def _drawn(policy: Policy, task: SwingUpTask, rng: np.random.Generator) -> Plant
 
 
 def plant_of(parameters: PlantParameters, period: float) -> JointPlant:
-    """Return the simulated plant, whose states are tuples [s]."""
-    # A mechanism as fine as with the simulator's own period.
+    """Return the simulated plant, whose states are tuples; ``period`` in [s]."""
+    # A mechanism gets the substeps of the simulator's own period.
     substeps = None if parameters.is_pendulum else max(1, round(period / 0.002))
     return make_joint_plant(parameters, period, substeps=substeps)
 
 
 def run_trial(policy: Policy, trial: Trial, start_time: float = START_TIME) -> tuple[NDArray[np.float64], str]:
-    """Return what was measured at each step, and why the policy gave up, if it did.
-
-    Returns:
-        n deviations from upright, n velocities and m efforts, shape (2 n + m, steps); and its notice.
-    """
+    """Return n deviations from upright, n velocities, m efforts, shape (2 n + m, steps), and a reason to give up."""
     coordinates, plant = policy.coordinates, plant_of(trial.plant, policy.period)
     controller = LearnedPolicy(policy, 1, policy.effort_limit, start_time=start_time)
     state = plant.reset(trial.position, trial.velocity)
@@ -136,16 +124,10 @@ def run_trial(policy: Policy, trial: Trial, start_time: float = START_TIME) -> t
 
 
 def is_up(policy: Policy, trial: Trial, rows: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return at which steps it is up: what turns is upright, and what slides is, and stays, where it may.
-
-    Args:
-        policy: The policy.
-        trial: The run.
-        rows: Of :func:`run_trial`.
-    """
+    """Return at which steps of :func:`run_trial` turning joints are up and sliding ones never left their travel."""
     up = np.ones(rows.shape[1], dtype=np.bool_)
     for joint, row in zip(policy.coordinates.joints, np.abs(rows), strict=False):
-        # A trial that has left the track does not count as up before that either.
+        # A trial that leaves the track does not count as up before that either.
         up &= row <= UP if joint.turns else bool(np.all(row <= trial.travel))
     return up
 
@@ -153,7 +135,7 @@ def is_up(policy: Policy, trial: Trial, rows: NDArray[np.float64]) -> NDArray[np
 def measured_success(
     policy: Policy, trials: list[Trial], on_progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Any]:
-    """Return how many trials end upright for the last second, and when they came up for good, median [s]."""
+    """Return how many trials are up for the last second, and the median time at which they came up for good [s]."""
     passed, times, gave_up = 0, [], 0
     last = round(HOLD / policy.period)
     for number, trial in enumerate(trials):

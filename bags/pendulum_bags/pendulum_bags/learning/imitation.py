@@ -1,4 +1,4 @@
-"""Imitation of a teacher on the states to which the pupil itself gets (DAgger, without a memory of earlier rounds).
+"""Imitation of a teacher on the states that the pupil itself visits (DAgger without memory of earlier rounds).
 
 Source: Ross, Gordon and Bagnell, A reduction of imitation learning and structured prediction to no-regret online
 learning, 2011, algorithm 3.1.
@@ -22,13 +22,13 @@ __all__ = ["Imitation"]
 _FIRST_RATE, _LAST_RATE = 2e-3, 2e-5
 _PASSES, _PARTS = 2, 12
 _LED = 0.2
-"""Share of the training in which the teacher leads some of the plants instead of the pupil, ever fewer."""
+"""Share of the training in which the teacher leads a falling number of the plants instead of the pupil."""
 _NEAR, _LOST = 2.0, 6.0
 """Costs of a deviation up to which an episode starts, and from which it is aborted for lack of a path."""
 _AT_ENDS = 0.15
-"""Shares of the episodes that start at the first node, and at rest upright; the others on the way."""
+"""Share of the episodes that start at the first node, and at rest upright; the others on the way."""
 _NOISE = 0.02
-"""Standard deviation of the noise on commands, which visits states off the trajectory, as a share of the limit."""
+"""Standard deviation of the noise on commands, as a share of the limit, which visits states off the trajectory."""
 
 
 class Imitation:
@@ -38,7 +38,6 @@ class Imitation:
         environment: The plants; episodes start along the teacher's swing-up.
         settings: Widths of the network and the horizon.
         generator: Draws first weights, starts, noise and the order of the data.
-        teacher: The law to imitate.
     """
 
     def __init__(
@@ -54,14 +53,8 @@ class Imitation:
     def update(self, remaining: float = 1.0) -> dict[str, float]:
         """Gather states with the present policy and fit it to the teacher's commands there.
 
-        Args:
-            remaining: Share of the training that is left.
-
-        Returns:
-            Mean reward a step, mean squared error of the commands as ``divergence``, no spread.
-
-        Raises:
-            FaultError: A parameter is no longer finite.
+        ``remaining`` is the remaining share of the training. Returns mean reward per step, mean squared command error
+        as ``divergence``, no spread. Raises a FaultError for a parameter that is not finite.
         """
         seen, taught, reward = self._gather(max(0.0, 1.0 - (1.0 - remaining) / _LED))
         rate = _LAST_RATE + (_FIRST_RATE - _LAST_RATE) * remaining
@@ -72,7 +65,7 @@ class Imitation:
             for part in range(_PARTS):
                 rows = order[part * size : (part + 1) * size]
                 answers, right = self.actor.forward(seen[rows]), taught[rows]
-                # What is beyond the limit is clipped to it.
+                # Commands beyond the limit are clipped to it.
                 enough = (np.abs(right) >= 1.0) & (answers * right >= 1.0)
                 error = np.where(enough, np.float32(0.0), answers - right)
                 losses.append(float(np.mean(error * error)))

@@ -18,7 +18,7 @@ class Mlp:
     """Dense layers with tanh between them and a linear last one.
 
     Args:
-        sizes: Values that go in, widths of the hidden layers, values that come out.
+        sizes: Number of inputs, widths of the hidden layers, number of outputs.
         generator: Draws the first weights.
         last: Factor on the first weights of the last layer.
     """
@@ -34,7 +34,7 @@ class Mlp:
         self._kept: dict[tuple[str, int, int], Floats] = {}
 
     def forward(self, x: Floats) -> Floats:
-        """Return the output for inputs of shape (n, in), shape (n, out), and keep what :meth:`backward` needs."""
+        """Return outputs (n, out) for inputs (n, in), and store what :meth:`backward` needs."""
         self._inputs = []
         last = len(self.parameters) - 2
         for k in range(0, last, 2):
@@ -48,11 +48,7 @@ class Mlp:
         return x
 
     def backward(self, slope: Floats) -> list[Floats]:
-        """Return the derivatives of a loss by the parameters.
-
-        Args:
-            slope: Its derivative by the last output, shape (n, out).
-        """
+        """Return a loss's derivatives by the parameters from that by the last output, shape (n, out)."""
         gradients: list[Floats] = []
         for k in range(len(self.parameters) - 2, -1, -2):
             x = self._inputs[k // 2]
@@ -64,14 +60,7 @@ class Mlp:
         return gradients[::-1]
 
     def _room(self, what: str, layer: int, like: Floats, width: int) -> Floats:
-        """Return an array of as many rows, the same each time: fresh memory costs more than the product that fills it.
-
-        Args:
-            what: What it is for.
-            layer: Of which layer.
-            like: Array of as many rows, of the type that is wanted.
-            width: Its columns.
-        """
+        """Return a reused array of ``like``'s rows and type: fresh memory costs more than the product that fills it."""
         key = (f"{what} {layer}", len(like), width)
         if key not in self._kept or self._kept[key].dtype != like.dtype:
             self._kept[key] = np.empty((len(like), width), dtype=like.dtype)
@@ -79,11 +68,7 @@ class Mlp:
 
 
 class Adam:
-    """Adam with a bound on the length of the gradient.
-
-    Args:
-        parameters: What it changes, in place.
-        longest: Length to which a longer gradient is cut [-].
+    """Adam that changes ``parameters`` in place, with gradients cut to the length ``longest`` [-].
 
     Source: Kingma and Ba, Adam: a method for stochastic optimization, 2015, algorithm 1.
     """
@@ -96,7 +81,7 @@ class Adam:
         self.second = [np.zeros_like(each) for each in parameters]
 
     def step(self, gradients: Sequence[Floats], rate: float) -> None:
-        """Take a step of a length given by the learning rate."""
+        """Take a step at the learning rate ``rate``."""
         length = math.sqrt(sum(float(np.sum(np.square(each, dtype=np.float64))) for each in gradients))
         cut = min(1.0, self.longest / (length + 1e-12))
         self.count += 1

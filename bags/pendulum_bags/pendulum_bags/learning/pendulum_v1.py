@@ -27,16 +27,11 @@ _REWARD = 0.1
 PLANT = pendulum_plant(
     inertia=_M * _L * _L / 3.0, damping=0.0, gravity=0.5 * _M * _G * _L, effort_limit=_MOST_TORQUE, name="Pendulum-v1"
 )
-"""The same plant in our terms."""
+"""The same plant in this project's parameters."""
 
 
 class PendulumV1:
-    """N of them; episodes begin at any angle and up to 1 rad/s, and last 200 steps.
-
-    Args:
-        count: N.
-        generator: Draws the starts.
-    """
+    """``count`` pendulums; episodes begin at any angle and up to 1 rad/s, and last 200 steps."""
 
     observation_size, privileged_size, action_size = 3, 0, 1
 
@@ -46,7 +41,7 @@ class PendulumV1:
         self.angle, self.velocity = np.zeros(count), np.zeros(count)
         self._left = np.zeros(count, dtype=np.int64)
         self.restart(np.ones(count, dtype=np.bool_))
-        # Not all end at once.
+        # Episodes must not all end at once.
         self._left[:] = generator.integers(1, EPISODE + 1, count)
 
     def observe(self) -> tuple[Floats, Floats]:
@@ -55,7 +50,7 @@ class PendulumV1:
         return seen.astype(np.float32), np.empty((self.count, 0), dtype=np.float32)
 
     def step(self, actions: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Take a step; return rewards and which episodes are over."""
+        """Take a step; return rewards and finished episodes."""
         torque = _MOST_TORQUE * actions[:, 0].astype(np.float64)
         cost = wrap(self.angle) ** 2 + 0.1 * self.velocity**2 + 0.001 * torque**2
         acceleration = 3.0 * _G / (2.0 * _L) * np.sin(self.angle) + 3.0 / (_M * _L**2) * torque
@@ -65,7 +60,7 @@ class PendulumV1:
         return (-_REWARD * cost).astype(np.float32), self._left <= 0
 
     def restart(self, which: NDArray[np.bool_]) -> None:
-        """Start new episodes in some of them."""
+        """Start new episodes."""
         number = int(which.sum())
         self.angle[which] = self._generator.uniform(-math.pi, math.pi, number)
         self.velocity[which] = self._generator.uniform(-1.0, 1.0, number)

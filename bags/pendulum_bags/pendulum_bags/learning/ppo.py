@@ -1,7 +1,7 @@
 """Proximal policy optimisation on a batch of environments.
 
-The actor outputs the mean of a normal distribution; the critic also sees what only a simulation has (the true
-plant). The learning rate follows the distance between the old and the new policy.
+The actor outputs the mean of a normal distribution; the critic also sees the true plant of the simulation. The learning
+rate follows the distance between the old and the new policy.
 
 Sources: Schulman et al., Proximal policy optimization algorithms, 2017, eq. 7; Schulman et al., High-dimensional
 continuous control using generalized advantage estimation, 2016, eq. 16; Rudin et al., Learning to walk in minutes using
@@ -37,13 +37,13 @@ class BatchEnvironment(Protocol):
         """Return the policy's observations, shape (N, observations), and the critic's further ones, (N, privileged)."""
 
     def step(self, actions: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Take actions of shape (N, actions), within [-1, 1] after a clip; return rewards and finished episodes."""
+        """Take actions of shape (N, actions), clipped to [-1, 1]; return rewards and finished episodes."""
 
     def restart(self, which: NDArray[np.bool_]) -> None:
-        """Start new episodes in some of them."""
+        """Start new episodes where ``which`` is true."""
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Return everything that a checkpoint has to keep."""
+        """Return the arrays of a checkpoint."""
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
         """Resume from a checkpoint."""
@@ -51,18 +51,18 @@ class BatchEnvironment(Protocol):
 
 @dataclass(frozen=True)
 class PpoSettings:
-    """How it learns.
+    """Settings of the learner.
 
     Attributes:
         hidden: Widths of the hidden layers.
         horizon: Steps of each environment between two updates.
-        discount: Weight of a reward a step later.
+        discount: Weight of a reward one step later.
         trace: Weight of longer returns (lambda).
         epochs: Passes over the data of an update.
         batches: Parts of a pass.
-        clip: Largest change of the probability ratio that is rewarded.
+        clip: Largest rewarded change of the probability ratio.
         rate: First learning rate.
-        divergence: Distance between old and new policy that the rate aims at (Kullback-Leibler).
+        divergence: Target distance between old and new policy (Kullback-Leibler).
         spread: First standard deviation of actions.
         least_spread: Smallest one.
     """
@@ -90,13 +90,7 @@ class _Old(NamedTuple):
 
 
 class Ppo:
-    """The learner: actor, critic and their optimisers.
-
-    Args:
-        environment: The environments.
-        settings: How it learns.
-        generator: Draws first weights, actions and the order of the data.
-    """
+    """Actor, critic and optimisers; ``generator`` draws first weights, actions and the order of the data."""
 
     def __init__(self, environment: BatchEnvironment, settings: PpoSettings, generator: np.random.Generator) -> None:
         self.environment = environment
@@ -113,14 +107,8 @@ class Ppo:
     def update(self, remaining: float = 1.0) -> dict[str, float]:
         """Gather data with the present policy and improve it.
 
-        Args:
-            remaining: Share of the training that is left; caps the learning rate.
-
-        Returns:
-            Mean reward a step, divergence, spread, loss of the critic.
-
-        Raises:
-            FaultError: A parameter is no longer finite.
+        ``remaining`` is the remaining share of the training, which caps the learning rate. Returns mean reward per
+        step, divergence, spread and the critic's loss. Raises a FaultError for a parameter that is not finite.
         """
         data, reward = self._gather()
         measured = self._improve(data, remaining)
@@ -144,7 +132,7 @@ class Ppo:
             actions[k] = means[k] + spread * noise
             rewards[k], overs[k] = env.step(np.clip(actions[k], -1.0, 1.0))
             if overs[k].any() or k == t - 1:
-                # Time that is over is no end of the task: the value of where it got to counts on.
+                # The end of the time is no end of the task: the value of the state reached counts on.
                 after[k] = self.critic.forward(np.concatenate(env.observe(), axis=1))[:, 0]
                 env.restart(overs[k])
             if k:
@@ -173,7 +161,7 @@ class Ppo:
             self._adam_critic.step(self.critic.backward(error / np.float32(size)), rate)
             return float(np.mean(error * error))
 
-        # Actor and critic share no numbers, so that a thread for each gives the same bits as one for both.
+        # Actor and critic share no numbers, so a thread for each gives the same bits as one for both.
         with ThreadPoolExecutor(1) as beside:
             for _ in range(s.epochs):
                 order = self.generator.permutation(len(seen))
@@ -190,7 +178,7 @@ class Ppo:
         }
 
     def _follow_advantages(self, x: Floats, old: _Old, gain: Floats, remaining: float) -> float:
-        """Take a step of the actor, and return how far the policy is from the old one."""
+        """Take a step of the actor; return the policy's distance from the old one."""
         s, size = self.settings, len(x)
         mean = self.actor.forward(x)
         variance = np.exp(2.0 * self.log_spread)
@@ -198,7 +186,7 @@ class Ppo:
         ratio = np.exp(_log_chance(old.actions, mean, self.log_spread) - old.chance)
         blocked = ((gain > 0.0) & (ratio > 1.0 + s.clip)) | ((gain < 0.0) & (ratio < 1.0 - s.clip))
         weight = np.where(blocked, np.float32(0.0), -gain * ratio) / np.float32(size)
-        # A mean far beyond the clip of the actions would never come back.
+        # A mean far beyond the clip of the actions would never return.
         beyond = np.clip(mean, -1.1, 1.1)
         slope = weight * deviation / variance + np.float32(0.02 / size) * (mean - beyond)
         spread_slope = np.sum(weight * (deviation * deviation / variance - 1.0), axis=0)
@@ -232,11 +220,7 @@ class Ppo:
 
 
 def finite_or_diverged(parameters: Iterable[Floats]) -> None:
-    """Refuse parameters that are no longer finite.
-
-    Raises:
-        FaultError: One is not.
-    """
+    """Raise a FaultError if a parameter is not finite."""
     if not all(np.isfinite(each).all() for each in parameters):
         raise FaultError("training diverged: a weight is no longer finite; expected another seed")
 

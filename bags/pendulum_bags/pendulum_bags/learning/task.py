@@ -1,4 +1,4 @@
-"""What a policy is trained to do, and on which plants, delays, noise and kicks: the settings that make it transfer."""
+"""The task and the variations of plant, delay, noise and kicks that make a policy transfer."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["VARIED", "SwingUpTask", "ranges_of", "value_of"]
+__all__ = ["VARIED", "SwingUpTask", "ranges_of"]
 
 VARIED = ("inertia", "damping", "gravity", "coulomb_friction")
-"""Parameters that differ from episode to episode; static friction keeps its ratio to Coulomb friction."""
+"""Parameters that vary between episodes; static friction has a fixed ratio to Coulomb friction."""
 _OF_JOINTS = ("damping", "coulomb_friction")
 _FIXED = ("gravity", "pole_length", "gear_ratio")
 """Parameters that are known exactly, or have no effect."""
@@ -25,16 +25,16 @@ class SwingUpTask:
 
     Attributes:
         period: Time between two commands [s].
-        share: Half width of the range of each parameter, as a share of its value; a plant file's interval, where it
-            is wider, counts instead [-].
-        delay: Longest mean delay from state to torque; each episode draws one from 0 to this [s].
+        share: Half width of each parameter's range, as a share of its value [-]; a wider interval of the plant file
+            overrides it.
+        delay: Longest mean delay from state to torque, drawn from 0 up to this in each episode [s].
         jitter: Standard deviation of the delay from command to command [s].
         angle_noise: Standard deviation of measured angles [rad].
         velocity_noise: Standard deviation of measured velocities [rad/s].
         offset: Largest error of the zero angle [rad], and of the torque as a share of the limit [-].
         kick: Largest torque on the link, as a share of the torque limit; a kick lasts 50 ms [-].
-        kick_rate: Kicks a second.
-        rate_time: Time in which the torque may go from one limit to the other [s].
+        kick_rate: Kicks per second.
+        rate_time: Least time for the torque to go from one limit to the other [s].
         history: Samples that the policy sees.
         travel: Largest deviation of a joint that slides [m].
         episode: Length of an episode [s].
@@ -55,7 +55,6 @@ class SwingUpTask:
     episode: float = 6.0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be trained on."""
         for name, value in asdict(self).items():
             if not math.isfinite(value) or value < 0.0 or (value == 0.0 and name in _POSITIVE):
                 raise ParameterError(f"{name} is {value}; expected a finite number >= 0 (> 0 for times and travel)")
@@ -73,20 +72,16 @@ class SwingUpTask:
 def ranges_of(
     plant: PlantParameters, share: float, intervals: Mapping[str, Sequence[float]]
 ) -> dict[str, tuple[float, float]]:
-    """Return lowest and highest value of each parameter that differs in training, static friction among them.
+    """Return the range of each parameter that varies in training, static friction among them.
 
-    Of a mechanism these are its own parameters but gravity, and the friction of its joints.
-
-    Args:
-        plant: The plant at the centre.
-        share: Half width as a share of the value [-].
-        intervals: Those of the plant file, by name.
+    Of a mechanism these are its own parameters but gravity, and the friction of its joints. ``share`` is the half width
+    as a share of the value [-], ``intervals`` are those of the plant file, by name.
     """
     if not plant.is_pendulum:
         numbers = plant.numbers
         varied = [name for name in numbers if name not in _FIXED and _varies(name)]
     else:
-        numbers = {name: value_of(plant, name) for name in (*VARIED, "static_friction")}
+        numbers = {name: plant.value(name) for name in (*VARIED, "static_friction")}
         varied = list(VARIED)
     found = {}
     for name in varied:
@@ -100,11 +95,6 @@ def ranges_of(
             low, high = found[coulomb]
             found[static] = (ratio * low, ratio * high)
     return {name: pair for name, pair in found.items() if pair[0] < pair[1]}
-
-
-def value_of(plant: PlantParameters, name: str) -> float:
-    """Return a parameter of a plant by its name."""
-    return plant.value(name)
 
 
 def _varies(name: str) -> bool:

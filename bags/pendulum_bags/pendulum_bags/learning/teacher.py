@@ -1,6 +1,6 @@
 """A swing-up with its tracking gains as a law of the state alone, which a network can imitate.
 
-Of all nodes of the swing-up the nearest one's law applies, by the tracking's own cost; the last node is upright::
+The law of the nearest node applies, by the tracking's own cost; the last node is upright::
 
     k = argmin_k e_k' P_k e_k,  e_k = x - x_k (wrapped where a joint turns),  u = clamp(u_k - K_k e_k)
 """
@@ -26,7 +26,7 @@ class TeacherAnswers(NamedTuple):
 
     Attributes:
         efforts: Within the limits, shape (N, m) [N m or N].
-        cost: Of the deviation from the nearest node, 1 on the edge of what the LQR upright catches, shape (N,).
+        cost: Of the deviation from the nearest node, 1 at the edge of the upright LQR's region, shape (N,).
     """
 
     efforts: Array
@@ -34,16 +34,12 @@ class TeacherAnswers(NamedTuple):
 
 
 class Teacher:
-    """The stored swing-up of a plant, tracked from wherever a state is near to it.
-
-    Args:
-        plant: A preset with a stored swing-up, or a file of its name.
-        period: Of the commands [s].
+    """The stored swing-up of a plant, tracked from any state near it; ``period`` of the commands in [s].
 
     Attributes:
         states: Its nodes, deviations from upright and velocities, shape (K, 2n).
         efforts: At the nodes, shape (K, m) [N m or N].
-        moving: Nodes before the LQR upright would catch it.
+        moving: Number of nodes before the upright LQR's region.
 
     Raises:
         ParameterError: No swing-up is stored for the plant.
@@ -66,11 +62,7 @@ class Teacher:
         self._roots = np.linalg.inv(np.linalg.cholesky(self._costs)).transpose(0, 2, 1)
 
     def answer(self, states: Array) -> TeacherAnswers:
-        """Return what it would do.
-
-        Args:
-            states: Deviations from upright, then velocities, shape (N, 2n).
-        """
+        """Return the efforts for deviations from upright and velocities, shape (N, 2n)."""
         nearest, cost = _nearest(states, self.states, self._costs, self._turns)
         error = states - self.states[nearest]
         error[:, self._turns] = wrap(error[:, self._turns])
@@ -78,16 +70,10 @@ class Teacher:
         return TeacherAnswers(np.clip(efforts, -self._limits, self._limits), cost)
 
     def around(self, nodes: NDArray[np.intp], cost: float, generator: np.random.Generator) -> tuple[Array, Array]:
-        """Return random states around nodes, and the efforts that act there: those of the node before.
-
-        Args:
-            nodes: Which, shape (N,).
-            cost: Largest cost of a deviation.
-            generator: Draws them.
-        """
+        """Return random states around nodes, up to a cost, and the efforts that act there: those of the node before."""
         direction = generator.standard_normal((nodes.size, self.states.shape[1]))
         direction /= np.linalg.norm(direction, axis=1)[:, None]
-        # Most of them near: there the commands have to be exact.
+        # Most of them near the node, where commands have to be exact.
         direction *= np.sqrt(cost) * generator.random((nodes.size, 1)) ** 2
         states = self.states[nodes] + np.einsum("kij,kj->ki", self._roots[nodes], direction)
         return states, np.where(nodes[:, None] > 0, self.efforts[nodes - 1], 0.0)

@@ -1,4 +1,4 @@
-"""A training from its settings to a policy file: one seed, one file; it resumes where it stopped."""
+"""A resumable training from its settings to a policy file: one seed, one file."""
 
 from __future__ import annotations
 
@@ -35,29 +35,25 @@ __all__ = ["EPISODES", "TASKS", "TEACHERS", "TRIALS", "Training", "checkpoint_pa
 
 TASKS = ("swing_up", "pendulum_v1")
 TEACHERS = ("none", "tvlqr")
-"""What a policy imitates: nothing, so that it learns from its reward, or the stored swing-up of its plant."""
+"""What a policy imitates: nothing (it learns from its reward), or the stored swing-up of its plant."""
 _CHECKPOINT_EVERY = 10
 _LARGEST_CHECKPOINT = 500_000_000
 TRIALS, EPISODES = 60, 100
-"""How many runs judge a finished policy."""
+"""Number of runs that judge a finished policy."""
 _EVALUATION_SEED = 10_000
 _SPEED_MARGIN = 1.1
-"""The box of velocities is this much wider than what training visited."""
+"""Ratio of the policy's box of velocities to what training visited."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """What is trained.
+    """Settings of a training.
 
     Attributes:
         task: One of ``TASKS``.
-        plant: The plant at the centre.
-        intervals: Intervals of its parameters, as a plant file gives them.
-        swing_up: What differs from episode to episode, for ``swing_up``.
-        ppo: How it learns.
+        intervals: Intervals of its parameters, as in a plant file.
+        swing_up: Variations between episodes, for ``swing_up``.
         environments: Pendulums at once.
-        updates: Updates of the policy.
-        seed: Seed of everything.
         teacher: One of ``TEACHERS``.
     """
 
@@ -72,7 +68,6 @@ class Training:
     teacher: str = "none"
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be trained."""
         if self.task not in TASKS:
             raise ParameterError(f"task is {self.task!r}; expected one of {', '.join(TASKS)}")
         if self.teacher not in TEACHERS:
@@ -90,12 +85,12 @@ class Training:
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest value of each parameter that differs."""
+        """Lowest and highest value of each varied parameter."""
         return ranges_of(self.plant, self.swing_up.share, self.intervals) if self.task == "swing_up" else {}
 
     @property
     def steps(self) -> int:
-        """Steps of the environment in all."""
+        """Total number of environment steps."""
         return self.environments * self.ppo.horizon * self.updates
 
     def to_json(self) -> dict[str, Any]:
@@ -130,18 +125,18 @@ def train(
     """Train, or resume from a checkpoint, and write the policy file.
 
     Args:
-        settings: What is trained.
+        settings: Settings of the training.
         out: The policy file.
-        on_update: Called with updates done and what was measured.
-        on_trial: Called with trials done and in all, after the last update.
+        on_update: Called with the number of finished updates and their measurements.
+        on_trial: Called with the number of finished and of all trials, after the last update.
 
     Returns:
-        The policy, and its curves: steps, mean reward, divergence and spread, one row an update, shape (n, 4).
+        The policy, and its curves: steps, mean reward, divergence and spread per update, shape (n, 4).
 
     Raises:
         ParameterError: A checkpoint of other settings is in the way.
         DataError: The file or the checkpoint cannot be written or read.
-        FaultError: The training diverged; the checkpoint before stays.
+        FaultError: The training diverged; the last checkpoint remains.
     """
     # One thread, so that sums are added in one order on any number of cores.
     with threadpoolctl.threadpool_limits(1):
@@ -252,7 +247,7 @@ def _keep(
 def _check_arrays(
     path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo | Imitation, joints: int, updates: int
 ) -> None:
-    """Refuse arrays that are not those of the settings; numpy would stretch, cast or keep them in silence."""
+    """Refuse arrays that do not fit the settings; numpy would broadcast or cast them silently."""
     expected = {f"learner/{name}": np.asarray(each) for name, each in learner.state().items()}
     expected |= {f"environment/{name}": each for name, each in learner.environment.state().items()}
     for name in (*expected, "curves", "fastest"):
@@ -280,7 +275,7 @@ def _check_arrays(
 def _restore(
     path: Path, settings: Training, learner: Ppo | Imitation, generator: np.random.Generator
 ) -> tuple[list[list[float]], NDArray[np.float64]]:
-    """Resume from a checkpoint; return the curves so far and the fastest motion of each joint [rad/s or m/s]."""
+    """Resume from a checkpoint; return the curves so far and each joint's fastest motion [rad/s or m/s]."""
     try:
         if path.stat().st_size > _LARGEST_CHECKPOINT:
             raise DataError(f"checkpoint {path} has more than {_LARGEST_CHECKPOINT} bytes; expected one of ours")

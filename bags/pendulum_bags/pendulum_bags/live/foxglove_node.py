@@ -1,7 +1,7 @@
-"""A node that hands the graph to viewers: topics as they are on the wire, parameters, and services to call.
+"""A node that passes the graph to viewers: topics as on the wire, parameters, and services to call.
 
-Nothing is published, and no viewer can: a torque comes from a controller. What can be called is what the graph offers,
-with its own rules: an e-stop latches, and arming is refused where a plant refuses it.
+It publishes nothing, and no viewer can: torques come from controllers. Services keep their rules: an e-stop latches,
+and a plant may refuse arming.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
 __all__ = ["LiveNode", "LiveOptions"]
 
 _TAKE_PERIOD = 0.02
-"""Time between two visits to the middleware [s]: that of a picture, and enough for several messages to go together."""
+"""Period of polling the middleware [s]: a video frame, long enough to send several messages together."""
 _LOOK_PERIOD = 0.3
 _TIMEOUT = 3.0
 """Longest wait for a response of a node [s]."""
@@ -51,7 +51,6 @@ class LiveOptions:
     """Where to listen, and which clients to admit.
 
     Args:
-        host: Address to listen on.
         port: Port; 0 for any.
         token: Token of a client; empty on loopback.
         origins: Origins of pages that may connect to loopback besides the known viewers.
@@ -64,15 +63,7 @@ class LiveOptions:
 
 
 class LiveNode(PollingNode):
-    """Serves what is on the graph to clients of the Foxglove WebSocket protocol.
-
-    Args:
-        options: Where to listen, and which clients to admit.
-        stop: Requests the runner to end the process.
-
-    Raises:
-        ParameterError: The port is not available.
-    """
+    """Serves the graph over the Foxglove WebSocket protocol; a ParameterError if the port is not available."""
 
     def __init__(self, options: LiveOptions, stop: Callable[[], None]) -> None:
         super().__init__("foxglove")
@@ -107,7 +98,7 @@ class LiveNode(PollingNode):
         create_wall_timer(self, _TAKE_PERIOD, self._take)
 
     def close(self) -> None:
-        """Hang up on all clients."""
+        """Disconnect all clients."""
         for topic in self._topics.values():
             self._leave(topic)
         self._topics.clear()
@@ -117,11 +108,9 @@ class LiveNode(PollingNode):
         print(f"handed on {self._sent} messages; {self._lost} were lost on the way from their publishers", flush=True)
 
     def _print_told(self) -> None:
-        """Print the gate's lines here: its threads would write into each other's lines."""
+        """Print the gate's lines in this thread, so that they do not mix."""
         while not self._told.empty():
             print(self._told.get(), flush=True)
-
-    # -- topics ------------------------------------------------------------------------------------------------
 
     def _take(self) -> None:
         self._print_told()
@@ -172,8 +161,6 @@ class LiveNode(PollingNode):
             self._no_plant_told = True
             self._server.publish_status(text, foxglove.StatusLevel.Warning, "no plant")
 
-    # -- services ----------------------------------------------------------------------------------------------
-
     def _look_for_services(self) -> None:
         own = f"{self.get_fully_qualified_name()}/"
         there = {
@@ -205,7 +192,7 @@ class LiveNode(PollingNode):
             return foxglove.MessageSchema(encoding="cdr", schema=schema)
 
         def answer(request: Any) -> bytes:
-            # A request without content is sent in more ways than one, not all of which ROS reads.
+            # Viewers encode empty requests in several ways, not all of which ROS reads.
             empty = not kind.Request.get_fields_and_field_types()
             asked = kind.Request() if empty else deserialize_message(request.payload, kind.Request)
             answered = self._call(self._callable[name], name, asked)
@@ -232,8 +219,6 @@ class LiveNode(PollingNode):
             raise FaultError(f"{name} does not answer within {_TIMEOUT:g} s")
         return future.result()
 
-    # -- parameters --------------------------------------------------------------------------------------------
-
     def _on_values(self, values: Mapping[str, Mapping[str, Any]], changed: str) -> None:
         if changed:
             self._server.publish_parameter_values(
@@ -241,7 +226,7 @@ class LiveNode(PollingNode):
             )
 
     def _shown(self, wanted: Sequence[str]) -> list[Any]:
-        """Return parameters as ``/sim/simulator.effort_limit``; all of them where none is named."""
+        """Return parameters such as ``/sim/simulator.effort_limit``; all if none is named."""
         known = {
             f"{node}.{name}": value
             for node, values in sorted(self._reader.values.items())
@@ -251,7 +236,7 @@ class LiveNode(PollingNode):
         return [foxglove.Parameter(name, value=value) for name, value in chosen.items()]
 
     def _set_all(self, asked: Sequence[Any]) -> None:
-        """Set parameters for a viewer, in a thread of the server; what a node refuses is shown with its reason."""
+        """Set parameters for a viewer, in a thread of the server; show refusals with their reason."""
         for parameter in asked:
             try:
                 self._set(parameter.name, parameter.get_value())
@@ -277,12 +262,7 @@ class LiveNode(PollingNode):
 
 
 class _Listener(ServerListener):
-    """The library's callbacks for parameters.
-
-    Args:
-        shown: Returns parameters by their names; all of them where none is named.
-        set_all: Sets parameters.
-    """
+    """The library's callbacks for parameters; without names all are shown."""
 
     def __init__(self, shown: Callable[[Sequence[str]], list[Any]], set_all: Callable[[Sequence[Any]], None]) -> None:
         self._shown = shown
@@ -293,7 +273,7 @@ class _Listener(ServerListener):
         return self._shown(param_names)
 
     def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:
-        """Set parameters for a viewer, and return those in force then."""
+        """Set parameters for a viewer and return their values."""
         self._set_all(parameters)
         return self._shown([parameter.name for parameter in parameters])
 
@@ -313,7 +293,7 @@ def _start_server(listener: Any, domain: int, context: Any) -> tuple[Any, str]:
             message_backlog_size=_BACKLOG,
         )
 
-    # No page in a browser can guess it. Where loopback has but one address, it is that.
+    # No page in a browser can guess it. If loopback has only one address, that is used.
     host = "127." + ".".join(str(1 + secrets.randbelow(254)) for _ in range(3))
     try:
         return start(host), host
@@ -328,7 +308,7 @@ def _in_words(answer: Any) -> str:
 
 
 def _like(value: Any, known: Any) -> Any:
-    """Return a value as the type of the one in force: a viewer writes 2 for 2.0."""
+    """Return a value as the type of the present one: a viewer writes 2 for 2.0."""
     if isinstance(known, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if isinstance(known, list) and isinstance(value, list) and known and value:

@@ -1,7 +1,6 @@
-"""The gate before the websocket server: admits permitted clients, and carries bytes in both directions.
+"""The gate before the websocket server: admits clients and carries bytes in both directions.
 
-The server's library checks neither token nor origin, so it listens on an address that only this program has, and all
-clients connect through here.
+The server's library checks neither token nor origin, so it listens on an address that only this program knows.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from pendulum_msgs_py.errors import FaultError
 __all__ = ["Gate"]
 
 _PAUSE = 0.004
-"""Rest after each delivery to a client [s]: what arrives in between goes in one piece, for a tenth of the processor."""
+"""Pause after each delivery to a client [s]: messages in between are sent together, for a tenth of the CPU time."""
 _PIECE = 1 << 18
 _LONGEST_HEAD = 16384
 _HANDSHAKE_TIME = 5.0
@@ -31,9 +30,8 @@ class Gate:
     """Listens, and connects admitted clients to a server.
 
     Args:
-        host: Address to listen on.
         port: Port to listen on; 0 for any.
-        server: Address and port of the server behind.
+        server: Address and port of the server.
         refusal: Returns why a request is refused, or nothing; called in any thread.
         tell: Called with a line on each client that connects, leaves or is refused, in any thread.
 
@@ -92,7 +90,7 @@ class Gate:
                 self._start(self._attend, client, f"{address[0]}:{address[1]}")
 
     def _attend(self, client: socket.socket, who: str) -> None:
-        """Carry what one client sends, for as long as it is there."""
+        """Carry a client's bytes until it leaves."""
         with contextlib.ExitStack() as leaving:
             leaving.callback(self._forget, client)
             try:
@@ -150,7 +148,7 @@ class Gate:
 
 
 def _read_head(source: socket.socket) -> tuple[bytes, bytes]:
-    """Return a head with its empty line, and the bytes after it; raise an OSError where none arrives."""
+    """Return a head with its empty line, and the bytes after it; an OSError if none arrives."""
     data = b""
     while _END not in data:
         piece = source.recv(4096)
@@ -162,7 +160,7 @@ def _read_head(source: socket.socket) -> tuple[bytes, bytes]:
 
 
 def _carry(source: socket.socket, sink: socket.socket, pause: float) -> None:
-    """Carry bytes until either end hangs up, then hang up on both."""
+    """Carry bytes until either end closes, then close both."""
     with contextlib.suppress(OSError):
         while data := source.recv(_PIECE):
             sink.sendall(data)

@@ -1,7 +1,7 @@
-"""Access control of websockets: programs and viewers of this machine, pages that the user named, the token.
+"""Access control of websockets: local programs and viewers, pages that the user named, the token.
 
-A page of any site that is open in a browser here can reach ``localhost``, and would find a service that arms a plant.
-The browser sends the page's ``Origin`` with it, which distinguishes it from a viewer.
+Any site open in a local browser can reach ``localhost`` and a service that arms a plant, but the browser sends the
+page's ``Origin``, which distinguishes it from a viewer.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pendulum_msgs_py.errors import FaultError
 __all__ = ["VIEWERS", "Request", "as_asked", "parse", "refusal", "to_server"]
 
 VIEWERS = frozenset({"https://app.foxglove.dev", "file://"})
-"""Origins that are let in besides those of this machine: Foxglove in a browser, and desktop programs (Electron)."""
+"""Admitted origins besides this machine's: Foxglove in a browser, and desktop programs (Electron)."""
 NEWER = "foxglove.sdk.v1"
 OLDER = "foxglove.websocket.v1"
 """Older name of the same protocol, which Lichtblick requests."""
@@ -26,12 +26,7 @@ _PROTOCOL = "sec-websocket-protocol"
 
 @dataclass(frozen=True)
 class Request:
-    """A request for a websocket.
-
-    Args:
-        query: Of the address, without the question mark.
-        headers: By their names in lower case.
-    """
+    """A request for a websocket: the address's query, and the headers by lower-case name."""
 
     query: str
     headers: Mapping[str, str]
@@ -43,19 +38,12 @@ class Request:
 
     @property
     def protocols(self) -> list[str]:
-        """Names of the client's protocols, in its order."""
+        """The client's protocols, in its order."""
         return [name.strip() for name in self.headers.get(_PROTOCOL, "").split(",") if name.strip()]
 
 
 def parse(head: bytes) -> Request:
-    """Read the head of a request.
-
-    Args:
-        head: Up to and with the empty line.
-
-    Raises:
-        FaultError: It is none of HTTP.
-    """
+    """Parse a request's head, including its empty line; a FaultError if it is not HTTP."""
     first, *lines = head.decode("latin-1").split("\r\n")
     words = first.split(" ")
     if len(words) != 3 or not words[2].startswith("HTTP/"):
@@ -67,10 +55,7 @@ def parse(head: bytes) -> Request:
 def refusal(request: Request, token: str, origins: Collection[str] = ()) -> str:
     """Return why a request is refused, or an empty text.
 
-    Args:
-        request: The request.
-        token: The expected token; empty where only loopback is served.
-        origins: Origins of pages that may connect without a token, besides the known viewers.
+    ``token`` is empty if only loopback is served; ``origins`` of pages need none, like the known viewers.
     """
     if token:
         given = parse_qs(request.query).get("token", [""])[0]
@@ -84,12 +69,12 @@ def refusal(request: Request, token: str, origins: Collection[str] = ()) -> str:
 
 
 def to_server(head: bytes) -> bytes:
-    """Return the head of a request as the server understands it, the protocol by its newer name."""
+    """Return the head of a request with the protocol's newer name, which the server understands."""
     return _rename(head, OLDER, NEWER)
 
 
 def as_asked(head: bytes, request: Request) -> bytes:
-    """Return the head of the server's response with the name of the protocol that the client requested."""
+    """Return the head of the server's response with the protocol name that the client requested."""
     if NEWER in request.protocols or OLDER not in request.protocols:
         return head
     return _rename(head, NEWER, OLDER)

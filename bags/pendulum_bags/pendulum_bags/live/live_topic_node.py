@@ -1,4 +1,4 @@
-"""One topic as viewers get it: the bytes of the graph, subscribed to while there is a viewer."""
+"""One topic for viewers: the bytes of the graph, subscribed to while there is a viewer."""
 
 from __future__ import annotations
 
@@ -16,24 +16,18 @@ from pendulum_rosbag.storage.message_types import message_type
 __all__ = ["LiveTopic"]
 
 _DEPTH = 2000
-"""Messages that the middleware holds between two visits: four seconds at 500 Hz."""
+"""Messages that the middleware holds between two polls: four seconds at 500 Hz."""
 
 
 class LiveTopic:
-    """A topic and its channel.
-
-    Args:
-        node: The node that subscribes.
-        topic: Full name.
-        type_name: ``package/msg/Name``.
-        context: Context of the viewers' server.
+    """A topic (of type ``package/msg/Name``) and its channel in the viewers' server.
 
     Raises:
         ImportError: The type of the messages is not installed.
 
     Attributes:
         sent: Messages that were passed on.
-        lost: Messages missing between them, by their sequence numbers; counted while there is one publisher.
+        lost: Messages missing between them, by sequence number; counted while there is one publisher.
     """
 
     def __init__(self, node: PollingNode, topic: str, type_name: str, context: Any) -> None:
@@ -51,7 +45,7 @@ class LiveTopic:
         self.lost = 0
 
     def take(self) -> None:
-        """Pass on what has arrived, if there is a viewer; subscribe to the topic, or unsubscribe, as that changes."""
+        """Pass on what has arrived; subscribe while there is a viewer."""
         if not self._channel.has_sinks():
             self._let_go()
             return
@@ -67,7 +61,7 @@ class LiveTopic:
             self._newest = number
 
     def poll(self) -> None:
-        """Update the publishers: sequence numbers of several are of no use."""
+        """Update the publishers: sequence numbers of several cannot be compared."""
         self._has_one_publisher = self._node.count_publishers(self._topic) == 1
 
     def close(self) -> None:
@@ -81,8 +75,8 @@ class LiveTopic:
             self._source = self._newest = None
 
     def _subscribe(self) -> PolledInput:
-        # Latched messages come to reliable subscribers only. The others are best effort: acknowledging them would cost
-        # the plants time, for a picture.
+        # Latched messages come to reliable subscribers only. The others are best effort, because acknowledging them
+        # would cost the plants time.
         _, latched = wanted_qos(self._node.get_publishers_info_by_topic(self._topic))
         profile = QoSProfile(
             depth=_DEPTH,

@@ -1,4 +1,4 @@
-"""Schemas in the form that viewers need: the text of messages and of both halves of services."""
+"""Schemas for viewers: the text of messages and of both halves of services."""
 
 from __future__ import annotations
 
@@ -16,14 +16,7 @@ _SEQUENCE = re.compile(r"sequence<(.+?)(?:, (\d+))?>$")
 
 
 def service_text(half: Any) -> str:
-    """Return the definition of a service's request or response, with those of the messages in it (``ros2msg``).
-
-    Args:
-        half: The class, as ``Trigger.Request``; its ``get_fields_and_field_types`` lists its fields.
-
-    Raises:
-        BagError: A message in it is of no known type.
-    """
+    """Return the ``ros2msg`` text of a service's request or response; a BagError for unknown messages in it."""
     lines, nested = [], []
     for name, kind in half.get_fields_and_field_types().items():
         written = _in_message(kind)

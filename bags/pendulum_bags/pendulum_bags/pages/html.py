@@ -1,4 +1,4 @@
-"""Self-contained pages of HTML, without network or further files."""
+"""Self-contained HTML pages, without network or further files."""
 
 from __future__ import annotations
 
@@ -22,13 +22,9 @@ __all__ = ["encoded", "render", "render_plain", "script_json"]
 def render(
     template: str, figures: Sequence[Figure], pictures: Mapping[str, bytes] = MappingProxyType({}), **content: Any
 ) -> str:
-    """Return a page whose figures are plots.
+    """Return a page of a template, its variables, and figures (with different names) as plots.
 
-    Args:
-        template: Name of its template.
-        figures: All that it shows, each of another name.
-        pictures: The same as PNG by name, for paper and for readers without scripts.
-        content: The template's other variables.
+    ``pictures`` are the same figures as PNG by name, for paper and for readers without scripts.
     """
     graphs = {
         figure.name: {f"{figure.name}-{i}": graph for i, graph in enumerate(graphs_of(figure))} for figure in figures
@@ -48,7 +44,7 @@ def render(
 
 
 def render_plain(template: str, **content: Any) -> str:
-    """Return a page of text, tables and pictures, by a template and its variables; it explains no terms."""
+    """Return a page of text, tables and pictures; it explains no terms."""
     return _render(template, Terms({}), **content)
 
 
@@ -68,7 +64,7 @@ def _render(template: str, terms: Terms, **content: Any) -> str:
 
 
 def encoded(picture: bytes) -> str:
-    """Return a picture as a page holds it."""
+    """Return a picture in base64."""
     return base64.b64encode(picture).decode("ascii")
 
 
@@ -79,7 +75,7 @@ def script_json(value: Any) -> str:
 
 @lru_cache(maxsize=1)
 def _packed_plotly() -> str:
-    """Return plotly.js, gzipped and in base64: a third of its size, and browsers unpack gzip by themselves."""
+    """Return plotly.js, gzipped and in base64: a third of its size, and browsers unpack it."""
     source = resources.files("plotly").joinpath("package_data").joinpath("plotly.min.js").read_bytes()
     return base64.b64encode(gzip.compress(source, 9, mtime=0)).decode("ascii")
 

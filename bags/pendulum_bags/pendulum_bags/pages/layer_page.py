@@ -1,4 +1,4 @@
-"""A page of its own for some layers of the verdict: their answers, tables and figures."""
+"""A page for some layers of the verdict: results, tables and figures."""
 
 from __future__ import annotations
 
@@ -26,19 +26,9 @@ def write_layer_page(
     *,
     emulated: bool = False,
 ) -> Path:
-    """Write the page and return its path.
+    """Write a page of layers, their evidence, tables, figures and notes; return its path.
 
-    Args:
-        path: File.
-        title: Heading.
-        layers: Answers, at the top.
-        figures: Drawn in order.
-        tables: Before the figures, behind the evidence of each layer.
-        notes: Sentences at the end.
-        emulated: Whether the hardware was emulated; all texts name it so then.
-
-    Raises:
-        BagError: The file cannot be written.
+    If the hardware was emulated, all texts say so. A BagError if the file cannot be written.
     """
     shown = [*(evidence_table(layer) for layer in layers), *tables]
     figures, layers, shown, notes = name_in((figures, layers, shown, notes), emulated=emulated)
@@ -49,7 +39,7 @@ def write_layer_page(
 
 
 def evidence_table(result: LayerResult) -> Table:
-    """Return the evidence of a layer of the answer."""
+    """Return the evidence of a layer."""
     rows = []
     for row in result.evidence:
         ends = ("–" if end is None else quantity(end) for end in (row.low, row.high))

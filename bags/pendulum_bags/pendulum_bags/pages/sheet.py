@@ -1,4 +1,4 @@
-"""A page of sentences, tables and pictures, for what needs no plots to zoom into."""
+"""A page of sentences, tables and pictures, without interactive plots."""
 
 from __future__ import annotations
 
@@ -16,12 +16,7 @@ __all__ = ["Sentence", "write_sheet"]
 
 @dataclass(frozen=True)
 class Sentence:
-    """A sentence at the top of a page.
-
-    Attributes:
-        text: Its text.
-        alarming: Whether it is highlighted.
-    """
+    """A sentence at the top of a page, highlighted if ``alarming``."""
 
     text: str
     alarming: bool = False
@@ -38,20 +33,11 @@ def write_sheet(
     listings: Sequence[tuple[str, str]] = (),
     notes: Sequence[str] = (),
 ) -> Path:
-    """Write the page and return its path.
+    """Write a page and return its path; a DataError if it cannot be written.
 
-    Args:
-        path: File.
-        title: Heading.
-        sentences: Its sentences; the first one stands above everything.
-        tables: Those with rows are shown, between the first picture and the others.
-        pictures: PNG files; the first one stands under the first sentence.
-        kicker: Line above the heading.
-        listings: Heading and text of what another program printed.
-        notes: Sentences before the pictures.
-
-    Raises:
-        DataError: The file cannot be written.
+    The first sentence is above everything, the first PNG picture under it. Tables with rows are between the first
+    picture and the others. ``kicker`` is a line above the heading; ``listings`` are heading and text of another
+    program's output; ``notes`` are sentences before the pictures.
     """
     text = render_plain(
         "sheet.html.j2",

@@ -1,4 +1,4 @@
-"""The terms of a report: what each means, in one sentence, and links to that where the term stands."""
+"""The terms of a report, each explained in one sentence, and links to that from the text."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Html(str):
 
 
 class Term(NamedTuple):
-    """A term, the words by which texts name it (a regular expression), and what it means."""
+    """A term, a regular expression for its words, and its meaning."""
 
     name: str
     words: str
@@ -185,7 +185,7 @@ TERMS: Mapping[str, Term] = {
         "revision", r"revision", "The state of the source code (git); +changes means that it was edited after that."
     ),
 }
-"""Every term that a report explains, by the anchor of its sentence."""
+"""All terms that a report explains, by the anchor of the sentence."""
 
 _COMMANDS = re.compile(
     r"python -m pendulum_\w+ [^;:()]*?(?=\)|;|:| \(|,? then\b|\.(?:\s|$)|$)"
@@ -196,20 +196,19 @@ _COMMANDS = re.compile(
 class Terms:
     """Marks commands and terms in the texts of one page, and records which terms the page used.
 
-    Args:
-        explained: The terms, by the anchors of their sentences: those of comparisons, or none where words mean others.
+    ``explained`` are the terms by anchor: those of comparisons, or none if the words mean something else.
     """
 
     def __init__(self, explained: Mapping[str, Term] = TERMS) -> None:
         self._used: set[str] = set()
-        # The longest words first: "not equivalent" is no "equivalent".
+        # Longest words first: "not equivalent" contains "equivalent".
         ranked = sorted(explained.items(), key=lambda item: -len(item[1].words.split("|")[0]))
         groups = "|".join(f"(?P<{key.replace('-', '_')}>{term.words})" for key, term in ranked)
         self._words = re.compile(rf"(?<![\w-])(?:{groups or '(?!)'})(?![\w-])")
 
     @property
     def used(self) -> Iterable[tuple[str, Term]]:
-        """Return the terms that texts of the page named so far, with their anchors."""
+        """The terms that texts of the page named so far, with their anchors."""
         return [(key, term) for key, term in TERMS.items() if key in self._used]
 
     def mark(self, text: str) -> Html:

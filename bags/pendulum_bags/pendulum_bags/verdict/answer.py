@@ -1,4 +1,4 @@
-"""The answer for a comparison, or for those of several joints, with the other layers of a run folder."""
+"""The answer of a comparison, or of those of several joints, with the other layers of a run folder."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def answer_of(
     Args:
         compared: The first layer, or that of each joint by its name, at least one.
         folders: Folders that may have further layers: of the run, or of experiments that measured them.
-        more: How to record more, where that is what is missing.
+        more: How to record more if that is missing.
         updated: Layers that were judged again, and replace those of the folders.
-        how: The command that measures a layer, where it is another than that of the recordings' plants.
-        refused: Why no plant could be identified from the recordings, as a sentence; empty where nobody tried.
+        how: The command that measures a layer, if it differs for the recordings' plants.
+        refused: Why no plant could be identified from the recordings, as a sentence; empty if not tried.
 
     Raises:
         DataError: A stored layer cannot be read, is in two of the folders, or is of other plants.
@@ -64,12 +64,9 @@ def _needed(comparison: Comparison) -> float:
 
 
 def join_joints(results: Mapping[str, LayerResult]) -> LayerResult:
-    """Return a layer's result for a plant, from those for each joint: yes if all are.
+    """Return a layer's result for a plant, from those of its joints (at least one): yes if all are.
 
-    Since all joints have to agree, more of them make a wrong yes no likelier (an intersection-union test).
-
-    Args:
-        results: The layer's result for each joint, at least one, all of one layer.
+    More joints make a wrong yes no likelier, since all must agree (an intersection-union test).
     """
     first = next(iter(results.values()))
     mark = next(mark for mark in _WORST_FIRST if any(one.mark is mark for one in results.values()))

@@ -1,7 +1,7 @@
 """The answer to "is the simulation good enough to design a controller on?" as the sum of four layers of evidence.
 
-Each layer has a question of its own, a mark, a sentence, evidence with intervals, and what to do next. A layer is a
-value: its measurement makes a :class:`LayerResult`, and :func:`sum_up` makes one answer of those there are.
+Each layer is a :class:`LayerResult` with its own question, mark, sentence, evidence with intervals, and next steps;
+:func:`sum_up` combines those that were measured.
 """
 
 from __future__ import annotations
@@ -20,20 +20,10 @@ from pendulum_bags.verdict.naming import name_in
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import without_nan
 
-__all__ = [
-    "HOW",
-    "Answer",
-    "Evidence",
-    "Layer",
-    "LayerResult",
-    "Mark",
-    "read_layers",
-    "sum_up",
-    "write_layer",
-]
+__all__ = ["HOW", "Answer", "Evidence", "Layer", "LayerResult", "Mark", "read_layers", "sum_up", "write_layer"]
 
 FOLDER = "layers"
-"""Folder within a run folder in which layers are stored, each in a file ``<key>.json``."""
+"""Folder within a run folder for the layers, each in a file ``<key>.json``."""
 
 
 class Mark(str, Enum):
@@ -51,7 +41,6 @@ class Layer(Enum):
     Attributes:
         key: Name in JSON and of files.
         title: Name in tables.
-        question: The question.
     """
 
     key: str
@@ -72,11 +61,7 @@ class Layer(Enum):
 
     @classmethod
     def of(cls, key: str) -> Layer:
-        """Return the layer of a key.
-
-        Raises:
-            DataError: There is none.
-        """
+        """Return the layer of a key; a DataError if there is none."""
         for layer in cls:
             if layer.key == key:
                 return layer
@@ -88,13 +73,11 @@ class Evidence:
     """One measured quantity of a layer.
 
     Args:
-        quantity: What was measured, as text.
+        quantity: Name of the quantity.
         unit: Its unit; empty for none.
-        estimate: Its value; None where it does not exist.
-        low: Lower end of its interval; None for none.
-        high: Upper end; None for none.
-        expected: What it was compared with, as text, such as ``within ±0.3 deg``; empty where it only informs.
-        mark: Its result.
+        estimate: Its value; None if it does not exist.
+        low: Lower end of its interval, or None.
+        expected: The criterion as text, such as ``within ±0.3 deg``; empty for mere information.
         note: A remark for the reader.
     """
 
@@ -108,12 +91,12 @@ class Evidence:
     note: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as JSON values; numbers that do not exist are None."""
+        """Return it as JSON values; missing numbers are None."""
         return without_nan({**asdict(self), "mark": self.mark.value})
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Evidence:
-        """Return the evidence that JSON values describe."""
+        """Return the evidence in JSON values."""
         return cls(**{**content, "mark": Mark(content["mark"])})
 
 
@@ -122,15 +105,12 @@ class LayerResult:
     """The result of one layer.
 
     Args:
-        layer: The layer.
-        mark: Its answer.
-        sentence: The answer as one sentence that stands alone.
-        evidence: Its evidence.
-        next_steps: What to do next, one sentence or command each; empty where there is nothing to do.
-        reason: Half a sentence for the answer as a whole, without a full stop: why it is no or undecided, such as
-            "the spread of the velocity is 31 % smaller on the hardware".
-        holds: Half a sentence: what may be relied on although another layer is no, such as "designs with a margin
-            above 0.21 stabilise the hardware too"; empty for nothing.
+        sentence: The result as a sentence that needs no context.
+        next_steps: One sentence or command each; empty if there is nothing to do.
+        reason: Clause for the whole answer, without a full stop: why it is no or undecided, such as "the spread of the
+            velocity is 31 % smaller on the hardware".
+        holds: Clause with what is reliable although another layer is no, such as "designs with a margin above 0.21
+            stabilise the hardware too"; empty for nothing.
         case: The plants that it is of.
     """
 
@@ -160,11 +140,7 @@ class LayerResult:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> LayerResult:
-        """Return the result that JSON values describe.
-
-        Raises:
-            DataError: They describe none.
-        """
+        """Return the result in JSON values; a DataError if they hold none."""
         try:
             return cls(
                 Layer.of(content["layer"]),
@@ -186,13 +162,12 @@ class Answer:
 
     Args:
         mark: Yes, no or undecided.
-        reasons: Why, half a sentence.
+        reasons: Why, as a clause.
         layers: One result for each layer, in order.
-        next_steps: What to do next.
-        decides: Which test decides about what, where two contradict each other; a sentence, empty where none do.
-        holds: What stays true although the answer is not yes, half a sentence; empty for nothing.
+        decides: Which of two contradicting tests decides about what, as a sentence; empty if none contradict.
+        holds: Clause with what remains true although the answer is not yes; empty for nothing.
         missing: Titles of layers that a yes lacks.
-        text: The answer as text where it is more than the sum of these.
+        text: The answer as text if it is more than the sum of these.
     """
 
     mark: Mark
@@ -210,11 +185,7 @@ class Answer:
         return self.text or f"{self.mark.value.capitalize()}: {self.reasons}.{self.remarks()}"
 
     def remarks(self, of: str = "") -> str:
-        """Return the sentences that follow the reasons, each behind a space.
-
-        Args:
-            of: The simulated plant, where there are several.
-        """
+        """Return the sentences after the reasons, each behind a space; ``of`` names the plant if there are several."""
         holds = f"What holds{f' with {of}' if of else ''}: {self.holds}." if self.holds else ""
         missing = f"Not measured: {_listed([f'“{title}”' for title in self.missing])}." if self.missing else ""
         return "".join(f" {one}" for one in (self.decides, holds, missing) if one)
@@ -243,14 +214,14 @@ def sum_up(
 ) -> Answer:
     """Return one answer from the layers that were measured.
 
-    One layer with no makes it no: each covers something that designing needs. It is yes where at least one layer was
-    measured and all of those are yes; the sentence then names what was not measured. What a layer certifies stays true
-    where another is no, and is in the sentence too.
+    One no makes it no: each layer covers something that designing needs. It is yes if at least one layer was measured
+    and all measured ones are yes; the sentence then names the others. It also keeps what a layer certifies although
+    another is no.
 
     Args:
         results: At most one for each layer; the others count as not measured.
-        emulated: Whether the hardware was emulated; the text then names it so.
-        how: The command that measures a layer of these plants, where it is not that of :data:`HOW`.
+        emulated: Whether the hardware was emulated; the text then says so.
+        how: The command that measures a layer of these plants, if it is not that of :data:`HOW`.
 
     Raises:
         DataError: A layer was given twice.
@@ -273,7 +244,7 @@ def sum_up(
             f"For the stability of a design, test 3 ({Layer.WHICH_CONTROLLERS.title}) decides; for how closely the "
             f"motion matches, test 1 ({Layer.SAME_RUN.title})."
         )
-    # Steps that mend a no come first, then those that decide, then those for missing layers.
+    # Remedies of a no come first, then steps that decide, then those for missing layers.
     order = (*by_mark[Mark.NO], *by_mark[Mark.UNDECIDED], *by_mark[Mark.YES])
     steps = dict.fromkeys(step for result in order for step in result.next_steps)
     for command in dict.fromkeys(result.reason for result in by_mark[Mark.NOT_MEASURED] if result.reason):
@@ -295,27 +266,18 @@ def _not_measured(layer: Layer, how: str) -> LayerResult:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names as a sentence lists them: a, b and c."""
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def write_layer(folder: Path, result: LayerResult) -> Path:
-    """Keep a layer's result in a run folder, where the report finds it; return the file."""
+    """Store a layer's result in a run folder, where the report finds it; return the file."""
     path = folder / FOLDER / f"{result.layer.key}.json"
     write_json(path, result.to_json())
     return path
 
 
 def read_layers(folder: Path, case: Case = UNKNOWN) -> list[LayerResult]:
-    """Return the stored layers of a run folder, in order.
-
-    Args:
-        folder: The folder.
-        case: The plants that they have to be of.
-
-    Raises:
-        DataError: A file holds no result of a layer, or one of other plants.
-    """
+    """Return a run folder's layers in order; a DataError if one is invalid or of other plants than ``case``."""
     found = []
     for layer in Layer:
         path = folder / FOLDER / f"{layer.key}.json"

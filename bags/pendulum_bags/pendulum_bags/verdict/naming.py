@@ -1,4 +1,4 @@
-"""Names hardware that was emulated ``emulated hardware`` in texts."""
+"""Names emulated hardware ``emulated hardware`` in texts."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _HARDWARE = re.compile(r"(?<![-/\w])(?<!emulated )(H|h)ardware\b(?!/)")
 
 
 def name_hardware(text: str, *, emulated: bool) -> str:
-    """Return a text with ``emulated hardware`` in place of hardware where that was emulated."""
+    """Return a text with ``emulated hardware`` in place of hardware if it was emulated."""
     if not emulated:
         return text
     return _HARDWARE.sub(lambda found: "Emulated hardware" if found[1] == "H" else "emulated hardware", text)
 
 
 def name_in(value: _T, *, emulated: bool) -> _T:
-    """Return a figure, a table, a layer or a part of one with its texts named so."""
+    """Return a figure, table, layer or part of one with its texts changed likewise."""
     return cast("_T", _named(value)) if emulated else value
 
 

@@ -32,17 +32,14 @@ _MOST_REASONS = 3
 _MOST_RECORDED = 1800.0
 """Longest further recordings that are recommended [s]."""
 _MOST_RECORDINGS = 4
-"""Recordings that the command names from which the plant is identified."""
+"""Most recordings in the command that identifies the plant."""
 
 
 def same_run_layer(comparison: Comparison, *, more: str = "", refused: str = "") -> LayerResult:
     """Return the first layer of a comparison.
 
-    Args:
-        comparison: The comparison.
-        more: How to record more where that is what is missing, such as ``make experiment ARGS="--budget 120"``; by
-            default the number of runs is given.
-        refused: Why no plant could be identified from the recordings, as a sentence; empty where nobody tried.
+    ``more`` tells how to record more, such as ``make experiment ARGS="--budget 120"``; by default the number of runs.
+    ``refused`` is why no plant could be identified from the recordings, as a sentence; empty if not tried.
     """
     verdict = comparison.verdict
     tests = verdict.tests
@@ -73,11 +70,7 @@ def same_run_layer(comparison: Comparison, *, more: str = "", refused: str = "")
 
 
 def case_of(comparison: Comparison) -> Case:
-    """Return the plants of a comparison.
-
-    Raises:
-        DataError: The runs of one side are of two plants.
-    """
+    """Return the plants of a comparison; a DataError if the runs of one side are of two plants."""
     return Case.of(
         [run_record(pair.simulation.metadata) for pair in comparison.pairs],
         [run_record(pair.hardware.metadata) for pair in comparison.pairs],
@@ -102,11 +95,7 @@ def how_to_measure(comparison: Comparison) -> dict[Layer, str]:
     choice = measurement_of(records, "ranking") or (
         "record several controllers on both plants (python -m pendulum_bags ranking FOLDER)"
     )
-    return {
-        Layer.SAME_PLANT: in_frequency,
-        Layer.WHICH_CONTROLLERS: in_frequency,
-        Layer.SAME_CHOICE: choice,
-    }
+    return {Layer.SAME_PLANT: in_frequency, Layer.WHICH_CONTROLLERS: in_frequency, Layer.SAME_CHOICE: choice}
 
 
 def layers_of_files(comparison: Comparison) -> list[LayerResult]:
@@ -133,7 +122,7 @@ def layers_of_files(comparison: Comparison) -> list[LayerResult]:
 
 
 def in_words(test: EquivalenceTest) -> str:
-    """Return what a test found as half a sentence, with its margin in the same quantity and unit."""
+    """Return a test's result as a clause, with its margin in the same quantity and unit."""
     value = test.interval.estimate
     unit = "" if test.unit == "-" else f" {test.unit}"
     allowed = f"{test.high if value >= 0.0 or not math.isfinite(test.low) else -test.low:.3g}{unit} allowed"
@@ -193,7 +182,7 @@ def _evidence(test: EquivalenceTest) -> Evidence:
 
 
 def _beyond(test: EquivalenceTest) -> float:
-    """Return how many margins an estimate is away."""
+    """Return an estimate's distance in margins."""
     value = test.interval.estimate
     if math.isfinite(test.low) and not math.isclose(test.low, -test.high):
         return abs(math.log(max(value, 1e-9))) / math.log(test.high)
@@ -201,12 +190,12 @@ def _beyond(test: EquivalenceTest) -> float:
 
 
 def simulated_plant(comparison: Comparison) -> str:
-    """Return the plant that a run simulated, as commands name it; MECHANISM if unknown."""
+    """Return the simulated plant, as commands name it; MECHANISM if unknown."""
     return str(run_record(comparison.pairs[0].simulation.metadata).get("plant", "MECHANISM"))
 
 
 def _each_once(failed: Sequence[EquivalenceTest]) -> list[EquivalenceTest]:
-    """Leave out distances that a delay or a spread, which is reported too, explains."""
+    """Leave out distances that a reported delay or spread explains."""
     plain = [test for test in failed if not test.quantity.startswith("distance")]
     return plain or list(failed)
 
@@ -255,10 +244,10 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest], refused
 
 
 def recordings_of(comparison: Comparison) -> list[str]:
-    """Return the recordings of the hardware to identify it from: those that were compared, as many as a line holds.
+    """Return the compared recordings to identify the hardware from, as many as a line holds.
 
-    A repeat in lockstep stays upright, where gravity shows little of itself: the run that it repeats comes first, also
-    where it does not count in the comparison, since states that are missing do not harm a fit.
+    A repeat in lockstep stays upright, where gravity has little effect, so the run that it repeats comes first, even if
+    it does not count in the comparison: missing states do not harm a fit.
     """
     sources = [pair.hardware.source for pair in comparison.pairs if pair.hardware.source]
     repeated = [path.parents[2] / path.name for path in map(Path, sources) if path.parts[-3:-2] == (REPEATS,)]
@@ -271,7 +260,7 @@ def _records(comparison: Comparison) -> list[Mapping[str, Any]]:
 
 
 def _next_file(fitted: str) -> str:
-    """Return the file for the next fit, which leaves the one that was simulated as it is."""
+    """Return the file of the next fit, which does not overwrite the simulated one."""
     if not fitted:
         return "plant.yaml"
     path = Path(fitted)
@@ -292,7 +281,6 @@ def _test_of_the_plant(comparison: Comparison, plant: str) -> str:
 
 
 def _late(test: EquivalenceTest) -> str:
-    """Return the change of the simulation's delay, as text."""
     value = test.interval.estimate
     return f"{abs(value):.3g} {test.unit} {'more' if value >= 0.0 else 'less'} delay than now"
 

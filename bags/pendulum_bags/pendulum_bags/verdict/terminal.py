@@ -20,21 +20,11 @@ from pendulum_msgs_py.programs.typed_commands import as_typed
 
 __all__ = ["layers_table", "print_answer", "print_sentence", "print_tests", "tests_table"]
 
-SIGNS = {
-    Mark.YES: "✓ yes",
-    Mark.NO: "✗ no",
-    Mark.UNDECIDED: "? undecided",
-    Mark.NOT_MEASURED: "– not measured",
-}
-"""Marks that differ in shape and in words, so that colour only helps."""
+SIGNS = {Mark.YES: "✓ yes", Mark.NO: "✗ no", Mark.UNDECIDED: "? undecided", Mark.NOT_MEASURED: "– not measured"}
+"""Marks that differ in shape and in words, so that colour is not needed."""
 _WIDTH = 78
 """Width of the longest column of the layers' table; the others need 40 more."""
-_STYLES = {
-    Mark.YES: "bold green",
-    Mark.NO: "bold red",
-    Mark.UNDECIDED: "bold yellow",
-    Mark.NOT_MEASURED: "dim",
-}
+_STYLES = {Mark.YES: "bold green", Mark.NO: "bold red", Mark.UNDECIDED: "bold yellow", Mark.NOT_MEASURED: "dim"}
 
 
 def layers_table(answer: Answer, title: str = "The layers of the answer") -> WholeTable:
@@ -67,19 +57,19 @@ def tests_table(verdict: Verdict, *, emulated: bool) -> WholeTable:
 
 
 def print_tests(console: Console, comparison: Comparison) -> None:
-    """Print the tests of the first layer, and of which samples their figures are."""
+    """Print the tests of the first layer, and which samples they use."""
     console.print(tests_table(comparison.verdict, emulated=comparison.is_emulated))
     console.print(name_hardware(seen_note(comparison), emulated=comparison.is_emulated), highlight=False, markup=False)
 
 
 def print_answer(console: Console, answer: Answer) -> None:
-    """Print layers, the answer in one sentence, and what to do next, near the prompt."""
+    """Print layers, the answer in one sentence, and the next steps, near the prompt."""
     console.print(layers_table(answer))
     print_sentence(console, answer)
 
 
 def print_sentence(console: Console, answer: Answer) -> None:
-    """Print the answer in one sentence, and what to do next."""
+    """Print the answer in one sentence, and the next steps."""
     console.print("\nIs the simulation good enough to design a controller on?")
     console.print(Text(answer.sentence, _STYLES[answer.mark]), highlight=False)
     if answer.next_steps:

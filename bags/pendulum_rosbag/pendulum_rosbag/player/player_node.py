@@ -243,8 +243,6 @@ def _recorded_qos(text: str) -> QoSProfile:
     )
 
 
-# -- command line ------------------------------------------------------------------------------------------------
-
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 

@@ -43,7 +43,6 @@ class Bag(Mapping[str, Any]):
     :class:`StoredMessage`.
 
     Attributes:
-        path: Where the bag is.
         topics: Topic name -> :class:`TopicInfo`.
         metadata: Run metadata (``custom_data``), JSON values parsed.
         damage: What is wrong with the bag, one sentence per file; empty for a healthy one.
@@ -124,13 +123,10 @@ class Bag(Mapping[str, Any]):
         return len(self._topics)
 
     def array(self, topic: str) -> npt.NDArray[Any]:
-        """Return a topic of one-joint JointState as an array with consistent times.
+        """Return a topic of one-joint JointState as an array with consistent times; a DataError for other topics.
 
         After a clock's step back, later times are shifted so that they continue; stamps that were never set are
         replaced by log times (see ``clock_notes``).
-
-        Raises:
-            DataError: The topic is missing, or its messages are something else.
         """
         values = self[topic]
         if not isinstance(values, np.ndarray):
@@ -150,11 +146,7 @@ class Bag(Mapping[str, Any]):
         return values
 
     def joints(self, topic: str) -> JointTable:
-        """Return a topic of JointState as arrays with one column per joint and times as in :meth:`array`.
-
-        Raises:
-            DataError: The topic is missing, its messages are something else, or not all of the same joints.
-        """
+        """Return JointStates as arrays, a column per joint, times as in :meth:`array`; a DataError if they differ."""
         if topic not in self._tables:
             table = joint_table(self.raw(topic), f"topic {topic} of bag {self.path}")
             self._check_one_motion(topic, *table.position.T)
@@ -204,11 +196,7 @@ class Bag(Mapping[str, Any]):
         return self._steps
 
     def messages(self, topic: str) -> list[StoredMessage]:
-        """Return all messages of a topic as objects of any type.
-
-        Raises:
-            DataError: Neither the bag nor ROS 2 Jazzy knows the message type, or a message is damaged.
-        """
+        """Return a topic's messages as objects of any type; a DataError if the type is unknown or one is damaged."""
         from pendulum_rosbag.reader.decode import decoder_for
 
         rows = self.raw(topic)
@@ -259,8 +247,6 @@ class Bag(Mapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"<Bag {self.path} with {sum(topic.info.count for topic in self._topics.values())} messages>"
-
-    # -- parts -------------------------------------------------------------------------------------------------
 
     def _entry(self, topic: str) -> _Topic:
         found = self._topics.get(topic) or self._topics.get(self._also.get(topic, ""))
@@ -415,10 +401,7 @@ def read_bags(
 
 
 def _group(sources: Sequence[Source], hashes: Mapping[str, str]) -> tuple[dict[str, _Topic], list[str]]:
-    """Return the topics by name, and a sentence for each that has several types.
-
-    The type of most messages gets the name; the others are offered as ``NAME (TYPE)``.
-    """
+    """Return the topics by name; if one has several types, the rarer ones are ``NAME (TYPE)``, with a sentence."""
     grouped: dict[str, dict[str, list[tuple[Source, Stream]]]] = {}
     stored = {stream.topic for source in sources for stream in source.streams}
     for source in sources:

@@ -31,10 +31,7 @@ def _unknown_origin(*_: int) -> str:
 
 
 def items_at(buffer: Bytes, item: np.dtype[Any], at: Int64) -> npt.NDArray[Any]:
-    """Return copies of the items at byte offsets of a buffer.
-
-    The strided view has one row per byte, so that indexing copies only the items.
-    """
+    """Return copies of the items at byte offsets of a buffer, by a strided view with one row per byte."""
     places = max(len(buffer) - item.itemsize + 1, 0)
     anywhere: npt.NDArray[Any] = np.ndarray((places,), f"V{item.itemsize}", buffer.data, strides=(1,))
     return anywhere[at].view(item)
@@ -82,11 +79,7 @@ class Batch:
         return MCAP_HEAD if self.sizes is None else 0
 
     def check_heads(self) -> None:
-        """Compare an MCAP message index, which no checksum covers, with the messages.
-
-        Raises:
-            BagError: A message has another channel or log time than the index says.
-        """
+        """Compare an MCAP message index, which has no checksum, with the messages; a BagError if they differ."""
         if self.sizes is not None:
             return
         heads = items_at(self.buffer, _HEAD, self.offsets)

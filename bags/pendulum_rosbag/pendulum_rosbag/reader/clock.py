@@ -41,10 +41,7 @@ class ClockStep:
 
 
 def steps_back(times: Int64) -> list[int]:
-    """Return the indices at which times [ns] in order of arrival, shape (n,), step back for good.
-
-    A single late message is no step.
-    """
+    """Return where times [ns] in arrival order, shape (n,), step back for good; a late message is no step."""
     intervals = np.diff(times)
     if not len(intervals) or int(intervals.min()) >= 0:
         return []

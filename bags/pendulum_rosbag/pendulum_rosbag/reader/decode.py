@@ -22,13 +22,10 @@ _MAX_DEPTH = 40
 
 
 def store_for(info: TopicInfo) -> Typestore:
-    """Return a type store with a topic's type as its bag defines it.
+    """Return a type store with a topic's type as its bag defines it; a DataError if it cannot be read.
 
     Each definition has a store of its own: in a shared one a bag could change how the next is read. ROS 2 Jazzy's types
     complete what the bag does not define.
-
-    Raises:
-        DataError: The definition cannot be read, or neither it nor ROS 2 has the type.
     """
     shared = typestore()
     try:
@@ -70,10 +67,7 @@ def _defined(name: str, definition: str) -> Typestore:
 
 
 def _values(kind: str, known: dict[str, Any], counted: dict[str, int], depth: int = 0) -> int:
-    """Return the least number of values in a message, with fixed-length arrays written out.
-
-    A line of text can define more than memory holds, or a recursive type.
-    """
+    """Return the least number of values in a message; one line of text can define more than memory holds."""
     from rosbags.interfaces import Nodetype
 
     if depth > _MAX_DEPTH:
@@ -94,11 +88,7 @@ def _values(kind: str, known: dict[str, Any], counted: dict[str, int], depth: in
 
 
 def decoder_for(info: TopicInfo) -> Callable[[bytes], Any]:
-    """Return a function from CDR bytes to an object of a topic's type.
-
-    Raises:
-        DataError: The type is unknown; or, in the function, a message is damaged.
-    """
+    """Return the decoder of a topic's CDR bytes; DataErrors for an unknown type or a damaged message."""
     store = store_for(info)
     kind = store.get_msgdef(info.type)
 

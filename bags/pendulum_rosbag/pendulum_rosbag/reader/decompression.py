@@ -21,17 +21,10 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 def decompress(packed: Bytes, compression: str, size: int, name: str, *, torn: bool = False) -> bytes:
-    """Return the content of a chunk, at most as much as its head claims, which is bounded.
+    """Return the content of a chunk (``zstd`` or ``lz4``), at most the bounded ``size`` in its head [bytes].
 
-    Args:
-        packed: The chunk, compressed.
-        compression: ``zstd`` or ``lz4``.
-        size: Content size in the chunk's head [bytes].
-        name: The file, for messages.
-        torn: Its end was cut off: return the beginning that can be recovered.
-
-    Raises:
-        BagError: Unknown compression, a chunk larger than any recorder's, or the bytes are damaged.
+    ``torn`` returns the recoverable beginning of a chunk whose end was cut off. Raises a BagError that names the file
+    for unknown compression, a chunk larger than any recorder's, or damaged bytes.
     """
     if size > _MAX_CHUNK:
         raise BagError(f"{name}: a chunk claims to hold {size} bytes; expected at most {_MAX_CHUNK}")
@@ -104,11 +97,7 @@ class UnpackedSource:
         self.unchecked = packed.unchecked
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
-        """Yield all messages of some channels with start <= log time < stop, in file order.
-
-        Raises:
-            BagError: A message cannot be decompressed, or claims to be larger than any message.
-        """
+        """Yield batches as :class:`Source`; a BagError if a message is damaged or claims an impossible size."""
         for batch in self.packed.batches(channels, start, stop):
             times: list[int] = []
             parts: list[bytes] = []

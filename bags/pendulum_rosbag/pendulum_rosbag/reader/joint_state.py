@@ -119,10 +119,7 @@ def canonical(data: bytes) -> bytes:
 
 
 class Trimmer:
-    """Cuts off the up to twelve meaningless bytes that rclpy appends to one-joint JointStates of one topic.
-
-    Readers such as rosbags refuse such messages. Other messages pass unchanged.
-    """
+    """Cuts off up to twelve meaningless bytes that rclpy appends to JointStates, which rosbags refuses."""
 
     def __init__(self) -> None:
         self._layouts: list[Layout] = []
@@ -144,10 +141,7 @@ _APART, _BACK, _SHARE = 0.05, 0.2, 0.12
 
 
 def two_motions(position: npt.NDArray[Any]) -> str:
-    """Return how an angle jumps to and fro, in words, if two senders share a topic; else nothing.
-
-    ``position``: of one joint in message order, shape (n,) [rad].
-    """
+    """Return how an angle, shape (n,) [rad], jumps to and fro if two senders share a topic, in words."""
     known = position[np.isfinite(position)]
     steps = np.diff(np.unwrap(known))
     least = np.minimum(np.abs(steps[1:]), np.abs(steps[:-1]))
@@ -156,9 +150,6 @@ def two_motions(position: npt.NDArray[Any]) -> str:
     if count < max(10, _SHARE * known.size):
         return ""
     return f"{count} of {known.size} messages jump by {float(np.median(least[there_and_back])):.2g} rad and back"
-
-
-# -- arrays ------------------------------------------------------------------------------------------------------
 
 
 def _words(offset: int, content: bytes) -> list[tuple[int, str, int]]:

@@ -43,8 +43,6 @@ class Episode:
     """Frames at a constant rate, without holes.
 
     Attributes:
-        source: The bag.
-        topic: Topic of the states.
         joints: Names of the joints, in the order of the columns.
         driven: Names of the commanded joints.
         state: Positions, then velocities; shape (k, 2 n) [rad or m, rad/s or m/s].
@@ -65,10 +63,7 @@ def episodes_of(bag: Bag, fps: int) -> list[Episode]:
     """Return the parts of a bag in which the states of a plant were answered with commands, at ``fps`` [Hz].
 
     Frame k is the state nearest to k / fps with the command of its stamp, or else the previous command, which the plant
-    held.
-
-    Raises:
-        DataError: There is no plant with commands, or none for as long as two frames.
+    held. A DataError if there is no plant with commands for at least two frames.
     """
     found: list[Episode] = []
     for topic, commanded in _commanded(bag):
@@ -147,13 +142,9 @@ def _rate(bags: Sequence[Bag]) -> int:
 def export_lerobot(
     bags: Sequence[Bag], folder: Path, *, fps: int | None = None, task: str = DEFAULT_TASK
 ) -> list[Path]:
-    """Write bags as one dataset in LeRobot's format v3.0; return the files.
+    """Write bags of plants with the same joints as one LeRobot v3.0 dataset; return the files.
 
-    Args:
-        bags: Recordings of plants with the same joints.
-        folder: Folder to create.
-        fps: Frames per second [Hz]; by default the state rate of the slowest plant.
-        task: The task, in words.
+    ``fps`` [Hz] is by default the state rate of the slowest plant; ``task`` is the task in words.
 
     Raises:
         BagError: The folder exists or cannot be written.

@@ -43,16 +43,10 @@ def indexed_counts(chunks: Sequence[Chunk]) -> dict[int, int]:
 
 
 def indexed_messages(path: Path, channel: int, index: Bytes, places: Sequence[tuple[int, int]]) -> tuple[Int64, Int64]:
-    """Return log times [ns] and record offsets of a channel's messages.
+    """Return log times [ns] and record offsets of a channel's messages; a BagError for damaged indexes.
 
-    Args:
-        path: The file, for its errors.
-        channel: Channel id.
-        index: Bytes that hold the message indexes, shape (n,).
-        places: Offset of each index there, and what to add to its offsets.
-
-    Raises:
-        BagError: An index is damaged.
+    ``index``: bytes that hold the message indexes, shape (n,); ``places``: offset of each index there, and what to add
+    to its offsets.
     """
     if not places:
         return np.empty(0, np.int64), np.empty(0, np.int64)

@@ -41,9 +41,6 @@ class McapScan:
     """All whole records from the start of the file; a torn end is left out.
 
     Args:
-        buffer: The file.
-        path: Its name, for errors.
-        topics: Collects the descriptions.
         sound: Collects the offsets of chunks with a correct checksum.
         damage: Damage that is known already.
 
@@ -165,10 +162,7 @@ class McapScan:
 
 
 def find_extras(buffer: Bytes) -> Iterator[rec.Attachment | rec.Metadata]:
-    """Yield a file's attachments and metadata, except the copy of ``metadata.yaml`` and broken records.
-
-    ``buffer``: the whole file, shape (n,).
-    """
+    """Yield the attachments and metadata in a file's bytes, except ``metadata.yaml`` and broken records."""
     view, size, at = buffer.data, len(buffer), len(rec.MAGIC)
     while at + _HEAD <= size:
         opcode, length = rec.RECORD_HEAD.unpack_from(view, at)

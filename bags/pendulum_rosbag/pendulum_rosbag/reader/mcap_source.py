@@ -47,7 +47,6 @@ class McapSource:
     ``damage`` then says what was found. ``unclosed`` marks a complete file that our recorder has not closed.
 
     Args:
-        path: The file.
         data: Its content, if it is not a plain file (a decompressed copy).
         verify: Checksums: ``None`` compares those of chunks that are read (of all if the file was not closed), ``True``
             all at once, leaving damaged chunks out, ``False`` none.
@@ -112,8 +111,6 @@ class McapSource:
             with contextlib.suppress(BufferError):  # an array still refers to it and releases it later
                 self._map.close()
             self._map = None
-
-    # -- opening -----------------------------------------------------------------------------------------------
 
     def _open(self, data: bytes | None) -> Bytes:
         if data is not None:
@@ -248,13 +245,8 @@ class McapSource:
         self.chunks, self._scanned, self._loose = found.chunks, found.scanned, found.loose
         self._counts, self.start_ns, self.stop_ns = found.counts, found.start_ns, found.stop_ns
 
-    # -- checksums ---------------------------------------------------------------------------------------------
-
     def _leave_out_damaged(self) -> None:
-        """Compare checksums and message indexes of all chunks, and leave damaged chunks out.
-
-        Raises DamagedError or BagError if a message index is damaged, so that the chunks must be scanned.
-        """
+        """Compare checksums and indexes of all chunks, drop damaged chunks, raise if an index is damaged."""
         kept: list[Chunk] = []
         lost: dict[int, int] = {}
         for number, chunk in enumerate(self.chunks):
@@ -282,8 +274,6 @@ class McapSource:
             self.chunks = kept
             self.start_ns = min((chunk.start_ns for chunk in kept), default=0)
             self.stop_ns = max((chunk.stop_ns for chunk in kept), default=0)
-
-    # -- reading -----------------------------------------------------------------------------------------------
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
         """Yield all messages of some channels with start <= log time < stop, in file order."""

@@ -89,11 +89,7 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def open_folder(path: Path) -> BagFolder:
-    """Read the metadata of a bag and list its storage files.
-
-    Raises:
-        BagError: The path does not exist, or there is no storage file.
-    """
+    """Read a bag's metadata and list its storage files; a BagError if there are none."""
     if not path.exists():
         raise BagError(f"bag {path} does not exist")
     if path.is_file():
@@ -167,10 +163,7 @@ def _read_metadata(path: Path) -> str:
 
 
 def _load_yaml(text: str) -> Any:
-    """Parse YAML without aliases, which can make gigabytes out of a line, and without deep nesting.
-
-    Depth overflows the stack of libyaml's composer, which ends the process.
-    """
+    """Parse YAML without aliases (a line could make gigabytes) and deep nesting (libyaml's stack overflows)."""
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     depth = 0
     for event in yaml.parse(text, loader):
@@ -255,10 +248,7 @@ def _file_order(file: Path) -> tuple[int, str]:
 
 
 def open_sources(folder: BagFolder, *, verify: bool | None = None) -> list[Source]:
-    """Open the storage files of a bag; unreadable ones are named in ``damage`` if others can be read.
-
-    ``verify`` is as for :class:`McapSource`. Raises a BagError if none can be read.
-    """
+    """Open the readable storage files and name the others in ``damage``; a BagError if none can be read."""
     sources: list[Source] = []
     errors: list[BagError] = []
     for file in folder.files:

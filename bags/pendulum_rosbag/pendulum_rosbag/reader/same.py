@@ -46,17 +46,11 @@ class Difference:
 
 
 def same_messages(bag_a: Bag, bag_b: Bag, topics: Sequence[str] | None = None, *, log_times: bool = True) -> Difference:
-    """Compare two bags topic by topic and message by message, each topic in order of log time.
+    """Compare two bags (all topics by default) message by message, each topic in order of log time.
 
     Padding and trailing bytes do not count: rclpy leaves both uninitialised. Types that neither the bags nor ROS 2
     Jazzy define are compared byte by byte. Messages of one topic and log time have no order, as two nodes may have
-    published them.
-
-    Args:
-        bag_a: One bag.
-        bag_b: The other.
-        topics: Topics to compare; by default all that either bag has.
-        log_times: Compare log times too; False for bags whose log time is the time of arrival.
+    published them. ``log_times`` False is for bags whose log time is the time of arrival.
     """
     answer = Difference()
     for topic in sorted(topics if topics is not None else {*bag_a.topics, *bag_b.topics}):

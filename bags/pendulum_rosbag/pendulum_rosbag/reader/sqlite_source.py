@@ -214,11 +214,7 @@ class SqliteSource:
         return row[0] if row and isinstance(row[0], str) else ""
 
     def batches(self, channels: set[int], start: int | None, stop: int | None) -> Iterator[Batch]:
-        """Yield all messages of some topics with start <= log time < stop, in file order.
-
-        Raises:
-            BagError: The file is damaged, or its recorder writes faster than it can be read.
-        """
+        """Yield batches as :class:`Source`; a BagError if the file is damaged or written faster than read."""
         if self._salvaged is not None:
             rows = [
                 row[1:]

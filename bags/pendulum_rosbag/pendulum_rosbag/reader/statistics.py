@@ -42,8 +42,6 @@ class TopicStatistics:
     """Timing of one topic; times in milliseconds, rates in Hz, NaN if there are too few messages.
 
     Args:
-        type: Message type.
-        count: Messages.
         rate: Messages per second between the first and the last.
         period: Median interval.
         jitter: Standard deviation of the intervals.
@@ -109,17 +107,12 @@ class BagStatistics:
 def time_statistics(
     kind: str, log_times: Int64, stamps: Int64 | None = None, senders: npt.NDArray[Any] | None = None
 ) -> TopicStatistics:
-    """Return the timing of one topic.
+    """Return the timing of one topic of type ``kind``.
 
     Intervals are between stamps if messages have them (reading in batches cannot blur them), else between log times.
     Messages have no period, and so no gaps, if fewer than half are near the median interval (events), or if they have
-    no stamps and come in bursts.
-
-    Args:
-        kind: Message type.
-        log_times: Log times in ascending order [ns], shape (n,).
-        stamps: Stamps of the messages [ns], shape (n,); unset ones as in ``set_stamps``.
-        senders: Sender of each message, shape (n,), if known.
+    no stamps and come in bursts. Log times ascend [ns]; stamps [ns] may be unset as in ``set_stamps``; senders, if
+    known, distinguish equal stamps; all have shape (n,).
     """
     result = TopicStatistics(kind, len(log_times))
     if stamps is not None and len(stamps):
@@ -170,14 +163,10 @@ def _stamp_statistics(
 def clock_jumps(log_times: Int64, stamps: Int64) -> list[int]:
     """Return the indices of messages at which one of the two clocks jumped.
 
-    The age of a message (log time minus stamp) is the difference of the clocks plus a delay, which is never negative
-    and sometimes small. So the *least* age shows the clocks: a jump is a step of more than ``CLOCK_JUMP`` upwards that
-    the least age of the next ``_LASTING`` seconds confirms, or one downwards below the least age of the seconds before.
-    Late messages, single or queued, are no jumps.
-
-    Args:
-        log_times: Log times in ascending order [ns], shape (n,).
-        stamps: Stamps [ns], shape (n,).
+    The age of a message (log time minus stamp [ns], shape (n,) each, log times ascending) is the difference of the
+    clocks plus a delay, which is never negative and sometimes small. So the *least* age shows the clocks: a jump is a
+    step of more than ``CLOCK_JUMP`` upwards that the least age of the next ``_LASTING`` seconds confirms, or one
+    downwards below the least age of the seconds before. Late messages, single or queued, are no jumps.
     """
     ages = (log_times - stamps) * 1e-9
     steps = np.diff(ages)

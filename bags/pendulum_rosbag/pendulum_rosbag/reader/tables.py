@@ -42,14 +42,11 @@ _ARROW_NAMES = {"bool": "bool_", "byte": "uint8", "char": "uint8", "octet": "uin
 
 
 def to_pandas(bag: Bag, topic: str) -> pd.DataFrame:
-    """Return a topic as a table, one row per message, ordered by log time.
+    """Return a topic as a table by log time, one row per message; a DataError if it cannot be read.
 
     JointStates of one joint have the array's columns and units, those of several joints a column per quantity and
     joint, such as ``elbow.position``, if all messages name the same joints. Other types have a column per field, nested
     fields joined by dots, arrays as lists.
-
-    Raises:
-        DataError: The topic is missing or its messages cannot be read.
     """
     import pandas as pd
 
@@ -83,11 +80,8 @@ def export_bag(
 ) -> list[Path]:
     """Write each topic to a file and the run metadata to ``metadata.json``, all or nothing; return the files.
 
-    Args:
-        bag: The bag.
-        folder: Folder to create.
-        format: ``parquet``, ``csv`` or ``mat`` (MATLAB's version 5).
-        on_left_out: Called with a sentence for each topic that cannot be read.
+    ``format`` is ``parquet``, ``csv`` or ``mat`` (MATLAB's version 5); ``on_left_out`` gets a sentence for each
+    unreadable topic.
 
     Raises:
         ParameterError: Unknown format, or pyarrow is missing.
@@ -167,10 +161,7 @@ def _write_parquet(path: Path, table: pd.DataFrame, info: TopicInfo) -> None:
 
 
 def _write_mat(path: Path, table: pd.DataFrame, start_ns: int) -> None:
-    """Write each column as a MATLAB variable, and ``time``: seconds from the bag's start.
-
-    Lists of one length become a matrix, text and other lists a cell array.
-    """
+    """Write columns as MATLAB variables (matrix, else cell array), and ``time`` [s] from the bag's start."""
     from scipy.io import savemat
 
     clock = table["stamp_ns" if "stamp_ns" in table else "log_time_ns"].to_numpy()

@@ -33,7 +33,6 @@ class TopicInfo:
     """A topic of a bag.
 
     Args:
-        name: Full name.
         type: Message type, such as ``sensor_msgs/msg/JointState``.
         count: Messages in the whole bag, also if a time span was requested.
         hash: Type description hash, empty if unknown.

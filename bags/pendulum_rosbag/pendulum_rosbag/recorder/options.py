@@ -32,7 +32,6 @@ class RecorderOptions:
         max_size: Largest storage file [bytes]; 0 for no limit.
         max_duration: Longest time span of a storage file [s]; 0 for no limit.
         duration: Stop after this time [s]; 0 for never.
-        metadata: Run metadata to store.
         log_time: ``receive`` or ``header``.
         wait: Start only when the service ``~/start`` is called.
         black_box: Length of the messages held in memory and written at each fault or stop [s]; 0 records all.

@@ -40,10 +40,7 @@ class ParameterReader:
         node.create_subscription(ParameterEvent, "/parameter_events", self._on_event, qos_profile_parameter_events)
 
     def poll(self, *, forget: bool = False) -> None:
-        """Send requests to new nodes whose services have appeared.
-
-        ``forget`` drops the values of nodes that are gone; a node of the same name is then read again.
-        """
+        """Send requests to new nodes with services; ``forget`` drops the values of nodes that are gone."""
         for client in self._finished:
             self._node.destroy_client(client)
         self._finished.clear()

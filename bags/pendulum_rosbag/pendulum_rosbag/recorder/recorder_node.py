@@ -100,8 +100,6 @@ class Recorder(PollingNode):
         self._poller.join()
         self._end()
 
-    # -- sessions ----------------------------------------------------------------------------------------------
-
     def _begin(self) -> RecordingSession:
         number = len(self.reports)
         base = self._options.output
@@ -160,8 +158,6 @@ class Recorder(PollingNode):
     def _on_failure(self, reason: str) -> None:
         self.get_logger().error(f"recording stops: {reason}")
         self._stop()
-
-    # -- intake ------------------------------------------------------------------------------------------------
 
     def _poll(self) -> None:
         try:
@@ -284,8 +280,6 @@ class Recorder(PollingNode):
             self._offer(tap, session, [(self._newest_stamp or received_ns, data)])
         self._unstamped.clear()
 
-    # -- the graph ---------------------------------------------------------------------------------------------
-
     def _discover(self) -> None:
         for topic, types in self.get_topic_names_and_types():
             if not self._options.wants(topic) or topic == self._events:
@@ -329,8 +323,6 @@ class Recorder(PollingNode):
         if topic not in self._refused:
             self._refused[topic] = reason
             self.get_logger().error(f"{topic} is NOT recorded: {reason}")
-
-    # -- events, parameters, services --------------------------------------------------------------------------
 
     def note(self, name: str, **details: Any) -> None:
         """Write an event of the recorder itself to the bag."""

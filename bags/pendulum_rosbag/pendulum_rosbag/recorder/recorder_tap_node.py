@@ -42,8 +42,6 @@ class Tap:
     """A polled subscription, and what is needed to record from it.
 
     Args:
-        node: The node that subscribes.
-        topic: Full name.
         publishers: The topic's publishers, with their QoS.
         before: The subscription that this one replaces; messages missed between them are counted, too.
 
@@ -118,10 +116,7 @@ class Tap:
             yield info["received_timestamp"], trim(data), see(sequence) if sequence else 0
 
     def repeats(self, session: RecordingSession | None, data: bytes) -> bool:
-        """Return whether a stamped message repeats the one before it in a recording, and store it.
-
-        In lockstep a plant repeats its state until a reply comes, and nodes repeat their replies.
-        """
+        """Store a stamped message; return whether it repeats the one before it, as in lockstep without a reply."""
         before, self._newest = self._newest, (session, data)
         again = before[0] is session and before[1] == data
         return again and self.stamp is not None and (self.stamp(data) or 0) > 0

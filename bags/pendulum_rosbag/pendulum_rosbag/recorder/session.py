@@ -207,8 +207,6 @@ class RecordingSession:
                     self.fail(error)
         return SessionReport(self.writer.path, self.counts(), self.failure)
 
-    # -- the threads -------------------------------------------------------------------------------------------
-
     def _run(self) -> None:
         due = time.monotonic() + self._seal_interval
         while not self._stop.wait(max(due - time.monotonic(), 0.0)):

@@ -24,7 +24,6 @@ class RepairReport:
     """What a repair found and did.
 
     Args:
-        path: The sound bag.
         damage: What was wrong, one sentence each; empty for a sound bag.
         messages: Topic -> number of messages saved.
         original: Where the broken bag is now; ``None`` if nothing was repaired.
@@ -63,10 +62,8 @@ def repair_bag(
     """Write all whole messages of a broken bag to a new one; a sound bag is left alone unless ``force``.
 
     Without ``output`` (a folder that must not exist) the new bag takes the place of the broken one, which becomes
-    ``NAME.broken``; a single storage file gets a folder ``NAME_repaired`` alongside it.
-
-    Raises:
-        BagError: There is no bag, nothing of it can be read, or the new one cannot be written.
+    ``NAME.broken``; a single storage file gets a folder ``NAME_repaired`` alongside it. A BagError if nothing can be
+    read or the new bag cannot be written.
     """
     from pendulum_rosbag.reader.open_source import damage_of, open_folder, open_sources
 

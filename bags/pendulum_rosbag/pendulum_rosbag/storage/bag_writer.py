@@ -271,8 +271,6 @@ class BagWriter:
     ) -> None:
         self.close()
 
-    # -- parts -------------------------------------------------------------------------------------------------
-
     def _require_open(self) -> None:
         if not self._open:
             raise BagError(f"bag {self.path} is closed; nothing can be written to it any more")

@@ -73,7 +73,6 @@ class McapLayout:
     Methods raise OSError when the disk is full or fails; readers then see the file as before the call.
 
     Args:
-        path: File to create.
         header: Magic and header record.
         summary: Content of the file's summary; its owner changes it and calls ``publish``.
     """
@@ -110,8 +109,6 @@ class McapLayout:
             self.abandon()
             temporary.unlink(missing_ok=True)
             raise
-
-    # -- what the writer of messages calls ---------------------------------------------------------------------
 
     @property
     def is_open(self) -> bool:
@@ -209,8 +206,6 @@ class McapLayout:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
-
-    # -- parts -------------------------------------------------------------------------------------------------
 
     @property
     def _tail(self) -> int:

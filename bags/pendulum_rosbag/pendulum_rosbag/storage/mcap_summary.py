@@ -149,10 +149,7 @@ class McapSummary:
         return rec.summary_checksum_record(zlib.crc32(tail, self._staged_crc))
 
     def tail(self, start: int, indexes: Sequence[bytes] = ()) -> tuple[bytes, int]:
-        """Return the records that close a summary at offset ``start``, with attachment and metadata ``indexes``.
-
-        Also returns where the summary's offsets begin [bytes].
-        """
+        """Return the records that close a summary at offset ``start``, and where its offsets begin [bytes]."""
         kinds = {
             opcode: b"".join(index for index in indexes if index[0] == opcode)
             for opcode in (rec.ATTACHMENT_INDEX, rec.METADATA_INDEX)

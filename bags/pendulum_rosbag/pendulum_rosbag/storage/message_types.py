@@ -45,13 +45,11 @@ def typestore() -> Typestore:
 
 @lru_cache(maxsize=256)
 def message_type(name: str, type_hash: str = "") -> MessageType:
-    """Return definition and hash of a message type; ``type_hash`` from discovery overrides the computed hash.
+    """Return definition and hash of a type ``package/msg/Name``; a BagError for other names.
 
     Types outside the ROS distribution are read from ``share/PACKAGE/msg/NAME.msg`` under ``AMENT_PREFIX_PATH``. An
-    unknown type has no definition; its messages are recorded all the same.
-
-    Raises:
-        BagError: The name has not the form ``package/msg/Name``.
+    unknown type has no definition; its messages are recorded all the same. ``type_hash`` from discovery overrides the
+    computed hash.
     """
     if len(name.split("/")) != 3:
         raise BagError(f"message type is {name!r}; expected package/msg/Name")

@@ -162,10 +162,7 @@ class SealedMcapFile:
         return self._layout.duplicate()
 
     def close(self, metadata: str = "") -> None:
-        """Seal, write summary and footer, cut off the unused room and close.
-
-        ``metadata`` is the text of ``metadata.yaml``, stored as rosbag2 does for files without their folder.
-        """
+        """Seal, write summary, the text of ``metadata.yaml`` and footer, cut off the unused room and close."""
         if not self._layout.is_open:
             return
         try:
@@ -182,8 +179,6 @@ class SealedMcapFile:
     def abandon(self) -> None:
         """Close without writing; the sealed content remains."""
         self._layout.abandon()
-
-    # -- parts -------------------------------------------------------------------------------------------------
 
     def _seal_pending(self) -> None:
         layout = self._layout

@@ -80,10 +80,7 @@ class SealedSqliteFile:
             raise
 
     def size_with(self, size: int, *, empty: bool = False) -> int:
-        """Return a bound of the closed file's size with one more message of ``size`` [bytes], less metadata.
-
-        ``empty`` leaves out all messages so far.
-        """
+        """Return a bound of the closed file's size [bytes] with one more message of ``size``, less metadata."""
         if empty:
             return _EMPTY_PAGES * PAGE
         rows, last = self.count + self._pending + 1, max(self.stop_ns, self._pending_span[1])
@@ -164,10 +161,7 @@ class SealedSqliteFile:
         raise BagError(f"storage sqlite3 has no place for {record.name!r}; expected storage mcap for attachments")
 
     def close(self, metadata: str = "") -> None:
-        """Seal, add rosbag2's index over time and close.
-
-        ``metadata`` is the text of ``metadata.yaml``, stored as rosbag2 does for files without their folder.
-        """
+        """Seal, add rosbag2's index over time and the text of ``metadata.yaml``, and close."""
         if self._fd < 0:
             return
         try:
@@ -185,8 +179,6 @@ class SealedSqliteFile:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
-
-    # -- parts -------------------------------------------------------------------------------------------------
 
     def _commit(self) -> None:
         pages = self._pages

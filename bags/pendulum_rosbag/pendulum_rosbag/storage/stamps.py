@@ -21,10 +21,7 @@ _BIG = struct.Struct(">iI")
 
 
 def stamp_reader(type_name: str) -> StampReader | None:
-    """Return the reader of a type's stamp, ``None`` for types without one.
-
-    The stamp is a leading ``std_msgs/Header`` or time, or ``stamp_ns`` in the JSON event of a ``std_msgs/String``.
-    """
+    """Return the reader of a type's stamp (leading Header or time, or a JSON event's ``stamp_ns``), or None."""
     if type_name == "std_msgs/msg/String":
         return _event_stamp
     definition = typestore().fielddefs.get(type_name)
