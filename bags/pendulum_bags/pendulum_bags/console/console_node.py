@@ -329,7 +329,6 @@ class Hub:
                 self._node.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=1.0)
 
     def _look(self) -> None:
-        """Find plants by their e-stop service."""
         self._reader.poll(forget=True)
         found = {
             name.removesuffix(_STOP_SERVICE)

@@ -20,14 +20,7 @@ _PATIENCE = 10.0
 
 @dataclass
 class Job:
-    """One started program.
-
-    Attributes:
-        kind: ``record`` or ``experiment``.
-        folder: Folder of its output.
-        started: Start [s of the monotonic clock].
-        ended: When its end was first seen; None while it runs.
-    """
+    """One started program: times in [s of the monotonic clock], ``ended`` None while it runs."""
 
     kind: str
     folder: Path

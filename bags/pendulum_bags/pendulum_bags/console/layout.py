@@ -120,7 +120,6 @@ class Layout:
                 card.section.classes(add="gone")
 
     def _plant_card(self, space: str, node: str) -> ControllerChoice:
-        """Make one plant's buttons; return the choice of its controller."""
         _heading(space)
         with ui.row():
             _button("Arm", lambda: self._carefully(self._graph.arm(node, on=True)), filled=True, of=space)
@@ -183,7 +182,6 @@ class Layout:
             self._try(partial(self._jobs.disturb, space))
 
     def _ask_to_move(self, space: str, goal: str) -> None:
-        """Describe a plant's motion, and start it on confirmation."""
         end = "the controller takes over" if goal == "upright" else "the plant is disarmed"
         with ui.dialog() as dialog, ui.card():
             ui.label(

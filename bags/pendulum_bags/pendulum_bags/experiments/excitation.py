@@ -69,8 +69,6 @@ class ExcitationPlay:
 
 @dataclass(frozen=True)
 class _LockstepRun(RunSpec):
-    """A run in lockstep at the sampling period of the design."""
-
     sampling: float = 0.01
     prediction: Mapping[str, Any] = field(default_factory=dict)
 

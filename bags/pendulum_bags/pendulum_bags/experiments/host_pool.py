@@ -31,8 +31,6 @@ _PATIENCE = 8.0
 
 @dataclass
 class _Host:
-    """A process that runs one kind of program, and the socket to it."""
-
     kind: tuple[str, str, int]
     process: subprocess.Popen[bytes]
     connection: socket.socket

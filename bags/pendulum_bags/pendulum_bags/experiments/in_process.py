@@ -72,7 +72,6 @@ def simulate_plant(spec: RunSpec, parameters: PlantParameters, sensors: Sensors 
 
 
 def _whole(period: float) -> float:
-    """Return a period rounded to whole nanoseconds [s]."""
     return round(NANOSECONDS * period) / NANOSECONDS
 
 

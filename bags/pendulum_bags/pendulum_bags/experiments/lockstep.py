@@ -142,7 +142,6 @@ def record_run(
 
 
 def _keep_time(session: Session, plant: PlantClient, spec: RunSpec) -> None:
-    """Start a run in real time, wait for its length by the plant's clock, and put the plant to rest."""
     conductor = session.conductor
     plant.watch()
     if spec.has_bridge:

@@ -123,7 +123,6 @@ def _kept_settings(machine: RealMachine, console: Console) -> Iterator[None]:
 
 
 def _lab(*arguments: str) -> str:
-    """Run a procedure of the lab; return why it failed, or an empty string."""
     try:
         # Ctrl-C is for the experiment: it must not end the restoring of settings.
         done = run_bridge_program("lab", *arguments, timeout=_CHECK_TIMEOUT, deaf_to_ctrl_c=True)
@@ -148,7 +147,6 @@ def run_checklist(bridge: NodeProgram, console: Console, *, flat: bool = False) 
 
 
 def _refusals(printed: str, said: str) -> str:
-    """Return the reasons against arming: the failed lines of the checklist, or why there is none."""
     try:
         items = json.loads(printed)["items"]
     except (ValueError, KeyError):

@@ -39,7 +39,6 @@ _TOO_LATE = re.compile(r"\bwithin \d|did not (?:answer|run)")
 
 
 def _busy_note(words: str) -> str:
-    """Return a remark if other programs may have caused the last lines, else nothing."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     if load <= 2.0 * cores or not _TOO_LATE.search(words):
         return ""

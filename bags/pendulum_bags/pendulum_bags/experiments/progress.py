@@ -63,7 +63,6 @@ class PhaseProgress:
             self._console.print(f"{name} ({expected:.0f} s)", highlight=False)
 
     def _tick(self) -> None:
-        """Show progress while the main thread is busy."""
         while not self._ended.wait(_TICK):
             elapsed = time.monotonic() - self._started
             # Never past the end of the phase.

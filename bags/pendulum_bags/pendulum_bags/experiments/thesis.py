@@ -121,7 +121,6 @@ def _regulate(
     on_idle: Callable[[], None],
     rests: Callable[[], bool],
 ) -> None:
-    """Carry out the phases, ramp to ramp."""
     conductor, noise = session.conductor, settings.noise
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
@@ -188,7 +187,6 @@ def _start_move(
     phase: str,
     progress: PhaseProgress,
 ) -> list[float]:
-    """Start the ramp on all plants at once; return how long each takes [s]."""
     ramps = []
     for plant in plants:
         assert plant.sample is not None

@@ -220,7 +220,6 @@ def _has_ended(plant: PlantClient, *, lockstep: bool) -> bool:
 
 
 def _topics(settings: TrialSettings) -> dict[str, int]:
-    """Return the number of subscribers of each topic of a trial, without the orchestrator."""
     topics = {
         names.JOINT_STATES: _LISTENERS,
         names.EFFORT_COMMAND: 2,

@@ -18,11 +18,8 @@ Kind = Literal["line", "step", "points", "interval", "band"]
 class Style:
     """Style of a role, readable in greyscale too.
 
-    Args:
-        colour: From the colour-blind safe set of Okabe and Ito.
-        dash: ``solid``, ``dash``, ``dot`` or ``dashdot``.
-        width: Line width [pt].
-        marker: ``circle``, ``square``, ``triangle`` or ``cross``.
+    Colours are from the colour-blind safe set of Okabe and Ito; ``dash`` is ``solid``, ``dash``, ``dot`` or
+    ``dashdot``, ``width`` in [pt], ``marker`` ``circle``, ``square``, ``triangle`` or ``cross``.
     """
 
     colour: str
@@ -121,15 +118,9 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure.
+    """A figure, with a file stem (also its anchor), a sentence computed from the data, and panels.
 
-    Args:
-        name: File stem and anchor.
-        sentence: Summary, computed from the data.
-        panels: One or more.
-        stacked: Panels above each other on one x axis; else side by side.
-        section: Heading of its section.
-        panel_height: Height of a panel [px on the page].
+    Panels are ``stacked`` above each other on one x axis, else side by side, ``panel_height`` high [px on the page].
     """
 
     name: str

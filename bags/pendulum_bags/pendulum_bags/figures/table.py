@@ -13,15 +13,7 @@ _NUMERIC = re.compile(r"^[-+−–±]?[\d.]*(×10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
-
-    Args:
-        sentence: What it shows.
-        head: Column headings; the first column holds row names.
-        rows: Cells as text.
-        section: Heading of its section; empty on a page without sections.
-        folded: Folded on a page for its length; paper shows it always.
-    """
+    """A table of texts, whose first column holds row names; ``folded`` on a page for its length."""
 
     title: str
     sentence: str

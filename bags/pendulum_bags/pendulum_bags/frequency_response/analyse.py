@@ -64,7 +64,6 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, 
 
 
 def _read(path: Path) -> tuple[Record, Mapping[str, Any]]:
-    """Return the excited plant of a bag, of one joint or several, and the bag's metadata of its run."""
     from pendulum_bags.runs.kept_bags import KeptBags
     from pendulum_bags.runs.run_data import joints_of, read_run
 
@@ -199,7 +198,6 @@ class _Kept(NamedTuple):
 
 
 def _kept(machine: Path) -> _Kept:
-    """Return the settings stored with a measured response, or defaults."""
     path = (machine if machine.is_dir() else machine.parent) / NUMBERS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

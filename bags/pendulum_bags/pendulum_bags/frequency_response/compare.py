@@ -147,7 +147,6 @@ def _at_common_lines(first: MeasuredResponse, second: MeasuredResponse) -> tuple
 
 
 def _gaps(first: Complex, second: Complex, a: Array, b: Array, scaling: SignalScaling) -> tuple[Array, Array, Array]:
-    """Return the chordal distance with its limits, from the discs of both."""
     one, two = scaling.plant(first), scaling.plant(second)
     gap = chordal_distance(one, two)
     room = np.zeros(gap.size)

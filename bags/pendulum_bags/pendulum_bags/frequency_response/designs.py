@@ -153,7 +153,6 @@ def lqr_name(weights: Sequence[float], cost: float) -> str:
 
 
 def _static(text: str, own_cost: float, model: LinearModel) -> Design:
-    """Return the gain of a text."""
     size = len(model.measured)
     if match := _WEIGHTS.fullmatch(text):
         weights, costs = _numbers(match[1]), _numbers(match[2] or f"{own_cost}")
@@ -171,7 +170,6 @@ def _static(text: str, own_cost: float, model: LinearModel) -> Design:
 
 
 def _numbers(text: str) -> list[float]:
-    """Return the numbers in a text, none if one of them is not a number."""
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:

@@ -178,7 +178,6 @@ def _distortion(y: Complex, harmonics: NDArray[np.int64]) -> tuple[float, float]
 
 
 def _facts(record: Record, method: str, blocks: int, length: float) -> dict[str, Any]:
-    """Return the method of measurement, and the amplitudes of motion and torque."""
     deviations = record.outputs - record.outputs.mean(axis=1, keepdims=True)
     largest = np.max(np.abs(deviations), axis=1)
     effort = float(np.max(np.abs(record.torque)))

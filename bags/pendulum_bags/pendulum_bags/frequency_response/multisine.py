@@ -18,15 +18,9 @@ _HIGHEST_OF_JOINTS = 100.0
 
 @dataclass(frozen=True)
 class Multisine:
-    """Whole periods of a multisine.
+    """Whole periods of a multisine, of which one more settles.
 
-    Attributes:
-        amplitude: Largest torque [N m].
-        signal_period: Length of one period [s].
-        periods: Averaged periods; one more settles.
-        lowest: Lowest frequency [Hz].
-        highest: Highest frequency [Hz].
-        lines: Largest number of frequencies.
+    Amplitude [N m], period [s], lowest and highest frequency [Hz], and the largest number of frequencies.
     """
 
     amplitude: float = 2.5

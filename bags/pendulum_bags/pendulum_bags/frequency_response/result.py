@@ -19,13 +19,9 @@ __all__ = ["Analysis"]
 
 @dataclass(frozen=True)
 class Analysis:
-    """The analysis of responses.
+    """The analysis of responses of simulation, hardware, or both, with the model of the designs' plant.
 
-    Attributes:
-        responses: Simulation, hardware, or both.
-        model: Of the plant that designs were made on.
-        difference: Of simulation and hardware, None for one of them.
-        certifier: Of model and hardware, None without hardware.
+    ``difference`` is None for one of them, ``certifier`` without hardware.
     """
 
     responses: Sequence[MeasuredResponse]

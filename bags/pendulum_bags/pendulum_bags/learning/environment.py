@@ -214,7 +214,6 @@ class SwingUp:
         self.motion[rows, 2 * n : 5 * n] = np.tile(efforts, (1, 3))
 
     def _meets_again(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return which rows repeat the plant of the episode that ends."""
         if self.body.excess is None or self.progress < _LEARNED:
             return np.zeros(rows.size, dtype=np.bool_)
         down = np.any(np.abs(wrap(self.motion[rows, : self._n][:, self._turns])) > _UP, axis=1)

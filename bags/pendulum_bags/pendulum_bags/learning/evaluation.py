@@ -83,7 +83,6 @@ def trials_of(
 
 
 def _drawn(policy: Policy, task: SwingUpTask, rng: np.random.Generator) -> PlantParameters:
-    """Return a plant from the ranges, drawn again if its masses and inertias make none."""
     plant = policy.plant
     for _ in range(_MOST_DRAWS):
         drawn = {name: float(rng.uniform(*pair)) for name, pair in policy.ranges.items() if "static" not in name}

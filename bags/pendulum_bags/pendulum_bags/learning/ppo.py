@@ -232,7 +232,6 @@ def _log_chance(actions: Floats, means: Floats, log_spread: Floats) -> Floats:
 
 
 def _divergence(old: Floats, old_log: Floats, new: Floats, new_log: Floats) -> float:
-    """Return the mean Kullback-Leibler divergence of the old distribution from the new one."""
     variance = np.exp(2.0 * (old_log - new_log))
     shift = np.square(old - new) * np.exp(-2.0 * new_log)
     return float(np.mean(np.sum(new_log - old_log + 0.5 * (variance + shift - 1.0), axis=1)))

@@ -81,7 +81,6 @@ class Teacher:
 
 @numba.njit(cache=True)
 def _nearest(states: Any, nodes: Any, costs: Any, turns: Any) -> Any:
-    """Return the node of least cost for each state, and that cost."""
     count, size = states.shape
     found, least = np.zeros(count, np.int64), np.full(count, np.inf)
     error = np.empty(size)

@@ -49,12 +49,8 @@ _SPEED_MARGIN = 1.1
 class Training:
     """Settings of a training.
 
-    Attributes:
-        task: One of ``TASKS``.
-        intervals: Intervals of its parameters, as in a plant file.
-        swing_up: Variations between episodes, for ``swing_up``.
-        environments: Pendulums at once.
-        teacher: One of ``TEACHERS``.
+    ``intervals`` of the plant's parameters are as in a plant file; ``swing_up`` has the variations between episodes;
+    ``environments`` is the number of pendulums at once.
     """
 
     task: str = "swing_up"

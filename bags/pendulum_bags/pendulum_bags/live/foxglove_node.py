@@ -205,7 +205,6 @@ class LiveNode(PollingNode):
         return foxglove.Service(name, schema=schema, handler=answer)
 
     def _call(self, client: Any, name: str, request: Any) -> Any:
-        """Call a node and wait for its response, in a thread of the server."""
         deadline = time.monotonic() + _TIMEOUT
         while not client.service_is_ready():
             if time.monotonic() > deadline:
@@ -262,8 +261,6 @@ class LiveNode(PollingNode):
 
 
 class _Listener(ServerListener):
-    """The library's callbacks for parameters; without names all are shown."""
-
     def __init__(self, shown: Callable[[Sequence[str]], list[Any]], set_all: Callable[[Sequence[Any]], None]) -> None:
         self._shown = shown
         self._set_all = set_all

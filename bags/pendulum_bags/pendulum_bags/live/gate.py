@@ -27,19 +27,10 @@ _END = b"\r\n\r\n"
 
 
 class Gate:
-    """Listens, and connects admitted clients to a server.
+    """Listens at ``port`` (0 for any), and connects admitted clients to a server at an address and port.
 
-    Args:
-        port: Port to listen on; 0 for any.
-        server: Address and port of the server.
-        refusal: Returns why a request is refused, or nothing; called in any thread.
-        tell: Called with a line on each client that connects, leaves or is refused, in any thread.
-
-    Raises:
-        ParameterError: The address or the port is not available.
-
-    Attributes:
-        port: The port that it listens on.
+    ``refusal`` returns why a request is refused, or nothing; ``tell`` gets a line on each client that connects, leaves
+    or is refused; both are called in any thread. A ParameterError if address or port are not available.
     """
 
     def __init__(
@@ -90,7 +81,6 @@ class Gate:
                 self._start(self._attend, client, f"{address[0]}:{address[1]}")
 
     def _attend(self, client: socket.socket, who: str) -> None:
-        """Carry a client's bytes until it leaves."""
         with contextlib.ExitStack() as leaving:
             leaving.callback(self._forget, client)
             try:
@@ -160,7 +150,6 @@ def _read_head(source: socket.socket) -> tuple[bytes, bytes]:
 
 
 def _carry(source: socket.socket, sink: socket.socket, pause: float) -> None:
-    """Carry bytes until either end closes, then close both."""
     with contextlib.suppress(OSError):
         while data := source.recv(_PIECE):
             sink.sendall(data)

@@ -20,14 +20,9 @@ _DEPTH = 2000
 
 
 class LiveTopic:
-    """A topic (of type ``package/msg/Name``) and its channel in the viewers' server.
+    """A topic (of type ``package/msg/Name``) and its channel in the viewers' server; or an ImportError.
 
-    Raises:
-        ImportError: The type of the messages is not installed.
-
-    Attributes:
-        sent: Messages that were passed on.
-        lost: Messages missing between them, by sequence number; counted while there is one publisher.
+    ``lost`` are messages missing between the ``sent`` ones, by sequence number; counted while there is one publisher.
     """
 
     def __init__(self, node: PollingNode, topic: str, type_name: str, context: Any) -> None:

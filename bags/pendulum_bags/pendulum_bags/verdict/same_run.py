@@ -182,7 +182,6 @@ def _evidence(test: EquivalenceTest) -> Evidence:
 
 
 def _beyond(test: EquivalenceTest) -> float:
-    """Return an estimate's distance in margins."""
     value = test.interval.estimate
     if math.isfinite(test.low) and not math.isclose(test.low, -test.high):
         return abs(math.log(max(value, 1e-9))) / math.log(test.high)
@@ -260,7 +259,6 @@ def _records(comparison: Comparison) -> list[Mapping[str, Any]]:
 
 
 def _next_file(fitted: str) -> str:
-    """Return the file of the next fit, which does not overwrite the simulated one."""
     if not fitted:
         return "plant.yaml"
     path = Path(fitted)
@@ -286,7 +284,6 @@ def _late(test: EquivalenceTest) -> str:
 
 
 def _foreign_simulation(comparison: Comparison) -> str:
-    """Return the name of a third-party simulation, else nothing."""
     run = comparison.pairs[0].simulation
     if run.of_file:
         return f"the simulation of {Path(run.source).name}"

@@ -167,7 +167,6 @@ def _open(path: Path, stack: ExitStack) -> _Input:
 
 
 def _from_ros1(path: Path, scratch: Path) -> Path:
-    """Convert a ROS 1 bag to a rosbag2 folder."""
     from rosbags.convert import ConverterError, convert
 
     target = scratch / path.stem

@@ -161,7 +161,6 @@ class Player(Node):
         self._stop()
 
     def _wait_for_subscribers(self) -> bool:
-        """Wait for subscribers to match; False on a request to end."""
         end = time.monotonic() + self._options.wait
         while time.monotonic() < end and not all(output.get_subscription_count() for output in self._outputs):
             if self._leave.wait(_LONGEST_WAIT):
@@ -169,7 +168,6 @@ class Player(Node):
         return True
 
     def _play_once(self) -> bool:
-        """Publish everything once; False on a request to end."""
         clock_due = 0
         times, order, datas = self._times.tolist(), self._order.tolist(), self._datas
         for time_ns, topic, data in zip(times, order, datas, strict=True):

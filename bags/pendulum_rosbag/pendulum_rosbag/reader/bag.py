@@ -275,7 +275,6 @@ class Bag(Mapping[str, Any]):
             )
 
     def _timed(self, topic: str, log_times: Int64, stamps: Int64) -> tuple[Int64, Int64]:
-        """Return log times and stamps that continue across clock steps, with all stamps set."""
         name = self._entry(topic).info.name
         if len(log_times) and int(np.diff(log_times).min(initial=0)) < 0:
             self.clock_steps()
@@ -304,7 +303,6 @@ class Bag(Mapping[str, Any]):
         return log_times, stamps
 
     def _moved(self, name: str, log_times: Int64) -> Int64:
-        """Return a topic's log times, shifted after each clock step so that they continue."""
         for step in self._steps or []:
             if step.rows.get(name, len(log_times)) < len(log_times):
                 log_times = log_times.copy()

@@ -124,7 +124,6 @@ def find_steps(
 def _sequences(
     wanted: Iterable[tuple[Source, Mapping[int, str]]], span: tuple[int | None, int | None]
 ) -> tuple[dict[str, Int64], dict[str, Int64]]:
-    """Return each topic's places among all messages, and its log times, in file order."""
     places: dict[str, list[Int64]] = {}
     times: dict[str, list[Int64]] = {}
     number, buffer = 0, None

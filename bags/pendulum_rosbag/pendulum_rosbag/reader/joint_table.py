@@ -20,15 +20,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class JointTable:
-    """The messages of one topic of n joints, ordered by log time.
+    """The k messages of one topic of n joints (columns) by log time.
 
-    Attributes:
-        names: The joints, in the order of the columns.
-        log_time_ns: Shape (k,) [ns].
-        stamp_ns: Shape (k,) [ns].
-        position: Shape (k, n), NaN if absent [rad or m].
-        velocity: Shape (k, n) [rad/s or m/s].
-        effort: Shape (k, n) [N m or N].
+    Times [ns] have shape (k,), the others (k, n): position [rad or m] (NaN if absent), velocity [rad/s or m/s], effort
+    [N m or N].
     """
 
     names: tuple[str, ...]

@@ -242,7 +242,6 @@ def export_lerobot(
 
 
 def _features(episodes: Sequence[Episode]) -> dict[str, dict[str, Any]]:
-    """Return the columns of the frames with type, shape and names of their entries."""
     joints, driven = episodes[0].joints, episodes[0].driven
     for episode in episodes[1:]:
         if (episode.joints, episode.driven) != (joints, driven):

@@ -40,17 +40,9 @@ _OURS = "rosbag2"
 class McapScan:
     """All whole records from the start of the file; a torn end is left out.
 
-    Args:
-        sound: Collects the offsets of chunks with a correct checksum.
-        damage: Damage that is known already.
-
-    Attributes:
-        chunks: In file order.
-        scanned: Messages of each chunk.
-        loose: Messages outside of chunks.
-        counts: Messages of each channel.
-        start_ns, stop_ns: First and last log time [ns].
-        damage: The first damage found, or empty.
+    ``sound`` collects the offsets of chunks with a correct checksum. Afterwards ``chunks`` are in file order,
+    ``scanned`` has each one's messages, ``loose`` those outside of chunks, ``counts`` the number per channel;
+    ``start_ns`` and ``stop_ns`` are log times [ns], ``damage`` is the first damage found, or empty.
     """
 
     def __init__(self, buffer: Bytes, path: Path, topics: McapTopics, sound: set[int], damage: str) -> None:
@@ -135,7 +127,6 @@ class McapScan:
         self._take_chunk(whole, raw, records)
 
     def _chunk_at(self, body: int) -> tuple[Chunk, int]:
-        """Return the chunk whose record's content begins at an offset, and its checksum."""
         view = self._buffer.data
         start, stop, raw_size, crc, text_size = CHUNK_FIELDS.unpack_from(view, body)
         compression, at = read_text(bytes(view[body + 28 : body + 32 + text_size]), 0)

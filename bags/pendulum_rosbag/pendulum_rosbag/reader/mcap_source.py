@@ -93,7 +93,6 @@ class McapSource:
         self.unchecked = self._without_checksums()
 
     def _without_checksums(self) -> str:
-        """Return which part of the file no checksum covers, in words."""
         bare = sum(not chunk.crc for chunk in self.chunks)
         if self._loose:
             return "messages outside of chunks have no checksum"
@@ -194,7 +193,6 @@ class McapSource:
             raise _NoIndexError  # messages outside of chunks
 
     def _describes_all(self) -> bool:
-        """Return whether the summary describes all its channels and their schemas."""
         named = {channel for channel, count in self._counts.items() if count}
         named.update(*(chunk.indexes for chunk in self.chunks))
         return self._topics.describe_all(named)
@@ -239,7 +237,6 @@ class McapSource:
         return Chunk(self.buffer, start, stop, data_start, packed, raw, compression, indexes, crc, offset)
 
     def _scan(self, damage: str) -> None:
-        """Replace what the index says by the result of a scan."""
         found = McapScan(self.buffer, self.path, self._topics, self._checksums.sound, damage)
         self.damage = found.damage
         self.chunks, self._scanned, self._loose = found.chunks, found.scanned, found.loose

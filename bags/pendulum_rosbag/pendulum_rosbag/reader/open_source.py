@@ -299,7 +299,6 @@ def _leave_out_copies(folder: BagFolder, sources: list[Source]) -> None:
 
 
 def _is_copy(source: Source, other: Source) -> bool:
-    """Return whether all messages of a file are in another; False if one cannot be read."""
     inside = other is not source and other.start_ns <= source.start_ns and source.stop_ns <= other.stop_ns
     try:
         # Simulation runs begin at the same time, so times alone prove nothing.
@@ -309,7 +308,6 @@ def _is_copy(source: Source, other: Source) -> bool:
 
 
 def _messages(source: Source) -> Counter[tuple[str, int, int]]:
-    """Return how often a file has each message: topic, log time [ns] and hash of its bytes."""
     topics = {stream.channel: stream.topic for stream in source.streams}
     counts: Counter[tuple[str, int, int]] = Counter()
     for batch in source.batches(set(topics), None, None):

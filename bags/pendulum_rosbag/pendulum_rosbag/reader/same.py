@@ -72,7 +72,6 @@ def same_messages(bag_a: Bag, bag_b: Bag, topics: Sequence[str] | None = None, *
 
 
 def _canonical_of(info: TopicInfo) -> Callable[[bytes], bytes]:
-    """Return a function that maps equal messages of a topic to equal bytes."""
     if info.type == "sensor_msgs/msg/JointState":
         return canonical
     try:
@@ -105,7 +104,6 @@ def _first_difference(
 
 
 def _ordered(messages: list[tuple[int, bytes]], clean: Callable[[bytes], bytes]) -> list[tuple[int, bytes]]:
-    """Order messages of one log time by their content."""
     ordered: list[tuple[int, bytes]] = []
     for _, group in itertools.groupby(messages, key=itemgetter(0)):
         same_time = list(group)

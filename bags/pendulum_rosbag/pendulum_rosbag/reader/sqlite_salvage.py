@@ -44,7 +44,6 @@ def salvaged_rows(content: bytes) -> Iterator[Row]:
 
 
 def _row(content: bytes, size: int, cell: int) -> Row | None:
-    """Return the row of a cell; ``None`` if it is no whole message."""
     length, at = _varint(content, cell)
     row_id, at = _varint(content, at)
     payload = _payload(content, size, at, length)
@@ -83,7 +82,6 @@ def _payload(content: bytes, size: int, at: int, length: int) -> bytes:
 
 
 def _varint(content: bytes, at: int) -> tuple[int, int]:
-    """Return the variable-length integer at an offset, and where it ends."""
     value = 0
     for place, byte in enumerate(content[at : at + 9]):
         if place == 8:

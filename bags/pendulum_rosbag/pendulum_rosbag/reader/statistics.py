@@ -209,7 +209,6 @@ def _latencies(times: dict[str, tuple[Int64, Int64]]) -> list[Latency]:
 
 
 def _times(bag: Bag, info: TopicInfo) -> tuple[Int64, Int64 | None]:
-    """Return log times and stamps of a topic of any type; no stamps if its messages have none."""
     readable = info.serialization == "cdr" and info.type not in _TIME_IS_CONTENT
     read = stamp_reader(info.type) if readable else None
     if read is None:

@@ -141,7 +141,6 @@ def _write_table(path: Path, table: pd.DataFrame, info: TopicInfo, format: str, 
 
 
 def _json(value: Any) -> str:
-    """Return a list as JSON, with null for NaN and infinity."""
     return json.dumps(without_nan(value), allow_nan=False)
 
 

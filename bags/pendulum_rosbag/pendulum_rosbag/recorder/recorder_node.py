@@ -222,7 +222,6 @@ class Recorder(PollingNode):
             self._tell_early(tap, session, unheard)
 
     def _write_black_box(self) -> None:
-        """If a plant has faulted or was stopped, write the black box to a bag of its own."""
         box = self._black_box
         if box is None or self._session is not None or not box.is_due(time.time_ns()):
             return

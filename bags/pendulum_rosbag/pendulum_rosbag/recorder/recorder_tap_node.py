@@ -39,18 +39,10 @@ def wanted_qos(publishers: Sequence[TopicEndpointInfo]) -> tuple[bool, bool]:
 
 
 class Tap:
-    """A polled subscription, and what is needed to record from it.
+    """A polled subscription, and what is needed to record from it; an ImportError if the type is not installed.
 
-    Args:
-        publishers: The topic's publishers, with their QoS.
-        before: The subscription that this one replaces; messages missed between them are counted, too.
-
-    Raises:
-        ImportError: The type of the messages is not installed.
-
-    Attributes:
-        source: The polled input; the node destroys it after ``close``.
-        announced: The session that has the topic.
+    It may replace the subscription ``before``; messages missed between them are counted, too. The node destroys
+    ``source`` after ``close``; ``announced`` is the session that has the topic.
     """
 
     def __init__(

@@ -21,14 +21,10 @@ __all__ = ["RepairReport", "message_type_of", "repair_bag"]
 
 @dataclass(slots=True)
 class RepairReport:
-    """What a repair found and did.
+    """What a repair found and did to the bag that is now at ``path``.
 
-    Args:
-        damage: What was wrong, one sentence each; empty for a sound bag.
-        messages: Topic -> number of messages saved.
-        original: Where the broken bag is now; ``None`` if nothing was repaired.
-        kept: Attachments and metadata of other writers, by name.
-        left_out: What was not copied, one sentence each.
+    ``damage`` and ``left_out`` are sentences, ``messages`` counts the saved ones by topic, ``kept`` names attachments
+    and metadata of other writers; ``original`` is where the broken bag is now, None if nothing was repaired.
     """
 
     path: Path
@@ -105,7 +101,6 @@ def repair_bag(
 
 
 def _copy(sources: list[Source], hashes: dict[str, str], writer: BagWriter) -> list[str]:
-    """Copy everything; return what could not be copied, in sentences."""
     left_out: list[str] = []
     for source in sources:
         streams: dict[int, Stream] = {}

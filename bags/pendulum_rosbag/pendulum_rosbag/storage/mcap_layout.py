@@ -253,7 +253,6 @@ class McapLayout:
             raise OSError(28, "No space left on device")  # (only when staged chunks could not be settled)
 
     def _fill_slot(self, slot: _Slot) -> bool:
-        """Update a slot; False if it is too small."""
         summary = self.summary
         description = summary.description
         body: bytes | bytearray
