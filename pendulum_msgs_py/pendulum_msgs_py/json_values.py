@@ -27,11 +27,8 @@ def without_nan(value: Any) -> Any:
 
 
 def _key(key: Any) -> Any:
-    return (
-        key
-        if isinstance(key, str | int) or key is None or (isinstance(key, float) and math.isfinite(key))
-        else str(key)
-    )
+    plain = isinstance(key, str | int) or key is None or (isinstance(key, float) and math.isfinite(key))
+    return key if plain else str(key)
 
 
 def _plain(value: Any) -> Any:

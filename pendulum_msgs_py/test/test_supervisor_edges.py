@@ -467,7 +467,7 @@ def _wait_for(supervisor: SharedSupervisor, step: Callable[[], object]) -> threa
 
 def test_who_has_waited_for_the_supervisor_is_next(monkeypatch: pytest.MonkeyPatch) -> None:
     # Nothing but the lock's own fairness would decide else, and it has none: a plant would act once more.
-    monkeypatch.setattr(shared_supervisor, "_LONGEST_COURTESY", 60.0)
+    monkeypatch.setattr(shared_supervisor, "_LONGEST_YIELD", 60.0)
     for _ in range(20):
         supervisor = SharedSupervisor(PlantLimits(effort=(5.0,)))
         assert supervisor.arm(0, JointSample.of_one(0, 0.0, 0.0)) == ""

@@ -496,7 +496,7 @@ BAD_FILES = {
     "of_another.yaml": "/tiny_plant:\n  ros__parameters: {of_another: 1.0}\n",
 }
 BAD_PARAMETERS = [
-    (["-p", "gain:=1"], "gain is 1; expected a number >= 0; ROS tells whole numbers and decimals apart: write 1.0"),
+    (["-p", "gain:=1"], "gain is 1; expected a number >= 0; ROS distinguishes whole numbers from decimals: write 1.0"),
     (["-p", "gain:=-1.0"], "gain is -1.0 N m/rad; expected >= 0"),
     (["-p", "gain:=.nan"], "gain is nan N m/rad; expected a finite number >= 0"),
     (["-p", "gain:=abc"], "gain is 'abc'; expected a number >= 0"),

@@ -16,7 +16,7 @@ from pendulum_msgs_py.contract.values import JointCommand, JointSample, Vector
 
 __all__ = ["SharedSupervisor"]
 
-_LONGEST_COURTESY = 0.005
+_LONGEST_YIELD = 0.005
 """Longest yield of :meth:`alone` to waiting threads [s]."""
 
 
@@ -48,7 +48,7 @@ class SharedSupervisor(PlantSupervisor):
         self._counting = threading.Condition()
         self._waiting = ctypes.c_int64(0)
         self._presses: deque[tuple[int, str]] = deque()
-        self._look_for_press: Callable[[], tuple[int, str] | None] = lambda: None
+        self._poll_press: Callable[[], tuple[int, str] | None] = lambda: None
         self._newest_press: tuple[int, str] | None = None
         self._prepare = prepare
         self._withdraw = withdraw
@@ -63,15 +63,15 @@ class SharedSupervisor(PlantSupervisor):
 
     def watch_for_presses(self, look: Callable[[], tuple[int, str] | None]) -> None:
         """Poll before each step for an e-stop that did not call :meth:`e_stop`: its time [ns] and reason, or None."""
-        self._look_for_press = look
+        self._poll_press = look
 
-    def _look_then_carry_out(self) -> bool:
-        press = self._look_for_press()
+    def _poll_then_latch(self) -> bool:
+        press = self._poll_press()
         if press is not None:
             self._presses.append(press)
-        return self._carry_out_presses()
+        return self._latch_presses()
 
-    def _carry_out_presses(self) -> bool:
+    def _latch_presses(self) -> bool:
         """Latch pending e-stops, whose own threads may not have run yet; return whether there were any."""
         pressed = bool(self._presses)
         while self._presses:
@@ -84,12 +84,12 @@ class SharedSupervisor(PlantSupervisor):
     def alone(self) -> Iterator[None]:
         """Hold the supervisor exclusively; waiting threads run next."""
         with self._lock:
-            self._look_then_carry_out()
+            self._poll_then_latch()
             yield
         # Python locks are unfair: without this yield a waiting disarm loses a period.
         if self._waiting.value:
             with self._counting:
-                self._counting.wait_for(lambda: not self._waiting.value, _LONGEST_COURTESY)
+                self._counting.wait_for(lambda: not self._waiting.value, _LONGEST_YIELD)
 
     @contextlib.contextmanager
     def _in_turn(self) -> Iterator[bool]:
@@ -98,7 +98,7 @@ class SharedSupervisor(PlantSupervisor):
             self._waiting.value += 1
         try:
             with self._lock:
-                yield self._look_then_carry_out()
+                yield self._poll_then_latch()
         finally:
             with self._counting:
                 self._waiting.value -= 1
@@ -107,7 +107,7 @@ class SharedSupervisor(PlantSupervisor):
     def offer(self, kind: Input, command: JointCommand | None, now_ns: int, problem: str = "") -> Refusal | None:
         """Offer a message of an input."""
         with self._lock:
-            self._carry_out_presses()
+            self._latch_presses()
             return super().offer(kind, command, now_ns, problem)
 
     def set_commander_conflict(self, conflict: str) -> None:
@@ -176,11 +176,11 @@ class SharedSupervisor(PlantSupervisor):
     def decide(self, now_ns: int, sample: JointSample | None) -> Drive:
         """Return the drive until the next decision."""
         with self._lock:
-            self._look_then_carry_out()
+            self._poll_then_latch()
             return super().decide(now_ns, sample)
 
     def report_applied(self, effort: Vector) -> None:
         """Record the applied efforts."""
         with self._lock:
-            self._carry_out_presses()
+            self._latch_presses()
             super().report_applied(effort)

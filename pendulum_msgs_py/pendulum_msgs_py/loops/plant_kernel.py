@@ -45,7 +45,7 @@ _IS_READ = -1
 
 
 @compiled
-def _somebody_waits(s: Any) -> Any:
+def _thread_waits(s: Any) -> Any:
     copy(s.waiting.ctypes.data, s.waiting_at, 8)
     return s.waiting[0] != 0
 
@@ -133,7 +133,7 @@ def plant_loop(layout: Any, step: Any) -> Any:
             deadline_ns = s.now_ns + s.period_ns
             sleep_until(s.time, deadline_ns - s.wall_ahead_ns)
             late_ns = _time_ns(s) - deadline_ns
-            if late_ns < 0 or late_ns >= s.period_ns or _somebody_waits(s):
+            if late_ns < 0 or late_ns >= s.period_ns or _thread_waits(s):
                 return UNUSUAL
             if is_called(s.time, s.calls):
                 return ENDED
@@ -149,7 +149,7 @@ def plant_loop(layout: Any, step: Any) -> Any:
     @compiled
     def in_lockstep(s: Any) -> Any:
         while True:
-            if _somebody_waits(s):
+            if _thread_waits(s):
                 return UNUSUAL
             waits = _take_inputs(s)
             if waits != _IS_READ:

@@ -97,7 +97,7 @@ class _Answers:
             self._gone_guid = _guid(header)
 
     def _follows_gone(self, header: Any) -> bool:
-        """Return whether a request is an earlier one of a client that has just been waited for in vain."""
+        """Return whether a gone client sent this request after the one that was waited for in vain."""
         if self._gone is None or header.source_timestamp > self._gone_ns or _guid(header) != self._gone_guid:
             return False
         return 0 < header.request_id.sequence_number - self._gone <= _FARTHEST

@@ -58,7 +58,10 @@ class DirectTopics:
         self._handles: list[Any] = []
 
     def add_input(self, record: NDArray[Any], subscription: Subscription, most: int) -> None:
-        """Write a subscription without executor into a record of ``INPUT``; one poll takes ``most`` messages."""
+        """Write a subscription without executor into a record of ``INPUT``, which must outlive this.
+
+        One poll takes ``most`` messages.
+        """
         record["subscription"] = subscription.handle.pointer
         record["most"] = most
         _allocate(_message_in(record), MOST_BYTES)

@@ -112,7 +112,7 @@ def check_closed(domain: int) -> None:
     if number > most:
         raise FaultError(
             f"this program is number {number} of ROS domain {domain} on this machine; expected at most {most}, since "
-            "those beyond find nobody: end some of them, or choose another domain (ROS_DOMAIN_ID)"
+            "those beyond are not discovered: end some of them, or choose another domain (ROS_DOMAIN_ID)"
         )
 
 
@@ -125,7 +125,7 @@ def participant_number(ports: Iterable[int], domain: int) -> int:
 def _most_participants() -> int:
     found = re.search(r"<maxInitialPeersRange>(\d+)<", _LOOPBACK.read_text(encoding="utf-8"))
     if found is None:
-        raise FaultError(f"{_LOOPBACK} says nothing of maxInitialPeersRange; expected it as it was installed")
+        raise FaultError(f"{_LOOPBACK} has no maxInitialPeersRange; expected the installed file")
     return int(found.group(1))
 
 

@@ -66,7 +66,7 @@ class NodeParameters:
             given = node._parameter_overrides.get(spec.name)
             value = given.value if given is not None else "of another type"
             decimals = _as_decimals(spec, value)
-            hint = f"; ROS tells whole numbers and decimals apart: write {decimals}" if decimals else ""
+            hint = f"; ROS distinguishes whole numbers from decimals: write {decimals}" if decimals else ""
             raise ParameterError(
                 f"{spec.name} is {_plain(value)!r}; expected {TYPE_NAMES[type(spec.default)]} {spec.domain}".rstrip()
                 + hint

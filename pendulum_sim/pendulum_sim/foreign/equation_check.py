@@ -217,10 +217,7 @@ def check_recording(position: Array, velocity: Array, effort: Array, equation: J
     runs.coarse = runs.traces
     if not traces:
         return np.empty((0, position.shape[1]))
-    runs.scales[_FULL] = (
-        np.max([np.max(np.abs(t.position - t.position[0]), axis=0) for t in traces], axis=0),
-        np.max([np.max(np.abs(t.velocity - t.velocity[0]), axis=0) for t in traces], axis=0),
-    )
+    runs.scales[_FULL] = _motion(traces)
     return np.array([_error(runs, i, trace) for i, trace in enumerate(traces)])
 
 
@@ -272,11 +269,14 @@ def _add(runs: _Runs, equation: JointPlant, coarse: JointPlant | None, probes: S
     runs.traces += traces
     runs.coarse += traces if coarse is None else [_run(coarse, probe, count) for probe in probes]
     for kind in dict.fromkeys(probe.kind for probe in probes):
-        of_kind = [trace for probe, trace in zip(probes, traces, strict=True) if probe.kind == kind]
-        runs.scales[kind] = (
-            np.max([np.max(np.abs(t.position - t.position[0]), axis=0) for t in of_kind], axis=0),
-            np.max([np.max(np.abs(t.velocity - t.velocity[0]), axis=0) for t in of_kind], axis=0),
-        )
+        runs.scales[kind] = _motion([t for probe, t in zip(probes, traces, strict=True) if probe.kind == kind])
+
+
+def _motion(traces: Sequence[_Trace]) -> tuple[Array, Array]:
+    return (
+        np.max([np.max(np.abs(t.position - t.position[0]), axis=0) for t in traces], axis=0),
+        np.max([np.max(np.abs(t.velocity - t.velocity[0]), axis=0) for t in traces], axis=0),
+    )
 
 
 def _run(plant: JointPlant, probe: _Probe, count: int) -> _Trace:

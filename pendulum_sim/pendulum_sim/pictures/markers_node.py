@@ -28,7 +28,7 @@ from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_msgs_py.ros.timers import create_wall_timer
 from pendulum_sim.pictures.joint_frames import across, full_effort
-from pendulum_sim.pictures.shown_plant import shown_pendulum, told_mechanism
+from pendulum_sim.pictures.shown_plant import described_mechanism, shown_pendulum
 from pendulum_sim.pictures.shown_torques import SHOWN_TOPICS, ShownTorques
 
 __all__ = ["SPECS", "MarkersNode", "arc_points", "arrow_points", "joint_marker", "main"]
@@ -89,7 +89,7 @@ class MarkersNode(Node):
         super().__init__("markers")
         self._settings = NodeParameters(self, SPECS)
         self._torques = ShownTorques()
-        self._told = ""
+        self._description = ""
         self._mechanism: PlantParameters | None = None
         self._publisher = self.create_publisher(MarkerArray, "markers", qos.TRAJECTORY)
         self.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)
@@ -109,8 +109,8 @@ class MarkersNode(Node):
         space = self.get_namespace()
         self._torques.mode = plant_mode(message, space) or self._torques.mode
         description = plant_value(message, space, PLANT_PARAMETERS)
-        if description and description != self._told:
-            self._told, self._mechanism = description, told_mechanism(description)
+        if description and description != self._description:
+            self._description, self._mechanism = description, described_mechanism(description)
 
     def _publish(self) -> None:
         newest = self._torques.newest_ns

@@ -199,6 +199,6 @@ class PlantPicture(Picture):
 
 
 def seen_from_the_side(mechanism: Mechanism, point: Point) -> tuple[float, float]:
-    """Return a point's place in a picture, to the right and up [m]; a spatial plant is seen from above."""
+    """Return a point's place in a picture, to the right and up [m]; a spatial plant is seen from slightly above."""
     x, y, z = point
     return (x, z * math.cos(_TILT) + y * math.sin(_TILT)) if mechanism.name == "furuta" else (x, z)

@@ -8,7 +8,7 @@ from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.plants.plant_differences import read_plants
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
 
-__all__ = ["ShownPlant", "shown_pendulum", "told_mechanism"]
+__all__ = ["ShownPlant", "described_mechanism", "shown_pendulum"]
 
 
 class ShownPlant:
@@ -25,7 +25,7 @@ class ShownPlant:
         self._pendulum = pendulum
         self._topic = topic
         self._named: tuple[str, ...] | None = None
-        self._told = ""
+        self._description = ""
 
     @property
     def missing(self) -> str:
@@ -48,13 +48,13 @@ class ShownPlant:
 
     def take_description(self, text: str) -> None:
         """Take the plant's description from its diagnostics; a ParameterError for other text."""
-        if text and text != self._told:
-            self._told = text
+        if text and text != self._description:
+            self._description = text
             self._find()
 
     def _find(self) -> None:
-        told = told_mechanism(self._told)
-        found = self._pendulum if len(self.joints) == 1 else told
+        described = described_mechanism(self._description)
+        found = self._pendulum if len(self.joints) == 1 else described
         # A description of other joints is that of an earlier or later plant.
         self.parameters = found if found is not None and found.coordinates.names == self.joints else None
 
@@ -64,7 +64,7 @@ def shown_pendulum(effort_scale: float) -> PlantParameters:
     return pendulum_plant(1.0, 0.0, 1.0, effort_limit=effort_scale)
 
 
-def told_mechanism(text: str) -> PlantParameters | None:
+def described_mechanism(text: str) -> PlantParameters | None:
     """Return the plant of several joints in a description, or None; a ParameterError for other text."""
     plants = read_plants(text) if text else ()
     return next((plant for plant in plants if not plant.is_pendulum), None)

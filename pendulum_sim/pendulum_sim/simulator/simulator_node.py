@@ -93,7 +93,7 @@ class SimulatorNode(PollingNode):
         parameters = self._plant.parameters
         self._dt = self._plant.dt
         period_ns = round(self._dt * NANOSECONDS)
-        self._told_plant = describe_plants([] if self._simulation.sealed else [parameters])
+        self._plant_description = describe_plants([] if self._simulation.sealed else [parameters])
         self._servo = PositionServo(parameters, self._dt) if parameters.is_pendulum else None
         self._failure = ""
         starts, sensor_noise = np.random.default_rng(values["seed"]).spawn(2)
@@ -146,7 +146,7 @@ class SimulatorNode(PollingNode):
         else:
             self._loop = RealtimeLoop(self._interface, self._advance, self._statistics, wall)
             self._stamp_ns = wall()
-        self._loop.compiled, self._told_loop = self._compile(period_ns)
+        self._loop.compiled, self._loop_text = self._compile(period_ns)
         self._loop.paused = values["paused"]
         self._restart(*self._start_state(values))
         if values["armed_at_start"]:
@@ -380,10 +380,10 @@ class SimulatorNode(PollingNode):
         values = self._settings.values
         figures: dict[str, object] = {
             "plant": self._simulation.name,
-            PLANT_PARAMETERS: self._told_plant,
+            PLANT_PARAMETERS: self._plant_description,
             "method": self._simulation.method,
             "clock": values["clock"],
-            "loop": self._told_loop,
+            "loop": self._loop_text,
             "paused": self._loop.paused,
             "samples_dropped": self._sensors.dropped,
         }
