@@ -58,14 +58,5 @@ class McapTopics:
         """Return the description of a channel, with the number of its messages."""
         schema, topic, encoding, metadata = self.channels[channel]
         name, schema_encoding, definition = self.schemas.get(schema, ("", "", ""))
-        return Stream(
-            channel,
-            topic,
-            name,
-            count,
-            definition,
-            schema_encoding,
-            metadata.get("topic_type_hash", ""),
-            qos=metadata.get("offered_qos_profiles", ""),
-            serialization=encoding,
-        )
+        type_hash, qos = metadata.get("topic_type_hash", ""), metadata.get("offered_qos_profiles", "")
+        return Stream(channel, topic, name, count, definition, schema_encoding, type_hash, qos, encoding)

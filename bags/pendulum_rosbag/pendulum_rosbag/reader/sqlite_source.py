@@ -190,19 +190,10 @@ class SqliteSource:
             ):
                 raise BagError(f"{self.path}: topic {item.get('name')!r} is described by values that are no text")
             encoding, text = definitions.get(item["type"], ("", ""))
-            streams.append(
-                Stream(
-                    item["id"],
-                    item["name"],
-                    item["type"],
-                    counts.get(item["id"], 0),
-                    text,
-                    encoding,
-                    item.get("type_description_hash", ""),
-                    item.get("offered_qos_profiles", ""),
-                    item["serialization_format"],
-                )
-            )
+            channel, count = item["id"], counts.get(item["id"], 0)
+            type_hash, qos = item.get("type_description_hash", ""), item.get("offered_qos_profiles", "")
+            known = (item["name"], item["type"], count, text, encoding, type_hash, qos, item["serialization_format"])
+            streams.append(Stream(channel, *known))
         return streams
 
     def custom_metadata(self) -> str:

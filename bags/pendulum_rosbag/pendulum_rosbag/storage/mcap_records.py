@@ -148,17 +148,9 @@ def statistics_record(
     channel_counts: Mapping[int, int],
 ) -> bytes:
     """Return counts and time span of the file."""
-    head = _STATISTICS.pack(
-        message_count,
-        schema_count,
-        len(channel_counts),
-        attachment_count,
-        metadata_count,
-        chunk_count,
-        start_ns,
-        stop_ns,
-        10 * len(channel_counts),
-    )
+    channels = len(channel_counts)
+    counts = (message_count, schema_count, channels, attachment_count, metadata_count, chunk_count)
+    head = _STATISTICS.pack(*counts, start_ns, stop_ns, 10 * channels)
     return record(STATISTICS, head + b"".join(struct.pack("<HQ", *item) for item in channel_counts.items()))
 
 
