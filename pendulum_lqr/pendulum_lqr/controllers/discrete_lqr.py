@@ -1,4 +1,4 @@
-"""Discrete LQR of any number of joints for the sampled loop, with the efforts that are on their way as states."""
+"""Discrete LQR of any number of joints, with the efforts in transit as states."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ _LAGGED, _PENDING = range(2)
 
 
 class SampledFeedback(LinearFeedback):
-    """Feedback of the sampled model's state: of what is measured, of what is hidden, and of efforts on their way.
+    """Feedback of the sampled model's state: measured and hidden states, and efforts in transit.
 
-    What is on its way, and what has come of it behind a lag, follows from what was sent, limits included.
+    Efforts in transit, and their effect behind a lag, follow from those sent, after limits.
 
     Attributes:
-        observer: Estimates the state; None where it is measured, and nothing is on its way.
+        observer: Estimates the state; None if all states are measured and no effort is in transit.
     """
 
     PREDICTS = True
     SETTLES_BY = "the loop is predicted"
     NOISE: ClassVar[Mapping[str, Any]] = {}
-    """What the estimate expects of noise, where no parameter says so; empty to take what is measured as it is."""
+    """Noise assumed by the estimate, without parameters for it; empty to use measurements unfiltered."""
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         super().__init__(plant, period, p)
@@ -72,7 +72,7 @@ class SampledFeedback(LinearFeedback):
         return efforts
 
     def _beyond(self, state: Array, held: Array) -> Array:
-        """Return the efforts beyond those that hold, for a state of the sampled model, limits left out, shape (m,)."""
+        """Return the efforts beyond the holding ones for a state of the sampled model, without limits, shape (m,)."""
         return np.asarray(-(self.gain.K @ state))
 
     def take_over(self, previous: Controller) -> None:
@@ -86,9 +86,9 @@ class SampledFeedback(LinearFeedback):
 def discrete_lqr_law(
     _t: float, angle: float, velocity: float, memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return u* - K [x - x*; lagged; on their way] within the limit [N m], as a :data:`.law.Law`.
+    """Return u* - K [x - x*; lagged; in transit] within the limit [N m], as a :data:`.law.Law`.
 
-    It remembers the lagged torque and those on their way, oldest first, as deviations from the one that holds [N m].
+    Its memory has the lagged torque and those in transit, oldest first, as deviations from the holding one [N m].
     """
     error = deviation(angle, numbers[SET_POINT])
     lags = numbers[_LAGS] != 0.0
@@ -101,7 +101,7 @@ def discrete_lqr_law(
         wanted -= numbers[_PENDING_GAIN + k] * memory[_PENDING + k]
         lagged += numbers[_PENDING_SHARE + k] * memory[_PENDING + k]
     effort = clamped(wanted, numbers[EFFORT_LIMIT])
-    # What is on its way is what was sent, limits included, as a deviation from the torque that holds.
+    # In transit is what was sent, after limits, as a deviation from the holding torque.
     sent = effort - numbers[_EQUILIBRIUM]
     if lags:
         memory[_LAGGED] = lagged + numbers[_SENT_SHARE] * sent
@@ -113,7 +113,7 @@ def discrete_lqr_law(
 
 
 class DiscreteLqr(SampledFeedback):
-    """Discrete LQR with delay compensation: u = u* - K [x - x*; lagged; on their way, oldest first], held."""
+    """Discrete LQR with delay compensation: u = u* - K [x - x*; lagged; in transit, oldest first], held."""
 
     SUMMARY = "discrete LQR for zero-order hold, with compensation of lag and delay"
 
@@ -138,7 +138,7 @@ class DiscreteLqr(SampledFeedback):
         shares = A[2, 3:] if lags else np.zeros(pending)
         numbers = (self.hold[0], equilibrium, K[0], K[1], lags, lag_gain, lag_share, sent_share, pending)
         weights = (*K[len(K) - pending :], *unused, *shares, *unused)
-        # No torque in the lag and none on its way.
+        # No torque in the lag or in transit.
         self._be_law(discrete_lqr_law, (*numbers, *weights), [-equilibrium] * (1 + pending))
 
     @classmethod
@@ -148,11 +148,11 @@ class DiscreteLqr(SampledFeedback):
         return (DELAY, ParameterSpec("cost", "sampled", "", meaning, choices=("sampled", "sum")))
 
     def describe(self) -> str:
-        """Return gain and efforts on their way."""
+        """Return gain and number of efforts in transit."""
         return f"{super().describe()}, {self.sampled.pending} efforts on their way"
 
     def take_over(self, previous: Controller) -> None:
-        """Take over the efforts on their way."""
+        """Take over the efforts in transit."""
         super().take_over(previous)
         if isinstance(previous, DiscreteLqr) and self.law is not None is not previous.law:
             shift = previous.numbers[_EQUILIBRIUM] - self.numbers[_EQUILIBRIUM]

@@ -19,19 +19,19 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["EnergySwingUp"]
 
 _REST = 0.02
-"""Velocity below which the pendulum may be held by dry friction [rad/s]."""
+"""Velocity below which dry friction may hold the pendulum [rad/s]."""
 
 
 class EnergySwingUp(CatchingController):
     """Pumps energy until the set-point is within reach, then hands over to an LQR.
 
-    Pumping torque: u = clamp(k (E* (1 + margin) - E) theta_dot + b theta_dot + tau_C sgn(theta_dot) - tau_0), with
-    E = M theta_dot^2 / 2 + G (1 - cos(theta - theta_0)) and E* that of rest at the set-point; theta_0 and tau_0 are the
-    plant's offsets. Its first part is passive; the other two compensate friction. At rest, where the velocity gives no
-    direction and dry friction holds more than it takes in motion, it pushes at the limit where gravity pulls.
+    Pumping torque: u = clamp(k (E* (1 + margin) - E) theta_dot + b theta_dot + tau_C sgn(theta_dot) - tau_0), with E =
+    M theta_dot^2 / 2 + G (1 - cos(theta - theta_0)) and E* that of rest at the set-point; theta_0 and tau_0 are the
+    plant's offsets. Its first part is passive; the others compensate friction. At rest, where the velocity gives no
+    direction and static friction is larger, it pushes at the limit in the direction of gravity.
 
     Raises:
-        DesignError: Dry friction holds more than the torque limit.
+        DesignError: Static friction exceeds the torque limit.
 
     Source: Astrom and Furuta, Swinging up a pendulum by energy control, Automatica 36(2), 2000, eq. 7.
     """
@@ -80,7 +80,7 @@ class EnergySwingUp(CatchingController):
         plant = self._plant
         angle -= plant.angle_offset
         if abs(velocity) < _REST:
-            # Where gravity pulls neither way, at the bottom, either side will do.
+            # At the bottom, without a pull of gravity, either side is suitable.
             pull = plant.gravity * math.sin(angle) + plant.torque_offset
             return math.copysign(self.effort_limit, pull)
         energy = 0.5 * plant.inertia * velocity * velocity + plant.gravity * (1.0 + math.cos(angle))
@@ -88,7 +88,7 @@ class EnergySwingUp(CatchingController):
         return self.gain * (self._target * (1.0 + self._margin.value) - energy) * velocity + friction
 
     def take_over(self, previous: Controller) -> None:
-        """Take over what was learnt, and whether the LQR is in charge."""
+        """Take over the margin, and whether the LQR is in charge."""
         super().take_over(previous)
         if isinstance(previous, EnergySwingUp):
             self._margin.take_over(previous._margin)

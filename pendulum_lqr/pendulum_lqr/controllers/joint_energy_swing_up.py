@@ -21,20 +21,14 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["JointEnergySwingUp"]
 
 _REST = 0.1
-"""Velocity below which nothing is learnt of where the pendulum turns back [rad/s]."""
+"""Velocity below which the margin does not adapt [rad/s]."""
 
 
 class JointEnergySwingUp(Controller):
     """Pumps energy into a pendulum by moving its hinge until the LQR can catch it.
 
-    The energy is that of :mod:`pendulum_lqr.swing_up.mechanism_pump`.
-    Nothing is planned, and a command takes microseconds: it starts from any state, also after a push.
-
-    Args:
-        plant: The plant.
-        pump: The pumping law.
-        margin: Target energy beyond that of upright, as a share of it [-].
-        catch: LQR with its sampled region.
+    The law is that of :mod:`pendulum_lqr.swing_up.mechanism_pump`. It plans nothing, and a command takes microseconds:
+    it starts from any state, also after a push. ``margin`` is the target energy beyond upright, as a share of it [-].
     """
 
     SUMMARY = "swing-up by energy from anywhere, then LQR; for a pendulum whose hinge is driven"
@@ -50,11 +44,7 @@ class JointEnergySwingUp(Controller):
 
     @classmethod
     def parameters(cls, plant: PlantParameters) -> tuple[ParameterSpec, ...]:
-        """Return gains, with those of the mechanism as defaults, and what the LQR takes.
-
-        Raises:
-            DesignError: The plant cannot be swung up so.
-        """
+        """Return gains, with the mechanism's defaults, and LQR parameters; DesignError if not supported."""
         gains = pump_gains(plant)
         joint = _driven(plant)
         q, r = plant.mechanism.weights
@@ -79,7 +69,7 @@ class JointEnergySwingUp(Controller):
         """Return the controller; its region takes a second to sample.
 
         Raises:
-            DesignError: The plant cannot be swung up so, or its LQR catches nothing.
+            DesignError: The plant is not supported, or its LQR catches nothing.
         """
         (limit,) = joint_limits(plant, p["effort_limit"])
         joint, (index,) = _driven(plant), plant.coordinates.driven
@@ -115,14 +105,14 @@ class JointEnergySwingUp(Controller):
         return (self.pump.effort(position, velocity, self.margin.value),)
 
     def describe(self) -> str:
-        """Return how far the driven joint goes, and from where the LQR catches."""
+        """Return the reach of the driven joint, and the LQR's region."""
         joint = self._coordinates.joints[self._coordinates.driven[0]]
         within = f" within {self.pump.reach:.3g} {joint.unit}" if math.isfinite(self.pump.reach) else ""
         K = ", ".join(f"{value:.4g}" for value in self.catch.gain.K)
         return f"pumps by {joint.name}{within}, LQR K = [{K}] within {self.catch.region.describe()}"
 
     def take_over(self, previous: Controller) -> None:
-        """Take over what was learnt, and whether the LQR is in charge."""
+        """Take over the margin, and whether the LQR is in charge."""
         if isinstance(previous, JointEnergySwingUp):
             self.margin.take_over(previous.margin)
             self.catch.active = previous.catch.active
@@ -134,7 +124,7 @@ def _driven(plant: PlantParameters) -> Any:
 
 
 def _bounded(plant: PlantParameters, reach: float) -> PlantParameters:
-    """Return the plant with stops where its driven joint may not go farther."""
+    """Return the plant with stops at the reach of its driven joint."""
     if not math.isfinite(reach):
         return plant
     (index,) = plant.coordinates.driven

@@ -1,4 +1,4 @@
-"""Swing-up of several joints that is planned when the controller starts: iterative LQR, TVLQR along it, then LQR."""
+"""Swing-up of several joints planned at start: iterative LQR, TVLQR along it, then LQR."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ _WEIGHTS = IlqrWeights(far=1.0, energy=0.0, effort=0.02, rate=1e-4, velocity=5e-
 
 
 class JointIlqr(JointSwingUp):
-    """From hanging along the cheapest swing-up that iterative LQR makes of some random guesses.
+    """From hanging along the cheapest swing-up found by iterative LQR from random guesses.
 
-    It is searched once, while the controller is designed: nothing is planned while the plant moves.
+    The search runs once, at design: nothing is planned while the plant moves.
 
     Raises:
-        ParameterError: A passive joint has dry friction, or no guess ends upright under the limits and between the end
-            stops.
+        ParameterError: A passive joint has dry friction, or no guess ends upright within limits and end stops.
     """
 
     SUMMARY = "swing-up planned by iterative LQR when it starts, followed by TVLQR, then LQR"
@@ -35,7 +34,7 @@ class JointIlqr(JointSwingUp):
 
     @classmethod
     def parameters(cls, plant: PlantParameters) -> tuple[ParameterSpec, ...]:
-        """Return what the search takes, and the limit."""
+        """Return parameters of the search, and the limit."""
         return (
             ParameterSpec(
                 "guesses", 16, "-", "Random guesses from which a swing-up is searched.", minimum=1, maximum=1000

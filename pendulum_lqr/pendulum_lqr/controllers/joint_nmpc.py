@@ -1,4 +1,4 @@
-"""Nonlinear MPC of a plant of several joints: from anywhere to upright, replanned continuously, then LQR."""
+"""Nonlinear MPC of several joints: from any state to upright, replanned continuously, then LQR."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ __all__ = ["JointNmpc"]
 
 
 class JointNmpc(CaughtController):
-    """Plans by iterative LQR over 1.4 s, every 20 ms, and hands over to the LQR in the region from which it catches.
+    """Plans by iterative LQR over 1.4 s, every 20 ms, and hands over to the LQR in its region.
 
     It is compiled at design time, so that its first command is not late.
 
     Raises:
-        ParameterError: A passive joint has dry friction: plans leave it out, and no effort can compensate it there.
+        ParameterError: A passive joint has dry friction, which plans neglect and no effort can compensate.
     """
 
     SUMMARY = "nonlinear MPC by iterative LQR, then LQR; swings up from anywhere"
@@ -36,6 +36,6 @@ class JointNmpc(CaughtController):
         inner.reset()
 
     def describe(self) -> str:
-        """Return its horizon, and from where the LQR catches."""
+        """Return its horizon, and the LQR's region."""
         length = PLAN.nodes * PLAN.step
         return f"plans of {length:.3g} s by iterative LQR, then LQR within {self._inner.catch.region.describe()}"

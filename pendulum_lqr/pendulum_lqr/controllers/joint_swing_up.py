@@ -1,4 +1,4 @@
-"""Swing-up of several joints on the graph: follow a stored trajectory by TVLQR, then LQR about upright."""
+"""Swing-up of several joints on the graph: a stored trajectory by TVLQR, then LQR about upright."""
 
 from __future__ import annotations
 
@@ -29,17 +29,12 @@ _FILE = ParameterSpec(
 
 
 class CaughtController(Controller):
-    """A controller of whole states that ends with an LQR; the inner controller defines how.
-
-    Args:
-        inner: The controller.
-        period: Period at which states come [s].
-    """
+    """A controller of whole states that ends with an LQR; ``inner`` defines how. ``period`` of the states in [s]."""
 
     NAME: ClassVar[str]
-    """What it is called in refusals."""
+    """Name in refusals."""
     EVERY_STATE: ClassVar[str]
-    """What is done at every state, in refusals."""
+    """Action at every state, in refusals."""
 
     def __init__(self, inner: MechanismTvlqr | MechanismMpc, period: float) -> None:
         super().__init__(inner.plant.effort_limits)
@@ -47,7 +42,7 @@ class CaughtController(Controller):
         self._inner = inner
 
     def check(self, period: float) -> None:
-        """Refuse another period than that of the design [s], and one at which its LQR does not settle."""
+        """Refuse another period than the design's [s], and one at which its LQR does not settle."""
         require_period(self.EVERY_STATE, self.period, period)
         require_catching(self.NAME, self._inner.catch, period)
 
@@ -61,11 +56,12 @@ class CaughtController(Controller):
 
 
 class JointSwingUp(CaughtController):
-    """From hanging along a swing-up; where it is lost, no effort at all.
+    """From hanging along a swing-up; no effort once it is lost.
 
     Raises:
-        ParameterError: No swing-up is stored for this plant and none is given, its file is refused, or it is that of
-            another mechanism.
+        ParameterError: No swing-up is stored for this plant and none is given, its file is refused, or it is for
+            another
+            mechanism.
     """
 
     SUMMARY = "swing-up along the stored trajectory of a preset, or that of a file, by TVLQR, then LQR"
@@ -91,5 +87,5 @@ class JointSwingUp(CaughtController):
         return default_catch(plant), trajectory
 
     def describe(self) -> str:
-        """Return how long it swings, and from where the LQR catches."""
+        """Return the duration of the swing-up, and the LQR's region."""
         return f"swing-up of {self._duration:.3g} s by TVLQR, then LQR within {self._inner.catch.region.describe()}"

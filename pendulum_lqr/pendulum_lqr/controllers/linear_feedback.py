@@ -1,4 +1,4 @@
-"""Linear feedback about a fixed point, of any number of joints: what LQR, LQI, discrete LQR, LQG and MPC share."""
+"""Linear feedback about a fixed point, of any number of joints: common part of LQR, LQI, discrete LQR, LQG and MPC."""
 
 from __future__ import annotations
 
@@ -37,44 +37,35 @@ _SMALLER_Q = "a faster plant, or a smaller q"
 
 
 def joint_limits(plant: PlantParameters, limit: float) -> Vector:
-    """Return the largest effort of each driven joint: its own, and the controller's where that is not 0 [N m or N]."""
+    """Return the smaller of each driven joint's own limit and the controller's (0 for none) [N m or N]."""
     return tuple(min(limit or math.inf, own) for own in plant.effort_limits)
 
 
 def require_catching(controller: str, catch: MechanismCatch, period: float) -> None:
-    """Refuse an LQR that would not hold the plant upright at a period [s], lag and delay included.
-
-    Raises:
-        DesignError: It does not settle.
-    """
+    """Raise DesignError for an LQR that does not settle upright at a period [s], including lag and delay."""
     require_settling(controller, catch.plant, Feedback(catch.gain.K), period, "a faster plant")
 
 
 def gain_text(rows: Array | Iterable[Iterable[float]], digits: str = ".6f") -> str:
-    """Return the rows of a gain for a line of text."""
+    """Return the rows of a gain as text."""
     return "; ".join(", ".join(f"{value:{digits}}" for value in row) for row in np.atleast_2d(np.asarray(rows)))
 
 
 class LinearFeedback(LawController):
     """Feedback of all deviations from a fixed point that the driven joints hold, by the linear model there.
 
-    With one joint it may be a law, which runs compiled; with several it is matrices.
-
-    Args:
-        plant: The plant.
-        period: Sampling period [s].
-        p: Checked parameters.
+    With one joint it may be a law, which can run compiled; with several it uses matrices.
 
     Attributes:
-        gain: The gain, which a subclass designs.
+        gain: Gain, designed by a subclass.
         model: Linear model at the fixed point.
         hold: The m efforts that are fed forward [N m or N].
-        position: The fixed point, n values [rad or m].
+        position: Fixed point, n values [rad or m].
     """
 
     BALANCES = True
     SETTLES_BY: ClassVar[str] = ""
-    """What is done at every state, in refusals of another period; empty where the gain alone must settle."""
+    """Action at every state, in refusals of another period; empty if only the gain must settle."""
 
     gain: Gain
 
@@ -93,12 +84,12 @@ class LinearFeedback(LawController):
 
     @classmethod
     def own(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
-        """Return the parameters of this controller beyond weights, feed-forward, set-point and limit."""
+        """Return the parameters of this controller alone."""
         return ()
 
     @classmethod
     def parameters(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
-        """Return weights, with those of the plant as defaults, what is its own, feed-forward, set-point and limit."""
+        """Return weights, with the plant's defaults, own parameters, feed-forward, set-point and limit."""
         if plant is None or plant.is_pendulum:
             return (Q, R, *cls.own(plant), FEEDFORWARD)
         q, r = plant.mechanism.weights
@@ -114,21 +105,21 @@ class LinearFeedback(LawController):
         )
 
     def check(self, period: float) -> None:
-        """Refuse another period than that of the design [s], and one at which the gain does not settle.
+        """Refuse another period than the design's [s], and one at which the gain does not settle.
 
-        A plant of one joint is judged with all that stands around the controller, by who makes it.
+        For one joint, ``make_controller`` checks it together with its wrappers.
         """
         if self._plant.is_pendulum:
             return
         if self.SETTLES_BY:
             require_period(self.SETTLES_BY, self.period, period)
         if self.feedback is not None:
-            # Sums of a sample count by the period.
+            # The gain on sums depends on the period.
             name = type(self).__name__.lower()
             require_settling(name, self._plant, self._feedback(period), period, _SMALLER_Q, self.position)
 
     def _feedback(self, period: float) -> Feedback:
-        """Return what it is as a gain at a period [s]."""
+        """Return the gain at a period [s]."""
         assert self.feedback is not None
         return self.feedback
 
@@ -141,7 +132,7 @@ class LinearFeedback(LawController):
         return self._answer(self.deviation(position), velocity)
 
     def deviation(self, position: Vector) -> Vector:
-        """Return n deviations from the fixed point; only what turns is wrapped [rad or m]."""
+        """Return n deviations from the fixed point; only turning joints are wrapped [rad or m]."""
         # A list is twice as fast as a generator.
         return tuple(
             [
@@ -151,14 +142,14 @@ class LinearFeedback(LawController):
         )
 
     def _answer(self, off: Vector, velocity: Vector) -> Vector:
-        """Return the efforts for n deviations and n velocities, where no law does [N m or N]."""
+        """Return the efforts for n deviations and n velocities without a law [N m or N]."""
         raise NotImplementedError(f"{type(self).__name__}._answer")
 
     def _within(self, wanted: Iterable[float]) -> Vector:
         return within_limits(wanted, self.effort_limits)
 
     def _be_law(self, law: Law, numbers: Iterable[float], memory: Iterable[float] = ()) -> None:
-        """Be a law where the plant has one joint; its memory is that of the matrices, too."""
+        """Use a law if the plant has one joint; its memory is also that of the matrices."""
         self._use(law if len(self._offsets) == 1 else None, numbers, memory)
 
     def describe(self) -> str:

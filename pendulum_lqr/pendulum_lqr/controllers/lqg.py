@@ -1,4 +1,4 @@
-"""LQG: discrete LQR on the state that a Kalman filter estimates from what is measured; of any number of joints."""
+"""LQG of any number of joints: discrete LQR on the state estimated by a Kalman filter."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["Lqg"]
 
 _ONE_JOINT = {"position_noise": "angle_noise", "effort_noise": "torque_noise"}
-"""What these are called where a plant has one joint, which turns."""
+"""Parameter names for a plant of one joint."""
 
 
 class Lqg(SampledFeedback):
-    """Stationary LQG regulator for the whole linear model: motor, spring, lags and efforts on their way estimated."""
+    """Stationary LQG regulator for the whole linear model: estimates motor, spring, lags and efforts in transit."""
 
     SUMMARY = "LQR on the state that a Kalman filter estimates, motor, lag, delay and constant torques included"
 
@@ -28,7 +28,7 @@ class Lqg(SampledFeedback):
 
     @classmethod
     def own(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
-        """Return the noise that is expected, and the delay."""
+        """Return the assumed noise, and the delay."""
         several = plant is not None and not plant.is_pendulum
         position, speed, effort = ("", "", "") if several else ("rad", "rad/s", "N m")
         names = list(_ONE_JOINT) if several else list(_ONE_JOINT.values())

@@ -25,10 +25,7 @@ _INTEGRAL = 0
 def lqi_law(
     _t: float, angle: float, velocity: float, memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return u* - K [x - x*; integral] within the limit [N m]; see :data:`pendulum_lqr.controller_interface.law.Law`.
-
-    It remembers the integral [rad s].
-    """
+    """Return u* - K [x - x*; integral] within the limit [N m], as a :data:`.law.Law`; memory: the integral [rad s]."""
     error = deviation(angle, numbers[SET_POINT])
     integral = memory[_INTEGRAL] + numbers[_PERIOD] * error
     wanted = numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity - numbers[_KI] * integral
@@ -41,9 +38,8 @@ def lqi_law(
 class Lqi(LinearFeedback):
     """LQI: u = u* - K [q - q*, v, integrals of the driven joints' q - q*].
 
-    As many outputs as there are efforts can be brought to where they belong, whatever constant effort disturbs: those
-    of the driven joints. None winds up while its joint's effort is at its limit:
-    :func:`~pendulum_lqr.controller_interface.law.winds_up`.
+    Integrals remove the offset of as many outputs as there are efforts, here the driven joints. None winds up while its
+    joint's effort is at its limit: :func:`~pendulum_lqr.controller_interface.law.winds_up`.
     """
 
     SETTLES_BY = "it is integrated"
@@ -82,6 +78,6 @@ class Lqi(LinearFeedback):
         return efforts
 
     def take_over(self, previous: Controller) -> None:
-        """Keep the efforts that the integrals stand for, though the gain on them has changed."""
+        """Preserve the efforts of the integrals under the new gain."""
         if isinstance(previous, Lqi):
             self.memory[:] = np.linalg.solve(self._KI, previous._KI @ previous.memory).tolist()

@@ -20,7 +20,7 @@ _HOLD, _K0, _K1 = range(OWN, OWN + 3)
 def lqr_law(
     _t: float, angle: float, velocity: float, _memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return u* - K (x - x*) within the limit [N m]; see :data:`pendulum_lqr.controller_interface.law.Law`."""
+    """Return u* - K (x - x*) within the limit [N m], as a :data:`.law.Law`."""
     error = deviation(angle, numbers[SET_POINT])
     return clamped(numbers[_HOLD] - numbers[_K0] * error - numbers[_K1] * velocity, numbers[EFFORT_LIMIT])
 
@@ -28,7 +28,7 @@ def lqr_law(
 class Lqr(LinearFeedback):
     """Continuous LQR, sampled: of one joint the controller of the thesis.
 
-    Where the plant has states that are not measured, K is the best gain on positions and velocities.
+    With hidden states, K is the best gain on positions and velocities.
     """
 
     SAMPLED = False
@@ -39,7 +39,7 @@ class Lqr(LinearFeedback):
         self.gain = output_lqr(self.model, p["q"], p["r"])
         self.feedback = Feedback(self.gain.K)
         self._be_law(lqr_law, (self.hold[0], *self.gain.rows[0]))
-        # Plain floats: indexing an array on every state costs more than the law itself.
+        # Floats: indexing arrays on every state costs more than the law itself.
         self._rows = tuple(tuple(map(float, row)) for row in self.gain.rows)
         self._hold = tuple(map(float, self.hold))
 

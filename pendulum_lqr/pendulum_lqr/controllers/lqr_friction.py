@@ -1,4 +1,4 @@
-"""LQR that pays for dry friction: the friction of the way back to the set-point is fed forward, with a smooth sign."""
+"""LQR with friction compensation: dry friction is fed forward in the direction of the set-point, with a smooth sign."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ __all__ = ["LqrFriction", "lqr_friction_law"]
 _HOLD, _K0, _K1, _FRICTION, _WIDTH = range(OWN, OWN + 5)
 
 _RESERVE = 2.0
-"""Factor by which the steepest gain may still grow before the sampled loop is unstable, where it is chosen here."""
+"""Gain margin of the steepest gain for an automatic width."""
 _STEEPEST = 20.0
-"""Most times the angle's gain is raised near the set-point: beyond that, noise of the angle fills the torque."""
+"""Largest factor on the angle's gain near the set-point: beyond it, noise of the angle fills the torque."""
 _LARGEST = 0.5
-"""Most of the torque limit that friction may be fed forward with."""
+"""Largest share of the torque limit for friction feedforward."""
 
 
 def lqr_friction_law(
@@ -42,13 +42,12 @@ def lqr_friction_law(
 
 
 class LqrFriction(LawController):
-    """u = u* - K (x - x*) - c tanh((theta - theta*) / w), with c below the friction that the plant has.
+    """u = u* - K (x - x*) - c tanh((theta - theta*) / w), with c below the plant's friction.
 
-    Back to the set-point the pendulum moves against its deviation: the smooth sign is that of the way, not that of
-    the measured velocity, whose noise it would make a torque of, and which is 0 where friction holds. Near the
-    set-point the compensation is a stiffer spring, c / w; the loop has to be stable for every spring from none to that
-    one at the rate at which it runs, friction or no friction, so that less friction than was identified cannot make it
-    hunt (sector condition for a static nonlinearity, by describing function).
+    The pendulum returns against its deviation, so the sign is that of the deviation. The measured velocity's sign would
+    turn noise into torque, and is 0 where friction holds. Near the set-point the compensation is a spring, c / w. The
+    loop must be stable at its rate, without friction, for every spring from none to that one, so that less friction
+    than identified cannot cause a limit cycle (sector condition for a static nonlinearity, by describing function).
 
     Attributes:
         friction: c, torque fed forward far from the set-point [N m].
@@ -94,7 +93,7 @@ class LqrFriction(LawController):
         super().__init__(lqr_friction_law, p["effort_limit"], p["set_point"], numbers)
 
     def describe(self) -> str:
-        """Return gain, what is compensated, and what to watch for."""
+        """Return gain, compensation, and a hint on limit cycles."""
         text = f"K = [{self.gain.K[0]:.6f}, {self.gain.K[1]:.6f}]"
         if self.friction == 0.0:
             return f"{text}, no dry friction to compensate"
@@ -118,7 +117,7 @@ def _width(model: LinearModel, gain: Gain, friction: float, period: float, given
         return given
     added = (_STEEPEST - 1.0) * stiffness
     while added > 1e-3 * stiffness:
-        # The reserve is one of the whole gain on the angle: what is added, and what was there.
+        # The reserve applies to the whole gain on the angle.
         if _bears(model, gain, period, _RESERVE * (stiffness + added) - stiffness):
             return friction / added
         added *= 0.8
@@ -129,7 +128,7 @@ def _width(model: LinearModel, gain: Gain, friction: float, period: float, given
 
 
 def _bears(model: LinearModel, gain: Gain, period: float, added: float) -> bool:
-    """Return whether the sampled loop is stable with every spring from none to the one added [N m/rad]."""
+    """Return whether the sampled loop is stable with every additional spring up to the given one [N m/rad]."""
     for extra in np.linspace(0.0, added, 24):
         K = np.array([gain.K[0] + extra, gain.K[1]])
         if delayed_spectral_radius(model, K, period) >= 1.0:

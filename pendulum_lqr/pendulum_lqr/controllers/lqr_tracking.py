@@ -1,4 +1,4 @@
-"""LQR that follows a moving reference: the plant's own torque fed forward, gains scheduled over the angle."""
+"""LQR that follows a moving reference: feedforward of the plant's torque, gains scheduled over the angle."""
 
 from __future__ import annotations
 
@@ -22,24 +22,21 @@ __all__ = ["LqrTracking"]
 _GAP = 0.1
 """Time without a state after which the reference is rejoined [s]: twice a plant's timeout."""
 _LONGER = (1.0, 2.0, 4.0, 8.0, 16.0)
-"""How many times longer the way onto the reference may become where the torque does not suffice."""
+"""Factors on the transition time that are tried if the torque does not suffice."""
 _POINTS = 40
 _AGAIN = 0.1
-"""Time after which the next search for a way onto the reference starts [s]."""
+"""Interval of searches for a transition onto the reference [s]."""
 
 
 class LqrTracking(BaseController):
     """u = u_r(t) - K(theta_r) (x - x_r(t)), where u_r moves the plant along the reference without feedback.
 
-    The reference is joined from where the pendulum is, at the first state, after a gap and after an error beyond
-    ``max_error``; a change of parameters continues from the reference before it. The time of the reference is that of
-    the states' stamps.
+    Transitions join the reference from the present state at the start, after a gap and after an error beyond
+    ``max_error``; a change of parameters continues from the previous reference. Its time is that of the states' stamps.
 
     Attributes:
-        reference: What it follows.
-        schedule: Gain and feedforward over the angle.
-        margins: How stable it is; None before it was checked.
-        needed: Largest torque that the reference takes [N m].
+        margins: Stability; None before it was checked.
+        needed: Largest torque of the reference [N m].
 
     Source:
         Rugh, Shamma, Automatica 36(10), 2000 (gain scheduling, frozen parameters); Spong, Hutchinson, Vidyasagar,
@@ -84,7 +81,7 @@ class LqrTracking(BaseController):
         self._approach_time = p["approach_time"]
         self._max_error = p["max_error"]
         self._within = (1.0 - p["reserve"]) * self.effort_limit
-        # A torque acts after the delay and is held for a period: it does best as that of the middle of its interval.
+        # A torque acts after the delay and is held for a period: use that of the middle of its interval.
         self._lead = plant.transport_delay + 0.5 * period
         self.needed, at = self._most_torque()
         if self.needed > self._within:
@@ -98,7 +95,7 @@ class LqrTracking(BaseController):
 
     @classmethod
     def judged_at(cls, p: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
-        """Return the ends and the middle of the reference, each as one that rests."""
+        """Return the ends and the middle of the reference, each as a constant one."""
         ends = {wrap(p["set_point"] + side * p["amplitude"]) for side in (-1.0, 0.0, 1.0)}
         return [{"set_point": end, "amplitude": 0.0, "approach_time": 0.0} for end in sorted(ends)]
 
@@ -107,7 +104,7 @@ class LqrTracking(BaseController):
         self.margins = scheduled_margins(self._plant, period, self.reference, self.schedule)
 
     def reset(self) -> None:
-        """Forget the way onto the reference."""
+        """Forget the transition."""
         self._way: Way | None = None
         self._joined = False
         self._newest: float | None = None
@@ -116,7 +113,7 @@ class LqrTracking(BaseController):
         self.notice = ""
 
     def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the torque [N m]; 0 where the torque does not suffice to join the reference."""
+        """Return the torque [N m]; 0 if it does not suffice to join the reference."""
         angle, velocity = x[0], x[1]
         if self._newest is not None and t - self._newest > _GAP:
             self._joined, self._next_try = False, t
@@ -140,15 +137,11 @@ class LqrTracking(BaseController):
         return self._torque(t, now, wrap(angle - now.angle), velocity)
 
     def motion(self, t: float) -> Motion:
-        """Return where the pendulum should be at a time since the first state [s], the way onto the reference included.
-
-        Args:
-            t: Time [s].
-        """
+        """Return the reference at a time since the first state [s], including the transition."""
         return self._motion_by(self._way, t)
 
     def take_over(self, previous: Controller) -> None:
-        """Continue from the reference before this one, so that neither it nor the torque jumps."""
+        """Continue from the previous reference, so that neither it nor the torque jumps."""
         if not isinstance(previous, LqrTracking) or previous._newest is None:
             return
         self._newest, self._lost, self.notice = previous._newest, previous._lost, previous.notice
@@ -159,7 +152,7 @@ class LqrTracking(BaseController):
         self._joined = True
 
     def describe(self) -> str:
-        """Return the reference, the gains at its ends, the torque that it takes, and how stable it is."""
+        """Return reference, gains at its ends, torque and stability."""
         reference = self.reference
         low, high = reference.centre - reference.amplitude, reference.centre + reference.amplitude
         gains = ", ".join(f"[{k0:.6f}, {k1:.6f}]" for k0, k1 in map(self.schedule.gain, (low, reference.centre, high)))
@@ -176,7 +169,7 @@ class LqrTracking(BaseController):
         return self.clamp(fed - k0 * error - k1 * (velocity - now.velocity))
 
     def _join(self, t: float, angle: float, velocity: float) -> None:
-        """Find a way onto the reference that begins where the pendulum is, with as little torque as possible."""
+        """Find a transition onto the reference from the present state, with as little torque as possible."""
         # At its own velocity, or at rest: sustaining a speed that damping stops within milliseconds would take torque.
         starts = [Motion(angle, velocity, 0.0), Motion(angle, 0.0, 0.0)]
         starts.sort(key=lambda start: abs(self.schedule.feedforward(start)))
@@ -196,7 +189,7 @@ class LqrTracking(BaseController):
         )
 
     def _find_way(self, t: float, starts: Sequence[Motion]) -> Way | None:
-        """Return the first way onto the reference that the torque suffices for; None where there is none."""
+        """Return the first transition for which the torque suffices, or None."""
         for start in starts:
             for longer in _LONGER:
                 way = self._way_from(t, start, longer)
@@ -229,7 +222,7 @@ class LqrTracking(BaseController):
         return True
 
     def _most_torque(self) -> tuple[float, float]:
-        """Return the largest torque that the reference itself takes [N m], and where [rad]."""
+        """Return the largest torque of the reference itself [N m], and its angle [rad]."""
         points = 200
         motions = [self.reference.at(self.reference.period * k / points) for k in range(points)]
         worst = max(motions, key=lambda motion: abs(self.schedule.feedforward(motion)))

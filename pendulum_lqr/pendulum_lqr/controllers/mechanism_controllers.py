@@ -1,4 +1,4 @@
-"""The controllers of plants of several joints, by name: each written once for any mechanism."""
+"""Controllers of plants of several joints by name, each for any mechanism."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 __all__ = ["DifferencedVelocity", "make_mechanism_controller", "mechanism_controller_names"]
 
 _CATCH_SUFFIX = "+lqr"
-"""What the name of a policy file ends with where an LQR takes over near upright."""
+"""Suffix of a policy file's name for an LQR that takes over near upright."""
 
 
 class DifferencedVelocity(Controller):
     """Gives a controller velocities from the last two positions in place of the measured ones.
 
-    The slope between two positions is the velocity in their middle; half a period of the model's acceleration brings
-    it to the end. That is exact to the period's square, and as good as the positions are: an encoder's steps over the
-    period come through as noise.
+    The slope between two positions is the velocity in their middle; half a period of the model's acceleration
+    extrapolates it to the end. That is exact to the square of the period; encoder steps over the period appear as
+    noise.
     """
 
     def __init__(self, plant: PlantParameters, inner: Controller) -> None:
@@ -80,14 +80,15 @@ def make_mechanism_controller(name: str, plant: PlantParameters, period: float) 
     """Design a controller; ilqr and mpc compile for some ten seconds the first time.
 
     Args:
-        name: Of :func:`mechanism_controller_names`, or the path of a policy file, ``FILE.npz``; of ``FILE.npz+lqr``
-            an LQR takes over near upright.
-        plant: The plant of its model.
+        name: Of :func:`mechanism_controller_names`, or the path of a policy file, ``FILE.npz``; with ``FILE.npz+lqr``
+            an LQR
+            takes over near upright.
+        plant: Plant of its model.
         period: Sampling period [s].
 
     Raises:
-        ParameterError: No controller has this name, it does not go with this plant, or the LQR that catches does not
-            settle at this period.
+        ParameterError: Unknown name, it does not fit this plant, or the LQR that catches does not settle at this
+            period.
         DataError: A policy file is refused.
     """
     file = name.removesuffix(_CATCH_SUFFIX)
@@ -97,7 +98,7 @@ def make_mechanism_controller(name: str, plant: PlantParameters, period: float) 
         check_policy_period(policy, period)
         catch = make_mechanism_catch(plant, *CALM_WEIGHTS) if file != name else None
         hold = states_to_hold(policy, period)
-        # It has all of its effort from the start.
+        # Full effort from the start.
         inner = LearnedPolicy(policy, hold, plant.effort_limits, start_time=0.0, catch=catch)
         inner.check(period)
         return inner

@@ -1,4 +1,4 @@
-"""Linear MPC: LQR under limits, as a quadratic program by OSQP; of any number of joints."""
+"""Linear MPC of any number of joints: LQR under limits, as a quadratic program by OSQP."""
 
 from __future__ import annotations
 
@@ -24,23 +24,24 @@ __all__ = ["LinearMpc"]
 Array = NDArray[np.float64]
 
 _SLACK_WEIGHT = 1e4
-"""Cost high enough that an angle and its velocity stay within their limits wherever a torque can achieve that."""
+"""Cost high enough that angle and velocity stay within their limits if a torque can achieve that."""
 _DEAR = 10.0
-"""Cost of a position of several beyond its limit, in the largest weight of a deviation: a pole must not fall for a
-track's end."""
+"""Cost of exceeding a position limit of several joints, relative to the largest weight: a pole must not fall for a
+track's end.
+"""
 _KEPT_CLEAR = 0.95
-"""Share of the way to an end stop that a plan may use."""
+"""Usable share of the way to an end stop."""
 _NOISE = {"position_noise": 2e-4, "velocity_noise": 1e-2, "effort_noise": 1.0}
-"""What the filter expects of encoder, velocity and unknown effort [rad, rad/s, N m]."""
+"""Assumed noise of encoder, velocity and unknown effort [rad, rad/s, N m]."""
 
 
 class LinearMpc(SampledFeedback):
     """Minimises the LQR's cost over N samples plus its cost to go, under limits of efforts and states.
 
-    The prediction is that of the whole linear model, efforts on their way included. Of one joint what is not measured
-    comes from a Kalman filter, of several it is predicted; with ``offset_noise`` constant efforts are estimated, too.
-    Without active limits the command is that of the discrete LQR. Limits of efforts are hard; those of states are soft
-    (one slack each, at a high cost): a hard state limit is infeasible once a disturbance has broken it.
+    It predicts the whole linear model with efforts in transit. Hidden states of one joint come from a Kalman filter,
+    those of several are predicted; with ``offset_noise`` constant efforts are estimated too. Without active limits it
+    equals the discrete LQR. Effort limits are hard; state limits are soft (one slack each, at a high cost), because a
+    hard one is infeasible once a disturbance has violated it.
     """
 
     SUMMARY = "linear MPC with limits of efforts and states (OSQP)"
@@ -73,13 +74,13 @@ class LinearMpc(SampledFeedback):
     def _make_observer(self, p: Mapping[str, Any]) -> Observer | None:
         if not self._plant.is_pendulum:
             return super()._make_observer({**p, **_NOISE} if p["offset_noise"] > 0.0 else p)
-        # Measured states need no filter: what they show is then what counts.
+        # Measured states need no filter.
         needed = self.model.hidden or self.sampled.pending or p["offset_noise"] > 0.0
         return super()._make_observer({**p, **_NOISE}) if needed else None
 
     @classmethod
     def own(cls, plant: PlantParameters | None) -> tuple[ParameterSpec, ...]:
-        """Return horizon, limits of states, where the plant has end stops by default, and what is estimated."""
+        """Return horizon, limits of states (by default inside end stops), and estimated offsets."""
         if plant is None or plant.is_pendulum:
             return (
                 ParameterSpec("horizon", 20, "-", "Samples of the horizon.", minimum=1, maximum=200),
@@ -98,7 +99,7 @@ class LinearMpc(SampledFeedback):
         )
 
     def _warn(self) -> None:
-        """Note that the horizon is too short, and how often the solver found no plan."""
+        """Report a horizon that is too short, and failures of the solver."""
         notices = []
         if self._program.horizon < self._enough:
             notices.append(
@@ -115,7 +116,7 @@ class LinearMpc(SampledFeedback):
         self._program.reset()
 
     def _beyond(self, state: Array, held: Array) -> Array:
-        """Return the first efforts of the plan; the LQR's where the solver finds none."""
+        """Return the first efforts of the plan; the LQR's without a solution."""
         plan = self._program.first(state, -self._limits - held, self._limits - held)
         if plan is None:
             self.failures += 1
@@ -131,13 +132,13 @@ class LinearMpc(SampledFeedback):
 
 
 def _enough_samples(A: Array) -> int:
-    """Return the samples in which what falls grows by e: behind a shorter horizon no limit of an effort is seen."""
+    """Return the samples in which a fall grows by e: a shorter horizon does not see the effort limit."""
     growth = float(np.max(np.abs(np.linalg.eigvals(A))))
     return math.floor(1.0 / math.log(growth)) if growth > 1.0 else 0
 
 
 def _within_stops(plant: PlantParameters) -> list[float]:
-    """Return how far each joint may go from upright to keep clear of its stops; 0 where it has none."""
+    """Return the largest deviation of each joint from upright to stay clear of its stops; 0 without stops."""
     widths = []
     for goal, joint in zip(plant.coordinates.goal, plant.joints, strict=True):
         ways = [abs(stop - goal) for stop in (joint.lower_stop, joint.upper_stop) if stop is not None]

@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 class NonlinearMpc(CatchingController):
     """Multiple shooting with RK4 over N steps, warm-started from the last plan; LQR takes over near upright.
 
-    Minimises the sum of h (q0 2 (1 - cos e) + q1 theta_dot^2 + r (u - u*)^2) and a terminal cost of the same form;
-    2 (1 - cos e) is e^2 near upright and periodic over turns.
+    Minimises the sum of h (q0 2 (1 - cos e) + q1 theta_dot^2 + r (u - u*)^2) and a terminal cost of the same form; 2 (1
+    - cos e) is e^2 near upright and periodic over turns.
     """
 
     SUMMARY = "nonlinear MPC by multiple shooting, swings up and balances"
@@ -55,7 +55,7 @@ class NonlinearMpc(CatchingController):
         self._plan = None
 
     def command(self, t: float, x: Sequence[float]) -> float:
-        """Return the first torque of the plan, or that of the last plan where the solver finds none [N m]."""
+        """Return the first torque of the plan, or that of the last plan without a solution [N m]."""
         if self.catch.holds(x[0], x[1]):
             self._plan = None
             return self.catch.command(x[0], x[1])
@@ -65,7 +65,7 @@ class NonlinearMpc(CatchingController):
         if np.all(np.isfinite(plan)) and float(np.max(np.abs(plan[2::3]))) <= 1.01 * self.effort_limit:
             self._plan = plan
         else:
-            # The last plan, shifted to now, is a better command than none.
+            # The last plan, shifted to now, is better than no command.
             self._failures += 1
             self.notice = f"no plan for {self._failures} states: the last plan answered"
             self._plan = guess
@@ -76,14 +76,14 @@ class NonlinearMpc(CatchingController):
         return f"horizon {self.steps} x {self.step:g} s, catch {self.catch.describe()}"
 
     def _first_guess(self, x: Sequence[float]) -> Array:
-        """Stay where it is, torque along the motion."""
+        """Return the constant state, with torque along the motion."""
         guess = np.zeros(3 * self.steps + 2)
         guess[0::3], guess[1::3] = x[0], 0.0
         guess[2::3] = 0.5 * self.effort_limit * (1.0 if x[1] >= 0.0 else -1.0)
         return guess
 
     def _shifted(self, plan: Array, x: Sequence[float]) -> Array:
-        """Return the plan one sampling period later, its angles on the turn on which the state is measured."""
+        """Return the plan one sampling period later, with angles on the measured turn."""
         shift = self.period / self.step
         guess = np.empty_like(plan)
         for offset, count in ((0, self.steps + 1), (1, self.steps + 1), (2, self.steps)):

@@ -21,7 +21,7 @@ _KP, _KD, _GRAVITY, _ANGLE_OFFSET, _OFFSET = range(OWN, OWN + 5)
 def pd_gravity_law(
     _t: float, angle: float, velocity: float, _memory: MutableSequence[float], numbers: Sequence[float]
 ) -> float:
-    """Return the weight's torque and that of the two gains within the limit [N m], as a :data:`.law.Law`."""
+    """Return gravity torque plus PD torque within the limit [N m], as a :data:`.law.Law`."""
     # sin(theta) = -sin(theta - pi)
     weight = -numbers[_GRAVITY] * math.sin(angle - numbers[_ANGLE_OFFSET]) - numbers[_OFFSET]
     error = deviation(angle, numbers[SET_POINT])
@@ -52,11 +52,11 @@ class PdGravity(LawController):
 
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         # The slowest pole of M s^2 + (b + k_d) s + k_p is placed at -bandwidth, critically damped if b allows; M and b
-        # are those of slow motion, motor and gears included.
+        # are those of slow motion, including motor and gears.
         w = p["bandwidth"]
         inertia, damping, _ = low_frequency(linearise(plant.with_values(gravity=0.0)))
         self.kd = p["kd"] if p["kd"] > 0.0 else max(0.0, 2.0 * inertia * w - damping)
-        # M w^2 - (b + k_d) w + k_p = 0; where damping is ample the other pole is faster.
+        # M w^2 - (b + k_d) w + k_p = 0; with ample damping the other pole is faster.
         self.kp = p["kp"] if p["kp"] > 0.0 else w * (damping + self.kd) - inertia * w * w
         gain = torque_gain(plant)
         numbers = (self.kp, self.kd, plant.gravity / gain, plant.angle_offset, plant.torque_offset / gain)

@@ -32,7 +32,7 @@ def pid_law(
 ) -> float:
     """Return the torque of the three terms within the limit [N m], as a :data:`.law.Law`.
 
-    It remembers the integral's torque [N m], the filtered derivative [rad/s] and the last angle [rad].
+    Its memory has the integral's torque [N m], the filtered derivative [rad/s] and the last angle [rad].
     """
     error = deviation(angle, numbers[SET_POINT])
     if not math.isnan(memory[_LAST]):
@@ -49,10 +49,9 @@ def pid_law(
 class Pid(LawController):
     """u = -(k_p e + k_i integral of e + k_d filtered derivative of theta).
 
-    The derivative is that of the angle, not of the error, so that a step of the set-point does not kick. Beyond the
-    limit the integral is led back with the time constant sqrt(T_i T_d).
-
-    Source: Astrom and Hagglund, Advanced PID Control, 2006, sections 3.3 to 3.5.
+    The derivative acts on the angle, not on the error, so that steps of the set-point do not kick. Beyond the limit,
+    back-calculation unwinds the integral with the time constant sqrt(T_i T_d). Source: Astrom and Hagglund, Advanced
+    PID Control, 2006, sections 3.3 to 3.5.
     """
 
     BALANCES = True

@@ -21,7 +21,7 @@ _LARGEST_FILE = 200_000_000
 
 
 class Playback(BaseController):
-    """Open loop: each recorded torque is held until the time of the next; zero before the first and after the last.
+    """Open loop: holds each recorded torque until the time of the next; zero before the first and after the last.
 
     Args:
         times: Times since the start, increasing, shape (n,) [s].
@@ -80,12 +80,12 @@ class Playback(BaseController):
 
     def command(self, t: float, x: Sequence[float]) -> float:
         """Return the recorded torque of this time, within the limit [N m]."""
-        # Stamps of a loop fall on the recorded times up to rounding; a hair early must not mean a sample late.
+        # Stamps equal the recorded times up to rounding, which must not cost a sample.
         index = bisect_right(self._times, t + 1e-9) - 1
         if index < 0 or t >= self._end:
             return 0.0
         return self.clamp(self._efforts[index])
 
     def describe(self) -> str:
-        """Return how much there is to play."""
+        """Return the number of torques and their duration."""
         return f"{len(self._times)} torques over {self._end - self._times[0]:.3f} s"

@@ -1,4 +1,4 @@
-"""A learned policy from a file, for a plant of any number of joints, with a fallback where it was never trained."""
+"""A learned policy from a file, for any number of joints, with a fallback outside its training."""
 
 from __future__ import annotations
 
@@ -33,21 +33,19 @@ _LQR = (ZERO, "lqr")
 class LearnedPolicy(Controller):
     """Runs the network of a policy file, at the policy's own period.
 
-    Where states come a whole number of times as often as the policy was trained for, each of its commands holds for as
-    many states. Outside of the box of states that training visited, or where the network's output is not finite, it
-    gives up: the fallback commands from then on, until the next start.
-
-    Its efforts, and its fallback's, begin at zero and may reach the limit after ``start_time``: a swing-up from hanging
-    needs much at once, which a plant refuses at the start (``start_effort_limit``, arming, position control).
+    Each command holds for a whole number of states if they come faster than in training. Outside the trained box of
+    states, or if the network's output is not finite, it gives up: the fallback commands until the next start. Its own
+    and the fallback's efforts are limited by a ramp over ``start_time``: a swing-up from hanging needs much effort at
+    once, which a plant refuses at the start (``start_effort_limit``, arming, position control).
 
     Args:
-        policy: The policy.
-        hold: States for which a command holds.
+        policy: Policy.
+        hold: States per command.
         effort_limits: Largest effort of each driven joint [N m or N].
-        fallback: Controller that takes over after it gave up; None for no effort.
-        start_time: Time from the first state until it has all of its effort [s].
-        catch: LQR that takes over near upright, of a plant of several joints; None for none.
-        plant: The plant that the fallback is checked with; None for that of the policy.
+        fallback: Controller after it gave up; None for no effort.
+        start_time: Time from the first state to full effort [s].
+        catch: LQR that takes over near upright, for several joints, or None.
+        plant: Plant with which the fallback is checked; None for that of the policy.
     """
 
     STARTS_SOFTLY = True  # it observes its own last effort, so it applies the limit itself
@@ -109,7 +107,7 @@ class LearnedPolicy(Controller):
 
     @property
     def notice(self) -> str:
-        """Why it gave up; empty as long as it did not."""
+        """Why it gave up, or empty."""
         return self._answers.notice
 
     @notice.setter
@@ -117,7 +115,7 @@ class LearnedPolicy(Controller):
         self._answers.notice = text
 
     def check(self, period: float) -> None:
-        """Refuse a period that the policy's is no multiple of, and at which catch or fallback do not settle [s]."""
+        """Refuse a period that is no whole fraction of the policy's, or at which catch or fallback are unstable [s]."""
         check_policy_period(self.policy, period)
         if self.catch is not None:
             require_catching("policy", self.catch, period)
@@ -127,7 +125,7 @@ class LearnedPolicy(Controller):
                 require_stable("the fallback", self.fallback, self.plant, period)
 
     def reset(self) -> None:
-        """Forget the past, and that it gave up."""
+        """Forget the past, including having given up."""
         self._answers.reset()
         if self.catch is not None:
             self.catch.active = False
@@ -144,19 +142,19 @@ class LearnedPolicy(Controller):
         elif self.catch is not None:
             x = deviation_of(self.policy.coordinates, position + velocity)
             if self.catch.holds(x):
-                # The network's samples hold the efforts that act: it may have to continue from here.
+                # The network's samples contain the applied efforts: it may have to continue from here.
                 efforts = self._answers.begun(t, self.catch.command(x))
                 self._answers.follow(efforts)
         return efforts
 
     def describe(self) -> str:
-        """Return which policy it is, what catches, and whether it gave up."""
+        """Return policy, catch, and whether it gave up."""
         nothing = "zero torque" if self.plant.is_pendulum else "no effort"
         text = self._answers.describe(nothing if self.fallback is None else self.fallback.describe())
         return text if self.catch is None else f"{text}; LQR within {self.catch.region.describe()}"
 
     def take_over(self, previous: Controller) -> None:
-        """Take over samples and efforts from the same kind of policy, and that it gave up."""
+        """Take over samples, efforts and notice from the same kind of policy."""
         if not isinstance(previous, LearnedPolicy):
             return
         self._answers.take_over(previous._answers)

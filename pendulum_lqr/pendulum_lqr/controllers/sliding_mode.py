@@ -16,15 +16,13 @@ __all__ = ["SlidingMode"]
 class SlidingMode(BaseController):
     """Drives s = theta_dot + lambda e, with e = theta - theta*, to zero.
 
-        u = G sin(theta - theta_0) - tau_0 - b lambda e - M lambda theta_dot - k sat(s / phi)
+      u = G sin(theta - theta_0) - tau_0 - b lambda e - M lambda theta_dot - k sat(s / phi)
 
-    with the plant's offsets theta_0 and tau_0. This leaves M s' = -b s - k sat(s / phi) + d: the
-    plant's own damping is kept and not cancelled, because cancelling
-    b theta_dot through a sampled loop is unstable as soon as the period exceeds 2 M / b (9 ms for the thesis's plant).
-    The switching is smooth inside the layer, so that it does not chatter; the price is that a constant torque d below
-    b phi + k is not rejected but leaves e = d / (lambda (b + k / phi)), which may be more than a plain LQR leaves.
-
-    Source: Slotine and Li, Applied Nonlinear Control, 1991, section 7.2.
+    with the plant's offsets theta_0 and tau_0. This leaves M s' = -b s - k sat(s / phi) + d. The plant's damping is not
+    cancelled, because that is unstable in a sampled loop with a period above 2 M / b (9 ms for the thesis's plant).
+    Switching is smooth inside the layer, to avoid chattering; so a constant torque d below b phi + k is not rejected
+    but leaves e = d / (lambda (b + k / phi)), which may be more than a plain LQR leaves. Source: Slotine and Li,
+    Applied Nonlinear Control, 1991, section 7.2.
     """
 
     SAMPLED = False

@@ -37,4 +37,3 @@ CATCH_SHARE = ParameterSpec(
     maximum=1.0,
     exclusive_minimum=True,
 )
-"""How much of what it can catch the LQR waits for."""

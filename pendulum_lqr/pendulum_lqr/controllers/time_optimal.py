@@ -1,4 +1,4 @@
-"""Swing-up in minimum time, by dynamic programming, caught by LQR."""
+"""Minimum-time swing-up by dynamic programming, caught by LQR."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["TimeOptimal"]
 
 
 class TimeOptimal(CatchingController):
-    """Picks the torque whose successor has the least time to go to the catch's region; a feedback from every state."""
+    """Applies the torque whose successor has the least time to the catch's region; a feedback from every state."""
 
     SUMMARY = "swing-up in minimum time by dynamic programming, caught by LQR"
     PARAMETERS = (
@@ -36,7 +36,7 @@ class TimeOptimal(CatchingController):
         super().__init__(plant, period, p)
         S = tuple(map(tuple, self.catch.gain.S.tolist()))
         self.table = _table(plant, self.effort_limit, S, self.catch.level, self.set_point, p["grid"])
-        # How far a candidate torque looks ahead [s].
+        # Prediction horizon of a candidate torque [s].
         self.horizon = max(period, self.table.step)
         self._plant = plant
         self._substeps = max(2, math.ceil(self.horizon * plant.damping / plant.inertia / 0.5))
@@ -49,7 +49,7 @@ class TimeOptimal(CatchingController):
         limit = self.effort_limit
         forward = self.table.lookup(*self._ahead(angle, velocity, limit))
         backward = self.table.lookup(*self._ahead(angle, velocity, -limit))
-        # Exactly symmetric states (hanging at rest) have no better side: take one.
+        # Symmetric states (hanging at rest) have no better side: take one.
         return limit if forward <= backward else -limit
 
     def _ahead(self, angle: float, velocity: float, effort: float) -> tuple[float, float]:

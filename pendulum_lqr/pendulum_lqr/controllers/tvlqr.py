@@ -1,4 +1,4 @@
-"""TVLQR: follows an optimised swing-up with time-varying gains."""
+"""Time-varying LQR along an optimised swing-up."""
 
 from __future__ import annotations
 
@@ -35,14 +35,13 @@ _ANGLE_SCALE, _VELOCITY_SCALE = 0.5, 2.0
 class Tvlqr(CatchingController):
     """u = u0(t) - K(t) (x - x0(t)) along an optimised swing-up, then LQR.
 
-    The trajectory and, for a plant without offsets, its mirror image are tracked from wherever the state is
-    close to one of them; far from both the
-    pendulum is pumped by energy until it is close again, so that a wrong start or a push does not end the swing-up.
+    It joins the trajectory, or its mirror image for a plant without offsets, where it is close; far from both it pumps
+    energy, so that a wrong start or a push does not end the swing-up.
 
     Attributes:
-        trajectory: The swing-up.
+        trajectory: Swing-up.
         gains: K at each sample, shape (n, 2).
-        pump: What swings it up where no trajectory is near.
+        pump: Swing-up away from the trajectories.
 
     Source: Tedrake, Underactuated Robotics, section 8.2 (finite-horizon LQR along a trajectory).
     """
@@ -86,7 +85,7 @@ class Tvlqr(CatchingController):
         self.reset()
 
     def reset(self) -> None:
-        """Forget where on the trajectory it was."""
+        """Forget the position on the trajectory."""
         super().reset()
         self.pump.reset()
         self._index: int | None = None
@@ -101,13 +100,13 @@ class Tvlqr(CatchingController):
             self._index, self._losses = None, 0
             return self.catch.command(x[0], velocity)
         if self._index is not None:
-            # By time, not by commands: a state without a command does not hold up the trajectory.
+            # By time, not by commands: a state without a command does not delay the trajectory.
             began, first = self._joined
             self._index = first + round((t - began) / self.period)
             if self._index >= len(self.planned) or self._distance(self._index, angle, velocity) > _LOST:
                 self._index = None
                 self._losses += 1
-        # A plant that cannot be kept on the trajectory differs from the model; energy control needs less of it.
+        # A plant that leaves the trajectory differs from the model; energy control depends less on it.
         if self._index is None and self._losses < _MOST_LOSSES:
             self._find(t, angle, velocity)
         if self._index is None:
@@ -120,7 +119,7 @@ class Tvlqr(CatchingController):
         return self.clamp(self._sign * (float(self.planned[k]) - feedback))
 
     def take_over(self, previous: Controller) -> None:
-        """Take over whether the LQR is in charge; a trajectory of its own has to be rejoined."""
+        """Take over whether the LQR is in charge; its own trajectory must be rejoined."""
         super().take_over(previous)
         if isinstance(previous, Tvlqr):
             self.pump.take_over(previous.pump)
@@ -134,12 +133,12 @@ class Tvlqr(CatchingController):
         return math.hypot(error, (self._sign * velocity - float(self.states[index, 1])) / _VELOCITY_SCALE)
 
     def _find(self, t: float, angle: float, velocity: float) -> None:
-        """Join the trajectory, or its mirror image, where it passes closest; not at all if that is too far."""
+        """Join the trajectory, or its mirror image, where it is closest, unless that is too far."""
         best = _CLOSE
         for sign in self._signs:
             error = (sign * angle - self.states[:, 0] + math.pi) % (2.0 * math.pi) - math.pi
             distance = np.hypot(error / _ANGLE_SCALE, sign * velocity / _VELOCITY_SCALE - self._scaled[:, 1])
-            # The last samples lie within the catch: joining there would follow a trajectory that is over.
+            # The last samples are within the catch: the trajectory would be over.
             index = int(np.argmin(distance[:-1]))
             if distance[index] < best:
                 best = float(distance[index])

@@ -1,4 +1,4 @@
-"""What ``design --machine`` prints: which rows of a design table are certified for a measured machine."""
+"""Output of ``design --machine``: certificates of a design table's rows for a measured machine."""
 
 from __future__ import annotations
 
@@ -21,16 +21,11 @@ __all__ = ["certificate_document", "certify_rows", "print_certificates"]
 
 
 def certify_rows(path: Path, model: LinearModel, gains: Sequence[Gain]) -> tuple[Certifier, list[Certificate]]:
-    """Return the certificates of a table's gains.
-
-    Args:
-        path: Measured response, or the folder of a run that holds one.
-        model: Model of the designs, upright.
-        gains: On angle and velocity.
+    """Return the certificates of a table's gains on angle and velocity, for an upright model.
 
     Raises:
         ParameterError: The designs are not for upright.
-        DataError: The file holds no response.
+        DataError: The file, or run folder, holds no response.
     """
     if model.theta != UPRIGHT:
         raise ParameterError(
@@ -41,7 +36,7 @@ def certify_rows(path: Path, model: LinearModel, gains: Sequence[Gain]) -> tuple
 
 
 def print_certificates(console: Console, certifier: Certifier, found: Sequence[Certificate], chosen: int) -> None:
-    """Print one line a row, from row 1, the chosen one marked, and what the certificates mean."""
+    """Print one line per row with the chosen one marked, and the meaning of certificates."""
     profile, machine = certifier.profile, certifier.machine
     headings = ("#", "margin b", "loop distance", "modulus there", "certified")
     table = RowTable("Certified for this machine", headings)

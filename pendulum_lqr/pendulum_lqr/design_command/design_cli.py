@@ -59,7 +59,7 @@ THESIS_WEIGHTS: tuple[tuple[tuple[float, float], float], ...] = (
 )
 """Combinations 1 to 4 of the thesis: (q11, q22) and r."""
 THESIS_CHOICE = 3
-"""The combination that the thesis runs on its hardware."""
+"""Combination that the thesis runs on its hardware."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -182,7 +182,7 @@ def _limit(given: float, plants_own: float) -> float:
 
 @dataclass(frozen=True)
 class _Table:
-    """Gains of a plant, one for each pair of weights, and their figures, those without feedback first."""
+    """Gains of a plant for pairs of weights, and their figures, preceded by those without feedback."""
 
     plant: PlantParameters
     model: LinearModel
@@ -257,7 +257,7 @@ class _Table:
         )
 
     def _plant_lines(self) -> list[str]:
-        """Return what the design was made for, in sentences."""
+        """Return sentences on the plant of the design."""
         model, joints = self.model, self.plant.coordinates.joints
         at = ", ".join(
             f"{state} = {value:.4f} {joint.unit}"
@@ -287,7 +287,7 @@ def _designed(
     own: Sequence[tuple[tuple[float, ...], float]],
     row: int,
 ) -> _Table:
-    """Return the gains of every Q with every R; of the plant's own weights where neither is given."""
+    """Return the gains of every Q with every R, by default of the plant's own weights."""
     weights = [*own]
     if q or r:
         diagonals = (
@@ -303,15 +303,7 @@ def _designed(
 
 
 def read_diagonal(text: str, states: Sequence[str] = ("theta", "theta_dot")) -> tuple[float, ...]:
-    """Return the diagonal of Q that a command line names as ``100,0.01``.
-
-    Args:
-        text: The weights.
-        states: What is measured, to each of which a weight belongs.
-
-    Raises:
-        ParameterError: The text is something else.
-    """
+    """Return the diagonal of Q from a text such as ``100,0.01``; ParameterError without one weight per state."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:

@@ -1,4 +1,4 @@
-"""Tables of ``design``: one row a combination; the loop in time, the worst case over the plant's uncertainty."""
+"""Tables of ``design``, one row per combination: the loop in time, and the worst case over uncertain plants."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class RowTable(WholeTable):
     """A table of combinations, one of them marked.
 
     Args:
-        title: What it shows.
-        headings: Of the columns, that of the combination's number first.
-        left: Those of them whose cells stand at the left.
+        title: Title.
+        headings: Column headings, that of the combination's number first.
+        left: Headings of left-aligned columns.
         no_wrap: Break no cell.
     """
 
@@ -43,7 +43,7 @@ class RowTable(WholeTable):
             self.add_column(heading, justify="left" if heading in left else "right", no_wrap=no_wrap)
 
     def add(self, index: int, *cells: str, chosen: int | None = None) -> None:
-        """Add a combination, marked where it is the chosen one."""
+        """Add a combination, marked if it is the chosen one."""
         self.add_row(f"{index}", *cells, style="bold cyan" if index == chosen else "")
 
 
@@ -59,12 +59,12 @@ def margin_cells(margins: Margins) -> list[str]:
 
 
 def time_cell(time: float) -> str:
-    """Return the cell of a time that may be any [s]."""
+    """Return the cell of a time, which may be infinite [s]."""
     return f"{time:.4f} s" if math.isfinite(time) else "any"
 
 
 def pole_cell(poles: Iterable[complex], digits: int = 2) -> str:
-    """Return the cell of poles, a pair of conjugate ones as one."""
+    """Return the cell of poles, with conjugate pairs as one."""
     return ", ".join(
         f"{pole.real:.{digits}f}" + (f" \u00b1 {pole.imag:.{digits}f}j" if abs(pole.imag) >= 1e-9 else "")
         for pole in poles
@@ -73,14 +73,7 @@ def pole_cell(poles: Iterable[complex], digits: int = 2) -> str:
 
 
 def print_time_figures(console: Console, found: Sequence[TimeFigures | None], chosen: int, limit: float) -> None:
-    """Print one line a row, and from which step on the chosen one meets the torque limit.
-
-    Args:
-        console: Where.
-        found: One for each row, from row 1; None for a loop that does not settle.
-        chosen: Row that is marked.
-        limit: Of the torque [N m].
-    """
+    """Print one line per row, and the step from which the chosen one exceeds the torque limit [N m]."""
     table = RowTable(
         "In time (linear, delay included)",
         (
@@ -118,7 +111,7 @@ def print_time_figures(console: Console, found: Sequence[TimeFigures | None], ch
 
 
 def print_worst_cases(console: Console, box: ParameterBox, found: Sequence[WorstCase], chosen: int) -> None:
-    """Print one line a row, from row 1: the worst of each margin over all plants, and which plant is the worst."""
+    """Print one line per row: the worst of each margin over all plants, and the worst plant."""
     headings = ("#", "not held", "gain up", "gain down", "phase margin", "delay margin", "modulus", "worst at")
     table = RowTable(f"Worst case over {found[0].plants} plants ({box.source})", headings, left={"worst at"})
     for index, one in enumerate(found, start=1):
@@ -146,7 +139,7 @@ def _place(where: Mapping[str, float]) -> str:
 
 
 def hidden_and_late(model: LinearModel) -> list[str]:
-    """Return what a design leaves out of the states that are not measured, and of the delay, in sentences."""
+    """Return sentences on hidden states and delay that the design neglects."""
     lines = []
     if model.hidden:
         measured = "angle and velocity" if model.measured[0] == "theta" else "positions and velocities"

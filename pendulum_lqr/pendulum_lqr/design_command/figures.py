@@ -1,6 +1,6 @@
 """Figures of a design: poles, root locus, Bode plot, step response, phase portrait with region of attraction.
 
-Each function returns a matplotlib figure made without pyplot: nothing global is touched, no display needed.
+Figures are made without pyplot: no global state, no display.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _legend_below(ax: Axes) -> None:
 
 
 def _s_plane(ax: Axes, values: NDArray[np.complex128], decades: bool) -> None:
-    """Label the s-plane; a logarithmic real axis where poles lie decades apart, with the unstable half shaded."""
+    """Label the s-plane and shade its unstable half; logarithmic real axis for poles decades apart."""
     sizes = np.abs(values.real)
     sizes = sizes[sizes > 0.0]
     if decades:
@@ -94,18 +94,13 @@ def _s_plane(ax: Axes, values: NDArray[np.complex128], decades: bool) -> None:
 
 
 def _spread(poles: NDArray[np.complex128]) -> bool:
-    """Return whether poles lie so far apart that only a logarithmic axis shows them all."""
+    """Return whether poles are so far apart that they need a logarithmic axis."""
     sizes = np.abs(poles)
     return bool(np.max(sizes) > 50.0 * np.min(sizes))
 
 
 def pole_map_figure(model: LinearModel, gains: Mapping[str, Array]) -> Figure:
-    """Return the map of open-loop poles and of the closed-loop poles of several gains.
-
-    Args:
-        model: Linear model.
-        gains: Label -> K, shape (2,).
-    """
+    """Return the map of open-loop poles and of the closed-loop poles of several gains K, shape (2,), by label."""
     figure, (ax,) = _figure()
     open_loop = model.poles
     poles = {label: closed_loop_poles(model, K) for label, K in gains.items()}
@@ -122,7 +117,7 @@ def pole_map_figure(model: LinearModel, gains: Mapping[str, Array]) -> Figure:
         zorder=4,
     )
     for index, (label, values) in enumerate(poles.items()):
-        # Gains of one table often share a pole: sizes differ so that none hides another.
+        # Gains of one table often share a pole: different sizes keep all visible.
         ax.plot(
             values.real,
             values.imag,
@@ -139,12 +134,7 @@ def pole_map_figure(model: LinearModel, gains: Mapping[str, Array]) -> Figure:
 
 
 def root_locus_figure(model: LinearModel, K: Array) -> Figure:
-    """Return the poles of A - k B K for k from 0 to 3, with k = 0 and k = 1 marked.
-
-    Args:
-        model: Linear model.
-        K: Gain, shape (2,).
-    """
+    """Return the poles of A - k B K for k from 0 to 3, with k = 0 and k = 1 marked."""
     figure, (ax,) = _figure()
     factors = np.concatenate([[0.0], np.logspace(-3, math.log10(3.0), 1500)])
     branches = np.array([closed_loop_poles(model, factor * np.asarray(K)) for factor in factors])
@@ -159,12 +149,7 @@ def root_locus_figure(model: LinearModel, K: Array) -> Figure:
 
 
 def bode_figure(model: LinearModel, K: Array) -> Figure:
-    """Return the Bode plot of the loop cut at the plant's input, with its margins.
-
-    Args:
-        model: Linear model.
-        K: Gain, shape (2,), that stabilises the model.
-    """
+    """Return the Bode plot of the loop cut at the plant's input, with its margins, for a stabilising gain."""
     report = analyse(model, K)
     margins = report.margins
     assert margins is not None
@@ -217,13 +202,7 @@ def bode_figure(model: LinearModel, K: Array) -> Figure:
 
 
 def step_figure(model: LinearModel, gains: Mapping[str, Array], report: LoopReport) -> Figure:
-    """Return angle and torque after a step of the set-point by 0.1 rad, linear model.
-
-    Args:
-        model: Linear model.
-        gains: Label -> K, shape (2,).
-        report: Figures of the gain that sets the time scale.
-    """
+    """Return angle and torque after a step of the set-point by 0.1 rad, linear; ``report`` sets the time scale."""
     figure, (top, bottom) = _figure(2, 5.2)
     horizon = 6.0 * report.time_constant if math.isfinite(report.time_constant) else 5.0
     times = np.linspace(0.0, horizon, 800)
@@ -248,14 +227,7 @@ def step_figure(model: LinearModel, gains: Mapping[str, Array], report: LoopRepo
 
 
 def phase_portrait_figure(plant: RigidPlant, gain: Gain, effort_limit: float, region: Region) -> Figure:
-    """Return the closed loop's phase portrait, with the sampled and the proven region of attraction.
-
-    Args:
-        plant: Plant parameters.
-        gain: LQR gain at upright.
-        effort_limit: Torque limit [N m].
-        region: From :func:`pendulum_lqr.linear.roa.region_of_attraction`.
-    """
+    """Return the closed loop's phase portrait, with the sampled and the proven region of attraction."""
     figure, (ax,) = _figure(height=5.2)
     ax.grid(visible=False)
     angles, velocities = region.angles, region.velocities
@@ -281,20 +253,12 @@ def phase_portrait_figure(plant: RigidPlant, gain: Gain, effort_limit: float, re
 def region_to_show(
     plant: RigidPlant, model: LinearModel, gain: Gain, effort_limit: float, *, points: int = 91
 ) -> Region:
-    """Return the region of attraction of a loop with two states, over the speeds that are worth showing.
-
-    Args:
-        plant: Plant parameters.
-        model: Linear model, upright.
-        gain: LQR gain.
-        effort_limit: Torque limit [N m].
-        points: Angles, and velocities, that are simulated.
-    """
-    # Those of a free fall, unless damping stops the pendulum long before.
+    """Return the region of attraction of a loop with two states, over relevant speeds."""
+    # Those of a free fall, unless damping stops the pendulum much earlier.
     span = 1.2 * math.sqrt(4.0 * max(plant.gravity, 1e-6) / plant.inertia)
     if plant.damping > 0.0:
         span = min(span, 3.0 * effort_limit / plant.damping)
-    # At its limit the torque no longer hurries what the plant does by itself: its own slow pole sets the time.
+    # At its limit the torque no longer accelerates the plant: its own slow pole sets the time.
     slowest = analyse(model, gain.K).time_constant
     duration = min(max(10.0 * slowest, 10.0 / max(float(model.poles[0].real), 1e-6), 4.0), 100.0)
     rollout = rigid_rollout(plant, gain, effort_limit, duration)
@@ -308,15 +272,7 @@ def design_figures(
     chosen: int,
     effort_limit: float,
 ) -> dict[str, Figure]:
-    """Return all figures of a design table by file name; a phase portrait only of a plant with two states.
-
-    Args:
-        plant: Plant parameters.
-        model: Linear model.
-        rows: Label and gain of each row.
-        chosen: Which row the single-gain figures show.
-        effort_limit: Torque limit [N m].
-    """
+    """Return all figures of a design table by file name; a phase portrait only for a plant with two states."""
     gains = {label: gain.K for label, gain in rows}
     gain = rows[chosen][1]
     figures = {
@@ -325,7 +281,7 @@ def design_figures(
         "bode": bode_figure(model, gain.K),
         "step_response": step_figure(model, gains, analyse(model, gain.K)),
     }
-    # Plane and proof are those of two states.
+    # Plane and proof need two states.
     if model.theta == UPRIGHT and not model.hidden:
         region = region_to_show(plant, model, gain, effort_limit)
         figures["phase_portrait"] = phase_portrait_figure(plant, gain, effort_limit, region)

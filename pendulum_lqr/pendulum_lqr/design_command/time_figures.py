@@ -1,6 +1,6 @@
-"""A closed loop in time: rise, overshoot, settling, torque of a step; how far a push and dry friction move it.
+"""Time response of a closed loop: rise, overshoot, settling and torque of a step; effect of a push and dry friction.
 
-The linear model has no torque limit; ``step_torque`` is the step from which on there is one.
+The linear model has no torque limit: ``step_torque`` gives the step that reaches it.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ __all__ = ["TimeFigures", "friction_band", "time_figures"]
 Array = NDArray[np.float64]
 
 _SAMPLES = 2000
-"""Samples of a response; without delay they are exact, with one the feedback is linear between samples."""
+"""Samples of a response; exact without delay, else with feedback linear between samples."""
 _PER_DELAY = 20
 _SETTLED = 0.002
-"""Share of the final value within which a response counts as ended."""
+"""Relative tolerance of the final value at which a response ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class TimeFigures:
-    """What the closed loop does in time; linear, the plant's delay included.
+    """Linear time response of the closed loop, including the plant's delay.
 
     Attributes:
-        rise_time: From 10 % to 90 % of a step of the set-point, the torque that holds it fed forward [s].
+        rise_time: From 10 % to 90 % of a step of the set-point, with feedforward of the holding torque [s].
         settling_time: Until the angle stays within 2 % of the step [s].
         overshoot: Beyond the step, as a share of it [-].
         step_torque: Largest torque of the step, per step [N m/rad].
-        push_rest: Deflection that stays under a constant torque on the link [rad/(N m)].
+        push_rest: Final deflection under a constant torque on the link [rad/(N m)].
         push_peak: Largest deflection after its beginning [rad/(N m)].
-        friction_band: Deviation up to which dry friction holds the pendulum at rest [rad]; nan where it is not known.
+        friction_band: Deviation up to which dry friction holds the pendulum at rest [rad]; nan if unknown.
     """
 
     rise_time: float
@@ -59,17 +59,17 @@ class TimeFigures:
 
 
 def time_figures(model: LinearModel, K: ArrayLike, plant: RigidPlant | None = None) -> TimeFigures | None:
-    """Return the figures of a gain's closed loop in time; None for a loop that does not come to rest.
+    """Return the time response of a gain (2,) on angle and velocity; None for a loop that does not come to rest.
 
     Args:
-        model: Linear model, its delay counts.
-        K: Gain on angle and velocity, shape (2,).
-        plant: The plant of the model, whose dry friction is used.
+        model: Linear model, including its delay.
+        K: Gain.
+        plant: Plant of the model, for its dry friction.
 
     Source:
         Astrom and Murray, Feedback Systems, 2nd ed., 2021, section 6.3 (step response: rise time, overshoot, settling).
     """
-    # Imported late: python-control brings matplotlib, which a controller node has no use for.
+    # Imported late: python-control imports matplotlib, which controller nodes do not need.
     import control
 
     gain = np.asarray(K, dtype=np.float64)
@@ -97,13 +97,7 @@ def time_figures(model: LinearModel, K: ArrayLike, plant: RigidPlant | None = No
 
 
 def friction_band(plant: RigidPlant, model: LinearModel, K: ArrayLike) -> float:
-    """Return the deviation from the set-point up to which static friction holds the pendulum at rest [rad].
-
-    Args:
-        plant: Its friction.
-        model: Linear model of the plant.
-        K: Gain on angle and velocity that stabilises it, shape (2,).
-    """
+    """Return the deviation from the set-point up to which static friction holds the pendulum at rest [rad]."""
     gain = np.asarray(K, dtype=np.float64)
     weight = abs(gravity_torque(model.theta - offset_of(plant, "angle_offset"), plant.gravity))
     static = offset_of(plant, "static_friction") + friction_of_terms(plant, weight)
@@ -117,7 +111,7 @@ def friction_band(plant: RigidPlant, model: LinearModel, K: ArrayLike) -> float:
 
 
 def _rest(model: LinearModel, gain: Array, entry: Array) -> float:
-    """Return the angle at which a constant unit torque that enters there leaves the loop [rad/(N m)]."""
+    """Return the final angle under a constant unit torque at an input [rad/(N m)]."""
     closed = model.A - model.B @ gain[None, :] @ model.C
     return float(-np.linalg.solve(closed, entry)[0, 0])
 
@@ -146,10 +140,10 @@ def _simulate(
     dt = model.delay / late if late else horizon / _SAMPLES
     count = math.ceil(horizon / dt) + 1
     on_measured = gain @ model.C
-    # Without delay the feedback acts within the step, exactly; with one it is what was sent that long ago.
+    # Without delay the feedback acts within the step, exactly; with one, as sent that long ago.
     A = model.A if late else model.A - model.B @ on_measured[None, :]
     drive = model.E[:, 0] * push + (0.0 if late else model.B[:, 0] * forward)
-    # Held from sample to sample it would act half a sample late, which counts near the delay margin.
+    # Linear interpolation: held samples would act half a sample late, which matters near the delay margin.
     block = np.zeros((n + 3, n + 3))
     block[:n, :n], block[:n, n], block[:n, n + 1], block[n + 1, n + 2] = A, drive, model.B[:, 0], 1.0 / dt
     step = scipy.linalg.expm(block * dt)

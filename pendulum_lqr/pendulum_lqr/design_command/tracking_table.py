@@ -1,4 +1,4 @@
-"""What ``design`` prints for a moving reference: gain, frozen margins and torque along it."""
+"""Output of ``design`` for a moving reference: gain, frozen margins and torque along it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["design_tracking", "print_tracking", "tracking_document"]
 
 _PERIOD = "period"
 _ELSEWHERE = ("q", "r", "effort_limit", "velocity", "start_time")
-"""Parameters that other options set, or that change nothing that is printed."""
+"""Parameters that other options set, or that do not affect the output."""
 
 
 def design_tracking(
@@ -57,7 +57,7 @@ def design_tracking(
 
 
 def print_tracking(console: Console, controller: LqrTracking, chosen: int) -> None:
-    """Print gain and frozen margins of a checked controller over the angle, and what the whole reference takes."""
+    """Print gain and frozen margins of a checked controller over the angle, and the torque of the reference."""
     document = tracking_document(controller)
     table = WholeTable(title="Gain along the reference (lqr_tracking)", title_justify="left", header_style="bold")
     for heading in ("angle \\[rad]", "K", "largest pole, sampled", "modulus"):
