@@ -82,10 +82,7 @@ BACKENDS: dict[str, Backend] = {
     ),
     "hebi": Backend(
         "pendulum_hw_bridge.backends.hebi:HebiBackend",
-        (
-            *_fixed("hebi_log", "", "`hebi`: new .hebilog file that hebi-py writes; empty for none."),
-            *_OF_GROUPS,
-        ),
+        (*_fixed("hebi_log", "", "`hebi`: new .hebilog file that hebi-py writes; empty for none."), *_OF_GROUPS),
     ),
     "replay": Backend(
         "pendulum_hw_bridge.backends.replay:ReplayBackend",

@@ -328,8 +328,7 @@ class HebiBackend:
             raise ActuatorError("not_connected", "HEBI module is not connected; call connect() first")
         if threading.get_ident() != self._owner:
             raise ActuatorError(
-                "exception",
-                "HEBI group was called from a second thread; expected only the one that connected",
+                "exception", "HEBI group was called from a second thread; expected only the one that connected"
             )
 
     def _new_command(self) -> Any:
@@ -347,8 +346,7 @@ class HebiBackend:
     def _acknowledged(self, what: str) -> None:
         if not self._group.send_command_with_acknowledgement(self._command, ACKNOWLEDGE_MS):
             raise ActuatorError(
-                "no_acknowledgement",
-                f"HEBI module did not acknowledge its {what} within {ACKNOWLEDGE_MS} ms",
+                "no_acknowledgement", f"HEBI module did not acknowledge its {what} within {ACKNOWLEDGE_MS} ms"
             )
 
     def _read_info(self) -> Any:

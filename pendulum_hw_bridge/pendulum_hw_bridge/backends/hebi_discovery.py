@@ -82,11 +82,7 @@ class ModuleSelection:
 
 
 def discover(
-    lookup: Any,
-    *,
-    look_time: float = LOOK_TIME,
-    patience: float = 5.0,
-    wait: Callable[[float], object] | None = None,
+    lookup: Any, *, look_time: float = LOOK_TIME, patience: float = 5.0, wait: Callable[[float], object] | None = None
 ) -> list[ModuleRecord]:
     """Return the modules on the network with their identity, ordered by name.
 
@@ -125,8 +121,7 @@ def select_module(modules: Sequence[ModuleRecord], wanted: ModuleSelection, *, s
     if len(alive) > 1:
         twins = ", ".join(map(str, alive))
         raise ActuatorError(
-            "module_lost",
-            f"HEBI module {wanted} is not the only one: {twins}; choose by serial or mac_address",
+            "module_lost", f"HEBI module {wanted} is not the only one: {twins}; choose by serial or mac_address"
         )
     module = alive[0]
     if wanted.module_type and _plain(wanted.module_type) != _plain(module.type):

@@ -19,13 +19,7 @@ from pendulum_hw_bridge.backends.hebi import (
     HebiBackend,
     open_lookup,
 )
-from pendulum_hw_bridge.backends.hebi_discovery import (
-    LOOK_TIME,
-    ModuleRecord,
-    ModuleSelection,
-    discover,
-    select_module,
-)
+from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleRecord, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.backends.hebi_log import import_hebi, start_log, stop_log
 from pendulum_hw_bridge.port.actuator import (
     NO_SETPOINT,

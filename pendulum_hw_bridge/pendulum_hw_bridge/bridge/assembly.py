@@ -49,38 +49,15 @@ _FASTEST = 30.0
 _RATE = 500.0
 """Default feedback rate: several links fall faster than one [Hz]."""
 _OF_ONE_MODULE = (
-    "lab_file",
-    "effort_strategy",
-    "effort_efficiency",
-    "gains_file",
-    "joint_offset",
-    "effort_tare",
-    "joint_sign",
-    "initial_position",
-    "flat",
-    "family",
-    "name",
-    "mac_address",
-    "serial",
-    "interface",
-    "hebi_log",
-    "back_emf_compensation",
-    "emulator_address",
-    "replay_file",
-    "drivetrain",
-    *OF_GROUPS,
-)
+    "lab_file", "effort_strategy", "effort_efficiency", "gains_file", "joint_offset", "effort_tare", "joint_sign",
+    "initial_position", "flat", "family", "name", "mac_address", "serial", "interface", "hebi_log",
+    "back_emf_compensation", "emulator_address", "replay_file", "drivetrain", *OF_GROUPS,
+)  # fmt: skip
 """Parameters that an emulated machine of several joints does not have; most are for a single module."""
 _OF_EVERY_GROUP = (
-    "effort_strategy",
-    "effort_efficiency",
-    "gains_file",
-    "interface",
-    "hebi_log",
-    "back_emf_compensation",
-    "drivetrain",
-    *OF_GROUPS,
-)
+    "effort_strategy", "effort_efficiency", "gains_file", "interface", "hebi_log", "back_emf_compensation",
+    "drivetrain", *OF_GROUPS,
+)  # fmt: skip
 """Those of them that a group of HEBI modules has."""
 _SLOWEST_DRIVE = 0.1
 """Longest delay and time constant of a drive that the output check supports [s]."""

@@ -46,8 +46,7 @@ def check(
     serial: Annotated[str | None, typer.Option(help="Serial number of the HEBI module.")] = None,
     interface: Annotated[str | None, typer.Option(help="Network address to look on; default all.")] = None,
     plant: Annotated[
-        str | None,
-        typer.Option(help=f"{EMULATOR_PRESET_NAMES}, a plant file with a drivetrain, or of several joints."),
+        str | None, typer.Option(help=f"{EMULATOR_PRESET_NAMES}, a plant file with a drivetrain, or of several joints.")
     ] = None,
     feedback_rate: Annotated[float | None, typer.Option(help="Feedback records per second [Hz].")] = None,
     gains_file: Annotated[str | None, typer.Option(help="HEBI gains file; default those of the X5-9.")] = None,

@@ -313,10 +313,7 @@ def state_items(
     speed, unit = max(abs(record.velocity) for record in records), joint.velocity_unit
     return [
         CheckItem(
-            "position, velocity, effort are numbers",
-            finite,
-            "all finite" if finite else "not all",
-            "all finite",
+            "position, velocity, effort are numbers", finite, "all finite" if finite else "not all", "all finite"
         ),
         CheckItem(f"{name} is at rest", speed <= _AT_REST, f"{speed:.3f} {unit}", f"at most {_AT_REST:g} {unit}"),
         CheckItem("motion stop is released", not last.m_stop, "pressed" if last.m_stop else "released", "released"),

@@ -152,11 +152,7 @@ def _check(
 
 
 def _rest_items(
-    module: Module,
-    records: Sequence[Feedback],
-    index: int,
-    parameters: PlantParameters,
-    window: tuple[float, float],
+    module: Module, records: Sequence[Feedback], index: int, parameters: PlantParameters, window: tuple[float, float]
 ) -> list[CheckItem]:
     """Check position and effort of a joint at rest."""
     joint, own = parameters.coordinates.joints[index], parameters.joints[index]

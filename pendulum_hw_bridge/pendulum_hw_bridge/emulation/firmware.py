@@ -48,13 +48,7 @@ def new_loop_memory() -> Array:
 
 
 def pid_step(
-    gains: Array,
-    memory: Array,
-    loop: int,
-    target: float,
-    measured: float,
-    normaliser: float,
-    period: float,
+    gains: Array, memory: Array, loop: int, target: float, measured: float, normaliser: float, period: float
 ) -> float:
     """Return the output of one PID loop after one cycle; a NaN target switches the loop off and resets it.
 

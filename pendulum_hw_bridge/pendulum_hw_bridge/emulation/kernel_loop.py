@@ -17,17 +17,7 @@ def actuator_loop() -> Any:
 
     @entry(LAYOUT)
     def run(s: Any) -> Any:
-        steps(
-            s.state,
-            s.constants,
-            s.gains,
-            s.memory,
-            s.setpoints,
-            s.strategy,
-            s.link_torque,
-            s.first_step,
-            s.steps,
-        )
+        steps(s.state, s.constants, s.gains, s.memory, s.setpoints, s.strategy, s.link_torque, s.first_step, s.steps)
         return 0
 
     return run

@@ -18,13 +18,7 @@ from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = [
-    "Dialogue",
-    "MountedZero",
-    "expect_numbers",
-    "find_zero_and_sign",
-    "measure_tare",
-]
+__all__ = ["Dialogue", "MountedZero", "expect_numbers", "find_zero_and_sign", "measure_tare"]
 
 _REST_WINDOW = 2.0
 _REST_TRAVEL = 5e-4

@@ -232,9 +232,7 @@ def backup(
 
 @app.command()
 def restore(
-    file: File,
-    folder: Annotated[Path, typer.Argument(help="Folder that ``lab backup`` wrote.")],
-    yes: Yes = False,
+    file: File, folder: Annotated[Path, typer.Argument(help="Folder that ``lab backup`` wrote.")], yes: Yes = False
 ) -> None:
     """Give the module the gains, safety parameters and M-stop action of a backup, and read them back.
 

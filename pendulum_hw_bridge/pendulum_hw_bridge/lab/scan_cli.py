@@ -10,13 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from pendulum_hw_bridge.backends import hebi
-from pendulum_hw_bridge.backends.hebi_discovery import (
-    LOOK_TIME,
-    ModuleRecord,
-    ModuleSelection,
-    discover,
-    select_module,
-)
+from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleRecord, ModuleSelection, discover, select_module
 from pendulum_hw_bridge.bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_hw_bridge.port.actuator import ActuatorError
 from pendulum_msgs_py.errors import ParameterError
@@ -141,13 +135,7 @@ def _print(modules: list[ModuleRecord], chosen: ModuleRecord | None, reason: str
                 module.name,
                 *(
                     text or "–"
-                    for text in (
-                        module.serial,
-                        module.type,
-                        module.firmware,
-                        module.mac_address,
-                        module.address,
-                    )
+                    for text in (module.serial, module.type, module.firmware, module.mac_address, module.address)
                 ),
                 state,
             )

@@ -34,21 +34,16 @@ SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("procedure", "hand", "", "Which experiment.", choices=("hand", "staircase"), read_only=True),
     ParameterSpec("trial", 1, "-", "Number of the trial.", minimum=1, maximum=1000, read_only=True),
     ParameterSpec("seed", 1, "-", "`hand`: seed of strokes and tremor.", minimum=0, read_only=True),
-    ParameterSpec(
-        "person",
-        False,
-        "",
+    ParameterSpec("person", False, "",
         "`hand`: a person turns the link; this node only holds the drive at zero torque, until `~/finish`.",
-        read_only=True,
-    ),
+        read_only=True),
     ParameterSpec("step", 10.0, "deg", "`staircase`: height of a step.", minimum=1.0, maximum=90.0, read_only=True),
     ParameterSpec("top", 90.0, "deg", "`staircase`: highest angle.", minimum=1.0, maximum=170.0, read_only=True),
-    ParameterSpec(
-        "hold", 2.0, "s", "`staircase`: time at rest on each step.", minimum=0.5, maximum=60.0, read_only=True
-    ),
+    ParameterSpec("hold", 2.0, "s", "`staircase`: time at rest on each step.", minimum=0.5, maximum=60.0,
+        read_only=True),
     ParameterSpec("autostart", False, "", "Start with the first state, without a call of ~/start.", read_only=True),
     REALTIME_PRIORITY,
-)
+)  # fmt: skip
 
 
 class ProcedureNode(Node):

@@ -16,14 +16,7 @@ import numpy as np
 from pendulum_msgs_py.contract.trajectory import Trajectory, thesis_ramp
 from pendulum_msgs_py.errors import ParameterError
 
-__all__ = [
-    "HAND_TRIALS",
-    "HandMotion",
-    "Phase",
-    "hand_trials",
-    "staircase",
-    "staircase_angles",
-]
+__all__ = ["HAND_TRIALS", "HandMotion", "Phase", "hand_trials", "staircase", "staircase_angles"]
 
 HAND_TRIALS = 6
 """Trials of experiment 1."""
@@ -138,13 +131,7 @@ def staircase_angles(step: float = 10.0, top: float = 90.0) -> tuple[float, ...]
     return tuple(math.radians(sign * step * index) for sign in (1.0, -1.0) for index in half)
 
 
-def staircase(
-    trial: int,
-    *,
-    step: float = 10.0,
-    top: float = 90.0,
-    hold: float = 2.0,
-) -> Iterator[Phase]:
+def staircase(trial: int, *, step: float = 10.0, top: float = 90.0, hold: float = 2.0) -> Iterator[Phase]:
     """Yield the phases of a trial of experiment 2: a ramp to each angle [deg], then a hold [s].
 
     Source:

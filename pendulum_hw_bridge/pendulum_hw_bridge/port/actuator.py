@@ -200,26 +200,12 @@ class Feedback(NamedTuple):
 
 
 FEEDBACK_QUANTITIES: Mapping[str, str] = {
-    "position": "rad",
-    "velocity": "rad/s",
-    "effort": "N m",
-    "position_command": "rad",
-    "velocity_command": "rad/s",
-    "effort_command": "N m",
-    "pwm_command": "-",
-    "motor_current": "A",
-    "winding_current": "A",
-    "motor_position": "rad",
-    "motor_velocity": "rad/s",
-    "deflection": "rad",
-    "deflection_velocity": "rad/s",
-    "voltage": "V",
-    "winding_temperature": "degC",
-    "housing_temperature": "degC",
-    "motor_sensor_temperature": "degC",
-    "board_temperature": "degC",
-    "processor_temperature": "degC",
-}
+    "position": "rad", "velocity": "rad/s", "effort": "N m", "position_command": "rad", "velocity_command": "rad/s",
+    "effort_command": "N m", "pwm_command": "-", "motor_current": "A", "winding_current": "A",
+    "motor_position": "rad", "motor_velocity": "rad/s", "deflection": "rad", "deflection_velocity": "rad/s",
+    "voltage": "V", "winding_temperature": "degC", "housing_temperature": "degC", "motor_sensor_temperature": "degC",
+    "board_temperature": "degC", "processor_temperature": "degC",
+}  # fmt: skip
 """Physical quantities of a feedback record and their units, in the order of :class:`Feedback`."""
 
 

@@ -112,10 +112,7 @@ _VELOCITY = PidGains(kp=0.05, feed_forward=1.0, output_lowpass=0.75)
 DEFAULT_GAINS: Mapping[int, GainSet] = {
     1: GainSet(1, PidGains(), PidGains(), PidGains(feed_forward=1.0)),
     2: GainSet(
-        2,
-        PidGains(kp=15.0, **_TORQUE_OUTPUT),
-        PidGains(kp=0.5, output_lowpass=0.75, **_TORQUE_OUTPUT),
-        _EFFORT,
+        2, PidGains(kp=15.0, **_TORQUE_OUTPUT), PidGains(kp=0.5, output_lowpass=0.75, **_TORQUE_OUTPUT), _EFFORT
     ),
     3: GainSet(3, PidGains(kp=1.5), _VELOCITY, _EFFORT),
     4: GainSet(4, PidGains(kp=15.0, **_TORQUE_OUTPUT), _VELOCITY, _EFFORT),

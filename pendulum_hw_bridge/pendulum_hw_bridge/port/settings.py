@@ -65,8 +65,7 @@ def expect_limits(reads: HardwareLimits, wanted: HardwareLimits) -> None:
         _expect(what, getattr(reads, what), getattr(wanted, what), wanted.joint.unit)
     if reads.m_stop is not wanted.m_stop:
         raise ActuatorError(
-            "settings",
-            f"motion stop action reads back as {reads.m_stop.value}; expected {wanted.m_stop.value}",
+            "settings", f"motion stop action reads back as {reads.m_stop.value}; expected {wanted.m_stop.value}"
         )
 
 

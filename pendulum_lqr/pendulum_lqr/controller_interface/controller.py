@@ -96,11 +96,7 @@ START_TIME = ParameterSpec(
 COMMON_PARAMETERS: tuple[ParameterSpec, ...] = (
     ParameterSpec("set_point", 0.0, "rad", "Angle to hold, from upright.", minimum=-math.pi, maximum=math.pi),
     ParameterSpec(
-        "effort_limit",
-        0.0,
-        "N m",
-        "Largest torque of the controller; 0 for the plant's own limit.",
-        minimum=0.0,
+        "effort_limit", 0.0, "N m", "Largest torque of the controller; 0 for the plant's own limit.", minimum=0.0
     ),
     ParameterSpec("velocity", "measured", "", "Source of the velocity.", choices=("measured", *VELOCITY_ESTIMATORS)),
     START_TIME,
@@ -151,12 +147,7 @@ class LawController(BaseController):
     numbers: tuple[float, ...]
 
     def __init__(
-        self,
-        law: Law,
-        effort_limit: float,
-        set_point: float,
-        numbers: Iterable[float],
-        memory: Iterable[float] = (),
+        self, law: Law, effort_limit: float, set_point: float, numbers: Iterable[float], memory: Iterable[float] = ()
     ) -> None:
         super().__init__(effort_limit, set_point)
         self._use(law, numbers, memory)

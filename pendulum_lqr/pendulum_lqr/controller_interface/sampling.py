@@ -12,14 +12,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = [
-    "ASSUMED_PERIOD",
-    "PeriodWatch",
-    "differs",
-    "goes_on",
-    "rate_problem",
-    "require_period",
-]
+__all__ = ["ASSUMED_PERIOD", "PeriodWatch", "differs", "goes_on", "rate_problem", "require_period"]
 
 ASSUMED_PERIOD = 0.01
 """Design period before the first states [s]: that of the thesis's loop."""

@@ -21,13 +21,7 @@ from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.dynamics.series_elastic import spring_deflection
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = [
-    "VELOCITY_ESTIMATORS",
-    "FilteredDifference",
-    "KalmanVelocity",
-    "SavitzkyGolay",
-    "VelocityEstimator",
-]
+__all__ = ["VELOCITY_ESTIMATORS", "FilteredDifference", "KalmanVelocity", "SavitzkyGolay", "VelocityEstimator"]
 
 _WINDOW, _ORDER = 7, 2
 """Samples to which a polynomial is fitted, and its degree."""

@@ -45,23 +45,14 @@ __all__ = ["NODE_SPECS", "DisturbanceNode", "main"]
 NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("autostart", False, "", "Start with the first state, without a call of ~/start.", read_only=True),
     ParameterSpec("duration", 0.0, "s", "Duration of the disturbance; 0 until ~/stop.", minimum=0.0),
-    ParameterSpec(
-        "file",
-        "",
-        "",
-        "For from_bag: CSV file with a header line and the columns time since the start [s] and torque [N m].",
-    ),
-    ParameterSpec(
-        "joints",
-        [""],
-        "",
+    ParameterSpec("file", "", "",
+        "For from_bag: CSV file with a header line and the columns time since the start [s] and torque [N m]."),
+    ParameterSpec("joints", [""], "",
         "Joints to disturb, in the plant's order, each by its own signal with the next seed. "
-        "Empty for the joint of a pendulum.",
-        read_only=True,
-    ),
+        "Empty for the joint of a pendulum.", read_only=True),
     COMPILED,
     REALTIME_PRIORITY,
-)
+)  # fmt: skip
 """Parameters of the node itself, without those of the signal."""
 
 

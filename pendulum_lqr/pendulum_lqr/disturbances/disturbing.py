@@ -148,9 +148,4 @@ class DisturbanceLoop:
         elapsed = (now_ns - before_ns) / NANOSECONDS
         rate = (self.answered - before) / elapsed if before_ns and elapsed > 0.0 else math.nan
         self._window = (now_ns, self.answered)
-        return {
-            "answered": self.answered,
-            "refused": self.refused,
-            "answer_rate_hz": rate,
-            "torque": self.last_torque,
-        }
+        return {"answered": self.answered, "refused": self.refused, "answer_rate_hz": rate, "torque": self.last_torque}

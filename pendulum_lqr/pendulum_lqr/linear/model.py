@@ -300,11 +300,7 @@ def _rigid_flow(plant: RigidPlant, x: tuple[complex, ...], torque: complex, push
 
 
 def _elastic_flow(
-    plant: RigidPlant,
-    drive: SeriesElasticParameters,
-    x: tuple[complex, ...],
-    torque: complex,
-    push: complex,
+    plant: RigidPlant, drive: SeriesElasticParameters, x: tuple[complex, ...], torque: complex, push: complex
 ) -> tuple[complex, ...]:
     angle, velocity, motor_angle, motor_velocity = x[:4]
     spring = in_arithmetic(spring_torque, cmath)(

@@ -2,16 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "DUPLICATE",
-    "FROM_FUTURE",
-    "LONGEST",
-    "NEW",
-    "OUT_OF_ORDER",
-    "STALE",
-    "is_saturated",
-    "judge_state",
-]
+__all__ = ["DUPLICATE", "FROM_FUTURE", "LONGEST", "NEW", "OUT_OF_ORDER", "STALE", "is_saturated", "judge_state"]
 
 NEW, STALE, FROM_FUTURE, DUPLICATE, OUT_OF_ORDER = range(5)
 """Results of :func:`judge_state`."""

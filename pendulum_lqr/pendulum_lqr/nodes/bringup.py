@@ -44,11 +44,7 @@ ARGUMENTS: tuple[Argument, ...] = (
         "/hw), or both (simulator and emulator).",
         tuple(SIDES),
     ),
-    Argument(
-        "lab",
-        "",
-        "Lab file, for plant:=hebi: selects the actuator and sets its zero, sign, limits and rate.",
-    ),
+    Argument("lab", "", "Lab file, for plant:=hebi: selects the actuator and sets its zero, sign, limits and rate."),
     Argument("controller", "lqr", "Controller of each plant.", (*controller_names(), "none")),
     Argument(
         "controller_waits",

@@ -17,32 +17,17 @@ from pendulum_msgs_py.loops.answer_record import LoopKind
 
 __all__ = ["ANSWERING", "CompiledController", "law_of"]
 
-_LENT = np.dtype(
-    [
-        ("simulated", "i8"),
-        ("timeout_ns", "i8"),
-        ("start_ns", "i8"),
-        ("interval_ns", "i8"),
-        ("watched_ns", "i8"),
-        ("newest_ns", "i8"),
-        ("limit", "f8"),
-    ],
-    align=True,
-)
+_LENT = np.dtype([
+    ("simulated", "i8"), ("timeout_ns", "i8"), ("start_ns", "i8"), ("interval_ns", "i8"), ("watched_ns", "i8"),
+    ("newest_ns", "i8"), ("limit", "f8"),
+], align=True)  # fmt: skip
 """``interval_ns`` is 0 if any interval between states is permitted."""
 _NEWEST = np.dtype([("position", "f8"), ("velocity", "f8"), ("measured", "f8"), ("effort", "f8"), ("saturated", "i8")])
 """Newest state (``measured`` is its effort), its reply, and the number of replies at the limit."""
-ANSWERING = np.dtype(
-    [
-        ("lent", _LENT),
-        ("newest", _NEWEST),
-        ("numbers", "f8", (MOST_NUMBERS,)),
-        ("remembered", "i8"),
-        ("memory", "f8", (MOST_MEMORY,)),
-        ("before", "f8", (MOST_MEMORY,)),
-    ],
-    align=True,
-)
+ANSWERING = np.dtype([
+    ("lent", _LENT), ("newest", _NEWEST), ("numbers", "f8", (MOST_NUMBERS,)), ("remembered", "i8"),
+    ("memory", "f8", (MOST_MEMORY,)), ("before", "f8", (MOST_MEMORY,)),
+], align=True)  # fmt: skip
 """What is lent for a slice, its newest reply, and the law's numbers and memory."""
 
 

@@ -40,10 +40,7 @@ from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_N
 from pendulum_msgs_py.programs.realtime import as_ordinary
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.compiled_answers import AnsweredInput
-from pendulum_msgs_py.ros.convert import (
-    problem_of_state,
-    sample_from_bytes,
-)
+from pendulum_msgs_py.ros.convert import problem_of_state, sample_from_bytes
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
 from pendulum_msgs_py.ros.first_answer import FirstAnswer
 from pendulum_msgs_py.ros.leaving import wait_until_heard

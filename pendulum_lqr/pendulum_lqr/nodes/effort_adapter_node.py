@@ -28,25 +28,13 @@ from pendulum_msgs_py.ros.timers import create_wall_timer
 __all__ = ["NODE_SPECS", "EffortAdapterNode", "main"]
 
 NODE_SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec(
-        "command_type",
-        "multi_array",
-        "",
+    ParameterSpec("command_type", "multi_array", "",
         "multi_array: std_msgs/Float64MultiArray on ~/commands, as to effort_controllers/JointGroupEffortController; "
         "joint_state: sensor_msgs/JointState on joint_commands, as from topic_based_ros2_control/TopicBasedSystem.",
-        choices=("multi_array", "joint_state"),
-        read_only=True,
-    ),
-    ParameterSpec(
-        "command_timeout",
-        0.05,
-        "s",
-        "Age at which a command that waits for a state is dropped.",
-        minimum=0.0,
-        exclusive_minimum=True,
-        read_only=True,
-    ),
-)
+        choices=("multi_array", "joint_state"), read_only=True),
+    ParameterSpec("command_timeout", 0.05, "s", "Age at which a command that waits for a state is dropped.",
+        minimum=0.0, exclusive_minimum=True, read_only=True),
+)  # fmt: skip
 
 _ARRAY_TOPIC = "~/commands"
 _JOINT_TOPIC = "joint_commands"

@@ -31,16 +31,10 @@ from pendulum_msgs_py.ros.timers import create_wall_timer
 __all__ = ["NODE_SPECS", "TrajectoryActionNode", "main"]
 
 NODE_SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec(
-        "silence_timeout",
-        2.0,
-        "s",
-        "Time without a state, or an answer to a goal, after which it is given up.",
-        minimum=0.0,
-        exclusive_minimum=True,
-        read_only=True,
-    ),
-)
+    ParameterSpec("silence_timeout", 2.0, "s",
+        "Time without a state, or an answer to a goal, after which it is given up.", minimum=0.0,
+        exclusive_minimum=True, read_only=True),
+)  # fmt: skip
 
 _ACTION = "~/follow_joint_trajectory"
 _FEEDBACK_PERIOD = 0.05

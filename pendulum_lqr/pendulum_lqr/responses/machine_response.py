@@ -217,10 +217,7 @@ def _continued(x: Array, inverse: Complex, spread: Array, wanted: Array) -> tupl
     )
     values = np.zeros(wanted.size, dtype=np.complex128)
     error = np.zeros(wanted.size)
-    for design, target, part, unit in (
-        (even, target_even, inverse.real, 1.0),
-        (odd, target_odd, inverse.imag, 1j),
-    ):
+    for design, target, part, unit in ((even, target_even, inverse.real, 1.0), (odd, target_odd, inverse.imag, 1j)):
         scaled = design * weight[:, None]
         solver = np.linalg.pinv(scaled)
         coefficients = solver @ (part * weight)

@@ -18,13 +18,7 @@ from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = [
-    "CaughtRegion",
-    "MechanismCatch",
-    "deviation_of",
-    "make_mechanism_catch",
-    "sample_caught_region",
-]
+__all__ = ["CaughtRegion", "MechanismCatch", "deviation_of", "make_mechanism_catch", "sample_caught_region"]
 
 Array = NDArray[np.float64]
 

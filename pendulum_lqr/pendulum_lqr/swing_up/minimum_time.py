@@ -147,10 +147,5 @@ def _successors(
     rest = b - j
     low, high = i % n, (i + 1) % n
     corners = [low * m + j, low * m + j + 1, high * m + j, high * m + j + 1]
-    weights = [
-        (1.0 - fraction) * (1.0 - rest),
-        (1.0 - fraction) * rest,
-        fraction * (1.0 - rest),
-        fraction * rest,
-    ]
+    weights = [(1.0 - fraction) * (1.0 - rest), (1.0 - fraction) * rest, fraction * (1.0 - rest), fraction * rest]
     return corners, weights

@@ -12,13 +12,7 @@ from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = [
-    "CALM_WEIGHTS",
-    "default_catch",
-    "refuse_passive_friction",
-    "stored_trajectory",
-    "tracked_swing_up",
-]
+__all__ = ["CALM_WEIGHTS", "default_catch", "refuse_passive_friction", "stored_trajectory", "tracked_swing_up"]
 
 CALM_WEIGHTS = ((1.0, 1.0, 1.0, 1.0), 10.0)
 """Weights of catch and tracking for two joints: the lowest gains that still catch from far."""

@@ -89,14 +89,7 @@ def swing_up_trajectory(
     opti.subject_to(opti.bounded(0.05, duration, 60.0))
     opti.minimize(duration + 1e-3 * casadi.sumsqr(U[1:] - U[:-1]))
     opti.solver(
-        "ipopt",
-        {
-            "expand": True,
-            "print_time": False,
-            "ipopt.print_level": 0,
-            "ipopt.sb": "yes",
-            "ipopt.max_iter": 600,
-        },
+        "ipopt", {"expand": True, "print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 600}
     )
     best: OptimisedTrajectory | None = None
     s = np.linspace(0.0, 1.0, nodes + 1)
