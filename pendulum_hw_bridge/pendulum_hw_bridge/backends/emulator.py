@@ -37,13 +37,7 @@ _FIRST_STEP_NS = 1_000_000
 
 
 class EmulatorBackend:
-    """Actuator port of an :class:`EmulatedX5`.
-
-    Args:
-        actuator: Emulated actuator; its clock must start at the present of ``clock``.
-        clock: Host clock, which stamps feedback.
-        seed: Seed of the jitter of the command delay.
-    """
+    """Actuator port of an :class:`EmulatedX5` whose clock must start at the present of ``clock``."""
 
     name = "emulator"
 

@@ -34,13 +34,7 @@ _RENEW_NS = NANOSECONDS // 2
 
 
 class EmulatorProcessBackend:
-    """Actuator port of an emulated actuator at a UDP address.
-
-    Args:
-        address: ``HOST:PORT``.
-        clock: Host clock, which stamps feedback on receipt.
-        attempts: Requests to an emulator that is starting, four per second [-].
-    """
+    """Actuator port of an emulator at ``HOST:PORT``; it is tried ``attempts`` times, four per second."""
 
     name = "emulator_process"
 
@@ -186,11 +180,7 @@ class EmulatorProcessBackend:
         return self._request({})
 
     def configure(self, *, patience: float = _ACKNOWLEDGE, **settings: Any) -> dict[str, Any]:
-        """Request settings in packet format, once; return the emulator's status.
-
-        Args:
-            patience: Time to wait for the acknowledgement [s].
-            settings: ``strategy``, ``gains``, ``limits``, ``command_lifetime`` [s], ``feedback_rate`` [Hz].
+        """Request settings in packet format, once, with ``patience`` [s]; return the emulator's status.
 
         Raises:
             ActuatorError: Not acknowledged, or refused.

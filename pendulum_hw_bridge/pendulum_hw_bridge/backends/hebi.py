@@ -59,12 +59,7 @@ STOP_ACKNOWLEDGE_MS = 15
 
 
 def connect_group(wanted: ModuleSelection, interface: str = "", look_time: float = LOOK_TIME) -> Any:
-    """Return hebi-py's group of the one selected module.
-
-    Args:
-        wanted: Module.
-        interface: Network address to search; empty for all.
-        look_time: Shortest search time [s].
+    """Return hebi-py's group of the selected module, after a search of at least ``look_time`` [s].
 
     Raises:
         ActuatorError: hebi-py is not installed, or the module is missing, ambiguous or of another type.

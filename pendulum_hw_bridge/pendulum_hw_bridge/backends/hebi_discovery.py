@@ -49,12 +49,7 @@ class ModuleRecord:
 
 @dataclass(frozen=True)
 class ModuleSelection:
-    """Criteria for a module; empty ones match anything.
-
-    Attributes:
-        mac_address: In any usual notation.
-        module_type: Required mechanical type, such as ``X5-9``.
-    """
+    """Criteria for a module, such as ``module_type`` ``X5-9``; empty ones match anything."""
 
     family: str = ""
     name: str = ""

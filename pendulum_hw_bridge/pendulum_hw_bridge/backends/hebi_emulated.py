@@ -33,13 +33,7 @@ _LOOK_ATTEMPTS = 2
 
 @dataclass(frozen=True)
 class EmulatedEntry:
-    """Lookup entry with hebi-py's field names.
-
-    Attributes:
-        mac_address: Derived from the address: an emulator has no network card.
-        is_stale: Whether it has stopped replying.
-        where: ``HOST:PORT``.
-    """
+    """Lookup entry with hebi-py's field names; ``mac_address`` is derived from ``where``, ``HOST:PORT``."""
 
     family: str
     name: str
@@ -50,15 +44,7 @@ class EmulatedEntry:
 
 
 class EmulatedLookup:
-    """Replaces hebi-py's ``Lookup``.
-
-    Args:
-        interface: ``emulator:HOST:PORT``, or several separated by commas.
-        hebi: Library.
-
-    Raises:
-        ParameterError: An address is not understood.
-    """
+    """Replaces hebi-py's ``Lookup`` on ``emulator:HOST:PORT[,...]``; ParameterError for an invalid address."""
 
     def __init__(self, interface: str, hebi: Any) -> None:
         self._hebi = hebi

@@ -153,13 +153,7 @@ class HebiGroup:
             raise ActuatorError("send_failed", "commands could not be sent to the HEBI modules: network down?")
 
     def acknowledged(self, index: int, packet: Any, strategy: Strategy | None, timeout_ms: float) -> bool:
-        """Send settings of one module; return whether all modules acknowledged in time.
-
-        Args:
-            index: Joint of the settings.
-            packet: hebi-py's command for the group.
-            strategy: Strategy among the settings, or None.
-            timeout_ms: [ms].
+        """Send settings of one joint, with a strategy or None; return whether all modules acknowledged in time [ms].
 
         Raises:
             ActuatorError: The joint is passive.
@@ -372,14 +366,7 @@ class _GroupPort(HebiBackend):
 
 
 class GroupDrive(_GroupPort):
-    """Actuator port of one driven joint; :meth:`flush` sends the setpoints of all joints.
-
-    Args:
-        shared: Group.
-        index: Joint.
-        clock: Host clock, which stamps feedback on receipt.
-        options: As for :class:`HebiBackend`.
-    """
+    """Actuator port of one driven joint; :meth:`flush` sends the setpoints of all joints."""
 
     def write(self, command: Command) -> Applied:
         """Store setpoints, checked and limited, for the next :meth:`flush`."""

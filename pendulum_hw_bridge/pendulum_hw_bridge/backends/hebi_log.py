@@ -101,14 +101,7 @@ def read_hebilog(path: Path, *, module: int | None = None) -> dict[str, NDArray[
 def to_joint(
     quantities: dict[str, NDArray[np.float64]], *, zero: float = 0.0, sign: int = 1, tare: float = 0.0
 ) -> dict[str, NDArray[np.float64]]:
-    """Return quantities of an actuator in joint coordinates.
-
-    Args:
-        quantities: From :func:`read_hebilog`.
-        zero: Joint angle where the actuator reads zero [rad].
-        sign: 1, or -1 for an actuator mounted the other way round.
-        tare: Torque that the sensor shows without load [N m].
-    """
+    """Return :func:`read_hebilog`'s quantities in joint coordinates, by zero [rad], sign (1 or -1) and tare [N m]."""
     found = dict(quantities)
     for name in _POSITIONS:
         found[name] = sign * quantities[name] + zero

@@ -47,8 +47,7 @@ class FeedbackRecording:
 
     Args:
         quantities: ``time`` [s], increasing, and quantities of :data:`FEEDBACK_QUANTITIES` in SI units, all of one
-            length.
-            ``position``, ``velocity`` and ``effort`` are required.
+            length. ``position``, ``velocity`` and ``effort`` are required.
         where: Source, for messages.
 
     Raises:

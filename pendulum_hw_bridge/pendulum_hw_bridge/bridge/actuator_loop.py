@@ -38,8 +38,7 @@ class ActuatorLoop:
         decide: Returns the decision for now.
         on_outcome: Called with the stamp of the state [ns] and the outcome.
         on_records: Called with the feedback record of each module after its cycle, off the critical path; after an
-            error,
-            when the drive is off already.
+            error, when the drive is off already.
         take_inputs: Passes received torques to :meth:`answered`, waiting at most the given time [s] for one.
         answer_window: Share of the period to wait for commands for a state before acting [-].
         report: Called with the text of an error that ended a cycle.

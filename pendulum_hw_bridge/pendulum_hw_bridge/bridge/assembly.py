@@ -89,16 +89,7 @@ class Assembly:
 
 
 def for_plant(specs: tuple[ParameterSpec, ...], plant: str, backend: str = "emulator") -> tuple[ParameterSpec, ...]:
-    """Return the bridge's parameters with the defaults that a plant of several joints needs.
-
-    Args:
-        specs: Parameters with the defaults of an X5-9.
-        plant: Preset or file.
-        backend: Backend of the actuator port.
-
-    Raises:
-        ParameterError: There is no such plant.
-    """
+    """Return the bridge's parameters with defaults for several joints; ParameterError if there is no such plant."""
     if not is_mechanism(plant):
         return specs
     mechanism = load_mechanism(plant)

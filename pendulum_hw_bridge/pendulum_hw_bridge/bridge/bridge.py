@@ -41,11 +41,7 @@ class Outcome:
 
 
 class Bridge:
-    """Carries out a supervisor's decisions on the modules of a plant.
-
-    Args:
-        modules: One per joint, in the order of the model; all on one clock.
-        supervisor: Rules and state of the plant.
+    """Carries out a supervisor's decisions on modules, one per joint in the model's order and all on one clock.
 
     Raises:
         ParameterError: The modules do not match the supervisor's joints and motors.
@@ -138,13 +134,9 @@ class Bridge:
                 self._note(getattr(error, "fault", "exception"))
 
     def observe(self, timeout: float) -> JointSample | None:
-        """Wait for new feedback and check it; on a fault all drives are released before this returns.
+        """Return the new state of the plant, waiting up to ``timeout`` [s] per module; None while a record is missing.
 
-        Args:
-            timeout: Longest time to wait for each module [s].
-
-        Returns:
-            New state of the plant, or None while a module has sent no new record.
+        On a fault all drives are released before this returns.
         """
         for module in self.modules:
             self._look_at(module, timeout)

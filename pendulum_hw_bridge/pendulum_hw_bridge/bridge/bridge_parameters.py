@@ -193,13 +193,7 @@ def effort_mapping(
 def supervisor_limits(
     values: Mapping[str, Any], effort_limits: Vector, *, coordinates: Coordinates = ONE_JOINT, lockstep: bool = False
 ) -> PlantLimits:
-    """Return the supervisor's limits of a plant of any number of joints.
-
-    Args:
-        values: Parameters of the bridge.
-        effort_limits: Limits of the driven joints in the plant file [N m or N].
-        coordinates: Joints of the plant.
-        lockstep: Whether time is simulated.
+    """Return the supervisor's limits; ``effort_limits`` [N m or N] are the plant file's for the driven joints.
 
     Raises:
         ParameterError: They contradict each other or the plant.
@@ -219,14 +213,7 @@ def bridge_settings(
     gains: GainSet,
     window: tuple[float, float] = (-math.inf, math.inf),
 ) -> BridgeSettings:
-    """Return the settings of the actuator.
-
-    Args:
-        values: Parameters of :data:`BRIDGE_SPECS`.
-        effort: Effort limit of the plant [N m].
-        velocity: Velocity limit of the plant [rad/s].
-        gains: For trajectories.
-        window: Allowed joint angles [rad].
+    """Return the actuator's settings for limits of effort [N m], velocity [rad/s] and joint angles [rad].
 
     Raises:
         ParameterError: ``joint_sign`` is zero, or a limit is refused.

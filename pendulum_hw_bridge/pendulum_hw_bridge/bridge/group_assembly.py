@@ -44,16 +44,7 @@ def refuse_slides(coordinates: Coordinates) -> None:
 
 
 class GroupAssembly:
-    """Modules of a plant's joints, in one HEBI group.
-
-    Args:
-        values: Parameters of the bridge.
-        coordinates: Joints, and which of them are driven.
-        limits: Limits of the supervisor.
-
-    Raises:
-        ParameterError: A parameter does not fit the joints.
-    """
+    """Modules of a plant's joints, in one HEBI group; ParameterError if a parameter does not fit the joints."""
 
     def __init__(self, values: Mapping[str, Any], coordinates: Coordinates, limits: PlantLimits) -> None:
         self._values = values

@@ -15,15 +15,7 @@ HOST_ITEM = "this computer keeps time"
 
 @dataclass(frozen=True)
 class CheckItem:
-    """One item of the checklist.
-
-    Attributes:
-        name: What was checked.
-        passed: Whether it passed; None if not judged or not tried.
-        seen: Measured value, with unit.
-        expected: Expected value.
-        hint: What to do if it has not passed, a sentence or nothing.
-    """
+    """One item; ``passed`` is None if not judged or not tried, ``hint`` says what to do if it has not passed."""
 
     name: str
     passed: bool | None
@@ -39,13 +31,7 @@ def error_item(error: PendulumError) -> CheckItem:
 
 @dataclass
 class Checklist:
-    """Results of the checklist.
-
-    Attributes:
-        items: Items in order.
-        figures: Rate [Hz], jitter, latencies and loss, by name with unit.
-        host_busy: Whether this computer was too busy to judge the actuator's timing.
-    """
+    """Results of the checklist; ``figures`` (rate [Hz], jitter, latencies, loss) by name with unit."""
 
     items: list[CheckItem] = field(default_factory=list)
     figures: dict[str, float] = field(default_factory=dict)

@@ -24,11 +24,7 @@ __all__ = ["bridge_values", "machine_of"]
 
 
 def bridge_values(ros_arguments: Sequence[str], given: Mapping[str, graph.ParameterArgument]) -> dict[str, Any]:
-    """Return the parameters that the bridge would have.
-
-    Args:
-        ros_arguments: ``--ros-args`` and the arguments after it.
-        given: Further parameters, which take precedence.
+    """Return the parameters that the bridge would have; ``given`` ones take precedence.
 
     Raises:
         ParameterError: A parameter, a file or the lab file is refused.

@@ -110,13 +110,7 @@ class TimingFigures:
 
 
 def measure(records: Sequence[Feedback], period: float, lateness: Sequence[float]) -> TimingFigures:
-    """Return the timing of a stretch of feedback.
-
-    Args:
-        records: At least two, in order.
-        period: Nominal period [s].
-        lateness: Lateness of this computer's wakings [s]; empty in simulated time.
-    """
+    """Return the timing of at least two records; ``lateness`` of wakings [s] is empty in simulated time."""
     measured = np.array([record.hardware_ns for record in records], dtype=np.int64)
     way = np.array([record.stamp_ns for record in records], dtype=np.int64) - measured
     gaps = np.diff(measured) / NANOSECONDS

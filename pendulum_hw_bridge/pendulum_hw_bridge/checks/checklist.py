@@ -74,16 +74,8 @@ def run_checklist(
 ) -> Checklist:
     """Run the checklist; the duty is always zero, and the motor is off at the end.
 
-    Args:
-        port: Actuator, not connected yet.
-        settings: Settings that the bridge would write.
-        limits: Limits of the feedback.
-        plant: Weight and friction of link and drivetrain.
-        window: Allowed joint angles [rad].
-        hand: Nudges the link to test the sign; None leaves the sign untried.
-        hangs: Whether the pendulum hangs; False for one that lies flat.
-        host: Measures lateness of this computer; by default on the wall clock.
-        progress: Called with a text before each step.
+    The port is not connected yet. ``window`` has the allowed joint angles [rad]; without ``hand`` the sign stays
+    untried; ``hangs`` is False for a pendulum that lies flat; ``host`` measures this computer's lateness.
     """
     found = Checklist()
     items = found.items
@@ -298,14 +290,7 @@ def monitor_item(records: Sequence[Feedback], monitor: SafetyMonitor) -> CheckIt
 def state_items(
     records: list[Feedback], limits: SafetyLimits, joint: Joint = ONE_JOINT.joints[0], name: str = "pendulum"
 ) -> list[CheckItem]:
-    """Check the state of a module at rest.
-
-    Args:
-        records: Its feedback.
-        limits: Limits of the feedback.
-        joint: Its joint, for units.
-        name: Name of what is at rest.
-    """
+    """Check the state of a module at rest; ``joint`` gives the units, ``name`` is what is at rest."""
     last = records[-1]
     finite = all(
         math.isfinite(value) for record in records for value in (record.position, record.velocity, record.effort)

@@ -48,14 +48,8 @@ def run_machine_checklist(
 ) -> Checklist:
     """Run the checklist; no motor gets an effort, and all are off at the end.
 
-    If modules do not match the joints, nothing is set in any of them.
-
-    Args:
-        modules: One for each joint, in the plant's order, not connected yet.
-        parameters: The plant.
-        windows: Allowed positions of each joint [rad or m].
-        host: Makes a measurement of this computer's lateness.
-        progress: Called with a text before each step.
+    Modules are in the plant's order and not connected yet. If they do not match the joints, nothing is set in any of
+    them. ``windows`` has the allowed positions of each joint [rad or m].
     """
     found = Checklist()
     try:

@@ -52,12 +52,7 @@ class Person:
 
 @dataclass
 class EmulatedHand:
-    """A torque on the link of an emulated actuator.
-
-    Attributes:
-        push: Sets the emulator's external torque [N m].
-        direction: 1 for counter-clockwise, -1 for clockwise.
-    """
+    """A torque on an emulator's link by ``push`` [N m]; ``direction`` 1 is counter-clockwise, -1 clockwise."""
 
     push: Callable[[float], None]
     direction: int = 1

@@ -25,11 +25,7 @@ _SHARE = 0.1
 
 @dataclass(frozen=True)
 class CurrentMapping(EffortMapping):
-    """Identity from torque to effort setpoint, within the effort limit.
-
-    Args:
-        late: Records for which the effort of an older setpoint may still show, because the drive has a delay [-].
-    """
+    """Identity within the effort limit; an older setpoint may still show in ``late`` records, by a delay [-]."""
 
     late: int = 0
 

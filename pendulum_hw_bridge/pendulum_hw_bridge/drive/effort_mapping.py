@@ -173,12 +173,7 @@ class EffortMapping:
         """Return offset of position [rad] and velocity setpoint [rad/s] with which strategy 3 takes over a duty.
 
         Strategy 3 has no PWM feed-forward: its position loop takes over the torque, its velocity loop the back-EMF.
-
-        Args:
-            effort: Torque in force [N m].
-            pwm: Duty in force [-].
-            velocity: Measured link speed [rad/s].
-            motor: Supply voltage and motor speed.
+        Effort [N m] and duty [-] are those in force; ``velocity`` is the link's [rad/s].
         """
         gains = self.gains
         if gains.position.kp <= 0.0 or not math.isfinite(pwm):

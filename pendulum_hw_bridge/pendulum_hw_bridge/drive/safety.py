@@ -54,14 +54,7 @@ _VOLTAGE_WEIGHT = 0.02
 
 
 class SafetyMonitor:
-    """Checks consecutive feedback records.
-
-    Args:
-        limits: Limits.
-        period: Nominal feedback period [s].
-        drivetrain: Constants for the check of the winding current, or None.
-        joint: Measured joint, for the units in messages.
-    """
+    """Checks consecutive records of nominal ``period`` [s]; without ``drivetrain`` the winding current is unchecked."""
 
     def __init__(
         self,

@@ -114,10 +114,8 @@ def control_pwm(
 
     Args:
         strategy: 0 off; 1 direct PWM (``setpoints[EFFORT]`` is the duty); 2 effort loop around torque plus outputs of
-            position
-            and velocity loops; 3 three loops, each giving PWM, clipped and added; 4 effort loop around torque plus
-            output of
-            the position loop, plus a velocity loop giving PWM.
+            position and velocity loops; 3 three loops, each giving PWM, clipped and added; 4 effort loop around torque
+            plus output of the position loop, plus a velocity loop giving PWM.
         gains: (3, 14).
         memory: (3, 5), changed in place.
         setpoints: Position [rad], velocity [rad/s], effort [N m] or PWM; NaN for a loop that is off.

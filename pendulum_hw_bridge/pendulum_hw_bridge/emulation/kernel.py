@@ -90,14 +90,8 @@ LAYOUT = np.dtype(
 class Actuator:
     """State of the emulated actuator in one block of memory, stepped by machine code if available.
 
-    Otherwise numba compiles the same function in this process, or Python runs it, with identical bits.
-
-    Attributes:
-        state: Entries as in :data:`STATES`.
-        constants: Entries as in :data:`CONSTANTS`.
-        gains: (3, 14), see :mod:`.firmware`.
-        memory: (3, 5), of the firmware's loops.
-        setpoints: Position, velocity, effort (or PWM); NaN for off.
+    Otherwise numba compiles the same function in this process, or Python runs it, with identical bits. Its arrays are
+    arguments of :func:`advance`.
     """
 
     def __init__(self) -> None:

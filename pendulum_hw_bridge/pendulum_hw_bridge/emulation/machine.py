@@ -155,13 +155,7 @@ class EmulatedMachine:
         self.drives[index].lifetime = check_lifetime(lifetime)
 
     def deliver(self, index: int, effort: float, sent_ns: int) -> None:
-        """Send a torque to a drive; it acts after command delay and transport delay.
-
-        Args:
-            index: Index of the driven joint.
-            effort: [N m or N]; NaN for none.
-            sent_ns: Time of sending [ns].
-        """
+        """Send a torque [N m or N], NaN for none, at ``sent_ns`` [ns]; it acts after command and transport delay."""
         self._deliveries += 1
         arrival_ns = sent_ns + round(self.hardware.command_delay * NANOSECONDS)
         heapq.heappush(self._inbox, (arrival_ns, self._deliveries, index, effort))
@@ -191,9 +185,7 @@ class EmulatedMachine:
     def advance_to(self, time_ns: int, *, wholly: bool = False) -> None:
         """Process everything due by a time [ns], of a long time only the last second.
 
-        Args:
-            time_ns: Time [ns].
-            wholly: Integrate to that very time, not only to the last event before it.
+        ``wholly`` integrates to that very time, not only to the last event before it.
         """
         self._skip(time_ns - self._next_sample_ns - _CATCH_UP_NS)
         while True:

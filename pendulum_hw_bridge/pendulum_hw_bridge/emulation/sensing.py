@@ -25,15 +25,10 @@ def measure(
     voltage: float,
     random: np.random.Generator,
 ) -> Feedback:
-    """Return a feedback record of a state, without times, senders and buttons.
+    """Return a feedback record of a kernel state, without times, senders and buttons.
 
-    Args:
-        state: Entries as in :data:`pendulum_hw_bridge.emulation.kernel.STATES`.
-        setpoints: Position, velocity and effort (or PWM) in force.
-        parameters: Constants.
-        limits: Limits of the firmware.
-        voltage: Supply voltage [V].
-        random: Source of noise: a constant number of draws per record.
+    ``setpoints`` are position, velocity and effort (or PWM); ``voltage`` in [V]. Each record takes the same number of
+    draws from ``random``.
     """
     drive, sensors = parameters.drivetrain, parameters.sensors
     motor_position, motor_velocity, position, velocity, _, winding, housing, body, pwm, current = state.tolist()[:10]

@@ -46,13 +46,7 @@ class EmulatorIdentity:
 
 
 class EmulatorServer:
-    """Serves one emulated actuator.
-
-    Args:
-        actuator: Actuator; its clock must start at the present of ``clock``.
-        address: Host and port to listen on; port 0 takes any.
-        clock: Wall time [ns].
-        identity: Reported identity.
+    """Serves one emulated actuator on UDP; its clock must start at the present of ``clock`` [ns]. Port 0 takes any.
 
     Raises:
         PendulumError: The address is in use or not ours.

@@ -146,12 +146,7 @@ class EmulatedX5:
         )
 
     def place(self, position: float, temperature: float | None = None) -> None:
-        """Put the link at rest at a position [rad], its weight carried by the spring.
-
-        Args:
-            position: [rad].
-            temperature: Of winding, housing and body [degC]; by default that of the parameters.
-        """
+        """Put the link at rest at a position [rad], its weight on the spring, all parts at a temperature [degC]."""
         if not math.isfinite(position):
             raise ParameterError(f"initial position is {position} rad; expected a finite number")
         drive = self.parameters.drivetrain
@@ -226,13 +221,7 @@ class EmulatedX5:
         self._refresh()
 
     def deliver(self, command: Command, arrival_ns: int, sender: int = 1) -> None:
-        """Deliver a command at a time not before now.
-
-        Args:
-            command: Setpoints; the strategy in force decides their meaning.
-            arrival_ns: Actuator time of arrival [ns].
-            sender: Sender; others are locked out during a command lifetime.
-        """
+        """Deliver a command at ``arrival_ns`` [ns], not before now; its lifetime locks other senders out."""
         self._deliveries += 1
         heapq.heappush(self._inbox, (max(arrival_ns, self.now_ns), self._deliveries, sender, command))
 

@@ -53,16 +53,10 @@ class MountedZero:
 
 
 def find_zero_and_sign(port: ActuatorPort, dialogue: Dialogue, hand: Hand, other_hand: Hand) -> MountedZero:
-    """Find the actuator's zero and sign; the motor gets no torque.
+    """Find the zero and sign of a connected actuator; the motor gets no torque.
 
     Friction stops a pendulum slightly off its lowest point, on the side it came from: zero is the middle between the
     rest positions after a turn to either side.
-
-    Args:
-        port: Connected, strategy off.
-        dialogue: The person.
-        hand: Turns counter-clockwise.
-        other_hand: Turns clockwise.
 
     Raises:
         ActuatorError: The link does not turn, does not come to rest, or both turns have one direction.
@@ -93,13 +87,7 @@ def find_zero_and_sign(port: ActuatorPort, dialogue: Dialogue, hand: Hand, other
 
 
 def measure_tare(port: ActuatorPort, settings: BridgeSettings, plant: PlantParameters, dialogue: Dialogue) -> float:
-    """Return the torque sensor's reading beyond the link's weight, in joint coordinates [N m].
-
-    Args:
-        port: Connected, strategy off.
-        settings: Zero and sign of the joint.
-        plant: Weight of the link.
-        dialogue: The person.
+    """Return the torque sensor's reading beyond the link's weight, in joint coordinates [N m], without torque.
 
     Raises:
         ActuatorError: The pendulum does not rest, or the tare is so large that something pulls.

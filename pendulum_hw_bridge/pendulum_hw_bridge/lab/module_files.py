@@ -46,15 +46,11 @@ _HALF = ".unfinished"
 
 
 def backup_group(group: Any, folder: Path) -> list[Path]:
-    """Write gains, safety parameters and M-stop action of a HEBI module; return the files.
-
-    Args:
-        group: hebi-py's group of one module.
-        folder: New folder, so that an older backup is never lost.
+    """Write gains, safety parameters and M-stop action of a HEBI module to a new folder; return the files.
 
     Raises:
         ActuatorError: The module does not reply.
-        ParameterError: The folder exists, or cannot be made.
+        ParameterError: The folder exists, so that no older backup is lost, or cannot be made.
     """
     info = _info(group)
     names = (GAINS, SAFETY, ENDS)
@@ -71,11 +67,7 @@ def backup_group(group: Any, folder: Path) -> list[Path]:
 def restore_group(group: Any, folder: Path, make_command: Callable[[], Any], say: Callable[[str], None]) -> None:
     """Send a module the settings of :func:`backup_group`, and read them back; no setpoint is sent, so nothing moves.
 
-    Args:
-        group: hebi-py's group of one module.
-        folder: Folder of the backup.
-        make_command: Makes an empty ``GroupCommand`` for one module.
-        say: Shows a warning if some settings may be in force after an error.
+    ``say`` warns if some settings may be in force after an error.
 
     Raises:
         ActuatorError: The module does not acknowledge, or other values read back.

@@ -61,12 +61,7 @@ def prove_lifetime(
 ) -> float:
     """Drive gently, stop sending, and return for how long the duty lasted [s].
 
-    Args:
-        port: Connected, strategy off.
-        settings: Command lifetime and limits that the bridge will set.
-        dialogue: The person.
-        checks: Limits of the feedback checks; None for the defaults.
-        drivetrain: Maps the duty to torque; None for an X5-9.
+    ``settings`` has the command lifetime and limits that the bridge will set; ``drivetrain`` maps the duty to torque.
 
     Raises:
         ActuatorError: No duty, a limit was exceeded, the duty did not end in time, or feedback did not show when.
@@ -113,17 +108,11 @@ def prove_m_stop(
 ) -> float:
     """Drive gently until the motion stop is pressed, and return for how long the duty lasted [s].
 
-    The duty is still commanded afterwards, with a longer lifetime, so that only the motion stop can end it.
-
-    Args:
-        port: Connected, strategy off.
-        settings: Command lifetime and limits that the bridge will set.
-        dialogue: The person.
-        checks: Limits of the feedback checks; None for the defaults.
-        drivetrain: Maps the duty to torque; None for an X5-9.
+    The duty is still commanded afterwards, with a longer lifetime, so that only the motion stop can end it. Arguments
+    as for :func:`prove_lifetime`.
 
     Raises:
-        ActuatorError: Not pressed in time, a limit was exceeded, the duty did not end in time, or feedback did not show
+        ActuatorError: Not pressed in time, a limit was exceeded, no end of the duty in time, or feedback did not show
             when.
     """
     if settings.limits.m_stop is not MStopAction.MOTOR_OFF:

@@ -65,12 +65,7 @@ def _logged(transition: Callable[..., TransitionCallbackReturn]) -> Callable[...
 
 
 class BridgeNode(LifecycleNode, PollingNode):
-    """An actuator as a plant.
-
-    Args:
-        stop: Asks the runner to end the process.
-        options: Further arguments of a node, such as ``parameter_overrides``.
-    """
+    """An actuator as a plant; ``stop`` asks the runner to end the process."""
 
     loop_type = ActuatorLoop
     """Class of the real-time loop."""

@@ -51,9 +51,6 @@ class ProcedureNode(Node):
 
     In simulated time a staircase ends held on its last step: the time at which zero torque takes over would depend on
     the load of the machine. Events: ``trial_start``, the phases, ``trial_end``, ``trial_failed``.
-
-    Args:
-        stop: Asks the runner to end the process.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:

@@ -107,12 +107,9 @@ class Phase:
 
 
 def hand_trials(seed: int, *, trials: int = HAND_TRIALS, start: float = 0.0) -> tuple[HandMotion, ...]:
-    """Return the trials of experiment 1, alternating in direction.
+    """Return the trials of experiment 1, alternating in direction, from an angle [rad].
 
-    Args:
-        seed: Seed of durations and tremor; a trial does not depend on the number of trials.
-        trials: Number of trials.
-        start: Angle at which each trial starts and ends [rad].
+    A trial depends on the seed alone, not on the number of trials.
 
     Source:
         Thesis, section "Determination of moment of inertia and damping": six trials, both directions.

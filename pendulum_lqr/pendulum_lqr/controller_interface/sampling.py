@@ -102,19 +102,10 @@ def rate_problem(
     uses: bool,
     set_point: float = 0.0,
 ) -> str:
-    """Return why a controller must not run on states at another rate than it was designed for; empty if it may.
+    """Return why a controller must not run on states at another period than designed [s]; empty if it may.
 
     Only a controller that settles at its own rate is refused: one that never settles, such as zero torque, is intended.
-
-    Args:
-        kind: Class of the controller.
-        name: Its name.
-        make: Designs it.
-        plant: Plant of the design.
-        designed: Period of the design [s].
-        measured: Period of the states [s].
-        uses: Whether its commands depend on the period.
-        set_point: Angle to hold, from upright [rad].
+    ``uses`` tells whether its commands depend on the period; ``set_point`` is from upright [rad].
     """
     if not kind.BALANCES or (uses and not differs(measured, designed)):
         return ""

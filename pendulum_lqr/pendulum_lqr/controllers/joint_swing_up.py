@@ -60,8 +60,7 @@ class JointSwingUp(CaughtController):
 
     Raises:
         ParameterError: No swing-up is stored for this plant and none is given, its file is refused, or it is for
-            another
-            mechanism.
+            another mechanism.
     """
 
     SUMMARY = "swing-up along the stored trajectory of a preset, or that of a file, by TVLQR, then LQR"

@@ -81,8 +81,7 @@ def make_mechanism_controller(name: str, plant: PlantParameters, period: float) 
 
     Args:
         name: Of :func:`mechanism_controller_names`, or the path of a policy file, ``FILE.npz``; with ``FILE.npz+lqr``
-            an LQR
-            takes over near upright.
+            an LQR takes over near upright.
         plant: Plant of its model.
         period: Sampling period [s].
 

@@ -34,12 +34,9 @@ DISTURBING = np.dtype(
 
 
 class CompiledDisturbance:
-    """Publishes uniform noise or zero, :class:`pendulum_msgs_py.loops.answer_record.Answerer`.
+    """Publishes uniform noise or zero for one joint, :class:`pendulum_msgs_py.loops.answer_record.Answerer`.
 
-    Args:
-        loops: A loop for each joint; only a single joint is compiled.
-        ready: Returns whether the next torque needs no other work.
-        refusal: Why no loop is used, or empty.
+    ``ready`` returns whether the next torque needs no other work; ``refusal`` says why no loop is used.
     """
 
     def __init__(self, loops: Sequence[DisturbanceLoop], ready: Callable[[], bool], refusal: str = "") -> None:

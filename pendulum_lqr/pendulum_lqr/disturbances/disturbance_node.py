@@ -61,9 +61,6 @@ class DisturbanceNode(PollingNode):
 
     Before the start and after the end it publishes zero, so that a plant in lockstep gets its reply and a plant in real
     time never holds an old torque. Events ``noise_start`` and ``noise_end`` mark the first and last disturbed state.
-
-    Args:
-        stop: Requests the runner to end the process.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:

@@ -173,11 +173,7 @@ def with_integrals(model: LinearModel, outputs: Sequence[int] = (0,)) -> LinearM
 def kalman_gain(A: Matrix, C: Matrix, process: ArrayLike, measurement: ArrayLike) -> KalmanGain:
     """Return the stationary Kalman filter of ``x[k+1] = A x[k] + w``, ``y[k] = C x[k] + v``.
 
-    Args:
-        A: State matrix, shape (n, n).
-        C: Output matrix, shape (m, n).
-        process: Covariance of w, shape (n, n).
-        measurement: Covariance of v, shape (m, m), positive definite.
+    Shapes: A (n, n), C (m, n), covariances of w (n, n) and of v (m, m), which is positive definite.
 
     Raises:
         DesignError: A driven mode is unobservable, or a covariance is out of domain.

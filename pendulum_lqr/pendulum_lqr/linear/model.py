@@ -76,10 +76,8 @@ class LinearModel:
         E: Input matrix of an external torque on each link, shape (n, joints); without delay.
         delay: Time between a command and its first effect [s], the longest of all actuators; not in A.
         states: theta, theta_dot, then motor_angle and motor_velocity (at the output side of the gears) of a
-            series-elastic
-            plant, then torque, the lagged command. Of a mechanism the joints, their velocities (``JOINT_dot``), then
-            the
-            lagged efforts (``JOINT_effort``).
+            series-elastic plant, then torque, the lagged command. Of a mechanism the joints, their velocities
+            (``JOINT_dot``), then the lagged efforts (``JOINT_effort``).
         position: Fixed point, one value for each joint [rad or m].
         efforts: The m efforts that hold it [N m or N].
     """
@@ -164,8 +162,7 @@ def linearise(plant: RigidPlant | PlantParameters, at: float | Sequence[float] |
     Args:
         plant: Plant parameters; dry friction, end stops and hysteresis are neglected.
         at: Position of the fixed point, 0 hanging down, of one joint or of each [rad or m]; None for upright. One joint
-            can
-            be held at every angle; a mechanism only where its driven joints can hold it.
+            can be held at every angle; a mechanism only where its driven joints can hold it.
 
     Raises:
         ParameterError: The position is not finite, has another length, or a passive joint would fall; or no joint is
@@ -212,11 +209,7 @@ def linearise(plant: RigidPlant | PlantParameters, at: float | Sequence[float] |
 
 
 def holding_effort(plant: PlantParameters, position: Sequence[float] | None = None) -> Vector:
-    """Return the efforts of the driven joints that hold a mechanism at a position, m values [N m or N].
-
-    Args:
-        plant: Plant.
-        position: n positions; None for upright [rad or m].
+    """Return the m efforts that hold a mechanism at n positions [rad or m], None for upright [N m or N].
 
     Raises:
         ParameterError: The position has another length, is not finite, or a passive joint would fall from it.

@@ -41,11 +41,9 @@ class Observer:
         coordinates: Joints, and which of them are driven.
         period: Sampling period [s].
         p: Standard deviations ``position_noise`` [rad or m], ``velocity_noise`` [rad/s or m/s], 0 to ignore velocities,
-            and
-            ``effort_noise`` of the unknown effort on every joint [N m or N]; drift ``offset_noise`` of constant
-            efforts, 0 for
-            none [N m/s^0.5]; ``delay`` in addition to the model's [s]. Without ``position_noise`` measurements are used
-            unfiltered, and the rest is predicted.
+            and ``effort_noise`` of the unknown effort on every joint [N m or N]; drift ``offset_noise`` of constant
+            efforts, 0 for none [N m/s^0.5]; ``delay`` in addition to the model's [s]. Without ``position_noise``
+            measurements are used unfiltered, and the rest is predicted.
 
     Attributes:
         gain: L; None for unfiltered measurements.
@@ -102,11 +100,8 @@ class Observer:
     def correct(self, off: Vector, velocity: Vector) -> Array:
         """Process a measurement and return [x; efforts in transit] for the gain of a design, shape (n + p m,).
 
-        Efforts are deviations from the holding ones, including constant efforts.
-
-        Args:
-            off: Measured deviations from the fixed point [rad or m].
-            velocity: Measured velocities [rad/s or m/s]; the first ones are always used.
+        Efforts are deviations from the holding ones, including constant efforts; ``off`` those from the fixed point
+        [rad or m]. The first measurement always uses velocities [rad/s or m/s].
         """
         measured = np.array([*off, *velocity])
         if self._estimate is None:

@@ -106,13 +106,9 @@ class WorstCase:
 
 
 def worst_case(plants: Sequence[PlantParameters], K: ArrayLike, theta: float, names: Sequence[str]) -> WorstCase:
-    """Return the worst margins of one gain over several plants, each linearised at the same measured angle.
+    """Return the worst margins of a gain, shape (2,), over plants linearised at a measured angle [rad].
 
-    Args:
-        plants: At least one, of one structure.
-        K: Gain on angle and velocity, shape (2,).
-        theta: Measured angle, 0 hanging down [rad].
-        names: Parameters to report of the worst plant.
+    The plants have one structure; ``names`` are the parameters of the worst one to report.
     """
     unstable, found = 0, []
     lost: PlantParameters | None = None
@@ -152,8 +148,7 @@ def parse_box(texts: Sequence[str], plant: PlantParameters, path: Path | None = 
 
     Args:
         texts: Per parameter a percentage to either side, or lowest and highest value in its unit; or ``identified``
-            alone,
-            for the intervals of the plant file.
+            alone, for the intervals of the plant file.
         plant: Nominal plant.
         path: Its file; None for a preset.
 

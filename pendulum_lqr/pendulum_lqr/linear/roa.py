@@ -91,16 +91,10 @@ class Region:
 
 
 def proven_level(plant: RigidPlant, gain: Gain, effort_limit: float, theta: float = UPRIGHT) -> float:
-    """Return the largest c for which {x' S x <= c} is proven to be attracted to a fixed point; 0 without a proof.
+    """Return the largest c for which {x' S x <= c} is proven attracted to a fixed point [rad]; 0 without a proof.
 
     Without dry friction (with which a pendulum comes to rest near the fixed point), lag, delay and drivetrain; with
-    ``angle_offset`` and ``torque_offset``.
-
-    Args:
-        plant: Plant parameters.
-        gain: LQR gain at the fixed point and its Riccati solution.
-        effort_limit: Torque limit [N m], > 0.
-        theta: Measured angle of the fixed point, 0 hanging down [rad].
+    ``angle_offset`` and ``torque_offset``. The gain is the LQR's there; ``effort_limit`` in [N m].
 
     Raises:
         DesignError: The limit is not positive, or too small to hold the fixed point.
@@ -156,16 +150,10 @@ def region_of_attraction(
     velocity_span: float = 10.0,
     points: int = 101,
 ) -> Region:
-    """Sample the region of attraction by batch simulation and prove its inner part.
+    """Sample the region of attraction of upright by batch simulation and prove its inner part.
 
-    Args:
-        plant: Plant parameters.
-        gain: LQR gain at upright and its Riccati solution.
-        effort_limit: Torque limit of the loop [N m].
-        rollout: Batch simulation of the closed loop, long enough to settle.
-        angle_span: Half width of the grid in angle [rad].
-        velocity_span: Half width of the grid in velocity [rad/s].
-        points: Points along each axis; an odd number includes upright.
+    ``effort_limit`` in [N m]. The grid has half widths ``angle_span`` [rad] and ``velocity_span`` [rad/s]; an odd
+    number of points includes upright. ``rollout`` must be long enough to settle.
     """
     angles = np.linspace(-angle_span, angle_span, points)
     velocities = np.linspace(-velocity_span, velocity_span, points)
@@ -179,16 +167,10 @@ def region_of_attraction(
 
 
 def rigid_rollout(plant: RigidPlant, gain: Gain, effort_limit: float, duration: float = 8.0) -> Rollout:
-    """Return a batch simulation of the smooth rigid plant under u = clamp(u* - K x), with wrapped angles.
+    """Return a batch simulation [s] of the smooth rigid plant under u = clamp(u* - K x) [N m], with wrapped angles.
 
     Exponential midpoint rule: damping, the fast pole of a stiff plant, is exact, so that the slow motion sets the step.
     For plants with friction use the simulator's batch engine.
-
-    Args:
-        plant: Plant parameters.
-        gain: LQR gain at upright.
-        effort_limit: Torque limit [N m].
-        duration: Length of the simulation [s].
     """
     k0, k1 = (float(value) for value in gain.K)
     hold = equilibrium_effort(plant, UPRIGHT)

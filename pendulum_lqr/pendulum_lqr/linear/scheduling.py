@@ -109,8 +109,7 @@ class ScheduledMargins:
         radii: Largest |pole| of the sampled loop at each [-]; below 1.
         moduli: Smallest distance of each L(j w) from -1, including hold and plant delay [-].
         time_constant: Decay time of deviations along the moving reference [s], by the product of all sampled loops over
-            a
-            period (Floquet), which frozen loops do not show.
+            a period (Floquet), which frozen loops do not show.
     """
 
     angles: tuple[float, ...]

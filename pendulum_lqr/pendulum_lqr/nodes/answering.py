@@ -179,16 +179,7 @@ class ControlLoop:
         ages_ns: Sequence[int],
         compute_times_ns: Sequence[int],
     ) -> None:
-        """Count replies that were already sent.
-
-        Args:
-            sample: Newest state that got a reply.
-            effort: The reply [N m or N].
-            answered: Number of replies.
-            saturated: Number of replies at a limit.
-            ages_ns: Ages of their states [ns].
-            compute_times_ns: Compute times [ns].
-        """
+        """Count replies already sent: efforts [N m or N], number, number at a limit, ages and compute times [ns]."""
         self.newest, self.kept_answer, self.last_effort = sample, effort, effort
         self.answered_ns = sample.stamp_ns
         self.answered += answered

@@ -95,9 +95,6 @@ class ControllerNode(LifecycleNode, PollingNode):
 
     Unconfigured: parameters are declared. Inactive: the gain is designed and printed, states are read without reply.
     Active: every new state gets one reply. Deactivation, shutdown and signals send zero torque and stop.
-
-    Args:
-        stop: Requests the runner to end the process.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:

@@ -45,9 +45,6 @@ class EffortAdapterNode(Node):
     """Publishes each command of ros2_control's kind as the reply to the newest state.
 
     While there are several publishers of commands none is passed on, because commands do not name their source.
-
-    Args:
-        stop: Requests the runner to end the process.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:

@@ -45,9 +45,6 @@ _AT_ONCE = 0.0
 class TrajectoryActionNode(Node):
     """Passes goals on to the plant's ``joint_trajectory``, one at a time, and ends them by its ``events``.
 
-    Args:
-        stop: Requests the runner to end the process.
-
     Raises:
         ParameterError: The package that has the action's type is not installed.
     """

@@ -115,8 +115,7 @@ def load_actor(path: str | Path) -> Actor:
 
     Raises:
         DataError: The archive is missing, too large, damaged, foreign, or not a plain network with tanh or relu from a
-            box of
-            vectors to a symmetric box.
+            box of vectors to a symmetric box.
     """
     path = Path(path).expanduser()
     where = f"archive {path}"

@@ -55,13 +55,8 @@ def controller_response(
 ) -> tuple[Complex, bool]:
     """Return K at some frequencies, shape (2, n) [N m/rad, N m s/rad], and whether the loop with the model is stable.
 
-    Args:
-        name: Controller.
-        plant: Plant that it is designed for.
-        frequency: Shape (n,), below the Nyquist frequency [Hz]; interpolated between lines 0.05 Hz apart.
-        period: Sampling period [s].
-        values: Its parameters by name; others have defaults.
-        size: Factor on disturbances of 0.1 mrad and 0.01 rad/s.
+    Frequencies (n,) [Hz] are below Nyquist, interpolated between lines 0.05 Hz apart; ``period`` in [s]; ``size``
+    multiplies the disturbances of 0.1 mrad and 0.01 rad/s.
 
     Raises:
         ParameterError: No such controller, or not for this plant or period.

@@ -109,14 +109,7 @@ DEFAULT_SCALING = Scaling()
 
 @dataclass(frozen=True, slots=True)
 class JointScaling(SignalScaling):
-    """Scaling of a plant of several joints, one of them driven.
-
-    Attributes:
-        names: Outputs: joints, then their velocities.
-        units: Of each [rad, m, rad/s or m/s].
-        values: Unit of scaling of each.
-        effort: Unit of scaling of the effort [N m or N].
-    """
+    """Scaling of several joints, one driven: ``values`` of outputs in ``units``, ``effort`` in ``effort_unit``."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]

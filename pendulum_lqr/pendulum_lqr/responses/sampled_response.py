@@ -42,16 +42,10 @@ def model_response(model: LinearModel, frequency: ArrayLike, period: float = 0.0
 def brought_to(
     response: ArrayLike, model: LinearModel, frequency: ArrayLike, *, measured: float, period: float = 0.0
 ) -> Complex:
-    """Convert a response measured at one sampling period to another, by a model's ratio.
+    """Convert a response (outputs, n), measured at a sampling period [s], to another one by a model's ratio.
 
     Only the change of hold and aliasing is the model's, so its error enters multiplied by that small change.
-
-    Args:
-        response: Measured response, shape (outputs, n).
-        model: A model of the plant.
-        frequency: Shape (n,) [Hz], below both Nyquist frequencies.
-        measured: Sampling period of the measurement [s].
-        period: Wanted sampling period [s]; 0 for the continuous plant.
+    Frequencies (n,) [Hz] must be below both Nyquist frequencies; period 0 is the continuous plant.
     """
     ratio = model_response(model, frequency, period) / model_response(model, frequency, measured)
     return np.asarray(np.asarray(response, dtype=np.complex128) * ratio, dtype=np.complex128)

@@ -14,12 +14,8 @@ _LEAST, _MOST = -0.2, 1.0
 class EnergyMargin:
     """Reduces the margin after passing upright uncaught, increases it after turning back before.
 
-    Args:
-        first: Initial margin, as a share of the energy of upright [-].
-        rest: Velocity below which noise decides the direction, and the margin is constant [rad/s].
-
-    Attributes:
-        value: Margin [-].
+    ``first`` and ``value`` are shares of upright's energy [-]. Below velocity ``rest`` [rad/s], where noise decides the
+    direction, the margin is constant.
     """
 
     def __init__(self, first: float, rest: float = 0.0) -> None:

@@ -133,12 +133,7 @@ def _costs(gain: Gain, deviations: Array) -> Array:
 
 @dataclass
 class MechanismCatch:
-    """u = -K x within a region, with hysteresis.
-
-    Attributes:
-        leave: Multiple of the region's level at which it releases.
-        active: Whether it is in charge.
-    """
+    """u = -K x within a region, with hysteresis: it releases at ``leave`` times the region's level."""
 
     plant: PlantParameters
     gain: Gain
@@ -169,13 +164,9 @@ class MechanismCatch:
 def make_mechanism_catch(
     plant: PlantParameters, q: ArrayLike, r: ArrayLike, limits: Vector | None = None
 ) -> MechanismCatch:
-    """Return the LQR of a plant about upright with its sampled region (a second or so).
+    """Return the LQR of a plant about upright, weights q (2n,) and r, with its sampled region (a second or so).
 
-    Args:
-        plant: Plant.
-        q: Weights of deviations, then velocities, shape (2n,).
-        r: Weight of the efforts.
-        limits: Largest effort of each driven joint, if below the plant's; they shrink the region [N m or N].
+    ``limits`` of the driven joints below the plant's shrink the region [N m or N].
     """
     if limits is not None:
         allowed = zip(plant.coordinates.driven_names, limits, plant.effort_limits, strict=True)

@@ -53,8 +53,7 @@ class PumpGains:
         damping: Its damping ratio [-].
         margin: Target energy beyond that of upright, relative [-].
         reach: Largest distance of the driven joint from its goal [rad or m], at most nine tenths of the way to its
-            stops;
-            0 for these.
+            stops; 0 for these.
         carried: Turn of the pendulum's frame per turn of the driven joint that carries it [-].
     """
 

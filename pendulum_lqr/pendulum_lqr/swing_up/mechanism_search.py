@@ -20,15 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """Settings of a search.
-
-    Attributes:
-        weights: Of the cost; dominated by being away from upright, so that plans are fast.
-        step: Distance of the plan's nodes [s].
-        nodes: Intervals of the horizon.
-        guesses: Number of random guesses.
-        iterations: Largest number of iterations for each of them.
-    """
+    """Settings of a search; ``step`` is the distance of the plan's nodes [s], ``iterations`` their largest number."""
 
     weights: IlqrWeights
     step: float
@@ -52,14 +44,9 @@ class PlanSearch:
     def solve(
         self, x: Vector, before: Vector, guess: Array, iterations: int, around: IlqrPlan | None = None
     ) -> IlqrPlan:
-        """Return the result of iterations on a guess.
+        """Return the result of iterations on a guess of efforts, shape (nodes, m), from the state x = [q, v].
 
-        Args:
-            x: Initial state, [q, v].
-            before: Efforts until then, m values.
-            guess: Efforts, shape (nodes, m).
-            iterations: Largest number of iterations.
-            around: Plan whose feedback follows the guess.
+        ``before`` has the m efforts until then; ``around`` is a plan whose feedback follows the guess.
         """
         n = len(x) // 2
         return self._problem.solve(x[:n], x[n:], before, guess, iterations, around)

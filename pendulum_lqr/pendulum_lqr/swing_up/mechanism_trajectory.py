@@ -82,15 +82,9 @@ class MechanismTrajectory:
 
 @dataclass(frozen=True)
 class SwingUpSearch:
-    """Settings of a search.
+    """Settings of a search: ``duration``, ``step`` of the nodes and ``shortest`` horizon of a guess in [s].
 
-    Attributes:
-        weights: Of the cost.
-        duration: Length of the trajectory [s].
-        step: Distance of its nodes [s].
-        shortest: Shortest horizon of a guess [s]; the LQR holds for the rest of ``duration``.
-        find: Weights of the first optimisation, from a random guess to upright.
-        iterations: Largest number of iterations of each solution.
+    ``find`` weights the first optimisation, from a random guess to upright; the LQR holds for the rest of the duration.
     """
 
     weights: IlqrWeights

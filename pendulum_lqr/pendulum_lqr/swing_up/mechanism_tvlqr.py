@@ -28,14 +28,8 @@ def tracking_gains(
 ) -> tuple[Array, Array]:
     """Return K (N, m, 2n) and cost matrices P (N + 1, 2n, 2n) of u = u0 - K (x - x0) along N samples.
 
-    Args:
-        plant: Plant.
-        states: x0 at the samples, shape (N + 1, 2n).
-        efforts: u0, held over a period, shape (N, m).
-        period: Sampling period [s].
-        q: Weights of the deviation, shape (2n,) [per s].
-        r: Weight of the efforts' deviation.
-        terminal: P at the end.
+    x0 are states (N + 1, 2n), u0 efforts (N, m) held over ``period`` [s]; q (2n,) and r weight their deviations [per
+    s]; ``terminal`` is P at the end.
 
     Source:
         Tedrake, Underactuated Robotics, section 8.2 (finite-horizon LQR along a trajectory).
@@ -79,10 +73,7 @@ class MechanismTvlqr(Controller):
 
     Args:
         period: Sampling period [s].
-        trajectory: Swing-up.
-        catch: LQR with its region and plant.
-        q: Weights of the deviation along the trajectory, shape (2n,).
-        r: Weight of the efforts' deviation.
+        q: Weights of the deviation along the trajectory, shape (2n,); r that of the efforts'.
         recover: Controller from anywhere else; None for no effort.
         tube: Largest cost x' P x of a deviation from the trajectory, as a multiple of the caught region's level.
 

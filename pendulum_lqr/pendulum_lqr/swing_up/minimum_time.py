@@ -83,15 +83,10 @@ def minimum_time(
     angles: int = 240,
     velocities: int = 241,
 ) -> TimeToGo:
-    """Return the time to go from every state of a grid to an ellipse around a set-point.
+    """Return the time to go from every state of a grid to the set x' S x <= c about ``centre``, from upright [rad].
 
-    Args:
-        plant: Plant parameters, with damping, gravity, dry friction and offsets.
-        effort_limit: [N m].
-        target: (S, c) of the set x' S x <= c.
-        centre: Of the set, from upright [rad].
-        angles: Grid points of a full turn.
-        velocities: Grid points in velocity, odd so that rest is one of them.
+    ``target`` is (S, c), ``effort_limit`` in [N m]; an odd number of ``velocities`` includes rest. The model has
+    damping, gravity, dry friction and offsets.
     """
     # 1.3 times the speed of a free fall from upright.
     span = 1.3 * math.sqrt(4.0 * max(plant.gravity, 1e-3) / plant.inertia)

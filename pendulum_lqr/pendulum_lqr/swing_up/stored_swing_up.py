@@ -48,12 +48,9 @@ def refuse_passive_friction(controller: str, plant: PlantParameters) -> None:
 
 
 def tracked_swing_up(plant: PlantParameters, period: float, *, recovers: bool = False) -> MechanismTvlqr:
-    """Return the controller that follows the stored swing-up of a plant by time-varying LQR.
+    """Return the controller that follows the stored swing-up of a plant by time-varying LQR at a sampling period [s].
 
-    Args:
-        plant: Plant.
-        period: Sampling period [s].
-        recovers: Whether it replans outside the tube; otherwise it continues to follow.
+    If it ``recovers``, it replans outside the tube; otherwise it continues to follow.
 
     Raises:
         ParameterError: There is none for this plant.

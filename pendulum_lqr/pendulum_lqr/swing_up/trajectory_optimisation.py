@@ -55,12 +55,7 @@ def swing_up_trajectory(
     """Return the fastest of the locally optimal swing-ups from several guesses, with a small cost of torque changes.
 
     Hermite-Simpson collocation with the torque linear between nodes; the guesses have different numbers of swings.
-
-    Args:
-        plant: Plant parameters.
-        effort_limit: Torque limit of the trajectory [N m], with a reserve for the feedback.
-        nodes: Number of intervals.
-        set_point: End, from upright [rad].
+    ``effort_limit`` [N m] should leave a reserve for the feedback; ``set_point`` is the end, from upright [rad].
 
     Raises:
         DesignError: No guess leads there.
