@@ -230,7 +230,7 @@ def judge(model: Linear, truth: Linear, q: Array, r: float, seed: int, cases: in
         certifier = Certifier(known, Machine.of(response), DEFAULT_SCALING)
     else:
         scaling = JointScaling.of_weights(known.measured, ["-"] * len(q), list(q), r, "-")
-        certifier = Certifier(known, Machine.beside(response, known), scaling)
+        certifier = Certifier(known, Machine.relative_to(response, known), scaling)
     random, found = np.random.default_rng([9, seed]), []
     for _ in range(cases):
         weights = q * 10.0 ** random.uniform(-0.5, 1.5, len(q))

@@ -35,7 +35,7 @@ def test_two_who_publish_for_one_button_stop_whatever_they_say_and_a_press_is_to
     button = EStopInput(0.5)
     button.hear(pressed=False, now_ns=0)
     button.count(2)
-    assert button.reason(0) == "2 publish for the e-stop button; expected one, whose silence can be told"
+    assert button.reason(0) == "2 publish for the e-stop button; expected one, whose silence is detectable"
     button.hear(pressed=True, now_ns=0)
     assert button.reason(0) == "e-stop button is pressed"
     button.hear(pressed=False, now_ns=0)

@@ -136,7 +136,7 @@ def test_a_goal_is_given_up_when_somebody_else_sends_a_trajectory(client: Client
     handle = client.send_away()
     client.elsewhere.publish(message((1.0, client.places[-1] + 0.2)))
     status, result = client.end(handle)
-    assert (status, result.error_string) == (ABORTED, "somebody else sent the plant a trajectory")
+    assert (status, result.error_string) == (ABORTED, "another sender published a trajectory")
     # Not before the other's has ended.
     handle = client.until(lambda: next(filter(accepted, [client.send((1.0, 0.3))]), None), "the end of the other's")
     assert client.end(handle)[0] == SUCCEEDED

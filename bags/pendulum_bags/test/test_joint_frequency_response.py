@@ -149,7 +149,7 @@ def test_between_and_below_the_lines_the_machine_is_what_it_is(name: str) -> Non
     plant, model = load_mechanism(name), _model(name)
     other = replace(linearise(stand_in_for(plant, share=0.1, delay=0.0, seed=2)), delay=0.005)
     measured = _exact(other, plant, "hw")
-    machine = Machine.beside(measured, model)
+    machine = Machine.relative_to(measured, model)
     true = model_response(other, machine.frequency, PERIOD)
     error = np.abs(machine.response - true)
     measured_there = machine.frequency >= measured.frequency[0]
@@ -165,7 +165,7 @@ def test_below_the_lowest_line_a_delay_goes_on_through_zero_without_a_kink() -> 
     plant, model = load_mechanism("acrobot_frictionless"), _model("acrobot_frictionless")
     late = replace(model, delay=0.02)
     measured = _exact(late, plant, "hw")
-    machine = Machine.beside(measured, model)
+    machine = Machine.relative_to(measured, model)
     below = machine.frequency < measured.frequency[0]
     true = model_response(late, machine.frequency, PERIOD)
     assert np.max(np.abs(machine.response / true - 1.0)[:, below]) < 1e-4
@@ -174,7 +174,7 @@ def test_below_the_lowest_line_a_delay_goes_on_through_zero_without_a_kink() -> 
 def test_what_noise_makes_of_the_lines_counts_between_them_too() -> None:
     plant, model = load_mechanism("furuta"), _model("furuta")
     exact = _exact(model, plant, "hw")
-    machine = Machine.beside(replace(exact, deviation=0.05 * np.abs(exact.response)), model)
+    machine = Machine.relative_to(replace(exact, deviation=0.05 * np.abs(exact.response)), model)
     share = machine.radius / np.abs(machine.response)
     on_line = np.isin(machine.frequency, exact.frequency)
     assert share[:, ~on_line].min() > 0.9 * share[:, on_line].min()
@@ -206,7 +206,7 @@ def test_no_certified_gain_fails_on_the_machine_that_was_measured(name: str) -> 
         machine = stand_in_for(plant, share=0.1, delay=0.0, seed=seed)
         other = replace(linearise(machine), delay=float(generator.uniform(0.0, 0.01)))
         measured = _exact(other, plant, "hw", 0.05)
-        certifier = Certifier(model, Machine.beside(measured, model), _scaling(plant, model))
+        certifier = Certifier(model, Machine.relative_to(measured, model), _scaling(plant, model))
         sampled = discretise(other, PERIOD)
         for _ in range(40):
             K = _gains(model, plant.mechanism.weights[0], generator)
@@ -226,7 +226,7 @@ def test_no_loop_that_an_unseen_stiffness_of_the_cart_may_tip_is_certified(stiff
     A, drive = model.A.copy(), model.B[:, 0]
     A[:, 0] -= drive * stiffness / drive[2]
     other = replace(model, A=A)
-    certifier = Certifier(model, Machine.beside(_exact(other, plant, "hw"), model), _scaling(plant, model))
+    certifier = Certifier(model, Machine.relative_to(_exact(other, plant, "hw"), model), _scaling(plant, model))
     sampled, generator = discretise(other, PERIOD), np.random.default_rng(11)
     refused = fell = certified = 0
     for _ in range(80):
@@ -256,7 +256,7 @@ def test_a_loop_slower_than_the_lowest_line_is_measured_again_from_below_it() ->
 def test_a_machine_that_falls_under_the_design_is_not_certified() -> None:
     plant, model = load_mechanism("cart_pole"), _model("cart_pole")
     late = replace(model, delay=0.15)
-    certifier = Certifier(model, Machine.beside(_exact(late, plant, "hw"), model), _scaling(plant, model))
+    certifier = Certifier(model, Machine.relative_to(_exact(late, plant, "hw"), model), _scaling(plant, model))
     K = output_lqr(model, *plant.mechanism.weights).K
     assert is_stable(discretise(model, PERIOD), K)
     assert not is_stable(discretise(late, PERIOD), K)
@@ -279,14 +279,14 @@ def test_a_machine_that_falls_under_the_design_is_not_certified() -> None:
 )
 def test_what_is_no_design_of_the_plant_is_refused(design: str, words: str) -> None:
     plant, model = load_mechanism("cart_pole"), _model("cart_pole")
-    certifier = Certifier(model, Machine.beside(_exact(model, plant, "hw"), model), _scaling(plant, model))
+    certifier = Certifier(model, Machine.relative_to(_exact(model, plant, "hw"), model), _scaling(plant, model))
     with pytest.raises(ParameterError, match=words):
         certify_designs([design], plant, certifier)
 
 
 def test_a_gain_is_certified_as_it_is_written() -> None:
     plant, model = load_mechanism("cart_pole"), _model("cart_pole")
-    certifier = Certifier(model, Machine.beside(_exact(model, plant, "hw"), model), _scaling(plant, model))
+    certifier = Certifier(model, Machine.relative_to(_exact(model, plant, "hw"), model), _scaling(plant, model))
     K = output_lqr(model, *plant.mechanism.weights).K
     own, same, wrong = certify_designs(
         ["q=10,100,1,1 r=0.1", "k=" + ",".join(map(repr, map(float, K))), "k=0,0,0,0"], plant, certifier

@@ -228,7 +228,7 @@ class EmulatorProcessBackend:
             except BlockingIOError:
                 return reply
             except OSError:
-                return reply  # "connection refused": nobody listens there, or not yet
+                return reply  # "connection refused": not listening, or not yet
             kind = wire.kind_of(packet)
             if kind == wire.FEEDBACK:
                 feedback = wire.decode_feedback(packet)

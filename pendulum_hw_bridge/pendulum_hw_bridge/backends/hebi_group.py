@@ -202,7 +202,7 @@ class HebiGroup:
             self._stop_told, self._stop_error = set(), None
             try:
                 self._stop_all()
-            except Exception as error:  # noqa: BLE001  (whatever it is, each joint is told)
+            except Exception as error:  # noqa: BLE001  (each joint gets it)
                 self._stop_error = error
         self._stop_told.add(index)
         if self._stop_error is not None:

@@ -80,9 +80,9 @@ def _check_hardware(values: Mapping[str, Any], limits: PlantLimits) -> None:
         ("velocity_limit", limits.velocity, 3.0, "rad/s", "twice what the motor can do, so that it limits nothing"),
         ("effort_slew_limit", limits.slew, 26e3, "N m/s", "from -13 to 13 N m in one cycle at 1 kHz"),
         ("start_effort_limit", limits.start_effort, 5.0, "N m", "a commander would begin with a blow"),
-        ("starvation_limit", limits.starvation, 120.0, "s", "so long nobody remembers that it is armed"),
+        ("starvation_limit", limits.starvation, 120.0, "s", "an armed plant would be forgotten"),
         ("position_window", width, 64.0, "rad", "from end to end, ten turns"),
-        ("handover_time", limits.handover_time, 1.0, "s", "so long a torque that nobody commands any more stays"),
+        ("handover_time", limits.handover_time, 1.0, "s", "a torque without a commander would last"),
         ("handover_effort_limit", limits.handover_effort, 5.0, "N m", "a commander would take over with a blow"),
         ("tracking_error_limit", limits.tracking_error, 1.0, "rad", "so far off it follows no trajectory"),
     ):

@@ -39,12 +39,12 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 @app.command()
 def check(
     context: typer.Context,
-    lab: Annotated[Path | None, typer.Option(help="Lab file; what is given beside it wins.")] = None,
+    lab: Annotated[Path | None, typer.Option(help="Lab file; explicit options take precedence.")] = None,
     backend: Annotated[str | None, typer.Option(help=f"One of {', '.join(BACKENDS)}.")] = None,
     family: Annotated[str | None, typer.Option(help="HEBI family; default any, if only one answers.")] = None,
     name: Annotated[str | None, typer.Option(help="HEBI name; default any, if only one answers.")] = None,
     serial: Annotated[str | None, typer.Option(help="Serial number of the HEBI module.")] = None,
-    interface: Annotated[str | None, typer.Option(help="Network address to look on; default all.")] = None,
+    interface: Annotated[str | None, typer.Option(help="Network address to search; default all.")] = None,
     plant: Annotated[
         str | None, typer.Option(help=f"{EMULATOR_PRESET_NAMES}, a plant file with a drivetrain, or of several joints.")
     ] = None,
@@ -56,7 +56,7 @@ def check(
     ] = None,
     joint_sign: Annotated[int | None, typer.Option(help="1, or -1 where the actuator turns the other way.")] = None,
     nudge: Annotated[
-        bool, typer.Option(help="Wait for a hand that turns the link counter-clockwise, to try the sign.")
+        bool, typer.Option(help="Wait for a hand to turn the link counter-clockwise, to test the sign.")
     ] = True,
     as_json: Json = False,
 ) -> int:

@@ -303,7 +303,7 @@ def state_items(
         CheckItem(f"{name} is at rest", speed <= _AT_REST, f"{speed:.3f} {unit}", f"at most {_AT_REST:g} {unit}"),
         CheckItem("motion stop is released", not last.m_stop, "pressed" if last.m_stop else "released", "released"),
         CheckItem(
-            "nobody else commands",
+            "no other commander",
             last.lock != CommandLock.LOCKED_BY_OTHER,
             _name(CommandLock, last.lock),
             "not locked_by_other",

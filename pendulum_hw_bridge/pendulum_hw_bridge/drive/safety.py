@@ -282,7 +282,7 @@ class SafetyMonitor:
                 return Fault(
                     "position_jump",
                     f"position jumped by {jump:.3f} {self.joint.unit} in {elapsed * 1e3:.0f} ms; "
-                    f"expected at most {allowed:.3g} {self.joint.unit} beside the velocity",
+                    f"expected at most {allowed:.3g} {self.joint.unit} in addition to the velocity",
                 )
         self._travelled += expected
         self._motion.append((self._travelled, feedback.position))

@@ -52,7 +52,7 @@ class ActuatorFault(str, Enum):
     POSITION_LIMIT = "position_limit", "the firmware's own position limit acts"
     VELOCITY_LIMIT = "velocity_limit", "the firmware's own velocity limit acts"
     EFFORT_LIMIT = "effort_limit", "the firmware's own effort limit acts"
-    OVERSPEED = "overspeed", "somebody turns the link faster than the bridge allows"
+    OVERSPEED = "overspeed", "the link is turned faster than the bridge allows"
     OUTSIDE_WINDOW = "outside_window", "the position reads outside the window"
     SEND_FAILED = "send_failed", "the network interface refuses to send"
 

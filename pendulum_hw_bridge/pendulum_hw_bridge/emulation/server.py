@@ -137,7 +137,7 @@ class EmulatorServer:
     def _answer(self, request: dict[str, Any], sender: Address) -> None:
         settings = request.get("settings")
         if settings is not None and self.actuator.faults & _UNREACHABLE:
-            return  # the packet was lost, or the module listens to somebody else: no acknowledgement
+            return  # the packet was lost, or the module listens to another sender: no acknowledgement
         reply: dict[str, Any] = {"id": request.get("id")}
         try:
             if settings is not None:

@@ -24,7 +24,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 @app.command()
 def convert(
     log: Annotated[Path, typer.Argument(help="The .hebilog file.")],
-    out: Annotated[Path | None, out_option("CSV file to write. Default: beside the log.")] = None,
+    out: Annotated[Path | None, out_option("CSV file to write. Default: next to the log.")] = None,
     lab: Annotated[Path | None, typer.Option(help="Lab file, for zero, sign and tare of the joint.")] = None,
     module: Annotated[int | None, typer.Option(help="Which module of a log of several, from 0.", min=0)] = None,
 ) -> None:

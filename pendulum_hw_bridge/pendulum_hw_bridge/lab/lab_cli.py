@@ -71,7 +71,7 @@ class _Terminal:
 def new(
     file: File,
     backend: Annotated[str, typer.Option(help="hebi, or emulator_process for a rehearsal.")] = "hebi",
-    interface: Annotated[str, typer.Option(help="Network address to look on; empty for all.")] = "",
+    interface: Annotated[str, typer.Option(help="Network address to search; empty for all.")] = "",
     family: Annotated[str, typer.Option(help="HEBI family of the module.")] = "",
     name: Annotated[str, typer.Option(help="HEBI name of the module.")] = "",
     serial: Annotated[str, typer.Option(help="Serial number of the module.")] = "",
@@ -187,7 +187,7 @@ def prove_lifetime(file: File, yes: Yes = False) -> None:
 
 @app.command(name="prove_m_stop")
 def prove_m_stop(file: File, yes: Yes = False) -> None:
-    """Prove that the motion stop ends the torque: press it when told to; the motor turns gently.
+    """Prove that the motion stop ends the torque: press it when prompted; the motor turns gently.
 
     Example: python -m pendulum_hw_bridge lab prove_m_stop lab.yaml
     """
@@ -201,7 +201,7 @@ def prove_m_stop(file: File, yes: Yes = False) -> None:
 @app.command()
 def backup(
     file: File,
-    out: Annotated[Path | None, out_option("New folder. Default: beside the lab file, with the time.")] = None,
+    out: Annotated[Path | None, out_option("New folder. Default: next to the lab file, with the time.")] = None,
 ) -> None:
     """Keep the module's gains, safety parameters and M-stop action in files, as they are now.
 

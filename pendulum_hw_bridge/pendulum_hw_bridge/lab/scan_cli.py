@@ -34,7 +34,7 @@ def scan(
     lab: Annotated[Path | None, typer.Option(help="Lab file that says which module is meant.")] = None,
     backend: Annotated[str | None, typer.Option(help="hebi, or emulator_process for an emulator.")] = None,
     interface: Annotated[
-        str | None, typer.Option(help="Network address to look on; default all; emulator:HOST:PORT in a rehearsal.")
+        str | None, typer.Option(help="Network address to search; default all; emulator:HOST:PORT in a rehearsal.")
     ] = None,
     family: Annotated[str | None, typer.Option(help="HEBI family that is meant.")] = None,
     name: Annotated[str | None, typer.Option(help="HEBI name that is meant.")] = None,

@@ -37,6 +37,6 @@ class EStopInput:
         if pressed:
             return "e-stop button is pressed"
         if publishers > 1:
-            return f"{publishers} publish for the e-stop button; expected one, whose silence can be told"
+            return f"{publishers} publish for the e-stop button; expected one, whose silence is detectable"
         silent = (now_ns - heard_ns) / NANOSECONDS
         return f"e-stop button is silent for {1e3 * silent:.0f} ms" if silent > self.timeout else ""

@@ -90,7 +90,7 @@ class DisturbanceLoop:
                 self.refused += 1
                 # A plant in lockstep repeats a state if the reply was lost: send the same reply again.
                 return DisturbanceAnswer(self.last_torque, "") if self._simulated_time else None
-            self._begin_anew()
+            self._restart()
         elif newest is not None:
             self.intervals_ns.append(stamp_ns - newest)
         self.newest_stamp_ns = stamp_ns
@@ -133,7 +133,7 @@ class DisturbanceLoop:
         """Interval between states [ns]; 0 before the second one."""
         return round(statistics.median_low(self.intervals_ns)) if self.intervals_ns else 0
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         """Forget the plant whose simulation has ended, so that the next one gets the same signal."""
         armed = self._armed or self._autostart
         self.stop()

@@ -119,7 +119,7 @@ class PlantFollowing:
 
     def on_other_trajectory(self) -> End | None:
         """Record that another sender published a trajectory."""
-        return self._end(Outcome.LEFT, "somebody else sent the plant a trajectory") if self.active else None
+        return self._end(Outcome.LEFT, "another sender published a trajectory") if self.active else None
 
     def on_wait(self, seconds: float, patience: float) -> End | None:
         """Give the goal up if the plant has not reported within ``patience`` [s] of a request ``seconds`` [s] ago."""

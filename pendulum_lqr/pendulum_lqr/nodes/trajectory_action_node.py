@@ -82,7 +82,7 @@ class TrajectoryActionNode(Node):
         elif self.count_services(self._of_goals) > 1:
             refusal = "two programs offer this action for one plant; expected one"
         elif self._plant.busy:
-            refusal = "the plant follows a trajectory that somebody else sent"
+            refusal = "the plant follows a trajectory of another sender"
         if refusal:
             self.get_logger().error(f"goal rejected: {refusal}")
             return GoalResponse.REJECT

@@ -47,8 +47,8 @@ def convert_policy(
 ) -> None:
     """Convert a policy file to ONNX, or an actor of Stable-Baselines3 (PPO, A2C, SAC, TQC) to a policy file.
 
-    Nothing in an archive is executed, and neither library is needed. No archive tells that observations were normalised
-    in training (VecNormalize): such an actor is another one than its archive says, so train without.
+    Nothing in an archive is executed, and neither library is needed. No archive shows whether observations were
+    normalised in training (VecNormalize), and such an actor would differ from its archive, so train without.
 
     Example: python -m pendulum_lqr convert_policy build/dfki.npz --out build/dfki.onnx
 

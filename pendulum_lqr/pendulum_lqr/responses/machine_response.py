@@ -101,7 +101,7 @@ class Machine:
         return cls(inside, response, discs, measured.period, float(lines[0]), ringing=ringing)
 
     @classmethod
-    def beside(cls, measured: MeasuredResponse, model: LinearModel) -> Machine:
+    def relative_to(cls, measured: MeasuredResponse, model: LinearModel) -> Machine:
         """Return the machine of several joints, interpolated relative to a model with the same outputs."""
         lines, period = measured.frequency, measured.period
         own = model_response(model, lines, period)

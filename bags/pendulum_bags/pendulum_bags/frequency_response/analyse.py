@@ -125,7 +125,7 @@ def analyse_responses(
         joints, effort_unit = mechanism.coordinates.joints, mechanism.coordinates.drive_unit
         units = [joint.unit for joint in joints] + [joint.velocity_unit for joint in joints]
         scaling = scaling or JointScaling.of_weights(model.measured, units, q, r, effort_unit)
-        machine = Machine.beside(by_label["hw"], model) if "hw" in by_label else None
+        machine = Machine.relative_to(by_label["hw"], model) if "hw" in by_label else None
         longer = longer or f"python -m pendulum_bags experiment joints --plant {plant} --periods 40"
     else:
         own = load_plant(plant)
