@@ -44,9 +44,9 @@ def run_closed_loop(
     period: float = 0.01,
     disturbance: Disturbance | None = None,
 ) -> Run:
-    from pendulum_sim.stepping.plants import make_plant
+    from pendulum_sim.stepping.plants import make_pendulum
 
-    simulated = make_plant(plant, period)
+    simulated = make_pendulum(plant, period)
     state = simulated.reset(theta, theta_dot)
     controller.reset()
     rows = []

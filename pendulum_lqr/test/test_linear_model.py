@@ -19,7 +19,7 @@ from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.equilibrium import fixed_points, overdamped_velocity, torque_gain
 from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 PLANTS = st.builds(
     pendulum_plant,
@@ -123,7 +123,7 @@ def test_the_linear_model_moves_as_the_simulated_plant_does_under_a_small_torque
     push = 5e-5
 
     def simulate(share):
-        simulated = make_plant(plant, period, substeps=20)
+        simulated = make_pendulum(plant, period, substeps=20)
         simulated.reset(theta)
         states = [simulated.step(model.effort + share * u, share * push) for u in torque]
         return np.array([(state.theta, state.theta_dot) for state in states])
@@ -153,7 +153,7 @@ def test_the_x5_9_linearised_is_a_slow_pole_behind_the_motor_and_not_a_fast_free
 def test_a_series_elastic_actuator_holds_with_less_than_the_weight_because_it_answers_with_more():
     plant = load_plant("x5_9")
     assert torque_gain(plant) == pytest.approx(1.0 / (0.65 * 1.008), rel=1e-12)
-    simulated = make_plant(_without_dry_friction(plant), 0.002)
+    simulated = make_pendulum(_without_dry_friction(plant), 0.002)
     simulated.reset(2.0)
     for _ in range(500):
         state = simulated.step(equilibrium_effort(plant, 2.0))
@@ -169,7 +169,7 @@ def test_the_simulated_plant_rests_at_its_fixed_points_whatever_its_offsets(angl
     for point in points:
         assert equilibrium_effort(plant, point.theta) == pytest.approx(effort, abs=1e-9)
         assert (linearise(plant, point.theta).poles[0].real < 0.0) == point.stable
-        simulated = make_plant(plant, 0.002)
+        simulated = make_pendulum(plant, 0.002)
         simulated.reset(point.theta)
         for _ in range(5):
             state = simulated.step(effort)

@@ -13,7 +13,7 @@ from pendulum_lqr.linear.design import DesignError, continuous_lqr, output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PRESETS, load_plant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 PERIOD = 0.01
 LATE = {"lag": {"actuator_time_constant": 0.02}, "delay": {"transport_delay": 0.013}}
@@ -45,7 +45,7 @@ def test_a_law_commands_what_the_matrices_do_also_at_the_limit(name: str, off: f
     plant = load_plant("dfki").with_values(coulomb_friction=0.0, static_friction=0.0, **CHANGES[late])
     law, matrices = (make_controller(name, plant, PERIOD, WEIGHTS) for _ in range(2))
     matrices._use(None, (), matrices.memory)  # type: ignore[attr-defined]
-    simulated = make_plant(plant, PERIOD)
+    simulated = make_pendulum(plant, PERIOD)
     state, efforts = simulated.reset(np.pi + off), []
     for k in range(400):
         arguments = (k * PERIOD, (state.theta,), (state.theta_dot,))

@@ -13,7 +13,7 @@ from pendulum_msgs_py.contract.supervisor import Input, PlantSupervisor
 from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSample
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 THESIS = load_plant("thesis")
 PERIOD = 0.01
@@ -24,7 +24,7 @@ def swing_up(controller, duration):
     limits = validate(LIMIT_SPECS, {"start_effort_limit": 2.0})
     supervisor = PlantSupervisor(limits_from_parameters(limits, (THESIS.effort_limit,), lockstep=False))
     loop = ControlLoop(controller, math.inf, simulated_time=True)
-    plant = make_plant(THESIS, PERIOD)
+    plant = make_pendulum(THESIS, PERIOD)
     state = plant.reset(0.0, 0.0)
     now = NANOSECONDS
     assert supervisor.arm(now, JointSample.of_one(now, 0.0, 0.0, 0.0)) == ""

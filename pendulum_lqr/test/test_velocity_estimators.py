@@ -11,7 +11,7 @@ from pendulum_lqr.controller_interface.velocity import VELOCITY_ESTIMATORS, Kalm
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 THESIS = load_plant("thesis")
 DFKI = load_plant("dfki")
@@ -42,7 +42,7 @@ def test_kalman_follows_a_swinging_pendulum_better_than_a_difference():
         "kalman": KalmanVelocity(plant, 0.01, position_noise=2e-3, torque_noise=0.1),
         "filtered_difference": VELOCITY_ESTIMATORS["filtered_difference"](plant, 0.01),
     }.items():
-        simulated = make_plant(plant, 0.01)
+        simulated = make_pendulum(plant, 0.01)
         state = simulated.reset(0.5)
         squares = []
         for k in range(500):
@@ -97,7 +97,7 @@ def test_kalman_gives_the_velocity_of_every_plant_in_a_free_fall_under_torque(na
         plant = plant.with_values(drivetrain=replace(plant.drivetrain, **smooth))
     # Hardly any torque but the one that it was told of: what it then says comes from its model.
     estimator = KalmanVelocity(plant, 0.01, position_noise=1e-2, torque_noise=1e-3)
-    simulated = make_plant(plant, 0.01)
+    simulated = make_pendulum(plant, 0.01)
     state = simulated.reset(2.5)
     effort, errors, speeds = 0.0, [], []
     for k in range(300):

@@ -21,7 +21,6 @@ from pendulum_msgs_py.plants.plant_parameters import (
 from pendulum_sim.exports.model_files import mjcf
 from pendulum_sim.foreign.equation_check import TOLERANCE, EquationCheck, check_equation
 from pendulum_sim.simulator.engines import open_simulation
-from pendulum_sim.stepping.joint_plant import joint_plant
 from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_sim.stepping.plants import make_plant
 
@@ -146,7 +145,7 @@ def test_a_motor_behind_a_spring_is_named_and_not_taken_for_a_delay(tmp_path: Pa
 def test_the_tolerance_is_five_per_cent_of_the_motion(inertia: float, agrees: bool) -> None:
     parameters = load_plant("dfki").with_values(coulomb_friction=0.0, load_friction=0.0)
     heavier = parameters.with_values(inertia=inertia * parameters.inertia)
-    one, other = (joint_plant(make_plant(each, 0.005)) for each in (heavier, parameters))
+    one, other = (make_plant(each, 0.005) for each in (heavier, parameters))
     assert check_equation(one, other).agrees == agrees
 
 

@@ -18,7 +18,7 @@ from pendulum_sim.pictures.drawing import save_gif, save_png
 from pendulum_sim.pictures.figures import overdamped_points
 from pendulum_sim.pictures.phase_plot import main
 from pendulum_sim.pictures.plant_picture import PlantPicture
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 
 def test_the_thesis_has_a_stable_point_below_and_an_unstable_one_above() -> None:
@@ -35,7 +35,7 @@ def test_an_overdamped_plant_with_offsets_creeps_as_its_phase_plot_says(name: st
     if parameters.drivetrain is not None:
         smooth = {"motor_coulomb_friction": 0.0, "motor_static_friction": 0.0, "hysteresis_torque": 0.0}
         parameters = parameters.with_values(drivetrain=replace(parameters.drivetrain, **smooth))
-    plant = make_plant(parameters, 0.002)
+    plant = make_pendulum(parameters, 0.002)
     plant.reset(1.0)
     # Until the spring has come to rest.
     for _ in range(1000):

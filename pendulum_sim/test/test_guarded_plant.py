@@ -17,7 +17,7 @@ from pendulum_sim.foreign.guarded_plant import GuardedPlant, PaceWatch, StallWat
 from pendulum_sim.foreign.gymnasium_plant import load_gymnasium_plant
 from pendulum_sim.foreign.mujoco_plant import load_mujoco_plant
 from pendulum_sim.stepping.plant import Plant, PlantState, RigidPlant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 
 class Broken(RigidPlant):
@@ -66,8 +66,8 @@ def _mujoco(folder: Path) -> Plant:
 
 
 _PLANTS: dict[str, Callable[[Path], Plant]] = {
-    "rigid": lambda _: make_plant(load_plant("thesis"), 0.002),
-    "series_elastic": lambda _: make_plant(load_plant("x5_9"), 0.002),
+    "rigid": lambda _: make_pendulum(load_plant("thesis"), 0.002),
+    "series_elastic": lambda _: make_pendulum(load_plant("x5_9"), 0.002),
     "gymnasium": lambda _: load_gymnasium_plant("Pendulum-v1"),
     "mujoco": _mujoco,
 }

@@ -16,7 +16,7 @@ from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.foreign.gymnasium_plant import GymnasiumPlant, load_adapter, load_gymnasium_plant
 from pendulum_sim.simulator.engines import open_simulation
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 
 class Lab(gymnasium.Env[Any, Any]):
@@ -68,7 +68,7 @@ def test_our_own_environment_is_our_plant() -> None:
     for name in ("inertia", "damping", "gravity", "effort_limit"):
         assert getattr(plant.parameters, name) == pytest.approx(getattr(ours, name), rel=1e-4), name
     # An action has single precision.
-    assert run(plant, 3.0, 5.0) == pytest.approx(run(make_plant(ours, 0.002), 3.0, 5.0), abs=1e-6)
+    assert run(plant, 3.0, 5.0) == pytest.approx(run(make_pendulum(ours, 0.002), 3.0, 5.0), abs=1e-6)
 
 
 def test_pendulum_v1_needs_no_adapter_and_hangs_at_our_zero() -> None:
@@ -94,7 +94,7 @@ def test_units_signs_and_entries_are_those_of_the_adapter() -> None:
     found = plant.parameters
     assert found.effort_limit == pytest.approx(3.0)
     assert (found.inertia, found.damping, found.gravity) == pytest.approx((0.1, 0.4, 2.0), rel=0.02)
-    assert run(plant, 2.0, 1.5) == pytest.approx(run(make_plant(found, 0.002), 2.0, 1.5), abs=0.02)
+    assert run(plant, 2.0, 1.5) == pytest.approx(run(make_pendulum(found, 0.002), 2.0, 1.5), abs=0.02)
     # The observation wraps at a right angle of ours, and our angle goes on.
     angles = run(plant, 1.2, 3.0)
     assert angles[-1] > 0.5 * math.pi

@@ -12,7 +12,7 @@ import pytest
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.plants.plant_parameters import PRESETS, PlantParameters, load_plant
 from pendulum_sim.exports.model_files import main, mjcf, urdf
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -58,7 +58,7 @@ def _farthest(parameters: PlantParameters, model_of: PlantParameters, effort: Ca
     model = mujoco.MjModel.from_xml_string(mjcf(model_of))
     data = mujoco.MjData(model)
     dt = 2e-3
-    plant = make_plant(parameters, dt, substeps=None if parameters.drivetrain is None else 40)
+    plant = make_pendulum(parameters, dt, substeps=None if parameters.drivetrain is None else 40)
     plant.reset(0.6)
     data.joint(JOINT).qpos[0] = 0.6
     if parameters.drivetrain is not None:
@@ -120,7 +120,7 @@ def test_the_urdf_of_the_series_elastic_plant_moves_slowly_as_the_plant_does() -
     assert limit is not None
     assert float(dynamics.get("damping", "nan")) == pytest.approx(13.196, abs=1e-3)
     # A joint of that damping, at the motor's torque, creeps as the plant does under a constant command.
-    plant = make_plant(parameters, 2e-3)
+    plant = make_pendulum(parameters, 2e-3)
     plant.reset(0.0)
     for _ in range(1000):
         state = plant.step(0.9)

@@ -15,7 +15,7 @@ from pendulum_sim.exports.model_files import mjcf, urdf
 from pendulum_sim.foreign.mujoco_mapping import MujocoMapping, load_mujoco_mapping
 from pendulum_sim.foreign.mujoco_plant import MujocoPlant, load_mujoco_plant
 from pendulum_sim.stepping.plant import RigidPlant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 pytest.importorskip("mujoco")
 
@@ -104,7 +104,7 @@ def test_an_exported_model_needs_no_mapping(tmp_path: Path, name: str, write_mod
             assert getattr(plant.parameters, value) == pytest.approx(getattr(parameters, value), rel=5e-4), value
     if write_model is mjcf:
         assert plant.parameters.effort_limit == parameters.effort_limit
-        ours = make_plant(
+        ours = make_pendulum(
             parameters.with_values(static_friction=parameters.coulomb_friction, load_friction=0.0), plant.dt
         )
         assert run(plant, 1.0, 2.0) == pytest.approx(run(ours, 1.0, 2.0), abs=0.05)

@@ -18,7 +18,7 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant
 from pendulum_sim.stepping.dry_friction import acceleration_with_friction
 from pendulum_sim.stepping.integrators import METHODS
 from pendulum_sim.stepping.plant import RigidPlant, pack, period_segments
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 _FREE = pendulum_plant(inertia=0.15, damping=0.0, gravity=3.0)
 _DRY = pendulum_plant(
@@ -299,7 +299,7 @@ def test_segments_of_a_period_add_up_to_it(fraction: float, substeps: int, dt: f
 )
 def test_a_plant_that_cannot_be_stepped_is_refused(kwargs: dict, message: str) -> None:
     with pytest.raises(ParameterError, match=message):
-        make_plant(_FREE, **kwargs)
+        make_pendulum(_FREE, **kwargs)
 
 
 def test_a_start_that_is_not_finite_is_refused() -> None:

@@ -10,7 +10,7 @@ from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, wi
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.stepping.plant import RigidPlant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 from pendulum_sim.stepping.series_elastic import SeriesElasticPlant
 from pendulum_sim.stepping.servo import PositionServo
 
@@ -45,7 +45,7 @@ def test_a_weight_that_friction_cannot_carry_sinks_until_it_can() -> None:
 
 def test_the_measured_effort_at_rest_is_the_weight_that_the_spring_carries() -> None:
     parameters = load_plant("x5_9")
-    plant = make_plant(parameters, 2e-3)
+    plant = make_pendulum(parameters, 2e-3)
     state = plant.reset(0.1)
     assert state.effort == pytest.approx(parameters.gravity * math.sin(0.1), rel=1e-12)
 
@@ -78,7 +78,7 @@ def test_without_losses_it_moves_like_the_rigid_plant_with_the_same_damping() ->
         stiffness=1000.0,
         winding_temperature=20.0,
     )
-    elastic = make_plant(parameters.with_values(drivetrain=drive), 2e-3)
+    elastic = make_pendulum(parameters.with_values(drivetrain=drive), 2e-3)
     damping = parameters.damping + shorted_winding_damping(
         drive.torque_constant, drive.back_emf_constant, drive.gear_ratio, drive.winding_resistance
     )
@@ -97,7 +97,7 @@ def test_without_losses_it_moves_like_the_rigid_plant_with_the_same_damping() ->
 @pytest.mark.parametrize(("name", "bound"), [("thesis", 2e-3), ("x5_9", 8e-3)])
 def test_the_servo_follows_a_ramp_to_upright_and_back_and_reports_a_bounded_effort(name: str, bound: float) -> None:
     parameters = load_plant(name)
-    plant = make_plant(parameters, 2e-3)
+    plant = make_pendulum(parameters, 2e-3)
     servo = PositionServo(parameters, 2e-3)
     state = plant.reset(0.0)
     for k in range(9000):
@@ -113,6 +113,6 @@ def test_the_servo_follows_a_ramp_to_upright_and_back_and_reports_a_bounded_effo
 
 def test_an_integrator_that_does_not_fit_is_refused() -> None:
     with pytest.raises(ParameterError, match="method is 'rk4'; expected semi_implicit or auto"):
-        make_plant(load_plant("x5_9"), 1e-3, method="rk4")
+        make_pendulum(load_plant("x5_9"), 1e-3, method="rk4")
     with pytest.raises(ParameterError, match="is series elastic; expected a rigid one"):
         RigidPlant(load_plant("x5_9"), 1e-3)

@@ -14,7 +14,7 @@ from pendulum_sim.batches.batch import simulate_batch
 from pendulum_sim.environments.environment import PlantEnv, PlantVectorEnv
 from pendulum_sim.stepping.integrators import METHODS, get_integrator
 from pendulum_sim.stepping.plant import RigidPlant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 from pendulum_sim.stepping.series_elastic import SeriesElasticPlant
 from pendulum_sim.stepping.stability import MOST_GROWTH, growth_rate, stable_substeps
 
@@ -115,7 +115,7 @@ def test_a_delay_that_cuts_the_period_is_judged_at_its_longest_piece() -> None:
 @pytest.mark.parametrize("name", ["thesis", "dfki", "x5_9"])
 @pytest.mark.parametrize("rate_hz", [20.0, 50.0, 500.0, 2000.0])
 def test_the_default_integrator_is_stable_on_every_preset_at_every_rate(name: str, rate_hz: float) -> None:
-    plant = make_plant(load_plant(name), 1.0 / rate_hz)
+    plant = make_pendulum(load_plant(name), 1.0 / rate_hz)
     plant.reset(2.0)
     for _ in range(round(2.0 * rate_hz)):
         plant.step(0.0)

@@ -184,7 +184,7 @@ from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.parameters import markdown_table, validate
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS, load_plant
 from pendulum_sim.stepping.mechanism_plant import is_smooth
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 from pendulum_sim.stepping.series_elastic import pack_series_elastic, series_elastic_step
 from pendulum_sim.simulator.simulator_node import main as simulator
 
@@ -209,7 +209,7 @@ def refused(call, *arguments):
 def with_drag():
     # What a drag does in each place that has an equation of its own.
     plant = load_plant(dragged)
-    free = make_plant(plant, 0.01, method="rk4")
+    free = make_pendulum(plant, 0.01, method="rk4")
     free.reset(0.0, 4.0)
     speeds = [free.step(0.0).theta_dot for _ in range(100)]
     geared = load_plant("x5_9")

@@ -22,7 +22,7 @@ from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.swing_up.trajectory_optimisation import swing_up_trajectory
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, pendulum_plant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 from tests.benchmarks import Peer, Row, measured, peer
 
 __all__ = ["rows"]
@@ -156,7 +156,7 @@ def _run(
     kick: Callable[[int], float] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return angle [rad], velocity [rad/s] and time per answer [us] of a closed loop."""
-    simulated = make_plant(plant, PERIOD)
+    simulated = make_pendulum(plant, PERIOD)
     state = simulated.reset(theta, theta_dot)
     controller.reset()
     angle, velocity, times = np.empty(steps), np.empty(steps), np.empty(steps)

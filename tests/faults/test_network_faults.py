@@ -14,7 +14,7 @@ import pytest
 from pendulum_lqr.linear.design import continuous_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.contract.angles import UPRIGHT
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 from tests.tools.faults.bag_property import COMMAND_LIFE, check_bag
 from tests.tools.faults.delay_margin import LIGHT, PERIOD, Q, R, predicted_margin
 from tests.tools.faults.network import PLANT_ADDRESS, cut_cable, two_machines, why_not
@@ -106,7 +106,7 @@ def test_predicted_margin_is_where_the_simulated_loop_turns_unstable() -> None:
     K = continuous_lqr(linearise(LIGHT), Q, R).K
     ends = []
     for delay in (0.93 * predicted, 1.07 * predicted):
-        plant = make_plant(LIGHT.with_values(transport_delay=delay), PERIOD, method="etd4")
+        plant = make_pendulum(LIGHT.with_values(transport_delay=delay), PERIOD, method="etd4")
         state = plant.reset(UPRIGHT + 1e-4, 0.0)
         for _ in range(2000):
             state = plant.step(-float(K[0] * (state.theta - UPRIGHT) + K[1] * state.theta_dot))

@@ -20,7 +20,7 @@ from pendulum_msgs_py.contract.values import JointSample
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 from pendulum_testing.policies import linear_policy
 
 # Not those that need a file or a task of their own to be designed.
@@ -57,7 +57,7 @@ def test_a_plant_with_motor_and_spring_is_not_stepped_by_the_thesis_s_integrator
     # Its simulator refused to start: the plant of the emulated actuator could not be simulated beside it.
     assert RegulationSettings().method == RunSpec().method == "euler"
     for settings in (RegulationSettings(plant="x5_9"), RunSpec(plant="x5_9")):
-        assert make_plant(load_plant("x5_9"), 0.002, method=settings.method).state.theta == 0.0
+        assert make_pendulum(load_plant("x5_9"), 0.002, method=settings.method).state.theta == 0.0
 
 
 def test_ramps_are_the_thesis_s_unless_told_and_told_slower_or_faster_in_all_that_they_are() -> None:

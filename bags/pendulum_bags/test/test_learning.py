@@ -24,7 +24,7 @@ from pendulum_lqr.policies.policy_file import load_policy
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.errors import DataError, FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 from pendulum_testing.policies import random_policy
 
 DFKI = load_plant("dfki")
@@ -112,7 +112,7 @@ def test_a_torque_acts_after_the_delay_as_in_the_simulator(delay):
     ours.motion[0] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     ours.effort[:], ours.delay[:] = 0.0, delay
     ours.step_limit[:] = math.inf
-    simulated = make_plant(plant, QUIET.period, substeps=8)
+    simulated = make_pendulum(plant, QUIET.period, substeps=8)
     simulated.reset(math.pi, 0.0)
     for effort in np.random.default_rng(1).uniform(-1.5, 1.5, 30):
         ours.step(np.array([[effort / 1.5]], dtype=np.float32))

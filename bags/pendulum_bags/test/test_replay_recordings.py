@@ -19,7 +19,7 @@ from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_rosbag.storage import BagWriter
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 from pendulum_testing.synthetic_runs import regulate, run_metadata, write_bag
 
 DFKI = Path("dfki_torque_limited_simple_pendulum")
@@ -27,7 +27,7 @@ DFKI = Path("dfki_torque_limited_simple_pendulum")
 
 def swinging(plant_name: str = "dfki", *, duration: float = 4.0, period: float = 0.002) -> Recording:
     """Return a noiseless recording of a plant that is pushed by a sine."""
-    plant = make_plant(load_plant(plant_name), period)
+    plant = make_pendulum(load_plant(plant_name), period)
     plant.reset(0.3, 0.0)
     t = period * np.arange(round(duration / period))
     torque = 0.8 * np.sin(2.0 * np.pi * 0.7 * t)

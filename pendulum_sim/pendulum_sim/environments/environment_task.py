@@ -14,9 +14,9 @@ from pendulum_msgs_py.contract import noise
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_sim.stepping.integrators import get_integrator
-from pendulum_sim.stepping.joint_plant import JointPlant, make_joint_plant
 from pendulum_sim.stepping.mechanism_plant import check_stable_step
 from pendulum_sim.stepping.plant import check_step
+from pendulum_sim.stepping.plants import JointPlant, make_plant
 
 __all__ = ["EPISODE_TIME", "STARTS", "Array", "EnvironmentTask"]
 
@@ -87,7 +87,7 @@ class EnvironmentTask:
     def make_plant(self) -> JointPlant:
         """Return the simulated plant."""
         substeps = self.substeps if self.substeps > 1 else None
-        return make_joint_plant(self.parameters, self.dt, method=self.method, substeps=substeps)
+        return make_plant(self.parameters, self.dt, method=self.method, substeps=substeps)
 
     def observe(self, position: Array, velocity: Array) -> Array:
         """Return x of shape (..., 2n)."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import FaultError
-from pendulum_sim.stepping.joint_plant import JointPlant
+from pendulum_sim.stepping.plants import JointPlant
 
 __all__ = ["TOLERANCE", "EquationCheck", "Switches", "check_equation", "check_recording"]
 

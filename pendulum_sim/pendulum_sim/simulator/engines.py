@@ -19,9 +19,8 @@ from pendulum_sim.foreign.gymnasium_plant import GymnasiumPlant, load_adapter, l
 from pendulum_sim.foreign.mujoco_mapping import MujocoMapping, load_mujoco_mapping
 from pendulum_sim.foreign.mujoco_plant import MujocoPlant, load_mujoco_plant
 from pendulum_sim.stepping.integrators import METHODS
-from pendulum_sim.stepping.joint_plant import JointPlant, OneJoint, joint_plant, make_joint_plant
 from pendulum_sim.stepping.plant import Plant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import JointPlant, OneJoint, make_plant
 
 __all__ = ["GYMNASIUM", "GYMNASIUM_PREFIX", "MUJOCO", "OWN", "Engine", "Simulation", "find_engine", "open_simulation"]
 
@@ -98,7 +97,7 @@ def _make_own(values: Mapping[str, Any]) -> Simulation:
     parameters, sealed = load_plant_to_run(values["plant"])
     method: str = values["method"]
     remarks: tuple[str, ...] = ()
-    plant = make_joint_plant(parameters, dt, method=method, substeps=values["substeps"] or None)
+    plant = make_plant(parameters, dt, method=method, substeps=values["substeps"] or None)
     if not parameters.is_pendulum:
         coordinates = parameters.coordinates
         driven = ", ".join(coordinates.driven_names) or "none"
@@ -131,23 +130,23 @@ def _foreign(plant: MujocoPlant | GymnasiumPlant, name: str, label: str) -> Simu
 
     def check() -> EquationCheck:
         substeps = math.ceil(plant.dt / _EXACT_STEP)
-        equation = joint_plant(make_plant(plant.parameters, plant.dt, substeps=substeps))
+        equation = make_plant(plant.parameters, plant.dt, substeps=substeps)
         switches = reseeded = None
         if isinstance(plant, MujocoPlant):
-            switches = Switches(plant.switches, lambda causes: joint_plant(GuardedPlant(plant.without(causes), label)))
+            switches = Switches(plant.switches, lambda causes: OneJoint(GuardedPlant(plant.without(causes), label)))
         else:
-            reseeded = joint_plant(GuardedPlant(plant.reseeded(), label))
+            reseeded = OneJoint(GuardedPlant(plant.reseeded(), label))
         try:
-            coarse = joint_plant(make_plant(plant.parameters, plant.dt, method="semi_implicit"))
+            coarse = make_plant(plant.parameters, plant.dt, method="semi_implicit")
         except ParameterError:
             # It is unstable with that period.
             coarse = None
-        return check_equation(joint_plant(guarded), equation, coarse=coarse, switches=switches, reseeded=reseeded)
+        return check_equation(OneJoint(guarded), equation, coarse=coarse, switches=switches, reseeded=reseeded)
 
     found = [(spec, getattr(plant.parameters, spec.name)) for spec in PLANT_SPECS if spec.name in _OF_EQUATION]
     values = ", ".join(f"{spec.name} {value:.6g} {spec.unit}" for spec, value in found)
     remarks = (*plant.remarks, f"closest equation: {values}")
-    return Simulation(joint_plant(guarded), name, plant.description, remarks, check=check)
+    return Simulation(OneJoint(guarded), name, plant.description, remarks, check=check)
 
 
 OWN = Engine(

@@ -8,8 +8,8 @@ import numpy as np
 
 from pendulum_msgs_py.loops.machine_code import NoMachineCodeError
 from pendulum_sim.stepping.dry_friction import PACKED
-from pendulum_sim.stepping.joint_plant import JointPlant, OneJoint
 from pendulum_sim.stepping.plant import RigidPlant
+from pendulum_sim.stepping.plants import JointPlant, OneJoint
 
 __all__ = ["BUILDER", "LAYOUT", "MOST_COEFFICIENTS", "LoopPlant", "loop_plant"]
 

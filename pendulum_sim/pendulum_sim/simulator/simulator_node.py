@@ -42,7 +42,7 @@ from pendulum_msgs_py.ros.runner import run_node
 from pendulum_sim.foreign.guarded_plant import PaceWatch, StallWatch
 from pendulum_sim.simulator.engines import OWN, Engine
 from pendulum_sim.simulator.loop_plant import loop_plant
-from pendulum_sim.stepping.joint_plant import random_start
+from pendulum_sim.stepping.plants import random_start
 from pendulum_sim.stepping.sensors import SENSOR_SPECS, Sensors
 from pendulum_sim.stepping.servo import PositionServo
 

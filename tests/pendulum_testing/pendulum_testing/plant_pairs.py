@@ -18,7 +18,7 @@ from pendulum_sim.batches.compiling import compile_tree
 from pendulum_sim.stepping.dry_friction import acceleration_with_friction, advance_dry, is_dry
 from pendulum_sim.stepping.integrators import get_integrator
 from pendulum_sim.stepping.plant import pack
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 from pendulum_sim.stepping.sensors import Sensors
 
 K = (33.345265, 0.158993)
@@ -64,7 +64,7 @@ def record(
     per_state = round(1.0 / rate / step)
     if abs(per_state * step * rate - 1.0) > 1e-9:
         raise ValueError(f"rate is {rate} Hz; expected whole milliseconds")
-    model = make_plant(plant, step)
+    model = make_pendulum(plant, step)
     state = model.reset(UPRIGHT, 0.0)
     count = round(duration / step)
     noise = uniform_array(seed, 0, round(duration / HOLD) + 1, amplitude)

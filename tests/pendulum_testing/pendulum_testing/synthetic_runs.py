@@ -22,7 +22,7 @@ from pendulum_msgs_py.contract.noise import uniform_array
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_rosbag.storage import BagWriter
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 K = (33.345265, 0.158993)
 STATE = "sensor_msgs/msg/JointState"
@@ -62,7 +62,7 @@ def _regulated(
     if hardware:
         plant = plant.with_values(coulomb_friction=0.02, static_friction=0.02, transport_delay=0.004, **dict(changes))
     period = 1.0 / rate
-    model = make_plant(plant, period)
+    model = make_pendulum(plant, period)
     model.reset(UPRIGHT, 0.0)
     count = round(duration * rate)
     index = (np.arange(count) * period / hold_time + 1e-9).astype(int)

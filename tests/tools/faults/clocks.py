@@ -41,7 +41,7 @@ from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.ros.plant_loop import LockstepLoop
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_rosbag.reader import read_bag
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 from tests.tools.faults.live import NAMESPACE, LiveSystem
 from tests.tools.faults.outcome import Outcome, Trial
 
@@ -200,7 +200,7 @@ def simulate_hours(hours: float, rate_hz: float = 50.0) -> Outcome:
         supervisor = SharedSupervisor(
             limits_from_parameters(dict(validate(LIMIT_SPECS, {})), (parameters.effort_limit,), lockstep=True)
         )
-        plant = make_plant(parameters, period_ns / NANOSECONDS)
+        plant = make_pendulum(parameters, period_ns / NANOSECONDS)
         plant.reset(UPRIGHT, 0.0)
         positions = np.empty(steps)
 

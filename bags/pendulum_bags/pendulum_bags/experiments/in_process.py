@@ -20,9 +20,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism, load_plant
-from pendulum_sim.stepping.joint_plant import JointPlant, OneJoint
-from pendulum_sim.stepping.mechanism_plant import MechanismPlant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import JointPlant, OneJoint, make_plant
 from pendulum_sim.stepping.sensors import Sensors
 
 __all__ = ["RunArrays", "simulate", "simulate_plant"]
@@ -61,14 +59,14 @@ def simulate(spec: RunSpec) -> RunArrays:
     if (foreign := spec.foreign) is not None:
         return _simulate(spec, OneJoint(foreign.open()), Sensors())
     if (mechanism := spec.mechanism) is not None:
-        return _simulate(spec, MechanismPlant(mechanism, _whole(spec.period)), Sensors())
+        return _simulate(spec, make_plant(mechanism, _whole(spec.period)), Sensors())
     return simulate_plant(spec, load_plant(spec.plant))
 
 
 def simulate_plant(spec: RunSpec, parameters: PlantParameters, sensors: Sensors | None = None) -> RunArrays:
     """Run another plant than the run's, with any sensors that drop no samples (None for the truth)."""
     plant = make_plant(parameters, _whole(spec.period), method=spec.method)
-    return _simulate(spec, OneJoint(plant), sensors or Sensors())
+    return _simulate(spec, plant, sensors or Sensors())
 
 
 def _whole(period: float) -> float:

@@ -19,7 +19,6 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
 from pendulum_sim.foreign.equation_check import TOLERANCE, EquationCheck, check_recording
 from pendulum_sim.simulator.engines import find_engine, open_simulation
-from pendulum_sim.stepping.joint_plant import joint_plant
 from pendulum_sim.stepping.plant import Plant
 from pendulum_sim.stepping.plants import make_plant
 
@@ -148,9 +147,7 @@ def recorded_difference(bag: Path, namespace: str, plant: str) -> str:
     effort = recording.input[held][:, None]
     parameters = load_plant(plant)
     substeps = None if parameters.drivetrain is not None else math.ceil(period / 1e-3)
-    errors = check_recording(
-        motion[0], motion[1], effort, joint_plant(make_plant(parameters, period, substeps=substeps))
-    )
+    errors = check_recording(motion[0], motion[1], effort, make_plant(parameters, period, substeps=substeps))
     if not errors.size:
         return f"{namespace} ran already, and its recording is too short to check {plant} against it."
     error = float(np.quantile(errors, _PIECES))

@@ -19,7 +19,7 @@ from pendulum_lqr.policies.policy import Policy
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_sim.stepping.joint_plant import JointPlant, make_joint_plant
+from pendulum_sim.stepping.plants import JointPlant, make_plant
 
 __all__ = ["HOLD", "UP", "Trial", "gymnasium_return", "is_up", "measured_success", "run_trial", "trials_of"]
 
@@ -105,7 +105,7 @@ def plant_of(parameters: PlantParameters, period: float) -> JointPlant:
     """Return the simulated plant, whose states are tuples; ``period`` in [s]."""
     # A mechanism gets the substeps of the simulator's own period.
     substeps = None if parameters.is_pendulum else max(1, round(period / 0.002))
-    return make_joint_plant(parameters, period, substeps=substeps)
+    return make_plant(parameters, period, substeps=substeps)
 
 
 def run_trial(policy: Policy, trial: Trial, start_time: float = START_TIME) -> tuple[NDArray[np.float64], str]:

@@ -20,7 +20,7 @@ from pendulum_bags.runs.read_recording import read_recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.stepping.plant import Plant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import make_pendulum
 
 __all__ = ["replay_input", "replay_recording"]
 
@@ -154,7 +154,7 @@ class _Driven:
         torque = _mean_input(recording, time)
         # Measured torque was applied, whatever the model's actuator could give.
         limit = max(parameters.effort_limit, 1.001 * float(np.abs(torque).max()))
-        plant = make_plant(parameters.with_values(effort_limit=limit), period)
+        plant = make_pendulum(parameters.with_values(effort_limit=limit), period)
         return cls(time, position, velocity, smooth, torque, plant)
 
     def run(self, first: int, steps: int, state: tuple[float, float] | None = None) -> Array:
