@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +140,36 @@ def ros1_bag(path: Path) -> None:
             writer.write(states, now, bytes(store.serialize_ros1(message, state.__msgtype__)))
 
 
+def lerobot(path: Path, version: str) -> None:
+    """Write two episodes as LeRobot does: one file each in version 2, one for both in version 3."""
+    import pyarrow as pa
+    import pyarrow.parquet
+
+    tables = []
+    for episode in range(2):
+        scale, count = 1.0 - 0.5 * episode, RUN["t"].size
+        states = scale * np.stack([RUN["position"], RUN["velocity"]], axis=1)
+        tables.append(pa.table({
+            "observation.state": pa.FixedSizeListArray.from_arrays(states.reshape(-1), 2),
+            "action": pa.array(RUN["torque"][:, None].tolist(), pa.list_(pa.float64())),
+            "timestamp": RUN["t"].astype(np.float32), "frame_index": np.arange(count),
+            "episode_index": np.full(count, episode), "index": episode * count + np.arange(count),
+            "task_index": np.zeros(count, np.int64),
+        }))  # fmt: skip
+    data = path / "data" / "chunk-000"
+    data.mkdir(parents=True)
+    if version == "v3.0":
+        pyarrow.parquet.write_table(pa.concat_tables(tables), data / "file-000.parquet")
+    for episode, table in enumerate(tables if version == "v2.1" else ()):
+        pyarrow.parquet.write_table(table, data / f"episode_{episode:06d}.parquet")
+    names = {"observation.state": ["hinge.pos", "hinge.vel"], "action": ["hinge.torque"]}
+    grouped = {key: {"motors": one} if version == "v2.1" else one for key, one in names.items()}
+    features = {key: {"dtype": "float32", "shape": [len(names[key])], "names": one} for key, one in grouped.items()}
+    info = {"codebase_version": version, "total_episodes": 2, "fps": round(1.0 / DT), "features": features}
+    (path / "meta").mkdir()
+    (path / "meta" / "info.json").write_text(json.dumps(info))
+
+
 FORMATS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "struct with time": ("a.mat", struct_with_time),
     "rows across, dt in the file": ("b.mat", rows_across),
@@ -149,6 +181,8 @@ FORMATS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "sparse": ("g.csv", plotjuggler),
     "foreign bag": ("h", foreign_bag),
     "ROS 1": ("i.bag", ros1_bag),
+    "LeRobot 2": ("j", partial(lerobot, version="v2.1")),
+    "LeRobot 3": ("k", partial(lerobot, version="v3.0")),
 }
 
 
@@ -185,6 +219,60 @@ def test_a_part_of_a_file_of_several_runs_is_chosen_by_its_number(tmp_path: Path
     assert "part 1 of 3" in " ".join(Reading(tmp_path / "c.mat").columns.notes)
     with pytest.raises(DataError, match=r"part is 4; expected 1 to 3"):
         Reading(tmp_path / "c.mat#4").columns  # noqa: B018
+    for version in ("v2.1", "v3.0"):
+        lerobot(tmp_path / version, version)
+        second = Reading(tmp_path / f"{version}#2").motion.joints[0]
+        np.testing.assert_allclose(second.position, 0.5 * RUN["position"])
+
+
+def test_a_plant_that_turns_one_way_is_told_from_its_clock_by_its_steps(tmp_path: Path) -> None:
+    """The layout of a motor's step response: counter, pulse width, microseconds, angle."""
+    t = 5080e-6 * np.arange(200) + 1e-5 * np.random.default_rng(0).random(200)
+    rows = np.stack([np.arange(200), np.full(200, 100), 1e6 * t, 6.0 * (t - 0.2 * (1.0 - np.exp(-t / 0.2)))], axis=1)
+    np.savetxt(tmp_path / "pwm.csv", rows, fmt=["%d", "%d", "%d", "%.6f"], delimiter=",")
+    reading = Reading(tmp_path / "pwm.csv")
+    assert [(guess.quantity, guess.column) for guess in reading.guesses] == [
+        ("time", "column2"), ("position", "column3")
+    ]  # fmt: skip
+    np.testing.assert_allclose(reading.motion.time, t, atol=1e-6)
+
+
+def test_a_long_recording_is_guessed_from_its_middle_if_all_moves_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pendulum_bags.recordings.guess._MOST_ROWS", 600)
+    read: list[int] = []
+    for name, write in (("e.npz", npz), ("f.parquet", parquet), ("d.mat", version_73)):
+        write(tmp_path / name)
+        reading = Reading(tmp_path / name)
+        rows = reading.columns.columns
+        for column in rows.values():
+
+            def count(wanted: slice, column: Any = column) -> Any:
+                values = column.read(wanted)
+                read.append(values.size)
+                return values
+
+            rows[column.name] = replace(column, read=count)  # type: ignore[index]
+        sections = reading.rules.joints[""]
+        assert {"position", "velocity", "input"} <= sections.keys()
+        assert set(read) == ({1200} if name == "e.npz" else {600}), name
+        np.testing.assert_allclose(reading.motion.joints[0].position, RUN["position"], atol=1e-6)
+        read.clear()
+    early = np.where(np.arange(1200) < 200, RUN["torque"], 0.0)
+    np.savez(tmp_path / "early.npz", time=RUN["t"], theta=RUN["position"], torque=early)
+    assert "input" in Reading(tmp_path / "early.npz").rules.joints[""]
+
+
+def test_lists_of_a_table_may_be_short_and_names_may_have_dots(tmp_path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet
+
+    states = pa.array([[1.0, 2.0], None, [3.0]], pa.list_(pa.float32()))
+    pyarrow.parquet.write_table(pa.table({"observation.state": states}), tmp_path / "a.parquet", row_group_size=1)
+    columns = Reading(tmp_path / "a.parquet").columns
+    np.testing.assert_array_equal(columns.values("observation.state[0]"), [1.0, np.nan, 3.0])
+    np.testing.assert_array_equal(columns.values("observation.state[1]"), [2.0, np.nan, np.nan])
 
 
 def test_small_integers_and_logicals_of_matlab_are_numbers(tmp_path: Path) -> None:
@@ -528,5 +616,16 @@ def test_one_recording_in_two_formats_is_no_pair_and_no_repetition(tmp_path: Pat
         "hold one and the same recording"
         in compared(capsys, tmp_path / "sim.mat", tmp_path / "copy.npz", code=2)["error"]
     )
+    thin, lines = np.sort(np.random.default_rng(0).permutation(800)[:500]), np.linspace(0.0, 7.2, 1500)
+    again = {
+        "rows left out": {key: values[thin] for key, values in step(1).items()},
+        "resampled": {key: np.interp(lines, step(1)["t"], values) for key, values in step(1).items()},
+        "cut, and another zero of the clock": {
+            key: values[100:] - (key == "t") for key, values in step(1).items()
+        },
+    }  # fmt: skip
+    for run in again.values():
+        pair = save(tmp_path / "run.npz", step(1)), save(tmp_path / "copy.npz", run)
+        assert "hold one and the same recording" in compared(capsys, *pair, code=2)["error"]
     sim, one, again = (save(tmp_path / f"{name}.npz", step(seed)) for name, seed in (("s", 0), ("a", 1), ("b", 1)))
     assert "hold one and the same recording" in compared(capsys, sim, one, again, code=2)["error"]

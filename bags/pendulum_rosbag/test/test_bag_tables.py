@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 
 from pendulum_msgs_py.contract.cdr import encode_joint_state, encode_joints
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
@@ -143,6 +144,27 @@ def test_tables_have_the_columns_of_the_arrays(tmp_path: Path) -> None:
         export_bag(bag, tmp_path / "xls", "xls")
     with pytest.raises(BagError, match="exists already"):
         export_bag(bag, tmp_path / "csv", "csv")
+
+
+def test_names_of_matlab_differ_within_63_characters_and_states_have_their_disturbance(tmp_path: Path) -> None:
+    joints = [f"{'a_long_name_of_a_joint_' * 3}{side}" for side in ("left", "right")]
+    with BagWriter(tmp_path / "bag") as writer:
+        for topic in ("joint_states", "disturbance", "hw/joint_states", "hw/disturbance"):
+            writer.add_topic(f"/{topic}", JOINT_STATE)
+        for stamp in range(4):
+            writer.write("/joint_states", stamp, joint_state(stamp, "", joints, [1.0, 2.0], [], []))
+            writer.write("/hw/joint_states", stamp, encode_joint_state(stamp, position=0.1 * stamp))
+        for stamp in (1, 3):
+            writer.write("/disturbance", stamp, joint_state(stamp, "", joints, [], [], [0.5 * stamp, -1.0]))
+            writer.write("/hw/disturbance", stamp, encode_joint_state(stamp, effort=0.5 * stamp))
+    export_bag(read_bag(tmp_path / "bag"), tmp_path / "out", "mat")
+    found = scipy.io.loadmat(tmp_path / "out" / "joint_states.mat")
+    names = [name for name in found if not name.startswith("__")]
+    assert max(map(len, names)) <= 63
+    assert [found[name][0, 0] for name in names if name.startswith("a_long")][:2] == [1.0, 2.0]
+    assert [0.0, 0.5, 0.5, 1.5] in [found[name].ravel().tolist() for name in names if name.startswith("a_long")]
+    one = scipy.io.loadmat(tmp_path / "out" / "hw__joint_states.mat")
+    assert one["disturbance_effort"].ravel().tolist() == [0.0, 0.5, 0.5, 1.5]
 
 
 def bag_of_lists(path: Path) -> Path:

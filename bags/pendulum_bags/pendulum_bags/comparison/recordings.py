@@ -33,7 +33,7 @@ from pendulum_bags.comparison.same_signal import AMPLITUDE, compare_signals
 from pendulum_bags.comparison.statistics import Interval, rms
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.runs.run_data import OpenBag, RunData, read_run
-from pendulum_bags.runs.series import Signal, uniform_times
+from pendulum_bags.runs.series import Series, Signal, uniform_times
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader import read_bag
 
@@ -206,6 +206,8 @@ def _described(pairs: Sequence[tuple[RunData, RunData]], kind: str, shared: Shar
     )
 
 
+_DIGITS = 2e-9
+"""Rounding of a text file, by the range of the motion."""
 _AGAIN = "Record the machine's run again, three times or more, and give all files: compare SIMULATION RUN1 RUN2 RUN3"
 _ADVICE = {
     _DISTURBANCE: f"{_AGAIN}.",
@@ -353,23 +355,41 @@ def _has_one_input(*runs: RunData) -> bool:
 
 
 def _refuse_copies(runs: Sequence[RunData]) -> None:
-    """Refuse a recording that is given twice, in whatever format: it is like itself, and varies by nothing.
-
-    This has to be seen before the runs are moved and cut, which leaves a sample more of one than of the other.
-    """
+    """Refuse a recording that is given twice, in whatever format: it is like itself, and varies by nothing."""
     for index, run in enumerate(runs):
         for other in runs[:index]:
-            a, b = other.whole.position, run.whole.position
-            # Another zero, and the digits of a text file, make no other recording.
-            if (
-                a.size == b.size
-                and np.ptp(a) > 0.0
-                and np.allclose(a - a[0], b - b[0], rtol=0.0, atol=1e-9 * float(np.ptp(a)))
-            ):
+            if _is_copy(other.whole, run.whole):
                 raise DataError(
                     f"{other.source} and {run.source} hold one and the same recording; expected one of each plant, and "
                     "independent runs of the machine"
                 )
+
+
+def _is_copy(one: Series, other: Series) -> bool:
+    """Return whether two recordings are one: the same rows, some of them, or points on the lines between them.
+
+    Another zero, another start of the clock and rows that were cut off at one end make no other recording; two accurate
+    simulations differ by more. A copy that was filtered or rounded, or resampled by splines, is not seen.
+    """
+    if one.t.size == other.t.size and _same(one.position, other.position):
+        return True
+    for a, b in ((one, other), (other, one)):
+        for shift in (a.t[0] - b.t[0], a.t[-1] - b.t[-1]):
+            at = b.t + shift
+            inside = (at >= a.t[0]) & (at <= a.t[-1])
+            # A motion that comes later than that of the other, after one and the same input, is another one.
+            if 2 * int(inside.sum()) >= b.t.size and all(
+                _same(np.interp(at[inside], a.t, x), y[inside])
+                for x, y in ((a.position, b.position), (a.effort, b.effort))
+                if x is a.position or np.ptp(y) > 0.0
+            ):
+                return True
+    return False
+
+
+def _same(one: Array, other: Array) -> bool:
+    """Return whether two signals that move are one, but for a constant."""
+    return 0.0 != float(np.ptp(other)) * _DIGITS >= float(np.ptp(one - other))
 
 
 def _check_guesses(simulation: RunData, hardware: RunData, shared: Shared) -> None:

@@ -6,11 +6,12 @@ dimensions. A cell or an array of structs with one entry for each run is one rec
 
 from __future__ import annotations
 
+import math
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,13 @@ def read_numpy(path: Path, part: int = 0) -> Columns:
     numbers: dict[str, float] = {}
     for file, stem in files.items():
         try:
-            loaded = np.load(file, mmap_mode="r" if stem else None, allow_pickle=False)
-            for name in [stem] if stem else loaded.files:
-                _take(name, loaded if stem else loaded[name], found, numbers)
+            if stem:
+                array = np.load(file, mmap_mode="r", allow_pickle=False)
+                _take(stem, array.shape, array.dtype, array.__getitem__, found, numbers, by_rows=True)
+                continue
+            for name, shape, kind in _members(file):
+                load = partial(_read_member, file, name)
+                _take(name, shape, kind, _shared(load) if len(shape) > 1 or kind.names else load, found, numbers)
         except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
             if file == path or path.is_dir():
                 raise DataError(f"{file} cannot be read as arrays: {str(error).splitlines()[0]}") from error
@@ -58,15 +63,48 @@ def read_numpy(path: Path, part: int = 0) -> Columns:
     return _columns(path, "file of arrays", found, numbers, {}, part, named=path.suffix == ".npz")
 
 
-def _take(name: str, array: Any, found: list[Column], numbers: dict[str, float]) -> None:
-    if array.dtype.names:
-        for field in array.dtype.names:
-            _take(f"{name}.{field}", array[field], found, numbers)
-    elif array.dtype.kind in "biuf":
-        if array.size == 1:
-            numbers[name] = float(array.reshape(()))
+def _members(path: Path) -> Iterator[tuple[str, tuple[int, ...], np.dtype[Any]]]:
+    """Yield name, shape and type of each array of an ``.npz`` file, by its header alone."""
+    headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    with zipfile.ZipFile(path) as archive:
+        for place in archive.namelist():
+            with archive.open(place) as member:
+                header = headers.get(np.lib.format.read_magic(member))
+                if header is not None:  # version 3.0 is for names of fields beyond Latin-1
+                    shape, _, kind = header(member)
+                    yield place.removesuffix(".npy"), shape, kind
+
+
+def _read_member(path: Path, name: str, key: Any) -> Any:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return arrays[name][key]
+    except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise DataError(f"{path}: array {name!r} cannot be read: {str(error).splitlines()[0]}") from error
+
+
+def _take(
+    name: str,
+    shape: tuple[int, ...],
+    kind: np.dtype[Any],
+    read: Callable[[Any], Any],
+    found: list[Column],
+    numbers: dict[str, float],
+    *,
+    by_rows: bool = False,
+) -> None:
+    for field in kind.names or ():
+        part = kind[field]
+
+        def read_field(key: Any, field: str = field) -> Any:
+            return read(...)[field][key]
+
+        _take(f"{name}.{field}", shape + part.shape, part.base, read_field, found, numbers, by_rows=by_rows)
+    if kind.kind in "biuf":
+        if math.prod(shape) == 1:
+            numbers[name] = float(np.asarray(read(...)).reshape(()))
         else:
-            found += columns_of_array(name, array.shape, lambda: array)
+            found += columns_of_array(name, shape, read, by_rows=by_rows)
 
 
 def read_matlab(path: Path, part: int = 0) -> Columns:
@@ -111,7 +149,8 @@ class _Node:
 
     Attributes:
         shape: Of an array of numbers; empty of other things.
-        read: Returns the numbers.
+        read: Returns those of the numbers that an index of NumPy chooses.
+        by_rows: Whether it does so without reading the others.
         fields: Of a struct.
         entries: Of a cell, or of an array of structs.
         opaque: Whether it is an object.
@@ -121,12 +160,14 @@ class _Node:
         self,
         *,
         shape: Sequence[int] = (),
-        read: Callable[[], Any] | None = None,
+        read: Callable[[Any], Any] | None = None,
+        by_rows: bool = False,
         fields: Mapping[str, Callable[[], _Node]] | None = None,
         entries: Sequence[Callable[[], _Node]] | None = None,
         opaque: bool = False,
     ) -> None:
-        self.shape, self.read, self.fields, self.entries, self.opaque = shape, read, fields, entries, opaque
+        self.shape, self.read, self.by_rows = shape, read, by_rows
+        self.fields, self.entries, self.opaque = fields, entries, opaque
 
 
 def _entries(node: _Node) -> list[_Node] | None:
@@ -153,9 +194,9 @@ def _gather(
     elif node.read is not None:
         size = int(np.prod(node.shape))
         if size == 1:
-            numbers[name] = float(np.asarray(node.read(), dtype=float).reshape(()))
+            numbers[name] = float(np.asarray(node.read(...), dtype=float).reshape(()))
         elif size > 1:
-            found += columns_of_array(name, node.shape, node.read)
+            found += columns_of_array(name, node.shape, node.read, by_rows=node.by_rows)
 
 
 def _columns(
@@ -228,17 +269,25 @@ def _variables(path: Path, opaque: list[str]) -> Iterator[tuple[str, _Node]]:
         if kind in {"unknown", "opaque", "object", "function"}:
             opaque.append(name)
         elif kind in {"struct", "cell"}:
-            yield name, _node(_loaded(path, name))
+            yield name, _node(_loaded(path, name, ...))
         elif kind not in {"char", "sparse"}:
-            yield name, _Node(shape=shape, read=partial(_loaded, path, name))
+            load = partial(_loaded, path, name)
+            # All columns of a table are taken from it once it is read; a vector is kept by what reads it.
+            yield name, _Node(shape=shape, read=load if 1 in shape else _shared(load))
 
 
-def _loaded(path: Path, name: str) -> Any:
-    """Return one variable; it is not kept, for the columns that are taken from it are."""
+def _shared(load: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return a reader that reads its array once."""
+    whole = cache(partial(load, ...))
+    return lambda key: whole()[key]
+
+
+def _loaded(path: Path, name: str, key: Any) -> Any:
+    """Return what an index chooses of one variable."""
     import scipy.io
 
     try:
-        return scipy.io.loadmat(str(path), variable_names=[name], mat_dtype=True)[name]
+        return scipy.io.loadmat(str(path), variable_names=[name], mat_dtype=True)[name][key]
     except Exception as error:  # scipy raises what a damaged file makes it stumble over
         raise DataError(f"{path}: variable {name!r} cannot be read: {type(error).__name__}: {error}") from error
 
@@ -253,7 +302,7 @@ def _node(value: Any) -> _Node:
     if value.dtype == object:
         return _Node(entries=[partial(_node, entry) for entry in value.flat])
     if value.dtype.kind in "biuf":
-        return _Node(shape=value.shape, read=partial(np.asarray, value))
+        return _Node(shape=value.shape, read=value.__getitem__, by_rows=True)
     return _Node()
 
 
@@ -286,7 +335,7 @@ def _hdf_variables(path: Path, _: list[str]) -> Iterator[tuple[str, _Node]]:
         if item.dtype.kind not in "biuf":
             return _Node()
         # MATLAB's arrays lie in the file transposed.
-        return _Node(shape=item.shape[::-1], read=lambda: item[()].T)
+        return _Node(shape=item.shape[::-1], read=lambda key: item[key if key is ... else key[::-1]], by_rows=True)
 
     def follow(reference: Any) -> _Node:
         return node(file[reference])

@@ -58,7 +58,7 @@ def read_bag_columns(path: Path) -> Columns:
         clock = f"{topic}/header/stamp" if _stamp(first) else f"{topic}/__time"
         count = source.topics[topic]
         for name, _ in numbers:
-            columns[name] = Column(name, count, partial(_column, source, topic, name), clock)
+            columns[name] = Column(name, count, partial(_column, source, topic, name), clock, by_rows=True)
         columns[clock] = Column(clock, count, partial(_clock, source, topic, stamped), unit="s")
     if not columns:
         raise DataError(f"{path} holds no numbers in {', '.join(source.topics) or 'no topic'}; expected those of a run")
@@ -147,8 +147,8 @@ def _numbers(value: Any, prefix: str) -> Iterator[tuple[str, float]]:
                     yield f"{name}.{index}", float(entry)
 
 
-def _column(source: _Source, topic: str, name: str) -> NDArray[Any]:
-    return _table(source, topic)[name]
+def _column(source: _Source, topic: str, name: str, rows: slice) -> NDArray[Any]:
+    return _table(source, topic)[name][rows]
 
 
 @cache
@@ -166,7 +166,7 @@ def _table(source: _Source, topic: str) -> dict[str, NDArray[Any]]:
     return dict(zip(names, table.T, strict=True))
 
 
-def _clock(source: _Source, topic: str, stamped: str) -> NDArray[Any]:
+def _clock(source: _Source, topic: str, stamped: str, rows: slice) -> NDArray[Any]:
     """Return the stamps of a topic [s].
 
     Of messages without a header they are the times of the log, on the clock of a topic that has stamps: that of a
@@ -174,8 +174,8 @@ def _clock(source: _Source, topic: str, stamped: str) -> NDArray[Any]:
     """
     messages = source.messages(topic)
     if _stamp(messages[0][1]):
-        return np.array([_stamp(message) for _, message in messages])
-    logged = np.array([time for time, _ in messages]) * 1e-9
+        return np.array([_stamp(message) for _, message in messages[rows]])
+    logged = np.array([time for time, _ in messages[rows]]) * 1e-9
     if not stamped:
         return logged
     pairs = np.array([(time * 1e-9, _stamp(message)) for time, message in source.messages(stamped)])

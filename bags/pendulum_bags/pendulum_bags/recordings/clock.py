@@ -27,8 +27,10 @@ def gap_length(stamps: Array) -> float:
 def continued(time: Array) -> tuple[Array, list[str]]:
     """Return stamps [s] that go on, behind a gap, where a clock stepped back, and a note on each step."""
     notes: list[str] = []
-    if not np.isfinite(time).all() or (time.size and float(np.abs(time).max()) > _LATEST):
+    if not np.isfinite(time).all() or (time.size and max(float(time.max()), -float(time.min())) > _LATEST):
         return time, notes  # no clock: what reads it refuses it
+    if np.all(time[1:] >= time[:-1]):
+        return time, notes
     gap = gap_length(np.sort(time))
     for row in steps_back(np.round(time * 1e9).astype(np.int64)):
         size = float(time[row - 1] - time[row])
@@ -39,4 +41,4 @@ def continued(time: Array) -> tuple[Array, list[str]]:
 
 def first_of_each_stamp(time: Array) -> NDArray[np.bool_]:
     """Return which samples to keep where a logger wrote some stamps more than once: the first of each, shape (n,)."""
-    return np.append(True, np.diff(time) != 0.0) if time.size else np.zeros(0, dtype=bool)
+    return np.append(True, time[1:] != time[:-1]) if time.size else np.zeros(0, dtype=bool)

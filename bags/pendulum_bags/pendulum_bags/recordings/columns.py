@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,16 +31,18 @@ class Column:
     Attributes:
         name: Where it is in the file: the name of a column, or a path such as ``data.theta.values``.
         size: Number of values.
-        read: Returns the values, as floating-point numbers of 64 bits whatever the file stores, shape (size,).
+        read: Returns the values of some rows as the file stores them, shape (rows,).
         clock: Name of the column with its stamps, where the file says which; empty otherwise.
         unit: As the file gives it; empty otherwise.
+        by_rows: Whether some rows are read in less time and memory than all.
     """
 
     name: str
     size: int
-    read: Callable[[], NDArray[Any]]
+    read: Callable[[slice], NDArray[Any]]
     clock: str = ""
     unit: str = ""
+    by_rows: bool = False
 
 
 @dataclass
@@ -70,8 +73,34 @@ class Columns:
         """Return a column as floating-point numbers, shape (size,)."""
         if name not in self._values:
             # Not one operation in the type of the file: MATLAB stores 200.0 in eight bits, and 3 * 200 is 88 there.
-            self._values[name] = np.ascontiguousarray(self.columns[name].read(), dtype=float).reshape(-1)
+            self._values[name] = np.ascontiguousarray(self.columns[name].read(slice(None)), dtype=float).reshape(-1)
         return self._values[name]
+
+    def forget(self) -> None:
+        """Release the memory of the columns that were read; they are read again when they are asked for."""
+        self._values.clear()
+
+    def stretch(self, rows: int) -> Columns:
+        """Return the middle of a long recording.
+
+        Args:
+            rows: Of its longest column; the others are cut in proportion.
+        """
+        share = rows / max(column.size for column in self.columns.values())
+        if share >= 1.0:
+            return self
+
+        def middle(column: Column) -> Column:
+            count = math.ceil(share * column.size)
+            first = (column.size - count) // 2
+
+            def read(wanted: slice) -> NDArray[Any]:
+                whole = slice(first, first + count)
+                return (column.read(whole) if column.by_rows else self.values(column.name)[whole])[wanted]
+
+            return replace(column, size=count, read=read)
+
+        return replace(self, columns={name: middle(column) for name, column in self.columns.items()}, _values={})
 
     def find(self, candidates: Iterable[str]) -> str | None:
         """Return the first column of some names; capital letters do not matter where only one can be meant."""
@@ -93,25 +122,33 @@ def part_of(path: str | Path) -> tuple[Path, int]:
     return source.with_name(found[1]), int(found[2])
 
 
-def columns_of_array(name: str, shape: Sequence[int], read: Callable[[], Any]) -> list[Column]:
+def columns_of_array(
+    name: str, shape: Sequence[int], read: Callable[[tuple[int | slice, ...]], Any], *, by_rows: bool = False
+) -> list[Column]:
     """Return an array of one or two dimensions as columns; the longer side is time.
 
     Args:
         name: Of the array.
         shape: Its shape; sides of length 1 do not count.
-        read: Returns the array.
+        read: Returns what an index of NumPy, of as many entries as the shape, chooses.
+        by_rows: Whether the file is read by rows; else the whole array is read for each of them.
     """
-    sides = [side for side in shape if side != 1]
-    if len(sides) == 1:
-        return [Column(name, sides[0], lambda: np.asarray(read()).reshape(-1))]
-    if len(sides) != 2 or min(sides) > _MOST_COLUMNS:
+    sides = [axis for axis, size in enumerate(shape) if size != 1]
+    if len(sides) not in {1, 2}:
+        return []
+    time = sides[0] if shape[sides[0]] > shape[sides[-1]] else sides[-1]
+    count = shape[sum(sides) - time] if len(sides) == 2 else 1
+    if count > _MOST_COLUMNS:
         return []
 
-    def column(index: int) -> NDArray[Any]:
-        table = np.asarray(read()).squeeze()
-        return table[:, index] if sides[0] > sides[1] else table[index]
+    def column(entry: int, rows: slice) -> NDArray[Any]:
+        key = (rows if axis == time else entry if axis in sides else 0 for axis in range(len(shape)))
+        return np.asarray(read(tuple(key))).reshape(-1)
 
-    return [Column(f"{name}[{index}]", max(sides), partial(column, index)) for index in range(min(sides))]
+    return [
+        Column(f"{name}[{entry}]" if len(sides) == 2 else name, shape[time], partial(column, entry), by_rows=by_rows)
+        for entry in range(count)
+    ]
 
 
 def grouped_parts(

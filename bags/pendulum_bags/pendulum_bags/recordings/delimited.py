@@ -79,7 +79,9 @@ def read_delimited(path: Path, *, delimiter: str = "", skip: int = 0) -> Columns
     table = _Table(path, names, layout, lines[layout.first : last])
     words = table.columns_of_words()
     columns = {
-        name: Column(name, len(table.lines), partial(table.column, index), unit=layout.units.get(name, ""))
+        name: Column(
+            name, len(table.lines), partial(table.column, index), by_rows=True, unit=layout.units.get(name, "")
+        )
         for index, name in enumerate(names)
         if index not in words
     }
@@ -245,12 +247,12 @@ class _Table:
                 found.add(index)
         return found
 
-    def column(self, index: int) -> Array:
+    def column(self, index: int, rows: slice) -> Array:
         if self._table is None:
             self._table = self._read()
         if index in self._bad:
             raise DataError(f"{self._path}: {self._bad[index]}")
-        return self._table[:, index]
+        return self._table[rows, index]
 
     def _read(self) -> Array:
         delimiter = None if self._mark == " " else self._mark

@@ -70,6 +70,10 @@ _UNIT_WORDS = {
 }  # fmt: skip
 _TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_]+")
 _MOST_PAIRS = 24
+_MOST_ROWS = 400_000
+"""Rows that a guess is tested on."""
+_EQUAL_STEPS = 0.05
+"""Largest spread of the steps of a clock, by their median."""
 _ASSUMED = "assumed, for the file does not say, and small angles in degrees move alike"
 _ASSUMED_PLACE = "m: assumed, for the file does not say"
 
@@ -130,6 +134,8 @@ def guess_rules(
 ) -> tuple[Rules, list[Guess]]:
     """Return the mapping of a recording, and how each of its entries was found.
 
+    A long recording is guessed from the middle of it, if all that moves does so there.
+
     Args:
         columns: The recording.
         period: Sampling period, where the caller knows it [s].
@@ -139,6 +145,16 @@ def guess_rules(
     Raises:
         DataError: No time, no position, or more than one way to read the file.
     """
+    part = columns.stretch(_MOST_ROWS)
+    if part is not columns:
+        try:
+            guesser = _Guesser(part, period, dict(only or {}))
+            found = guesser.rules()
+        except DataError:
+            pass  # all rows may show what these do not
+        else:
+            if not guesser.moves_elsewhere(columns):
+                return found
     return _Guesser(columns, period, dict(only or {})).rules()
 
 
@@ -175,6 +191,11 @@ class _Guesser:
             *self.guesses,
             *(replace(row, quantity=joint.of(row.quantity)) for joint in joints for row in joint.rows),
         ]
+
+    def moves_elsewhere(self, whole: Columns) -> bool:
+        """Return whether something that has one value here, and a role by its name, moves in another part."""
+        still = (one.name for one in self.candidates if not moves(self.columns.values(one.name)))
+        return any(moves(whole.values(name)) for name in still)
 
     # -- names -----------------------------------------------------------------------------------------------------
 
@@ -261,7 +282,12 @@ class _Guesser:
             names = [name for name in self.columns.columns if self._may_be_time(name)]
             how = "the only column that increases, and by unequal steps or fractions"
             if len(names) > 1:
-                raise self._ambiguous("time", names)
+                spreads = {name: _spread_of_steps(self.columns.values(name)) for name in names}
+                first, second = sorted(spreads.values())[:2]
+                if not (first < _EQUAL_STEPS and second > 10.0 * first):
+                    raise self._ambiguous("time", names)
+                names = [min(spreads, key=lambda name: spreads[name])]
+                how = "of the columns that increase the one by steps ten times as equal as those of the others"
         if not names and self.columns.period is not None:
             self.guesses.append(Guess("time", f"every {self.columns.period:g} s", "s", "the file states it"))
             return {"period": self.columns.period, "unit": "s"}
@@ -330,10 +356,10 @@ class _Guesser:
             still: A column with the name of a position, which has one value throughout; empty for none.
         """
         taken = {guess.column for guess in self.guesses}
-        names = [
-            name
-            for name, column in self.columns.columns.items()
-            if name not in taken and moves(self.columns.values(name)) and not _increases(self.columns.values(name))
+        moving = [name for name in self.columns.columns if name not in taken and moves(self.columns.values(name))]
+        # What increases may be a counter or another clock, but for unequal steps: those of a plant that turns one way.
+        names = [name for name in moving if not _increases(self.columns.values(name))] or [
+            name for name in moving if _spread_of_steps(self.columns.values(name)) > _EQUAL_STEPS
         ]
         pairs = []
         if len(names) <= _MOST_PAIRS:
@@ -718,6 +744,12 @@ def _increases(values: Array) -> bool:
         return False
     steps = np.diff(known)
     return bool(np.mean(steps >= 0.0) > 0.99 and np.mean(steps > 0.0) > 0.5)
+
+
+def _spread_of_steps(values: Array) -> float:
+    """Return the range of the middle nine tenths of the steps of a column, by their median."""
+    low, middle, high = np.quantile(np.diff(values[np.isfinite(values)]), (0.05, 0.5, 0.95))
+    return float((high - low) / max(abs(middle), 1e-300))
 
 
 def _time_unit(step: float) -> str:

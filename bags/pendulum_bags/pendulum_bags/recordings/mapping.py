@@ -88,6 +88,7 @@ _OF_JOINT = tuple(key for key in _SECTION_KEYS if key != "time")
 _TOP_KEYS = {"format", "delimiter", "skip", "rows", "drop_nan", "meta", "joints", *_SECTION_KEYS}
 
 Sections = Mapping[str, Mapping[str, Any]]
+_Rows = NDArray[np.bool_] | slice
 
 
 @dataclass(frozen=True)
@@ -305,6 +306,7 @@ class _Reader:
         if columns.notes:
             self.meta["clock_notes"] = list(columns.notes)
         self.cut = self._row_range()
+        self.stamps: dict[str, Array] = {}
 
     def _row_range(self) -> slice:
         if self.rules.further.get("rows") is None:
@@ -334,9 +336,10 @@ class _Reader:
         time, steps = self._time(base, rows)
         if steps:
             self.meta["clock_notes"] = [*self.meta.get("clock_notes", ()), *steps]
-        kept = first_of_each_stamp(time)
-        if not kept.all():
-            self.meta["repeated_stamps"] = int(np.sum(~kept))
+        first = first_of_each_stamp(time)
+        if not first.all():
+            self.meta["repeated_stamps"] = int(np.sum(~first))
+        kept = _chosen(first)
         joints = []
         for name, found in tracks.items():
             position = self._state(found["position"], "position", rows, time)
@@ -419,8 +422,10 @@ class _Reader:
             assert name is not None
             clock, unit = self.columns.columns[name], section.get("unit")
         self._check_stated(clock, unit)
-        start = _number("start", section, "time", self.origin)
-        return clock.name, (self.columns.values(clock.name) - start) * factor(unit, "time", where)
+        if clock.name not in self.stamps:
+            start = _number("start", section, "time", self.origin)
+            self.stamps[clock.name] = (self.columns.values(clock.name) - start) * factor(unit, "time", where)
+        return clock.name, self.stamps[clock.name]
 
     def _rows(self, base: _Track, tracks: Sequence[tuple[str, _Track]]) -> NDArray[np.bool_]:
         """Return the rows of the base clock that hold the motion, and mark what is apart from them."""
@@ -446,7 +451,7 @@ class _Reader:
 
     def _time(self, track: _Track, rows: NDArray[np.bool_]) -> tuple[Array, list[str]]:
         self._refuse_holes(track.clock, track.stamps, rows)
-        return continued(track.stamps[rows])
+        return continued(track.stamps[_chosen(rows)])
 
     def _refuse_holes(self, name: str, values: Array, rows: NDArray[np.bool_]) -> None:
         bad = np.flatnonzero(~np.isfinite(values) & rows)
@@ -463,7 +468,9 @@ class _Reader:
         if sign not in (1, -1):
             raise DataError(f"{self.origin}: sign of {key} is {sign!r}; expected 1 or -1")
         self._refuse_holes(track.column.name, track.values, rows)
-        return np.asarray(sign * (track.values[rows] + _number("offset", section, key, self.origin)) * size)
+        values = track.values[_chosen(rows)] + _number("offset", section, key, self.origin)
+        values *= sign * size
+        return np.asarray(values)
 
     def _apart(self, track: _Track, key: str, quantity: str) -> tuple[Array, Array]:
         """Return stamps and values of what has rows of its own."""
@@ -480,7 +487,7 @@ class _Reader:
             return self._si(track, key, quantity, rows)
         return np.interp(time, *self._apart(track, key, quantity))
 
-    def _drive(self, track: _Track, key: str, rows: NDArray[np.bool_], time: Array, kept: NDArray[np.bool_]) -> Drive:
+    def _drive(self, track: _Track, key: str, rows: NDArray[np.bool_], time: Array, kept: _Rows) -> Drive:
         section = track.section
         quantity = input_quantity(section.get("unit"), self.origin, reference=key == "reference")
         if track.apart:
@@ -495,6 +502,11 @@ class _Reader:
         assumed = "hold" not in section or self.rules.guessed or self.origin.startswith("built-in")
         values = _detrended(values, section.get("detrend"), self.origin)
         return Drive(stamps, values, quantity, hold, track.apart, assumed)
+
+
+def _chosen(rows: NDArray[np.bool_]) -> _Rows:
+    """Return an index of rows that copies nothing where it chooses all."""
+    return slice(None) if rows.all() else rows
 
 
 def _detrended(values: Array, detrend: Any, origin: str) -> Array:
@@ -519,7 +531,8 @@ def _check_step(source: Path, time: Array) -> None:
 
 
 def _check_jumps(source: Path, position: Array) -> None:
-    largest = float(np.max(np.abs(np.diff(position)), initial=0.0))
+    steps = np.diff(position)
+    largest = max(float(np.max(steps, initial=0.0)), -float(np.min(steps, initial=0.0)))
     if position.size > 10 and largest > 25.0:
         raise DataError(
             f"{source}: the angle jumps by {largest:.3g} rad between samples; expected rad: is the unit deg?"

@@ -8,7 +8,6 @@ import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -160,6 +159,7 @@ class Reading:
         """The recording in SI units."""
         if "motion" not in self._cache:
             self._cache["motion"] = apply_rules(self.columns, self.rules)
+            self.columns.forget()
         return self._cache["motion"]
 
     def forget(self) -> None:
@@ -260,7 +260,7 @@ def _read_json(path: Path) -> Columns:
         except (TypeError, ValueError, OverflowError):
             continue
         if array.ndim == 1:
-            columns[name] = Column(name, array.size, partial(np.asarray, array))
+            columns[name] = Column(name, array.size, array.__getitem__, by_rows=True)
     if not columns:
         raise DataError(f"{path} has no list of numbers, and no list of entries with numbers; expected a recording")
     is_table = len({column.size for column in columns.values()}) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,13 @@ from pendulum_msgs_py.errors import DataError
 
 __all__ = ["is_lerobot", "read_lerobot", "read_parquet"]
 
+Pieces = Callable[[slice], Iterator[tuple[int, Any]]]
+"""Returns pieces of a column, each with the number of its first row."""
+
 _INFO = Path("meta", "info.json")
 _MOST_ENTRIES = 256
+_BATCH = 1 << 17
+"""Rows that are decoded at once."""
 _BOOKKEEPING = frozenset({"frame_index", "episode_index", "index", "task_index", "timestamp"})
 
 
@@ -38,8 +44,17 @@ def read_parquet(path: Path) -> Columns:
     except Exception as error:
         raise DataError(f"{path} is no Parquet file: {str(error).splitlines()[0]}") from error
 
-    def read(name: str) -> Any:
-        return file.read(columns=[name]).column(name.split(".", maxsplit=1)[0])
+    def read(name: str, rows: slice) -> Iterator[tuple[int, Any]]:
+        start, stop, _ = rows.indices(count)
+        first = 0
+        for group in range(file.num_row_groups):
+            size = file.metadata.row_group(group).num_rows
+            if first < stop and start < first + size:
+                for batch in file.iter_batches(_BATCH, row_groups=[group], columns=[name]):
+                    yield first, batch.column(0)
+                    first += batch.num_rows
+            else:
+                first += size
 
     count = file.metadata.num_rows
     columns = {
@@ -73,8 +88,13 @@ def read_lerobot(folder: Path, part: int = 0) -> Columns:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{folder} is no LeRobot dataset that can be read: {type(error).__name__}: {error}") from error
 
-    def read(name: str) -> Any:
-        return data.to_table(columns=[name], filter=chosen).column(name)
+    def read(name: str, _: slice) -> Iterator[tuple[int, Any]]:
+        first = 0
+        # Without these two pyarrow reads 16 batches of 4 files ahead.
+        ahead = {"batch_readahead": 1, "fragment_readahead": 1}
+        for batch in data.to_batches(columns={name: arrow.field(name)}, filter=chosen, **ahead):
+            yield first, batch.column(0)
+            first += batch.num_rows
 
     columns = {}
     for entry in data.schema:
@@ -83,7 +103,7 @@ def read_lerobot(folder: Path, part: int = 0) -> Columns:
         labels = list(_labels((features.get(entry.name) or {}).get("names")))
         for index, column in enumerate(_arrow_columns(entry.name, entry.type, count, partial(read, entry.name))):
             name = f"{entry.name}.{labels[index]}" if index < len(labels) else column.name
-            columns[name] = Column(name, column.size, column.read)
+            columns[name] = replace(column, name=name)
     notes = [f"episode 1 of {episodes} is read; {folder.name}#2 is the next"] if episodes > 1 and not part else []
     # Stamps are stored in 32 bits; the frames of an episode are equally spaced.
     return Columns(folder, "LeRobot dataset", columns, notes, 1.0 / rate, is_table=True)
@@ -98,20 +118,64 @@ def _labels(names: Any) -> Iterator[str]:
         yield from map(str, names)
 
 
-def _arrow_columns(name: str, kind: Any, count: int, read: Callable[[], Any]) -> Iterator[Column]:
+def _arrow_columns(name: str, kind: Any, count: int, read: Pieces) -> Iterator[Column]:
+    """Yield a column of Arrow's as columns of numbers.
+
+    Args:
+        name: Of the column.
+        kind: Its type.
+        count: Number of rows.
+        read: Yields the pieces that hold some rows, each with the number of its first row.
+    """
     import pyarrow as pa
 
     if pa.types.is_struct(kind):
         for index in range(kind.num_fields):
             entry = kind.field(index)
-            yield from _arrow_columns(f"{name}.{entry.name}", entry.type, count, partial(_field, read, entry.name))
+            yield from _arrow_columns(f"{name}.{entry.name}", entry.type, count, partial(_field, read, index))
     elif pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
         if count and _is_number(kind.value_type):
-            size = kind.list_size if pa.types.is_fixed_size_list(kind) else len(read()[0].as_py() or ())
-            for index in range(min(size, _MOST_ENTRIES)):
-                yield Column(f"{name}[{index}]", count, partial(_entry, read, index))
+            first = next(piece[0].as_py() for _, piece in read(slice(0, 1)) if len(piece)) or ()
+            for index in range(min(kind.list_size if pa.types.is_fixed_size_list(kind) else len(first), _MOST_ENTRIES)):
+                entries = partial(_numbers, count, read, partial(_entry, index=index))
+                yield Column(f"{name}[{index}]", count, entries, by_rows=True)
     elif _is_number(kind) or pa.types.is_timestamp(kind):
-        yield Column(name, count, lambda: _numbers(read()), unit=_unit(kind))
+        yield Column(name, count, partial(_numbers, count, read, None), unit=_unit(kind), by_rows=True)
+
+
+def _numbers(count: int, read: Pieces, part: Callable[[Any], Any] | None, rows: slice) -> NDArray[Any]:
+    """Return some rows as numbers, piece by piece: the table of Arrow, several times as large, is never in memory."""
+    import pyarrow as pa
+
+    start, stop, _ = rows.indices(count)
+    values = np.full(stop - start, np.nan)
+    for first, piece in read(rows):
+        numbers = part(piece) if part else piece
+        if pa.types.is_timestamp(numbers.type):
+            numbers = numbers.cast(pa.int64())
+        begin, end = max(start, first), min(stop, first + len(piece))
+        if begin < end:
+            found = numbers.cast(pa.float64()).to_numpy(zero_copy_only=False)
+            values[begin - start : end - start] = found[begin - first : end - first]
+    return values
+
+
+def _entry(lists: Any, index: int) -> Any:
+    """Return one entry of each list, null where a list is shorter."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    if pa.types.is_fixed_size_list(lists.type):
+        return pc.list_element(lists, index)
+    long = pc.fill_null(pc.greater(pc.list_value_length(lists), index), False)
+    return pc.list_element(pc.if_else(long, lists, pa.scalar([None] * (index + 1), lists.type)), index)
+
+
+def _field(read: Pieces, index: int, rows: slice) -> Iterator[tuple[int, Any]]:
+    import pyarrow.compute as pc
+
+    for first, piece in read(rows):
+        yield first, pc.struct_field(piece, [index])
 
 
 def _is_number(kind: Any) -> bool:
@@ -129,26 +193,6 @@ def _unit(kind: Any) -> str:
     import pyarrow as pa
 
     return str(kind.unit) if pa.types.is_timestamp(kind) else ""
-
-
-def _field(read: Callable[[], Any], key: str) -> Any:
-    import pyarrow.compute as pc
-
-    return pc.struct_field(read(), key)
-
-
-def _entry(read: Callable[[], Any], index: int) -> NDArray[Any]:
-    import pyarrow.compute as pc
-
-    return _numbers(pc.list_element(read(), index))
-
-
-def _numbers(values: Any) -> NDArray[Any]:
-    import pyarrow as pa
-
-    if pa.types.is_timestamp(values.type):
-        values = values.cast(pa.int64())
-    return np.asarray(values.cast(pa.float64()).to_numpy())
 
 
 def _pyarrow(path: Path, module: str) -> Any:

@@ -143,6 +143,9 @@ _APART, _BACK, _SHARE = 0.05, 0.2, 0.12
 def two_motions(position: npt.NDArray[Any]) -> str:
     """Return how an angle, shape (n,) [rad], jumps to and fro if two senders share a topic, in words."""
     known = position[np.isfinite(position)]
+    steps = np.diff(known)
+    if max(float(np.max(steps, initial=0.0)), -float(np.min(steps, initial=0.0))) <= _APART:
+        return ""
     steps = np.diff(np.unwrap(known))
     least = np.minimum(np.abs(steps[1:]), np.abs(steps[:-1]))
     there_and_back = (least > _APART) & (np.abs(steps[1:] + steps[:-1]) < _BACK * least)
