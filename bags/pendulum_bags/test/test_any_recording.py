@@ -617,14 +617,14 @@ def test_one_recording_in_two_formats_is_no_pair_and_no_repetition(tmp_path: Pat
         in compared(capsys, tmp_path / "sim.mat", tmp_path / "copy.npz", code=2)["error"]
     )
     thin, lines = np.sort(np.random.default_rng(0).permutation(800)[:500]), np.linspace(0.0, 7.2, 1500)
-    again = {
+    copies = {
         "rows left out": {key: values[thin] for key, values in step(1).items()},
         "resampled": {key: np.interp(lines, step(1)["t"], values) for key, values in step(1).items()},
         "cut, and another zero of the clock": {
             key: values[100:] - (key == "t") for key, values in step(1).items()
         },
     }  # fmt: skip
-    for run in again.values():
+    for run in copies.values():
         pair = save(tmp_path / "run.npz", step(1)), save(tmp_path / "copy.npz", run)
         assert "hold one and the same recording" in compared(capsys, *pair, code=2)["error"]
     sim, one, again = (save(tmp_path / f"{name}.npz", step(seed)) for name, seed in (("s", 0), ("a", 1), ("b", 1)))
