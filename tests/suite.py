@@ -58,7 +58,6 @@ _WAITS = (
 """Other tests with processes that keep a plant's time, longest first: they wait for most of it, two at a time."""
 _SIMULATED_TIME = (
     "tests/integration/test_experiments.py",
-    "tests/integration/test_course.py",
     "tests/integration/test_several_joints.py",
 )
 """Whole systems whose processes wait for each other and not for a clock: they compute."""
