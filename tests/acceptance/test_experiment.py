@@ -26,7 +26,10 @@ from pendulum_testing.processes import ProcessGroup, RunningProgram
 pytestmark = pytest.mark.timeout(600)
 
 NOISE = 5.0
-RAMP = math.pi / 0.002 / 100.0
+SPEED = 0.8
+"""Mean speed of the ramps [rad/s]; at the default each takes 16 s."""
+SHORT = f"--ramp-speed {SPEED} --contenders 3 --seeds 1 --periods 3"
+"""Each step of the default run, with less of it."""
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +39,9 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningProg
     processes = ProcessGroup(folder, cwd=PROJECT)
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("ROS_DOMAIN_ID", raising=False)
-        program = processes.start_command(["make", "--no-print-directory", "experiment", f"OUT={folder / 'run'}"])
+        program = processes.start_command(
+            ["make", "--no-print-directory", "experiment", f"OUT={folder / 'run'}", f"ARGS={SHORT}"]
+        )
     try:
         assert program.wait(540) == 0, program.output
         assert processes.leftovers() == []
@@ -115,9 +120,9 @@ def test_both_bags_hold_the_whole_experiment(run_folder: Path) -> None:
         bag = read_bag(run_folder / name)
         states = bag[f"/{name}/joint_states"]
         duration = (states["stamp_ns"][-1] - states["stamp_ns"][0]) * 1e-9
-        assert duration > 2 * RAMP + NOISE
+        assert duration > 2 * math.pi / SPEED + NOISE
         assert states["position"].max() == pytest.approx(math.pi, abs=0.05)
-        assert abs(states["position"][-1]) < 0.05
+        assert abs(states["position"][-1]) < 0.2
         events = [event["name"] for event in bag.events()]
         for phase in ("ramp_up", "regulation", "noise_start", "noise_end", "ramp_down", "done"):
             assert phase in events
@@ -208,7 +213,9 @@ def test_ctrl_c_behind_the_first_layer_gives_the_answer_so_far(
     processes: ProcessGroup, domain_id: int, tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
-    program = processes.start("pendulum_bags", "experiment", "thesis", "--out", folder, *FAST, alone=True)
+    # What follows the identification would be recorded already, and is not what is looked at.
+    words = ("--out", folder, *FAST, "--only", "identified")
+    program = processes.start("pendulum_bags", "experiment", "thesis", *words, alone=True)
     program.wait_for_output(r"^identifying the plant", 300)
     program.interrupt()
 
