@@ -146,16 +146,15 @@ def region_of_attraction(
     effort_limit: float,
     rollout: Rollout,
     *,
-    angle_span: float = math.pi,
     velocity_span: float = 10.0,
     points: int = 101,
 ) -> Region:
     """Sample the region of attraction of upright by batch simulation and prove its inner part.
 
-    ``effort_limit`` in [N m]. The grid has half widths ``angle_span`` [rad] and ``velocity_span`` [rad/s]; an odd
+    ``effort_limit`` in [N m]. The grid has half widths pi and ``velocity_span`` [rad/s]; an odd
     number of points includes upright. ``rollout`` must be long enough to settle.
     """
-    angles = np.linspace(-angle_span, angle_span, points)
+    angles = np.linspace(-math.pi, math.pi, points)
     velocities = np.linspace(-velocity_span, velocity_span, points)
     x, v = np.meshgrid(angles, velocities)
     end_angle, end_velocity = rollout(x.ravel(), v.ravel())

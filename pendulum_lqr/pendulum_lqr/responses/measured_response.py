@@ -89,9 +89,9 @@ class MeasuredResponse:
         """Index of the output that is the driven joint's velocity."""
         return self.outputs // 2 + self.driven
 
-    def radius(self, confidence: float = 0.95, *, joint: bool = True) -> Array:
-        """Return the radius of each confidence disc, shape (outputs, n); ``joint``: for all together (Bonferroni)."""
-        tail = (1.0 - confidence) / (self.response.size if joint else 1)
+    def radius(self, *, joint: bool = True) -> Array:
+        """Return the radius of each 95 % disc, shape (outputs, n); ``joint``: for all together (Bonferroni)."""
+        tail = (1.0 - 0.95) / (self.response.size if joint else 1)
         # scipy.stats gives the same number, but takes a third of a second to import.
         quantile = float(scipy.special.fdtri(2.0, 2.0 * (self.blocks - 1.0), 1.0 - tail))
         return np.sqrt(quantile) * self.deviation

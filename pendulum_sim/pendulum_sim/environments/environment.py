@@ -10,7 +10,6 @@ Importing this module registers them, and so does ``gymnasium.make("pendulum_sim
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.environments.environment_motion import Lanes, make_motion
-from pendulum_sim.environments.environment_task import EPISODE_TIME, Array, EnvironmentTask, check_reset_options
+from pendulum_sim.environments.environment_task import Array, EnvironmentTask, check_reset_options
 
 __all__ = ["IDS", "PlantEnv", "PlantVectorEnv", "register"]
 
@@ -71,26 +70,15 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         self,
         plant: str | PlantParameters = "thesis",
         *,
-        dt: float = 2e-3,
-        method: str = "auto",
-        substeps: int = 1,
-        start: str = "top",
-        disturbance: float = 0.0,
-        hold: int = 1,
-        q: Sequence[float] | None = None,
-        r: float | None = None,
         render_mode: str | None = None,
         screen_size: tuple[int, int] = (600, 600),
-        episode_time: float = EPISODE_TIME,
+        **arguments: Any,
     ) -> None:
-        self._task = task = EnvironmentTask(
-            plant, dt=dt, method=method, substeps=substeps, start=start, disturbance=disturbance, hold=hold, q=q, r=r,
-            episode_time=episode_time,
-        )  # fmt: skip
+        self._task = task = EnvironmentTask(plant, **arguments)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ParameterError(f"render_mode is {render_mode!r}; expected None, human or rgb_array")
         self.parameters = task.parameters
-        self.dt = dt
+        self.dt = dt = task.dt
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / dt))}
         self.render_mode = render_mode
         self.observation_space, self.action_space = task.observation_space, task.action_space
@@ -198,21 +186,10 @@ class PlantVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         *,
         max_episode_steps: int | None = None,
         plant: str | PlantParameters = "thesis",
-        dt: float = 2e-3,
-        method: str = "auto",
-        substeps: int = 1,
-        start: str = "top",
-        disturbance: float = 0.0,
-        hold: int = 1,
-        q: Sequence[float] | None = None,
-        r: float | None = None,
         render_mode: str | None = None,
-        episode_time: float = EPISODE_TIME,
+        **arguments: Any,
     ) -> None:
-        self._task = task = EnvironmentTask(
-            plant, dt=dt, method=method, substeps=substeps, start=start, disturbance=disturbance, hold=hold, q=q, r=r,
-            episode_time=episode_time,
-        )  # fmt: skip
+        self._task = task = EnvironmentTask(plant, **arguments)
         self._last = task.last if max_episode_steps is None else max_episode_steps
         if num_envs < 1 or self._last < 1:
             raise ParameterError(
