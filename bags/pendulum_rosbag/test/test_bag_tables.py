@@ -146,10 +146,10 @@ def test_tables_have_the_columns_of_the_arrays(tmp_path: Path) -> None:
         export_bag(bag, tmp_path / "csv", "csv")
 
 
-def test_names_of_matlab_differ_within_63_characters_and_states_have_their_disturbance(tmp_path: Path) -> None:
+def test_names_of_matlab_differ_within_63_characters_and_states_have_their_inputs(tmp_path: Path) -> None:
     joints = [f"{'a_long_name_of_a_joint_' * 3}{side}" for side in ("left", "right")]
     with BagWriter(tmp_path / "bag") as writer:
-        for topic in ("joint_states", "disturbance", "hw/joint_states", "hw/disturbance"):
+        for topic in ("joint_states", "disturbance", "hw/joint_states", "hw/disturbance", "hw/applied_effort"):
             writer.add_topic(f"/{topic}", JOINT_STATE)
         for stamp in range(4):
             writer.write("/joint_states", stamp, joint_state(stamp, "", joints, [1.0, 2.0], [], []))
@@ -157,6 +157,7 @@ def test_names_of_matlab_differ_within_63_characters_and_states_have_their_distu
         for stamp in (1, 3):
             writer.write("/disturbance", stamp, joint_state(stamp, "", joints, [], [], [0.5 * stamp, -1.0]))
             writer.write("/hw/disturbance", stamp, encode_joint_state(stamp, effort=0.5 * stamp))
+            writer.write("/hw/applied_effort", stamp, encode_joint_state(stamp, effort=-stamp))
     export_bag(read_bag(tmp_path / "bag"), tmp_path / "out", "mat")
     found = scipy.io.loadmat(tmp_path / "out" / "joint_states.mat")
     names = [name for name in found if not name.startswith("__")]
@@ -165,6 +166,7 @@ def test_names_of_matlab_differ_within_63_characters_and_states_have_their_distu
     assert [0.0, 0.5, 0.5, 1.5] in [found[name].ravel().tolist() for name in names if name.startswith("a_long")]
     one = scipy.io.loadmat(tmp_path / "out" / "hw__joint_states.mat")
     assert one["disturbance_effort"].ravel().tolist() == [0.0, 0.5, 0.5, 1.5]
+    assert one["applied_effort"].ravel().tolist() == [0.0, -1.0, -1.0, -3.0]
 
 
 def bag_of_lists(path: Path) -> Path:

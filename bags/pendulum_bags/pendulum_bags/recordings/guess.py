@@ -58,7 +58,10 @@ _WEAK = frozenset({"y", "q", "x", "th", "control", "motor", "current", "encoder"
 """Words that mean something else where a plainer one is there."""
 _NAMING = frozenset({"theta", "alpha", "phi", "psi", "beta", "x", "cart", "distance", "angle", "slider"})
 """Words that are the name of a joint, too."""
-_MEASURED, _FILTERED = frozenset({"meas", "measured", "actual"}), frozenset({"filt", "filtered", "est", "estimated"})
+_MEASURED, _FILTERED = (
+    frozenset({"meas", "measured", "actual", "applied"}),
+    frozenset({"filt", "filtered", "est", "estimated"}),
+)
 _COMMANDED = frozenset({"con", "cmd", "command", "commanded", "controller", "u"})
 _PLAIN = frozenset(
     {"joint", "joints", "states", "state", "observation", "values", "value", "signals", "data", "sim", "hw"}
@@ -588,7 +591,8 @@ class _Guesser:
             unit = "N"
         section: dict[str, Any] = {"column": one.name, "unit": unit}
         if role == "input":
-            measured = unit in {"N m", "N"} and (one.rank == 0 or (one.rank == 1 and not _is_command(one.name)))
+            known = one.rank == 0 and "applied" not in one.name.casefold()
+            measured = unit in {"N m", "N"} and (known or (one.rank == 1 and not _is_command(one.name)))
             section["hold"] = "linear" if measured and not self._is_apart(one.name, joint.position) else "zero"
             how += f"; taken as {'a measurement' if section['hold'] == 'linear' else 'a command'}"
         if assumed and "taken for" not in how:

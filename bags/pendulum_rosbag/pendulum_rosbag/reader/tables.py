@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pendulum_msgs_py.contract.names import DISTURBANCE, JOINT_STATES
+from pendulum_msgs_py.contract.names import APPLIED_EFFORT, DISTURBANCE, JOINT_STATES
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_msgs_py.json_values import without_nan
 from pendulum_msgs_py.programs.extras import how_to_install
@@ -105,7 +105,7 @@ def export_bag(
             place.mkdir()
             for topic in bag.topics:
                 try:
-                    table = _with_disturbance(bag, topic, to_pandas(bag, topic))
+                    table = _with_inputs(bag, topic, to_pandas(bag, topic))
                 except DataError as error:
                     failed = error
                     on_left_out(str(error))
@@ -121,22 +121,25 @@ def export_bag(
     return [folder / path.name for path in files]
 
 
-def _with_disturbance(bag: Bag, topic: str, table: pd.DataFrame) -> pd.DataFrame:
-    """Return states with the disturbance that acted at each of them, held, so that one file has input and output."""
-    other = f"{topic.removesuffix(JOINT_STATES)}{DISTURBANCE}"
-    if not topic.endswith(JOINT_STATES) or other not in bag.topics or "stamp_ns" not in table:
+def _with_inputs(bag: Bag, topic: str, table: pd.DataFrame) -> pd.DataFrame:
+    """Return states with disturbance and applied torque, held at each, so that one file has input and output."""
+    if not topic.endswith(JOINT_STATES) or "stamp_ns" not in table:
         return table
-    values = bag[other]
-    if isinstance(values, np.ndarray):
-        stamps, efforts = values["stamp_ns"], {"disturbance_effort": values["effort"]}
-    else:
-        found = joint_table(bag.raw(other), other)
-        stamps = found.stamp_ns
-        efforts = {f"{name}.disturbance_effort": found.effort[:, index] for index, name in enumerate(found.names)}
-    order = np.argsort(stamps, kind="stable")
-    held = np.searchsorted(stamps[order], table["stamp_ns"], side="right")
-    columns = {name: np.concatenate(([0.0], effort[order]))[held] for name, effort in efforts.items()}
-    return table.assign(**columns)
+    for signal, column in ((DISTURBANCE, "disturbance_effort"), (APPLIED_EFFORT, "applied_effort")):
+        other = f"{topic.removesuffix(JOINT_STATES)}{signal}"
+        if other not in bag.topics:
+            continue
+        values = bag[other]
+        if isinstance(values, np.ndarray):
+            stamps, efforts = values["stamp_ns"], {column: values["effort"]}
+        else:
+            found = joint_table(bag.raw(other), other)
+            stamps = found.stamp_ns
+            efforts = {f"{name}.{column}": found.effort[:, index] for index, name in enumerate(found.names)}
+        order = np.argsort(stamps, kind="stable")
+        held = np.searchsorted(stamps[order], table["stamp_ns"], side="right")
+        table = table.assign(**{name: np.concatenate(([0.0], one[order]))[held] for name, one in efforts.items()})
+    return table
 
 
 def _free_path(folder: Path, topic: str, format: str, taken: Sequence[Path]) -> Path:
