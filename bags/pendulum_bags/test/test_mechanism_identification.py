@@ -140,11 +140,11 @@ def test_a_step_in_which_joints_rest_and_break_away_ends_where_fifty_short_ones_
 
 
 @pytest.mark.parametrize(
-    ("preset", "window", "late"),
-    [("furuta", (0.1, 0.3), 0), ("pendubot", (0.1, 0.4), 0), ("cart_pole", (0.2, 0.8), 18)],
+    ("preset", "seconds", "window", "late"),
+    [("furuta", 5.0, (0.1, 0.3), 0), ("pendubot", 5.0, (0.1, 0.4), 0), ("cart_pole", 8.0, (0.2, 0.8), 18)],
 )
-def test_intervals_from_a_run_held_upright_hold_the_values_of_a_machine_that_is_off(preset, window, late):
-    plant, run = load_mechanism(preset), run_balanced(preset, 3, 8.0)
+def test_intervals_from_a_run_held_upright_hold_the_values_of_a_machine_that_is_off(preset, seconds, window, late):
+    plant, run = load_mechanism(preset), run_balanced(preset, 3, seconds)
     # Efforts that are stamped too early by so many samples act that much later: far from the start's delay of 0.
     stop = len(run.position) - late
     time = 0.002 * np.arange(stop)
@@ -199,17 +199,17 @@ def test_swapped_columns_are_refused_by_name(both_driven):
 
 
 @pytest.mark.parametrize(
-    ("name", "position", "effort", "words"),
+    ("name", "seconds", "position", "effort", "words"),
     [
-        ("double_pendulum", [[1, 0], [0, 1]], (-1, -1), "with every effort negated"),
-        ("double_pendulum", [[1, 0], [0, 1]], (1, -1), "with the effort of elbow negated"),
-        ("acrobot", [[1, 0], [1, 1]], (1, 1), "with the angle of elbow less that of shoulder"),
-        ("cart_pole", [[1, 0], [0, 1]], (-1, 1), "with the effort of cart negated"),
+        ("double_pendulum", 6.0, [[1, 0], [0, 1]], (-1, -1), "with every effort negated"),
+        ("double_pendulum", 3.0, [[1, 0], [0, 1]], (1, -1), "with the effort of elbow negated"),
+        ("acrobot", 6.0, [[1, 0], [1, 1]], (1, 1), "with the angle of elbow less that of shoulder"),
+        ("cart_pole", 6.0, [[1, 0], [0, 1]], (-1, 1), "with the effort of cart negated"),
     ],
 )
-def test_a_wrong_sign_and_an_angle_against_the_world_are_refused_by_name(name, position, effort, words):
+def test_a_wrong_sign_and_an_angle_against_the_world_are_refused_by_name(name, seconds, position, effort, words):
     plant = truth(name)
-    one = motion(plant, 3)
+    one = motion(plant, 3, seconds)
     wrong = replace(one, position=one.position @ np.array(position, dtype=float).T, effort=one.effort * effort)
     result = identify_mechanism(plant, [wrong], extras="friction")
     assert result.refused
