@@ -1,4 +1,4 @@
-"""``emulator``: emulate the X5-9; ``emulator_fault``: inject faults; ``emulator_hand``: turn the link a little."""
+"""``emulator``: emulate the X5-9; ``emulator_fault``: inject its faults; ``emulator_hand``: turn the link a little."""
 
 from __future__ import annotations
 
