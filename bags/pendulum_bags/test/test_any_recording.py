@@ -392,6 +392,15 @@ def test_a_cart_is_a_place_and_the_column_that_another_hides_is_listed(tmp_path:
     assert ("left out", "theta_filtered") in {(guess.quantity, guess.column) for guess in reading.guesses}
 
 
+def test_an_encoder_between_two_counts_is_one_motion_and_the_applied_torque_its_input(tmp_path: Path) -> None:
+    flips = np.round(np.random.default_rng(0).random(RUN["t"].size))
+    efforts = {"effort": RUN["torque"] + 0.1 * flips, "applied_effort": RUN["torque"]}
+    np.savez(tmp_path / "run.npz", t=RUN["t"], theta=-102.26 + 0.09 * flips, **efforts)
+    reading = Reading(tmp_path / "run.npz")
+    assert reading.rules.joints[""]["input"] == {"column": "applied_effort", "unit": "N m", "hold": "zero"}
+    assert np.unique(np.round(reading.motion.joints[0].position, 6)).size == 2
+
+
 def test_a_position_that_stands_still_is_named(tmp_path: Path) -> None:
     np.savez(tmp_path / "run.npz", t=RUN["t"], theta=np.full(RUN["t"].size, 3.0), u=RUN["torque"])
     for topics in ((), ("position=theta",)):

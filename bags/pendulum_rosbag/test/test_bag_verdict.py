@@ -133,5 +133,14 @@ def test_noise_ticks_wraps_and_spikes_are_one_motion() -> None:
     spikes = swing + 0.5 * (np.arange(time.size) % 50 == 7)
     wrapped = np.angle(np.exp(1j * (np.pi + 0.02 * random.standard_normal(time.size))))
     ticks = 0.006 * random.integers(0, 2, time.size)
-    for angle in (swing, spikes, wrapped, ticks, random.normal(0.0, 0.3, time.size), np.full(time.size, np.nan)):
+    degrees = 0.36 / 0.006 * ticks - 102.6  # of 1000 counts a turn
+    for angle in (
+        swing,
+        spikes,
+        wrapped,
+        ticks,
+        degrees,
+        random.normal(0.0, 0.3, time.size),
+        np.full(time.size, np.nan),
+    ):
         assert two_motions(angle) == ""

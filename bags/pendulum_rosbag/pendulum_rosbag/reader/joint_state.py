@@ -148,7 +148,10 @@ def two_motions(position: npt.NDArray[Any]) -> str:
         return ""
     steps = np.diff(np.unwrap(known))
     least = np.minimum(np.abs(steps[1:]), np.abs(steps[:-1]))
-    there_and_back = (least > _APART) & (np.abs(steps[1:] + steps[:-1]) < _BACK * least)
+    # An encoder at rest between two counts goes to and fro, too: 0.36 deg of 1000 counts, read as radians.
+    levels = np.diff(np.unique(known))
+    count_size = float(np.min(levels, initial=0.4, where=levels > 1e-9))
+    there_and_back = (least > max(_APART, 1.5 * count_size)) & (np.abs(steps[1:] + steps[:-1]) < _BACK * least)
     count = int(np.sum(there_and_back))
     if count < max(10, _SHARE * known.size):
         return ""
