@@ -13,7 +13,32 @@ from numba import njit
 
 from pendulum_bags.arrays import Array
 
-__all__ = ["eliminate", "find_states"]
+__all__ = ["bounded_step", "eliminate", "find_states"]
+
+
+def bounded_step(system: Array, gradient: Array, values: Array, low: Array, high: Array | float) -> Array:
+    """Return the step of a quadratic model within bounds: what would leave them stops there, the others solve again.
+
+    Args:
+        system: Damped matrix, shape (k, k).
+        gradient: Half of the cost's derivative, shape (k,).
+        values: Where the step begins, shape (k,).
+        low: Lower bounds, shape (k,).
+        high: Upper bounds.
+    """
+    step = np.linalg.solve(system, -gradient)
+    active = np.zeros(step.size, dtype=bool)
+    for _ in range(step.size):
+        reached = values + step
+        outside = ((reached < low) | (reached > high)) & ~active
+        if not outside.any():
+            break
+        step[outside] = np.clip(reached, low, high)[outside] - values[outside]
+        active |= outside
+        idle = np.flatnonzero(~active)
+        right = -(gradient + system @ np.where(active, step, 0.0))[idle]
+        step[idle] = np.linalg.solve(system[np.ix_(idle, idle)], right)
+    return np.asarray(step)
 
 
 @njit(cache=True)

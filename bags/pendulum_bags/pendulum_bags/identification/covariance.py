@@ -49,21 +49,8 @@ class _Information:
     states: int
 
 
-def candidate_errors(
-    candidate: Candidate,
-    pieces: Sequence[Piece],
-    scale: float,
-    *,
-    white: bool,
-) -> Errors:
-    """Return the standard errors of a candidate.
-
-    Args:
-        candidate: The fit.
-        pieces: Its data.
-        scale: Of the robust loss [rad].
-        white: Whether its residuals are white; if not, clusters and the jackknife over the folds count too.
-    """
+def candidate_errors(candidate: Candidate, pieces: Sequence[Piece], scale: float, *, white: bool) -> Errors:
+    """Return the standard errors of a candidate; of residuals that are not white, by clusters and a jackknife too."""
     model = candidate.solution.model
     edges = set(at_bounds(candidate))
     names = tuple(n for n in candidate.free if n not in edges)

@@ -86,15 +86,9 @@ def cross_validate(
     *,
     count: int = 6,
 ) -> CrossValidation | None:
-    """Fit without each fold in turn and score on it; None where there is but one window.
+    """Fit without each of ``count`` folds in turn and score on it; None where there is but one window.
 
-    Args:
-        model: Fit on all data: start of each partial fit.
-        pieces: Data.
-        states: Fitted window states by piece.
-        free: Fitted parameters.
-        scale: Of the robust loss [rad].
-        count: Most folds.
+    The arguments are of the fit to all data, from which each partial fit starts.
     """
     parts = folds(pieces, count)
     if not parts:
@@ -122,7 +116,5 @@ def cross_validate(
         samples.append(number)
         losses.append(loss)
     return CrossValidation(
-        rms=float(np.sqrt(np.sum(squares) / np.sum(samples))),
-        losses=np.array(losses),
-        vectors=np.array(vectors),
+        rms=float(np.sqrt(np.sum(squares) / np.sum(samples))), losses=np.array(losses), vectors=np.array(vectors)
     )

@@ -111,12 +111,7 @@ def explained(fit: OutputErrorFit, outliers: Sequence[tuple[str, float, float, f
 
 
 def undetermined_fit(fit: OutputErrorFit, uncertainty: Uncertainty) -> str | None:
-    """Return the sentence that the recording does not determine what a plant file needs; None where it does.
-
-    Args:
-        fit: The fit.
-        uncertainty: Its intervals.
-    """
+    """Return the sentence that the recording does not determine what a plant file needs; None where it does."""
     model = fit.model
     free = model.input_kind == "none"
     lost: dict[str, str] = {}

@@ -9,6 +9,7 @@ from datetime import datetime, timezone
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pendulum_bags.identification.between_recordings import Alone, excluding
 from pendulum_bags.identification.covariance import FREQUENCY, candidate_errors
 from pendulum_bags.identification.explained import REFUSED, explained, undetermined_fit
 from pendulum_bags.identification.geometry import check_geometry
@@ -25,9 +26,6 @@ from pendulum_bags.runs.datasets import Recording, distinct_names
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["identify"]
-
-_SURE = 3.0
-"""Standard errors to each side within which the natural frequency of a recording lies."""
 
 _ONE_MACHINE = {FREQUENCY: 1.1, "inertia": 1.35, "gravity": 1.35}
 """Ratios up to which what differs from recording to recording may be one machine's: what the model lacks moves them."""
@@ -66,13 +64,15 @@ def identify(
     tests = residual_tests(fit)
     account = explained(fit, tests.outliers)
     explains = account.share <= DOUBTFUL_SHARE
-    uncertainty = assess(fit, tests, profiles=0 if account.refusal is not None else profiles, explains=explains)
+    alone = _alone(fit)
+    profiles = 0 if account.refusal is not None else profiles
+    uncertainty = assess(fit, tests, profiles=profiles, explains=explains, alone=alone)
     if account.refusal is None and (lost := undetermined_fit(fit, uncertainty)) is not None:
         account = replace(account, refusal=lost)
-    excluding = _excluding(fit)
-    if account.refusal is not None and excluding is not None:
+    two = excluding(alone, _ONE_MACHINE, fit.model.unit)
+    if account.refusal is not None and two is not None:
         # What one fit to two machines lacks is no fault of either recording.
-        account = replace(account, refusal=f"{REFUSED}: {excluding[0].lower()}{excluding[1:]}")
+        account = replace(account, refusal=f"{REFUSED}: {two[0].lower()}{two[1:]}")
     geometry = check_geometry(fit.model, uncertainty, options.geometry)
     scores = {}
     for name, recording in zip(distinct_names(held_out), held_out, strict=True):
@@ -102,37 +102,22 @@ def identify(
         tests,
         geometry,
         moved,
-        excluding,
+        two,
     )
 
 
-def _excluding(fit: OutputErrorFit) -> str | None:
-    """Return that two recordings of a fit exclude each other: they are of two machines, or of one with two loads."""
+def _alone(fit: OutputErrorFit) -> list[Alone]:
+    """Return what each recording of several says alone."""
     if len(fit.pieces) < 2 or fit.reading is not None:
-        return None
-    chosen = fit.chosen
-    found: dict[str, list[tuple[float, float, float, str]]] = {name: [] for name in _ONE_MACHINE}
+        return []
+    chosen, found = fit.chosen, []
     names = distinct_names([piece.recording for piece in fit.pieces])
     for label, piece, state in zip(names, fit.pieces, chosen.solution.states, strict=True):
         alone = solve(fit.model, [piece], chosen.free, states=[state], scale=fit.scale, tolerance=1e-5)
         errors = candidate_errors(replace(chosen, solution=alone, validation=None), [piece], fit.scale, white=False)
-        for name, rows in found.items():
-            if name in errors.deviation:
-                value = alone.model.natural_frequency if name == FREQUENCY else alone.model[name]
-                reach = _SURE * errors.deviation[name]
-                rows.append((value - reach, value, value + reach, label))
-    for name, rows in found.items():
-        if len(rows) < 2:
-            continue
-        small, large = min(rows, key=lambda one: one[2]), max(rows)
-        if small[2] < large[0] and large[1] > _ONE_MACHINE[name] * small[1]:
-            listing = " and ".join(f"{low:.4g} to {high:.4g} ({label})" for low, _, high, label in (small, large))
-            unit = fit.model.units.get(name, "rad/s")
-            return (
-                f"The recordings exclude each other: fitted alone, {name} is {listing} {unit}; a common fit describes "
-                "neither. Expected recordings of one machine with one load: fit them one by one."
-            )
-    return None
+        values = {n: alone.model.natural_frequency if n == FREQUENCY else alone.model[n] for n in errors.deviation}
+        found.append(Alone(label, values, errors.deviation))
+    return found
 
 
 def _moved_zero(fit: OutputErrorFit, recording: Recording, rms: float) -> tuple[float, float] | None:

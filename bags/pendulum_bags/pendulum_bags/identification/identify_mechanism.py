@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
+from pendulum_bags.identification.between_recordings import Alone, excluding, half_width
 from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED, Explained
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_choice import ALL_EXTRAS, choose
@@ -31,6 +32,7 @@ from pendulum_bags.identification.mechanism_fit import (
 )
 from pendulum_bags.identification.mechanism_model import DELAY, MechanismModel, tellable
 from pendulum_bags.identification.notes import Interval, held_sentences, open_sentences
+from pendulum_bags.identification.own_offsets import OwnOffsets
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_bags.identification.residual_tests import INCOMPLETE
 from pendulum_bags.identification.result import IdentificationResult, check_distinct, fingerprint
@@ -66,6 +68,9 @@ _PUSHED = 0.25
 
 _FEWEST = 5
 """Windows below which no fit is tried."""
+
+_ONE_MACHINE = 1.1
+"""Ratio up to which a size that differs from recording to recording may be one machine's."""
 
 
 # BLAS on one core, as for one joint: a recording has the same result on every worker.
@@ -111,16 +116,21 @@ def identify_mechanism(
     weights = error_weights(found)
     for _ in range(0 if found.worst > LARGEST_SHARE else 2 if measured else 1):
         weights = error_weights(found)
-        found = fit(found.model, found.data, found.free, weights, states=found.states)
+        found = found.again(weights)
     found, held = _hold_undetermined(found, weights)
     names = distinct_names([*recordings, *held_out])
     training = dict(zip(names, found.scores, strict=False))
     others = [prepare_windows(recording, best.length, stride=stride) for recording in held_out]
-    outside = dict(zip(names[len(recordings) :], scores(found.model, others, weights), strict=True))
+    outside = dict(zip(names[len(recordings) :], scores(found.model, others, weights, own=found.own), strict=True))
     refused = refusal(found, training, outside)
     if refused is None and not found.converged:
         refused = f"{REFUSED}: the search had not ended after {MOST} steps; expected a start nearer to the machine"
-    uncertainty = _uncertainty(found, held)
+    alone = _alone(found, weights)
+    sizes = dict.fromkeys((name for name in tellable(plant) if name in found.free), _ONE_MACHINE)
+    two = excluding(alone, sizes, found.model.unit)
+    if refused is not None and two is not None:
+        refused = f"{REFUSED}: {two[0].lower()}{two[1:]}"
+    uncertainty = _uncertainty(found, held, alone)
     if refused is None:
         try:
             identified = found.model.identified(found.free, plant.name)
@@ -141,7 +151,10 @@ def identify_mechanism(
         tuple(np.sqrt(np.mean(np.square(values), axis=0)).tolist())
         for values in zip(*((one.rms, one.lines) for one in found.scores), strict=True)
     )
-    notes = _notes(recordings, pushed)
+    notes = [*([two] if two is not None else []), *_notes(recordings, pushed)]
+    if found.own:
+        zeros = OwnOffsets(found.own, found.offsets - found.offsets.mean(axis=0))
+        notes.append(zeros.sentence(names[: len(recordings)], found.model.unit))
     if window is None and best.length < longest:
         notes.append(
             f"Windows of {best.length:.2g} s: over longer ones neighbouring motions part (chaos, or no balance)."
@@ -198,11 +211,7 @@ class _Search:
     stride: int
 
     def best(self, length: float, *, fixed: bool) -> _Attempt:
-        """Return the best fit.
-
-        Args:
-            length: Length of the windows [s].
-            fixed: Whether it was asked for, and no shorter one is an answer.
+        """Return the best fit to windows of a length [s], or to shorter ones unless it is fixed.
 
         Raises:
             DataError: There are too few windows, or none is explained.
@@ -287,7 +296,7 @@ def _without_pushes(found: MechanismFit) -> tuple[MechanismFit, list[tuple[str, 
         rest = np.delete(np.arange(len(part.time)), window)
         kept = [p.subset(rest) if i == piece else p for i, p in enumerate(now.data)]
         states = [np.delete(x, window, axis=0) if i == piece else x for i, x in enumerate(now.states)]
-        now = fit(now.model, kept, now.free, 1.0 / np.maximum(lines, 1e-9), states=states, most=10, tolerance=1e-3)
+        now = now.again(1.0 / np.maximum(lines, 1e-9), data=kept, states=states, most=10, tolerance=1e-3)
         if now.worst <= min(DOUBTFUL_SHARE, _CLEARS * share):
             return now, sorted(out)
     return found, []
@@ -312,7 +321,7 @@ def _hold_undetermined(found: MechanismFit, weights: Array) -> tuple[MechanismFi
         values[found.model.index([worst])] = start[worst]
         free = tuple(name for name in found.free if name != worst)
         try:
-            trial = fit(found.model.with_values(values), found.data, free, weights, states=found.states)
+            trial = found.again(weights, model=found.model.with_values(values), free=free)
         except DataError:
             break
         if trial.cost > 1.1 * found.cost:
@@ -323,16 +332,48 @@ def _hold_undetermined(found: MechanismFit, weights: Array) -> tuple[MechanismFi
     return found, held
 
 
-def _uncertainty(found: MechanismFit, held: Sequence[str] = ()) -> Uncertainty:
-    """Return 95 % intervals that coloured residuals and differences between recordings widen, cut at the domain's edge.
+def _uncertainty(found: MechanismFit, held: Sequence[str] = (), alone: Sequence[Alone] = ()) -> Uncertainty:
+    """Return 95 % intervals, widened by coloured residuals and differences between recordings, within the domain."""
+    free = found.free
+    errors = _errors(found)
+    intervals = {}
+    for name, error, white in zip(free, errors.largest, errors.white, strict=True):
+        value = found.model[name]
+        half, deviation = half_width(name, alone, float(error), errors.freedom)
+        low = max(value - half, found.model.lowest(name))
+        intervals[name] = Interval(value, low, value + half, deviation, float(white))
+    spread = np.sqrt(np.diag(errors.inverse))
+    correlation = errors.inverse / np.outer(spread, spread)
+    condition = float(errors.level[-1] / max(float(errors.level[0]), 1e-300))
+    said = open_sentences(intervals, free, correlation, condition, errors.weakest, DELAY)
+    largest = np.array([intervals[name].standard_error for name in free])
+    return Uncertainty(
+        intervals,
+        free,
+        correlation * np.outer(largest, largest),
+        correlation,
+        condition,
+        float(np.max(largest / np.maximum(errors.white, 1e-300))),
+        "windows as clusters, recordings one by one",
+        {},
+        (*said, *held_sentences(found, held)),
+    )
 
-    The largest of three errors counts: white residuals; windows as clusters (a sandwich), since within a window the
-    residuals are coloured; recordings as clusters, where there are three or more.
 
-    Args:
-        found: The fit.
-        held: Sizes that were held since the recordings do not determine them.
-    """
+@dataclass(frozen=True)
+class _Errors:
+    """Standard errors of a fit, shape (k,), their degrees of freedom, and the scaled normal matrix that they are of."""
+
+    largest: Array
+    white: Array
+    freedom: float
+    inverse: Array
+    level: Array
+    weakest: Array
+
+
+def _errors(found: MechanismFit) -> _Errors:
+    """Return the larger of two errors: white residuals, and windows as clusters (a sandwich), as these are coloured."""
     free = found.free
     matrix = np.diag(Prior.of(found.model, free).weights) + sum(b.matrices.sum(axis=0) for b in found.blocks)
     # Each in its own error, were the others known: what the data hardly see is no rounding of what they see well.
@@ -345,43 +386,36 @@ def _uncertainty(found: MechanismFit, held: Sequence[str] = ()) -> Uncertainty:
     # A direction that the data do not see has a wide interval, not none.
     inverse = (axes / np.maximum(level, 1e-12 * max(float(level[-1]), 1e-300))) @ axes.T
     scores_by_window = np.concatenate([b.gradients for b in found.blocks]) * size
-    samples = sum(b.samples for b in found.blocks)
-    windows = len(scores_by_window)
-    states = found.states[0].shape[1]
-    variance = found.cost / max(samples - states * windows - len(free), 1)
-    errors = [variance * np.diag(inverse)]
-    groups = [scores_by_window]
-    if len(found.blocks) >= 3:
-        groups.append(np.array([b.gradients.sum(axis=0) for b in found.blocks]) * size)
-    for group in groups:
-        count = len(group)
-        spread = (group.T @ group) * count / (count - 1) + prior
-        errors.append(np.diag(inverse @ spread @ inverse))
-    largest = np.sqrt(np.maximum(np.max(errors, axis=0), 0.0)) * size
-    white = np.sqrt(np.maximum(errors[0], 0.0)) * size
-    factor = float(student_quantile(0.975, max(windows - len(free), 3)))
-    intervals = {
-        name: Interval(
-            found.model[name],
-            max(found.model[name] - factor * e, found.model.lowest(name)),
-            found.model[name] + factor * e,
-            float(e),
-            float(w),
-        )
-        for name, e, w in zip(free, largest, white, strict=True)
-    }
-    spread = np.sqrt(np.diag(inverse))
-    correlation = inverse / np.outer(spread, spread)
-    condition = float(level[-1] / max(float(level[0]), 1e-300))
-    said = open_sentences(intervals, free, correlation, condition, axes[:, 0], DELAY)
-    return Uncertainty(
-        intervals,
-        free,
-        correlation * np.outer(largest, largest),
-        correlation,
-        condition,
-        float(np.max(largest / np.maximum(white, 1e-300))),
-        "windows and recordings as clusters",
-        {},
-        (*said, *held_sentences(found, held)),
+    samples, windows = sum(b.samples for b in found.blocks), len(scores_by_window)
+    fitted = found.states[0].shape[1] * windows + len(free) + found.offsets.size
+    white = found.cost / max(samples - fitted, 1) * np.diag(inverse)
+    spread = (scores_by_window.T @ scores_by_window) * windows / (windows - 1) + prior
+    clusters = np.diag(inverse @ spread @ inverse)
+    return _Errors(
+        np.sqrt(np.maximum(np.maximum(white, clusters), 0.0)) * size,
+        np.sqrt(np.maximum(white, 0.0)) * size,
+        float(max(windows - len(free), 3)),
+        inverse,
+        level,
+        axes[:, 0],
     )
+
+
+def _alone(found: MechanismFit, weights: Array) -> list[Alone]:
+    """Return what each recording of several says alone."""
+    rows = []
+    names = distinct_names([part.recording for part in found.data])
+    for i, (name, part) in enumerate(zip(names, found.data, strict=True)):
+        if len(found.data) < 2 or len(part.time) < 2:
+            continue
+        try:
+            offsets = found.offsets[[i]]
+            one = found.again(weights, data=[part], states=[found.states[i]], offsets=offsets, tolerance=1e-5)
+        except (DataError, np.linalg.LinAlgError):
+            continue
+        errors = _errors(one)
+        # The error of few windows is itself uncertain.
+        factor = float(student_quantile(0.975, errors.freedom) / student_quantile(0.975, 1e6))
+        deviation = dict(zip(one.free, (factor * errors.largest).tolist(), strict=True))
+        rows.append(Alone(name, {n: one.model[n] for n in one.free}, deviation))
+    return rows

@@ -10,6 +10,8 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.identification.explained import LARGEST_SHARE
 from pendulum_bags.identification.mechanism_fit import MechanismFit, Windows, fit
 from pendulum_bags.identification.mechanism_model import MechanismModel
+from pendulum_bags.identification.own_offsets import pay
+from pendulum_bags.identification.selection import effective_samples
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["ALL_EXTRAS", "EXTRAS", "choose"]
@@ -54,16 +56,44 @@ def choose(
         free = start.fitted(**wanted)
         if (name != extras if extras else name == ALL_EXTRAS) or free in [b[1].free for b in ([best] if best else [])]:
             continue
-        found = fit(model, data, free, weights, states=states, hopeless=LARGEST_SHARE)
+        found = fit(model, data, free, weights, states=states, tolerance=1e-4, hopeless=LARGEST_SHARE)
         if extras is not None:
-            return found, name, {}
+            return _with_own_offsets(found, weights), name, {}
         model, states = (found.model, found.states) if best is None else (model, states)
         errors[name] = _held_out_error(found, data, weights)
         if best is None or errors[name] < _WORTH * best[0]:
             best = (errors[name], found, name)
     if best is None:
         raise DataError(f"extras is {extras!r}; expected one of {', '.join(EXTRAS)}")
-    return best[1], best[2], errors
+    return _with_own_offsets(best[1], weights), best[2], errors
+
+
+def _with_own_offsets(found: MechanismFit, weights: Array) -> MechanismFit:
+    """Return the fit in which each of several recordings has offsets of its own, where the data ask for it."""
+    groups = found.model.own_offsets if len(found.data) > 1 else ()
+    if not groups:
+        return found
+    trials = [
+        found.again(
+            weights,
+            own=own,
+            offsets=None,
+            free=tuple(name for name in found.free if name not in own),
+            tolerance=1e-4,
+            hopeless=LARGEST_SHARE,
+        )
+        for own in groups
+    ]
+    best = min(trials, key=lambda one: one.cost)
+    each = weights[: len(found.model.plant.joints)]
+    left = [
+        joint[inside]
+        for errors, part in zip(found.residuals, found.data, strict=True)
+        for window, inside in zip(errors * each, part.inside, strict=True)
+        for joint in window.T
+    ]
+    more = len(best.own) * len(found.data) - len(set(found.free) - set(best.free))
+    return best if pay(found.cost, best.cost, effective_samples(left), more) else found
 
 
 def _held_out_error(found: MechanismFit, data: Sequence[Windows], weights: Array) -> float:

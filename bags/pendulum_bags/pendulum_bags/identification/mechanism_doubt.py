@@ -99,13 +99,7 @@ def _readings(plant: PlantParameters, data: Sequence[Windows]) -> Iterator[_Read
 
 
 def refusal(found: MechanismFit, training: Mapping[str, Score], held_out: Mapping[str, Score]) -> str | None:
-    """Return why a fit is no model of the machine, in a sentence; None where it may be one.
-
-    Args:
-        found: The fit.
-        training: Scores of the recordings of the fit, by name.
-        held_out: Scores of recordings that took no part, by name.
-    """
+    """Return why a fit is no model of the machine, by its scores, in a sentence; None where it may be one."""
     plant, data = found.model.plant, found.data
     far = _far_off(found)
     if far is not None or max(score.share for score in training.values()) > DOUBTFUL_SHARE:
@@ -151,11 +145,6 @@ def better_reading(plant: PlantParameters, data: Sequence[Windows], found: Mecha
 
     Each reading is fitted to a few short windows, and so is the given one: a fit that ended in a poor minimum is no
     fault of the columns. What is named has then explained all of the data.
-
-    Args:
-        plant: The start.
-        data: The windows of the fit.
-        found: The fit; None where there is none.
     """
     own = math.inf
     if found is not None:

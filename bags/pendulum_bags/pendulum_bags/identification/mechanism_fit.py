@@ -12,11 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.identification.arrowhead import bounded_step
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.kernel import cumulative_input
 from pendulum_bags.identification.mechanism_kernel import lagged, motion_kernel
@@ -131,13 +133,7 @@ class Windows:
 
 
 def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1) -> Windows:
-    """Cut a recording into windows.
-
-    Args:
-        recording: The data.
-        window: Length [s].
-        stride: Take every n-th sample, n being this; the effort between them is not lost, its mean drives the step.
-    """
+    """Cut a recording into windows of a length [s], of every ``stride``-th sample; the mean effort drives each step."""
     # What was commanded before the recording acts on in its first moments.
     begin = int(np.searchsorted(recording.time, recording.time[0] + _BEFORE))
     cuts = begin + cut_windows(recording.time[begin:], window)
@@ -184,12 +180,7 @@ def _first_state(recording: JointRecording, first: int) -> Array:
 
 @dataclass(frozen=True)
 class Prior:
-    """What the plant file knows of the parameters of a fit.
-
-    Attributes:
-        values: Of the plant file, shape (k,).
-        weights: One over the variance of each, 0 where it does not count, shape (k,).
-    """
+    """Values of the plant file for the parameters of a fit, shape (k,), and one over their variances or 0."""
 
     values: Array
     weights: Array
@@ -228,11 +219,6 @@ class Score:
     def of(cls, rms: Array, data: Windows) -> Score:
         """Return the score of errors of each joint, shape (n,)."""
         return cls(rms, line_errors(data), noise_of(data.recording.position))
-
-    @property
-    def total(self) -> float:
-        """Rms over all joints [rad or m]."""
-        return float(np.sqrt(np.mean(self.rms**2)))
 
     @property
     def share(self) -> float:
@@ -281,11 +267,13 @@ class MechanismFit:
         free: Names of what was fitted.
         states: Start states by recording, shape (w, 2 n).
         cost: Weighted sum of squares.
-        blocks: Normal equations by recording, at the minimum.
+        blocks: Normal equations by recording, at the minimum, without what each recording has of its own.
         errors: Simulated minus measured by recording, positions before velocities, shape (w, l, 2 n), 0 in the padding
             and where no velocity was measured.
         converged: Whether the search ended at a minimum, before its most steps.
         data: The windows of each recording.
+        own: Names of what each recording has a value of its own of; the model has their mean.
+        offsets: Those values, shape (recordings, m).
     """
 
     model: MechanismModel
@@ -296,6 +284,13 @@ class MechanismFit:
     errors: list[Array]
     converged: bool
     data: Sequence[Windows]
+    own: tuple[str, ...]
+    offsets: Array
+
+    def again(self, weights: Array, **changes: Any) -> MechanismFit:
+        """Return the fit from here under other weights, and with other arguments of :func:`fit`."""
+        start = {"model": self.model, "data": self.data, "free": self.free, "states": self.states}
+        return fit(weights=weights, **{**start, "own": self.own, "offsets": self.offsets, **changes})
 
     @property
     def residuals(self) -> list[Array]:
@@ -315,14 +310,7 @@ class MechanismFit:
 
 
 def _motions(model: MechanismModel, values: Array, data: Windows, states: Array) -> Array:
-    """Return the motions of c sets of parameter values and start states, shape (c, w, l, 2 n).
-
-    Args:
-        model: Names the parameters.
-        values: Shape (c, parameters).
-        data: The windows.
-        states: Shape (c, w, 2 n).
-    """
+    """Return motions, shape (c, w, l, 2 n), of values (c, parameters) and start states (c, w, 2 n)."""
     pairs, which = np.unique(values[:, model.index((DELAY, LAG))], axis=0, return_inverse=True)
     drive = np.array([data.input(*pair) for pair in pairs])
     path = np.empty((len(values), *data.time.shape, states.shape[-1]))
@@ -355,7 +343,9 @@ def fit(
     free: Sequence[str],
     weights: Array,
     *,
+    own: Sequence[str] = (),
     states: Sequence[Array] | None = None,
+    offsets: Array | None = None,
     most: int = MOST,
     tolerance: float = 1e-6,
     hopeless: float = np.inf,
@@ -367,27 +357,33 @@ def fit(
         data: Windows of each recording.
         free: Names of what to fit; none fits the start states alone.
         weights: Of each joint's error, shape (n,), or of its position and its velocity, shape (2 n,).
+        own: Names of offsets of which each recording has a value of its own; none of them is in ``free``.
         states: Start of the start states; by default the windows' first guesses.
+        offsets: Start of the own offsets, shape (recordings, m); by default the model's.
         most: Most steps to try.
         tolerance: Relative decrease of the cost below which the fit ends.
         hopeless: Weighted rms error above which the fit ends as soon as it makes little progress: it is refused anyway.
     """
-    index = model.index(free)
+    index, apart = model.index(free), model.index(own)
     count = len(model.plant.joints)
     if weights.size == count:
         weights = np.concatenate((weights, np.zeros(count)))
     prior = Prior.of(model, free)
-    size = np.array([model.size(name) for name in free])
+    size = np.array([model.size(name) for name in (*free, *own)])
     low = np.array([model.lowest(name) for name in free])
-    values = model.values.copy()
-    values[index] = np.maximum(values[index], low)
-    best, x = model.with_values(values), [np.array(s) for s in (states or [part.states for part in data])]
+    # One row for each recording: they differ in what is their own.
+    values = np.tile(model.values, (len(data), 1))
+    values[:, index] = np.maximum(values[:, index], low)
+    if offsets is not None:
+        values[:, apart] = offsets
+    x = [np.array(s) for s in (states or [part.states for part in data])]
     damping, k, converged = 1e-4, len(index), True
-    cost, paths = _simulate(best, data, x, weights)
-    cost += prior.cost(values[index])
+    cost, paths = _simulate(model, values, data, x, weights)
+    cost += prior.cost(values[0, index])
     if not np.isfinite(cost):
         raise DataError(_AWAY)
-    normal, errors = _linearise(best, free, data, x, paths, weights)
+    columns = (*free, *own)
+    normal, errors = _linearise(model, values, columns, data, x, paths, weights)
     if not all(np.isfinite(matrix).all() for matrix in normal[0]):
         raise DataError(_AWAY)
     beyond, costs = hopeless**2 * sum(_measurements(part, weights) for part in data), [cost]
@@ -396,21 +392,21 @@ def fit(
             converged = False
             break
         costs.append(cost)
-        step = _step(normal, prior, values[index], size, low, damping)
+        step, shifts, starts = _step(normal, prior, values[0, index], size, low, damping)
         trial = values.copy()
-        trial[index] = np.maximum(values[index] + step[0], low)
-        candidate = best.with_values(trial)
-        moved = [a + b for a, b in zip(x, step[1], strict=True)]
-        new, paths = _simulate(candidate, data, moved, weights)
-        new += prior.cost(trial[index])
+        trial[:, index] = np.maximum(trial[:, index] + step, low)
+        trial[:, apart] += shifts
+        moved = [a + b for a, b in zip(x, starts, strict=True)]
+        new, paths = _simulate(model, trial, data, moved, weights)
+        new += prior.cost(trial[0, index])
         if new < cost:
-            following = _linearise(candidate, free, data, moved, paths, weights)
+            following = _linearise(model, trial, columns, data, moved, paths, weights)
             if not all(np.isfinite(matrix).all() for matrix in following[0][0]):
                 # So far along an unstable motion the derivatives have no size: a smaller step.
                 damping *= 8.0
                 continue
             done = (cost - new) < tolerance * cost
-            values, best, x, cost = trial, candidate, moved, new
+            values, x, cost = trial, moved, new
             damping = max(0.2 * damping, 1e-9)
             normal, errors = following
             if done:
@@ -422,13 +418,19 @@ def fit(
     else:
         converged = False
     blocks = []
-    for matrix, gradient, part in zip(normal[0], normal[1], data, strict=True):
-        coupling, own = matrix[:, :k, k:], matrix[:, k:, k:]
-        solved = np.linalg.pinv(own, hermitian=True) @ coupling.transpose(0, 2, 1)
-        reduced = matrix[:, :k, :k] - coupling @ solved
-        along = gradient[:, :k] - np.einsum("wxk,wx->wk", solved, gradient[:, k:])
+    for matrix, gradient, part in zip(*normal, data, strict=True):
+        both = len(columns)
+        solved = np.linalg.pinv(matrix[:, both:, both:], hermitian=True) @ matrix[:, both:, :both]
+        reduced = matrix[:, :both, :both] - matrix[:, :both, both:] @ solved
+        along = gradient[:, :both] - np.einsum("wxk,wx->wk", solved, gradient[:, both:])
+        if own:
+            # What follows from the recording's own offsets is no evidence on what all have in common.
+            total = reduced.sum(axis=0)
+            follow = np.vstack((np.eye(k), -np.linalg.pinv(total[k:, k:], hermitian=True) @ total[k:, :k]))
+            reduced, along = follow.T @ reduced @ follow, along @ follow
         blocks.append(Blocks(reduced, along, _measurements(part, weights)))
-    return MechanismFit(best, tuple(free), x, cost, blocks, errors, converged, data)
+    best = model.with_values(values.mean(axis=0))
+    return MechanismFit(best, tuple(free), x, cost, blocks, errors, converged, data, tuple(own), values[:, apart])
 
 
 def _measurements(part: Windows, weights: Array) -> int:
@@ -436,12 +438,12 @@ def _measurements(part: Windows, weights: Array) -> int:
 
 
 def _simulate(
-    model: MechanismModel, data: Sequence[Windows], states: Sequence[Array], weights: Array
+    model: MechanismModel, values: Array, data: Sequence[Windows], states: Sequence[Array], weights: Array
 ) -> tuple[float, list[Array]]:
     """Return the cost, inf where a motion leaves all bounds, and the motions of each recording."""
     total, paths = 0.0, []
-    for part, x in zip(data, states, strict=True):
-        path = _motions(model, model.values[None], part, x[None])[0]
+    for part, own, x in zip(data, values, states, strict=True):
+        path = _motions(model, own[None], part, x[None])[0]
         paths.append(path)
         if not np.isfinite(path).all():
             return np.inf, paths
@@ -458,6 +460,7 @@ def _errors(part: Windows, path: Array) -> Array:
 
 def _linearise(
     model: MechanismModel,
+    values: Array,
     free: Sequence[str],
     data: Sequence[Windows],
     states: Sequence[Array],
@@ -466,10 +469,10 @@ def _linearise(
 ) -> tuple[tuple[list[Array], list[Array]], list[Array]]:
     """Return the normal equations about the motions, and their errors."""
     matrices, gradients, errors = [], [], []
-    for part, x, path in zip(data, states, paths, strict=True):
+    for row, part, x, path in zip(values, data, states, paths, strict=True):
         plain = _errors(part, path)
         own = weights * np.repeat([1.0, float(part.velocity is not None)], part.position.shape[-1])
-        scaled = _sensitivity(model, free, part, x, path) * (part.inside[..., None] * own)[..., None]
+        scaled = _sensitivity(model.with_values(row), free, part, x, path) * (part.inside[..., None] * own)[..., None]
         flat = scaled.reshape(len(path), -1, scaled.shape[-1])
         matrices.append(flat.transpose(0, 2, 1) @ flat)
         gradients.append(np.einsum("wia,wi->wa", flat, (plain * weights).reshape(len(path), -1)))
@@ -479,55 +482,61 @@ def _linearise(
 
 def _step(
     normal: tuple[list[Array], list[Array]], prior: Prior, values: Array, size: Array, low: Array, damping: float
-) -> tuple[Array, list[Array]]:
-    """Return the damped step of parameters and start states; what would leave its domain stops at the edge."""
-    k = values.size
-    reduced, gradient, solved = np.diag(prior.weights), prior.gradient(values), []
-    for matrix, own_gradient in zip(*normal, strict=True):
-        states = matrix[:, k:, k:].copy()
-        # A start that a wrong model's motion hardly shows must not stop the search.
-        diagonal = np.einsum("wii->wi", states)
-        diagonal[:] = (1.0 + damping) * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True)
-        right = np.concatenate((matrix[:, k:, :k], own_gradient[:, k:, None]), axis=2)
-        found = np.linalg.solve(states, right)
-        solved.append(found)
-        both = matrix[:, :k, k:] @ found
-        reduced += matrix[:, :k, :k].sum(axis=0) - both[:, :, :k].sum(axis=0)
-        gradient += own_gradient[:, :k].sum(axis=0) - both[:, :, k].sum(axis=0)
+) -> tuple[Array, Array, list[Array]]:
+    """Return the damped step of parameters, own offsets and start states; what would leave its domain stops there."""
+    k, both = values.size, size.size
+    reduced, gradient, starts, offsets = np.diag(prior.weights), prior.gradient(values), [], []
+    for matrix, slope in zip(*normal, strict=True):
+        found = _eliminated(matrix, slope, both, damping)
+        starts.append(found)
+        across = matrix[:, :both, both:] @ found
+        # Of the own offsets with those of the parameters of this recording, its start states eliminated.
+        own = (matrix[:, :both, :both] - across[:, :, :both]).sum(axis=0)
+        down = slope[:, :both].sum(axis=0) - across[:, :, both].sum(axis=0)
+        found = _eliminated(own[None], down[None], k, damping)[0]
+        offsets.append(found)
+        reduced = reduced + own[:k, :k] - own[:k, k:] @ found[:, :k]
+        gradient = gradient + down[:k] - own[:k, k:] @ found[:, k]
     step = np.zeros(k)
     if k:
         # In shares of the parameters' scales. The little that is added keeps what the data do not see where it is.
-        system = reduced * np.outer(size, size)
-        own = np.diag(system)
-        system += np.diag((damping + 1e-10) * own + np.where(own > 0.0, 0.0, 1.0))
-        active = np.zeros(k, dtype=bool)
-        for _ in range(k):
-            idle = np.flatnonzero(~active)
-            if not idle.size:
-                break
-            right = -(size * gradient + system @ np.where(active, step / size, 0.0))[idle]
-            step[idle] = size[idle] * np.linalg.solve(system[np.ix_(idle, idle)], right)
-            outside = (values + step < low) & ~active
-            if not outside.any():
-                break
-            step[outside] = (low - values)[outside]
-            active |= outside
-    return step, [-(found[:, :, k] + found[:, :, :k] @ step) for found in solved]
+        scale = size[:k]
+        system = reduced * np.outer(scale, scale)
+        diagonal = np.diag(system)
+        system += np.diag((damping + 1e-10) * diagonal + np.where(diagonal > 0.0, 0.0, 1.0))
+        step = scale * bounded_step(system, scale * gradient, values / scale, low / scale, np.inf)
+    shifts = np.array([-(found[:, k] + found[:, :k] @ step) for found in offsets])
+    return (
+        step,
+        shifts,
+        [
+            -(found[:, :, both] + found[:, :, :both] @ np.concatenate((step, shift)))
+            for found, shift in zip(starts, shifts, strict=True)
+        ],
+    )
 
 
-def scores(model: MechanismModel, data: Sequence[Windows], weights: Array | None = None) -> list[Score]:
-    """Return how well a model explains each recording with the start of each window fitted.
+def _eliminated(matrix: Array, gradient: Array, k: int, damping: float) -> Array:
+    """Return how what comes after the first k unknowns follows them, and their own step, shape (w, x, k + 1)."""
+    inner = matrix[:, k:, k:].copy()
+    # What a wrong model's motion hardly shows must not stop the search.
+    diagonal = np.einsum("wii->wi", inner)
+    diagonal[:] = (1.0 + damping) * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True, initial=0.0)
+    right = np.concatenate((matrix[:, k:, :k], gradient[:, k:, None]), axis=2)
+    return np.linalg.solve(inner, right)
 
-    Args:
-        model: The model.
-        data: Windows of each recording.
-        weights: Of each joint's error, shape (n,); by default one over what straight lines miss: metres and radians
-            have no common scale.
+
+def scores(
+    model: MechanismModel, data: Sequence[Windows], weights: Array | None = None, *, own: Sequence[str] = ()
+) -> list[Score]:
+    """Return how well a model explains each recording, with the start of each window and its ``own`` offsets fitted.
+
+    Joints weigh by default as one over what straight lines miss: metres and radians have no common scale.
     """
     found: list[Score] = []
     for part in data:
-        own = 1.0 / np.maximum(line_errors(part), 1e-9) if weights is None else weights
-        found += fit(model, [part], (), own, most=12, tolerance=1e-6).scores
+        size = 1.0 / np.maximum(line_errors(part), 1e-9) if weights is None else weights
+        found += fit(model, [part], (), size, own=own, most=12, tolerance=1e-6).scores
     return found
 
 
@@ -538,11 +547,6 @@ def window_length(model: MechanismModel, recordings: Sequence[JointRecording], l
     long as a joint rests), carries a small difference on. Where it grows by more than a factor of 30 (3 where
     velocities were measured) the start of a window does not determine its end, and a fit to it has many minima: chaotic
     motion, and motion about an unstable equilibrium.
-
-    Args:
-        model: The start of the fit.
-        recordings: The data.
-        longest: Largest length [s].
     """
     n, lengths = len(model.plant.joints), []
     smooth = model.values.copy()

@@ -108,20 +108,32 @@ class MechanismModel:
             return value
         return {DELAY: 0.01, LAG: 1e-3}.get(name, 0.01 if name.endswith("offset") else 1e-3)
 
-    def fitted(
-        self, *, offsets: bool = False, zeros: bool = False, delay: bool = False, lag: bool = False
-    ) -> tuple[str, ...]:
+    def fitted(self, *, offsets: bool = False, delay: bool = False, lag: bool = False) -> tuple[str, ...]:
         """Return the names that are free, of those that the motion can tell apart."""
         joints = self.plant.coordinates
         names = [*tellable(self.plant), *(f"{joint}.damping" for joint in joints.names)]
         names += [f"{joint}.coulomb_friction" for joint in joints.names]
         if offsets:
             names += [f"{joint}.effort_offset" for joint in joints.driven_names]
-        if zeros:
-            names += [f"{joint.name}.angle_offset" for joint in joints.joints if joint.turns]
         if joints.driven:
             names += [name for name, wanted in ((DELAY, delay), (LAG, lag)) if wanted]
         return tuple(names)
+
+    @property
+    def own_offsets(self) -> tuple[tuple[str, ...], ...]:
+        """Offsets that each recording may have of its own: of the efforts, and of the angles that gravity shows."""
+        joints, plant = self.plant.coordinates, self.plant
+        efforts = tuple(f"{joint}.effort_offset" for joint in joints.driven_names)
+        rng, rest = np.random.default_rng(0), (0.0,) * len(plant.joints)
+        q = rng.uniform(-3.0, 3.0, len(plant.joints))
+        still = np.array(plant.acceleration(tuple(q), rest, rest))
+        angles = tuple(
+            f"{joint.name}.angle_offset"
+            for joint, step in zip(joints.joints, np.eye(q.size), strict=True)
+            if joint.turns
+            and np.any(np.abs(np.subtract(plant.acceleration(tuple(q + step), rest, rest), still)) > 1e-9)
+        )
+        return tuple(group for group in (efforts, angles) if group)
 
     def identified(self, free: Sequence[str], name: str) -> PlantParameters:
         """Return the plant that has the values of what was fitted; a delay below 0 and offsets are left out.

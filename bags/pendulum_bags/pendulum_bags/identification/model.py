@@ -52,12 +52,7 @@ UNITS: Mapping[str, str] = {
     **{name: quantity.unit for name, (_, quantity) in _FURTHER.items()},
 }
 
-_PER_INERTIA = {
-    "kg m^2": "1",
-    "N m": "1/s^2",
-    "N m s/rad": "1/s",
-    "N m per unit of input": "1/s^2 per unit of input",
-}
+_PER_INERTIA = {"kg m^2": "1", "N m": "1/s^2", "N m s/rad": "1/s", "N m per unit of input": "1/s^2 per unit of input"}
 
 BOUNDS: Mapping[str, tuple[float, float]] = {
     "inertia": (1e-7, 1e3),

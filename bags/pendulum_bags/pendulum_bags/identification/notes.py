@@ -99,13 +99,7 @@ def open_sentences(
 
 
 def scale_sentences(intervals: Mapping[str, Interval], names: Sequence[str], fit: OutputErrorFit) -> list[str]:
-    """Return what fixes the scale of all torques of a pendulum, and how well, in words.
-
-    Args:
-        intervals: By parameter, and for ``natural_frequency``.
-        names: What was fitted.
-        fit: The fit.
-    """
+    """Return what fixes the scale of all torques of a pendulum, and how well, in words."""
     said = []
     kind = fit.pieces[0].recording.input_kind
     if kind == "none" and "inertia" in names:
@@ -136,10 +130,7 @@ def scale_sentences(intervals: Mapping[str, Interval], names: Sequence[str], fit
 def edge_sentences(intervals: Mapping[str, Interval], fit: OutputErrorFit, unresolved: str | None = None) -> list[str]:
     """Return which parameters of a pendulum ended at the edge of their domain, and which offset stands for two.
 
-    Args:
-        intervals: By parameter.
-        fit: The fit.
-        unresolved: Offset that was left out, though it would have done as well as the one that was kept.
+    ``unresolved`` is an offset that was left out, though it would have done as well as the one that was kept.
     """
     said = []
     edges = [_edge(name, fit, intervals) for name in at_bounds(fit.chosen)]
@@ -151,12 +142,7 @@ def edge_sentences(intervals: Mapping[str, Interval], fit: OutputErrorFit, unres
 
 
 def held_sentences(found: MechanismFit, undetermined: Sequence[str]) -> list[str]:
-    """Return what was held in the fit of a mechanism, and what its plant file leaves out, in words.
-
-    Args:
-        found: The fit.
-        undetermined: Sizes that were held since the recordings do not determine them.
-    """
+    """Return what was held in the fit of a mechanism, ``undetermined`` or known, and what its plant file leaves out."""
     said, model = [], found.model
     if undetermined:
         said.append(
@@ -168,7 +154,7 @@ def held_sentences(found: MechanismFit, undetermined: Sequence[str]) -> list[str
         "Held at the values of the plant file, as known or since no motion tells them from the others: "
         f"{', '.join(held)}. Where one of them is wrong, the fitted ones carry its error."
     )
-    offsets = [f"{n} {model[n]:+.3g} {model.unit(n)}" for n in found.free if n.endswith("effort_offset")]
+    offsets = [f"{n} {model[n]:+.3g} {model.unit(n)}" for n in (*found.free, *found.own) if n.endswith("effort_offset")]
     if offsets:
         said.append(f"The recorded efforts have offsets, which the plant file leaves out: {', '.join(offsets)}.")
     return said

@@ -11,10 +11,10 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.identification.cross_validation import COARSE, cross_validate
 from pendulum_bags.identification.model import FRICTION_MODELS, FURTHER_TERMS, SERVO_ONLY, FitModel
 from pendulum_bags.identification.options import DEFAULTS, Geometry, Options, default_window
-from pendulum_bags.identification.own_zeros import OwnZeros, align
+from pendulum_bags.identification.own_offsets import OwnOffsets, align
 from pendulum_bags.identification.problem import Piece, prepare
 from pendulum_bags.identification.readings import misfit_cause
-from pendulum_bags.identification.selection import Candidate, choose, effective_samples
+from pendulum_bags.identification.selection import Candidate, by_window, choose, effective_samples
 from pendulum_bags.identification.solver import Solution, refine, residuals, robust_cost, solve
 from pendulum_bags.identification.starts import first_models, rank
 from pendulum_bags.runs.datasets import Recording
@@ -67,7 +67,7 @@ class OutputErrorFit:
     sign_flipped: bool
     offset_candidates: tuple[Candidate, ...] = ()
     reading: str | None = None
-    zeros: OwnZeros | None = None
+    zeros: OwnOffsets | None = None
     recordings: tuple[Recording, ...] = ()
 
     @property
@@ -82,11 +82,7 @@ class OutputErrorFit:
 
 
 def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULTS) -> OutputErrorFit:
-    """Fit the model to recordings of one and the same pendulum.
-
-    Args:
-        recordings: At least one; all with the same kind of input.
-        options: Choices.
+    """Fit the model to recordings of one and the same pendulum with one kind of input.
 
     Raises:
         DataError: for no data, mixed inputs, or a recording in which nothing moves.
@@ -226,14 +222,7 @@ def _anneal(
             s = solve(start.model, pieces, free, scale=first_scale, tolerance=1e-4, max_iterations=25, coarse=COARSE)
             finalists.append(
                 solve(
-                    s.model,
-                    pieces,
-                    free,
-                    states=s.states,
-                    scale=0.03,
-                    tolerance=1e-5,
-                    max_iterations=30,
-                    coarse=COARSE,
+                    s.model, pieces, free, states=s.states, scale=0.03, tolerance=1e-5, max_iterations=30, coarse=COARSE
                 )
             )
     best = min(finalists, key=lambda s: s.cost)
@@ -310,7 +299,7 @@ def _fit_friction(
     validation = cross_validate(best.model, pieces, best.states, everything, scale, count=options.folds)
     mean_cost = robust_cost(inside, scale) / inside.size
     rms = float(np.sqrt(np.mean(inside**2)))
-    return Candidate(name, everything, best, rms, validation, mean_cost, effective_samples(parts, pieces))
+    return Candidate(name, everything, best, rms, validation, mean_cost, effective_samples(by_window(parts, pieces)))
 
 
 def _inside(solution: Solution, pieces: Sequence[Piece]) -> Array:

@@ -130,12 +130,9 @@ def _between_gaps(recording: Recording, window: float | None) -> NDArray[np.int6
 
 
 def prepare(recording: Recording, window: float | None, *, across_gaps: bool = False) -> Piece:
-    """Return the recording with windows and first guesses of their initial states.
+    """Return the recording with windows of a length [s], None for all of it, and first guesses of their initial states.
 
-    Args:
-        recording: The data.
-        window: Length of the windows [s]; None for all of it, or all between two gaps.
-        across_gaps: Whether windows reach across stretches in which nothing was recorded.
+    Windows reach across stretches in which nothing was recorded only by ``across_gaps``.
     """
     windows = _between_gaps(recording, window) if not across_gaps else cut_windows(recording.time, window)
     stamps = recording.input_stamps
@@ -147,13 +144,9 @@ def prepare(recording: Recording, window: float | None, *, across_gaps: bool = F
 
 
 def first_state(time: Array, position: Array, first: int, reach: int) -> tuple[Array, Array]:
-    """Return position and velocity at a sample from a parabola through its neighbours on both sides.
+    """Return position and velocity at a sample from a parabola through ``reach`` neighbours to each side.
 
-    Args:
-        time: shape (n,) [s].
-        position: shape (n,) or (n, joints) [rad or m].
-        first: The sample.
-        reach: Neighbours to each side.
+    Positions have the shape (n,) or (n, joints) [rad or m].
     """
     near = slice(max(first - reach, 0), first + reach + 1)
     t = time[near] - time[first]

@@ -59,14 +59,7 @@ def misfit_cause(
     """Return in words why a fit misses the motion, with what mends it; None where all is well or nothing tried helps.
 
     A cause is named only where a fit to all of the data without it explains the motion, by a torque that moves the
-    pendulum: following the advice leads to a fit that is taken.
-
-    Args:
-        found: First fit, with Coulomb friction.
-        pieces: Data.
-        fixed: Values of what is not free.
-        free: Fitted parameters.
-        window: Length of the windows [s].
+    pendulum: following the advice leads to a fit that is taken. ``found`` is a first fit, with Coulomb friction.
     """
     share = _share(found, pieces)
     static = _is_static(found, pieces)

@@ -21,13 +21,7 @@ from pendulum_bags.identification.geometry import CONTRADICTION, GeometryCheck
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_fit import MechanismFit, Score
 from pendulum_bags.identification.mechanism_model import MechanismModel
-from pendulum_bags.identification.model import (
-    FRICTION_MODELS,
-    PLANT_FRICTION_MODELS,
-    UNITS,
-    FitModel,
-    to_plant,
-)
+from pendulum_bags.identification.model import FRICTION_MODELS, PLANT_FRICTION_MODELS, UNITS, FitModel, to_plant
 from pendulum_bags.identification.notes import Interval
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.residual_tests import INCOMPLETE, ResidualTests
@@ -251,14 +245,11 @@ class IdentificationResult:
 
     def _own_values(self) -> dict[str, Any]:
         assert isinstance(self.fit, MechanismFit)
-        return {"mechanism": self.fit.model.plant.mechanism.name}
+        own = dict(zip(self.fit.own, self.fit.offsets.T.tolist(), strict=True))
+        return {"mechanism": self.fit.model.plant.mechanism.name, "own_offsets": own}
 
     def write(self, path: str | Path, *, name: str = "identified") -> Path:
-        """Write the plant file with intervals and provenance, and everything else as JSON beside it.
-
-        Args:
-            path: Plant file to write, ``*.yaml``; the JSON gets the same name.
-            name: Name of the plant.
+        """Write the plant file, ``*.yaml``, with intervals and provenance, and all the rest as JSON of the same name.
 
         Raises:
             DataError: The fit is refused, or the name has another suffix.
@@ -402,7 +393,7 @@ class PendulumResult(IdentificationResult):
             "training_rms": chosen.training_rms,
             "natural_frequency": self.model.natural_frequency,
             "sign_flipped": self.fit.sign_flipped,
-            "own_zeros": None if zeros is None else {"name": zeros.name, "values": zeros.values.tolist()},
+            "own_zeros": None if zeros is None else {"name": zeros.names[0], "values": zeros.values[:, 0].tolist()},
             "profiles": {n: list(p) for n, p in self.uncertainty.profiles.items()},
             "predicted_half_widths": self.predicted,
             "candidate_parameters": {c.friction: {n: c.solution.model[n] for n in c.free} for c in self.fit.candidates},
@@ -418,13 +409,7 @@ class PendulumResult(IdentificationResult):
         }
 
     def write(self, path: str | Path, *, name: str = "identified", effort_limit: float = 13.0) -> Path:
-        """Write the plant file and JSON as :meth:`IdentificationResult.write` does.
-
-        Args:
-            path: Plant file to write.
-            name: Name of the plant.
-            effort_limit: Of the actuator [N m]; a recording does not tell.
-        """
+        """Write as :meth:`IdentificationResult.write`, with the actuator's limit [N m], which no recording shows."""
         return self._write(path, None if self.refused else self.plant(name, effort_limit))
 
     def _of_the_file(self, plant: PlantParameters) -> tuple[dict[str, tuple[float, float]], dict[str, Any], list[str]]:
@@ -482,23 +467,13 @@ def _held(name: str, delay: Interval, recording: Recording) -> str:
 
 
 def data_sentences(fit: OutputErrorFit, delay: Interval | None, *, refused: bool) -> list[str]:
-    """Return what was done to the recordings of a fit, and what they seem to be, in words.
-
-    Args:
-        fit: The fit.
-        delay: Interval of the delay.
-        refused: Whether the fit is refused.
-    """
+    """Return what was done to the recordings of a fit, and what they seem to be, in words."""
     named = list(zip(distinct_names([p.recording for p in fit.pieces]), fit.pieces, strict=True))
     said = [f"{name}: {note}" for name, piece in named for note in data_notes(piece.recording)]
     if delay is not None:
         said += [_held(name, delay, p.recording) for name, p in named if _looks_held(p.recording, delay)]
     if fit.zeros is not None:
-        listing = ", ".join(f"{name} {value:+.4f}" for (name, _), value in zip(named, fit.zeros.values, strict=True))
-        said.append(
-            f"Each recording has a zero of its own (homing, or the tare of the torque): {fit.zeros.name} is {listing} "
-            f"{fit.model.units[fit.zeros.name]} beside the common one, which is their mean."
-        )
+        said.append(fit.zeros.sentence([name for name, _ in named], fit.model.unit))
     if fit.sign_flipped and not refused:
         said.append(
             "The recorded effort has the opposite sign of the motion that it causes: the fit counts it with sign "

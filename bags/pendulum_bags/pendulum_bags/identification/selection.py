@@ -19,6 +19,7 @@ __all__ = [
     "admissible",
     "akaike_weights",
     "at_bounds",
+    "by_window",
     "choose",
     "effective_samples",
     "implausible_rival",
@@ -59,16 +60,18 @@ class Candidate:
         return self.training_rms if self.validation is None else self.validation.rms
 
 
-def effective_samples(parts: Sequence[Array], pieces: Sequence[Piece]) -> float:
+def by_window(parts: Sequence[Array], pieces: Sequence[Piece]) -> list[Array]:
+    """Return the residuals of each window of some pieces."""
+    return [part[a:b] for part, piece in zip(parts, pieces, strict=True) for a, b in piece.windows]
+
+
+def effective_samples(windows: Sequence[Array]) -> float:
     """Return how many independent samples carry as much as the correlated residuals do, N / (1 + 2 sum rho)."""
-    total, longest = 0, max(int(np.max(np.diff(piece.windows, axis=1))) for piece in pieces)
-    products = np.zeros(min(longest, 2000))
-    for part, piece in zip(parts, pieces, strict=True):
-        for first, stop in piece.windows:
-            r = part[first:stop]
-            total += r.size
-            spectrum = np.abs(np.fft.rfft(r, 2 * r.size)) ** 2
-            products[: r.size] += np.fft.irfft(spectrum)[: min(r.size, products.size)]
+    total, products = 0, np.zeros(min(max(r.size for r in windows), 2000))
+    for r in windows:
+        total += r.size
+        spectrum = np.abs(np.fft.rfft(r, 2 * r.size)) ** 2
+        products[: r.size] += np.fft.irfft(spectrum)[: min(r.size, products.size)]
     if products[0] <= 0.0:
         return float(total)
     rho = products / products[0]
@@ -155,10 +158,6 @@ def implausible_rival(candidates: Sequence[Candidate], chosen: Candidate) -> Can
     """Return the candidate left out for its static friction that the data clearly speak for, or None.
 
     What was chosen in its place has to stand in for it, and no interval of that counts the error.
-
-    Args:
-        candidates: All friction models that were tried.
-        chosen: The one taken.
     """
     rivals = [candidate for candidate in candidates if not is_plausible(candidate)]
     if not rivals or not is_plausible(chosen):

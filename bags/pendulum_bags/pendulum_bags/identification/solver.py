@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification import kernel
-from pendulum_bags.identification.arrowhead import eliminate, find_states
+from pendulum_bags.identification.arrowhead import bounded_step, eliminate, find_states
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
 from pendulum_bags.identification.model import BOUNDS, INDEX, FitModel
 from pendulum_bags.identification.problem import Piece, longest_step, simulate
@@ -36,6 +36,7 @@ class Solution:
         cost: Robust cost, sum over samples [rad^2].
         converged: Whether the step or the decrease became negligible.
         iterations: Steps tried.
+        own: What each recording has a value of its own of, shape (pieces, m); the model has their mean.
     """
 
     model: FitModel
@@ -43,6 +44,7 @@ class Solution:
     cost: float
     converged: bool
     iterations: int
+    own: Array | None = None
 
 
 def robust_cost(residual: Array, scale: float) -> float:
@@ -64,6 +66,7 @@ def solve(
     pieces: Sequence[Piece],
     free: Sequence[str],
     *,
+    own: Sequence[str] = (),
     states: Sequence[Array] | None = None,
     scale: float = np.inf,
     max_iterations: int = 60,
@@ -77,6 +80,7 @@ def solve(
         model: Start.
         pieces: Data.
         free: Names of the parameters to fit; none fits the window states alone.
+        own: Names of what each piece has a value of its own of; none of them is in ``free``.
         states: Start of the window states; by default the pieces' first guesses.
         scale: Where the loss turns from quadratic to linear [rad].
         max_iterations: Most steps to try.
@@ -84,16 +88,28 @@ def solve(
         bounds: Domain of parameters where it differs from ``BOUNDS``.
         coarse: Factor on the integration step; a search may take 3, an answer 1.
     """
-    index = np.array([INDEX[name] for name in free], dtype=np.int64)
+    names = (*free, *(name for _ in pieces for name in own))
+    index = np.array([INDEX[name] for name in names], dtype=np.int64)
+    k, m = len(free), len(own)
+    # The unknowns of each piece: those that all have in common, then its own.
+    columns = [[*range(k), *range(k + m * r, k + m * (r + 1))] for r in range(len(pieces))]
     limits = {**BOUNDS, **(bounds or {})}
-    low = np.array([limits[name][0] for name in free])
-    high = np.array([limits[name][1] for name in free])
+    low = np.array([limits[name][0] for name in names])
+    high = np.array([limits[name][1] for name in names])
     x = [np.array(s, dtype=float) for s in (states or [piece.states for piece in pieces])]
-    vector = np.array(model.vector)
-    vector[index] = np.clip(vector[index], low, high)
-    best = model.with_vector(vector)
+    found = np.clip(model.vector[index], low, high)
+
+    def models(values: Array) -> list[FitModel]:
+        vectors = [np.array(model.vector) for _ in pieces]
+        for vector, own_columns in zip(vectors, columns, strict=True):
+            vector[index[own_columns]] = values[own_columns]
+        if not m:
+            return [model.with_vector(vectors[0])] * len(pieces)
+        return [model.with_vector(vector) for vector in vectors]
+
+    best = models(found)
     # The steps must not change within one fit, or the cost would jump with them.
-    steps = [coarse * longest_step(best, piece.recording) for piece in pieces]
+    steps = [coarse * longest_step(best[0], piece.recording) for piece in pieces]
     masks = [piece.mask() for piece in pieces]
     measured = [piece.recording.position[mask] for piece, mask in zip(pieces, masks, strict=True)]
     ends = np.cumsum([len(piece.windows) for piece in pieces])[:-1]
@@ -103,31 +119,31 @@ def solve(
     while iterations < max_iterations:
         iterations += 1
         if blocks is None:
-            cost, blocks = _linearise(best, pieces, x, index, scale, steps, masks)
+            cost, blocks = _linearise(best, pieces, x, index, columns, scale, steps, masks)
             if not math.isfinite(cost):
                 break
-        step = _damped_step(blocks, vector[index], low, high, damping, typical)
+        step = _damped_step(blocks, found, low, high, damping, typical)
         if step is None:
             damping *= 10.0
             if damping > 1e12:
                 break
             continue
         d_p, d_x, gain = step
-        trial = vector.copy()
-        trial[index] = np.clip(vector[index] + d_p, low, high)
+        trial = np.clip(found + d_p, low, high)
+        candidates = models(trial)
         # An inertia is never negative: at most a fourfold change at a time.
-        if trial[0] < 0.25 * vector[0] or trial[0] > 4.0 * vector[0]:
+        before, after = best[0]["inertia"], candidates[0]["inertia"]
+        if after < 0.25 * before or after > 4.0 * before:
             damping *= 4.0
             continue
-        candidate = model.with_vector(trial)
         x_trial = [a + b for a, b in zip(x, np.split(d_x, ends), strict=True)]
         new_cost = 0.0
-        for piece, state, h, mask, known in zip(pieces, x_trial, steps, masks, measured, strict=True):
-            r = simulate(candidate, piece, state, step=h).theta[mask] - known
+        for one, piece, state, h, mask, known in zip(candidates, pieces, x_trial, steps, masks, measured, strict=True):
+            r = simulate(one, piece, state, step=h).theta[mask] - known
             new_cost += robust_cost(r, scale) if np.isfinite(r).all() else np.inf
         if new_cost < cost:
             relative = (cost - new_cost) / cost
-            vector, best, x, blocks = trial, candidate, x_trial, None
+            found, best, x, blocks = trial, candidates, x_trial, None
             good = (cost - new_cost) / max(gain, 1e-300) > 0.25
             damping = max(damping * (0.2 if good else 1.0), 1e-10)
             cost = new_cost
@@ -139,16 +155,13 @@ def solve(
             if gain < tolerance * cost or damping > 1e10:
                 converged = gain < 1e-3 * cost
                 break
-    return Solution(best, x, cost, converged, iterations)
+    if not m:
+        return Solution(best[0], x, cost, converged, iterations)
+    mean = model.with_vector(np.mean([one.vector for one in best], axis=0))
+    return Solution(mean, x, cost, converged, iterations, found[k:].reshape(len(pieces), m))
 
 
-def refine(
-    solution: Solution,
-    pieces: Sequence[Piece],
-    free: Sequence[str],
-    *,
-    scale: float,
-) -> Solution:
+def refine(solution: Solution, pieces: Sequence[Piece], free: Sequence[str], *, scale: float) -> Solution:
     """Return a solution that other initial states of single windows cannot better.
 
     Near standstill dry friction makes the cost of a window's initial velocity have several valleys (it moves on,
@@ -198,10 +211,11 @@ class _Blocks:
 
 
 def _linearise(
-    model: FitModel,
+    models: Sequence[FitModel],
     pieces: Sequence[Piece],
     states: Sequence[Array],
     index: NDArray[np.int64],
+    columns: Sequence[Sequence[int]],
     scale: float,
     steps: Sequence[float],
     masks: Sequence[NDArray[np.bool_]],
@@ -211,8 +225,8 @@ def _linearise(
         np.zeros((k, k)), np.zeros((windows, k, 2)), np.zeros((windows, 2, 2)), np.zeros(k), np.zeros((windows, 2))
     )
     cost, begin = 0.0, 0
-    for piece, state, h, mask in zip(pieces, states, steps, masks, strict=True):
-        result = simulate(model, piece, state, free=index.tolist(), step=h)
+    for model, at, piece, state, h, mask in zip(models, columns, pieces, states, steps, masks, strict=True):
+        result = simulate(model, piece, state, free=index[at].tolist(), step=h)
         residual = result.theta - piece.recording.position
         inside = residual[mask]
         if not (np.isfinite(inside).all() and np.isfinite(result.jacobian).all()):
@@ -223,17 +237,13 @@ def _linearise(
             weight = 1.0 / np.sqrt(1.0 + (residual / scale) ** 2)
         own = slice(begin, begin + len(piece.windows))
         begin = own.stop
+        h_pp, h_px, g_p = np.zeros((len(at), len(at))), np.zeros((len(piece.windows), len(at), 2)), np.zeros(len(at))
         kernel.normal_blocks(
-            result.jacobian,
-            residual,
-            weight,
-            piece.windows,
-            blocks.h_pp,
-            blocks.h_px[own],
-            blocks.h_xx[own],
-            blocks.g_p,
-            blocks.g_x[own],
+            result.jacobian, residual, weight, piece.windows, h_pp, h_px, blocks.h_xx[own], g_p, blocks.g_x[own]
         )
+        blocks.h_pp[np.ix_(at, at)] += h_pp
+        blocks.h_px[own, at] = h_px
+        blocks.g_p[at] += g_p
     return cost, blocks
 
 
@@ -250,19 +260,7 @@ def _damped_step(
         system = reduced.copy()
         system.flat[:: k + 1] += damping * (np.maximum(own, 0.0) + floor / typical**2)
         try:
-            d_p = np.linalg.solve(system, -gradient)
-            active = np.zeros(k, dtype=bool)
-            for _ in range(k):
-                reached = values + d_p
-                outside = ((reached < low) | (reached > high)) & ~active
-                if not outside.any():
-                    break
-                # Parameters that would leave their domain stop at its edge; the others solve again around them.
-                d_p[outside] = np.clip(reached, low, high)[outside] - values[outside]
-                active |= outside
-                idle = np.flatnonzero(~active)
-                right = -(gradient + system @ np.where(active, d_p, 0.0))[idle]
-                d_p[idle] = np.linalg.solve(system[idle[:, None], idle], right)
+            d_p = bounded_step(system, gradient, values, low, high)
         except np.linalg.LinAlgError:
             return None
     d_x, decrease = find_states(blocks.h_px, blocks.h_xx, blocks.g_x, inverses, d_p)

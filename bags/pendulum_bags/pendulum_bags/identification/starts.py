@@ -132,12 +132,7 @@ def first_models(recording: Recording, fixed: FitModel, free: Sequence[str], *, 
 
 
 def _around(
-    estimate: Array,
-    recording: Recording,
-    fixed: FitModel,
-    free: Sequence[str],
-    delays: Sequence[float],
-    spread: bool,
+    estimate: Array, recording: Recording, fixed: FitModel, free: Sequence[str], delays: Sequence[float], spread: bool
 ) -> list[FitModel]:
     inertia, damping, coulomb, gravity, _ = map(float, estimate)
     sign = -1.0 if gravity < 0.0 and inertia < 0.0 else 1.0
@@ -192,12 +187,7 @@ def _servo_models(fixed: FitModel, delays: Sequence[float], spread: bool) -> lis
 
 
 def rank(
-    models: Sequence[FitModel],
-    pieces: Sequence[Piece],
-    free: Sequence[str],
-    *,
-    keep: int = 3,
-    scale: float = 0.3,
+    models: Sequence[FitModel], pieces: Sequence[Piece], free: Sequence[str], *, keep: int = 3, scale: float = 0.3
 ) -> list[Solution]:
     """Return the ``keep`` most promising starts after a short search on some of the windows, best first."""
     total = sum(len(piece.windows) for piece in pieces)

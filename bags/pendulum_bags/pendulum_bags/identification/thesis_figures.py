@@ -78,21 +78,10 @@ def _cloud(trials: TrialSet, column: int, label: str, name: str, title: str) -> 
         fit = trial.values[column] * ends
         points = Trace(x[::step], trial.response[::step], "measured", "hw", "points")
         panels.append(
-            Panel(
-                label,
-                "effort [N m]",
-                [points, Trace(ends, fit, "its part of the fit", "fit")],
-                title=title_of_trial,
-            )
+            Panel(label, "effort [N m]", [points, Trace(ends, fit, "its part of the fit", "fit")], title=title_of_trial)
         )
     return Figure(
-        name,
-        title,
-        f"The regression gives {_found(trials)}.",
-        panels,
-        stacked=False,
-        section=INERTIA,
-        panel_height=180,
+        name, title, f"The regression gives {_found(trials)}.", panels, stacked=False, section=INERTIA, panel_height=180
     )
 
 
@@ -151,12 +140,7 @@ def static_phase(trials: TrialSet) -> Figure | str:
                 t = recording.input_stamps[inside] - hold.start
                 role = f"trial {i % ROLES + 1}" if hold.upward else "reference"
                 traces.append(
-                    Trace(
-                        t,
-                        recording.input[inside],
-                        f"{name}, going up" if hold.upward else "coming down",
-                        role,
-                    )
+                    Trace(t, recording.input[inside], f"{name}, going up" if hold.upward else "coming down", role)
                 )
         if traces:
             panels.append(Panel("time in the hold [s]", "effort [N m]", traces, title=f"Hold at {degrees:.0f}°"))

@@ -9,6 +9,7 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
+from pendulum_bags.identification.between_recordings import Alone, half_width
 from pendulum_bags.identification.covariance import FREQUENCY, Errors, candidate_errors, least_scale
 from pendulum_bags.identification.model import BOUNDS, INDEX, UNITS, FitModel
 from pendulum_bags.identification.notes import Interval, edge_sentences, open_sentences, scale_sentences
@@ -56,7 +57,9 @@ class Uncertainty:
     sentences: tuple[str, ...]
 
 
-def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2, explains: bool = True) -> Uncertainty:
+def assess(
+    fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2, explains: bool = True, alone: Sequence[Alone] = ()
+) -> Uncertainty:
     """Return intervals and what limits them.
 
     With white residuals the intervals are those of least squares (the window states profiled out), corrected for
@@ -71,6 +74,7 @@ def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2, expl
         tests: Its residual tests.
         profiles: For how many of the weakest parameters to compute profile intervals.
         explains: Whether the fit explains the motion; else its cost excludes nothing that the folds leave open.
+        alone: What each of several recordings says alone.
 
     Source:
         Ljung, System Identification, ch. 9; Newey and West, Econometrica 55, 1987; Liang and Zeger, Biometrika
@@ -87,12 +91,14 @@ def assess(fit: OutputErrorFit, tests: ResidualTests, *, profiles: int = 2, expl
     samples = sum(piece.samples for piece in fit.pieces)
     states = 2 * sum(len(piece.windows) for piece in fit.pieces)
     freedom = float(samples - states - len(names)) if tests.white else float(folds - 1)
-    quantile = float(student_quantile(0.975, max(freedom, 2.0)))
-    intervals = {
-        name: _interval(name, model, deviation[name], own.white_deviation[name], quantile)
-        for name in (*names, FREQUENCY)
-        if name in deviation
-    }
+    freedom = max(freedom, 2.0)
+    quantile = float(student_quantile(0.975, freedom))
+    intervals = {}
+    for name in (*names, FREQUENCY):
+        if name in deviation:
+            half, deviation[name] = half_width(name, alone, deviation[name], freedom)
+            factor = half / max(deviation[name], 1e-300)
+            intervals[name] = _interval(name, model, deviation[name], own.white_deviation[name], factor)
     _widen_by_joint_offsets(intervals, fit, quantile, white=tests.white)
     ratio = np.array([deviation[n] / max(own.deviation[n], 1e-300) for n in names])
     covariance = own.covariance * np.outer(ratio, ratio) if names else own.covariance
@@ -151,10 +157,7 @@ def _widen_by_joint_offsets(
         return
     name, errors = kept[0], candidate_errors(joint, fit.pieces, fit.scale, white=white)
     if name in errors.deviation:
-        alone, both = (
-            intervals[name],
-            _interval(name, joint.solution.model, errors.deviation[name], 0.0, quantile),
-        )
+        alone, both = (intervals[name], _interval(name, joint.solution.model, errors.deviation[name], 0.0, quantile))
         wide = max(alone.standard_error, both.standard_error)
         intervals[name] = replace(
             alone, low=min(alone.low, both.low), high=max(alone.high, both.high), standard_error=wide
@@ -248,12 +251,7 @@ def profile_interval(fit: OutputErrorFit, name: str, *, inflation: float = 1.0) 
     """Return the 95 % profile interval of one parameter: where the refitted cost has risen by its share.
 
     The other parameters and all window states are fitted again at each value, so a curved or one-sided valley
-    shows, which a covariance cannot.
-
-    Args:
-        fit: The fit.
-        name: A free parameter.
-        inflation: Factor on standard errors for correlated residuals; the threshold rises by its square.
+    shows, which a covariance cannot. The threshold rises by the square of ``inflation``, of coloured residuals.
     """
     solution = fit.chosen.solution
     best = solution.model

@@ -61,12 +61,8 @@ def window_score(model: FitModel | PlantParameters, recording: Recording, window
     Windows of length ``window`` follow one another from the first sample; a rest of at least half a window is
     one more, a shorter rest is left out. For each window, angle and velocity at its first sample are those that
     minimise the sum of squared angle errors over that window; all parameters are those of the model, and the
-    input is the recorded one. The score is sqrt(sum of squared errors / number of samples) over all windows.
-
-    Args:
-        model: Fit model or rigid plant.
-        recording: Data with the input that the model takes.
-        window: Length [s]; None for one window over all of the recording.
+    input is the recorded one. The score is sqrt(sum of squared errors / number of samples) over all windows. The window
+    None is all of the recording.
     """
     fit_model = from_plant(model) if isinstance(model, PlantParameters) else model
     piece = prepare(recording, window)
@@ -93,11 +89,7 @@ def free_run(
 ) -> WindowScore:
     """Simulate a whole recording from one initial state, never corrected by the measurement again.
 
-    Args:
-        model: Fit model or rigid plant.
-        recording: Data.
-        settle: The initial state is fitted to this first stretch only [s].
-        fitted: False takes the first measured angle and velocity as they are.
+    The state is fitted to a first stretch, ``settle`` [s], or, unless ``fitted``, the first one measured.
     """
     fit_model = from_plant(model) if isinstance(model, PlantParameters) else model
     piece = prepare(recording, None, across_gaps=True)
