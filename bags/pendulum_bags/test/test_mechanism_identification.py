@@ -34,10 +34,11 @@ def save(path, recording, names, driven, order=None):
     return path
 
 
-def record(path, recording, plant, *, joints=None, push=0.0):
+def record(path, recording, plant, *, joints=None, push=0.0, called=None):
     """Write a recording as the bag of a plant: an applied effort with each state, or measured efforts alone."""
     names, driven = plant.coordinates.names, plant.coordinates.driven_names
     columns = [list(names).index(name) for name in driven]
+    names, driven = (tuple((called or {}).get(name, name) for name in one) for one in (names, driven))
     with BagWriter(path) as bag:
         for topic in ("joint_states", "applied_effort", "push"):
             bag.add_topic(f"/plant/{topic}", "sensor_msgs/msg/JointState")
@@ -386,9 +387,11 @@ def test_bags_that_are_not_of_this_plant_or_were_pushed_are_refused(both_driven,
     swapped = record(tmp_path / "swapped", short, plant, joints=("elbow", "shoulder"))
     np.testing.assert_array_equal(read_joints(swapped, plant.coordinates).position, short.position[:, ::-1])
     np.testing.assert_array_equal(read_joints(swapped, plant.coordinates).effort, short.effort)
-    foreign = record(tmp_path / "foreign", short, plant, joints=("elbow", "wrist"))
-    with pytest.raises(DataError, match=r"is of the joints elbow, wrist; expected shoulder, elbow .`pendulum export`"):
-        read_joints(foreign, plant.coordinates)
+    three = record(tmp_path / "three", short, plant, called={"shoulder": "a", "elbow": "b"})
+    with pytest.raises(
+        DataError, match=r"is of the joints a, b; expected shoulder, elbow, and neither names nor efforts"
+    ):
+        read_joints(three, plant.coordinates)
     pushed = record(tmp_path / "pushed", short, plant, push=0.2)
     with pytest.raises(DataError, match=r"topic /plant/push of bag .* pushes links from outside"):
         read_joints(pushed, plant.coordinates)
@@ -398,6 +401,37 @@ def test_bags_that_are_not_of_this_plant_or_were_pushed_are_refused(both_driven,
         read_joints(record(tmp_path / "one", short, truth("acrobot")), plant.coordinates)
     with pytest.raises(DataError, match="nowhere does not exist"):
         read_joints(tmp_path / "nowhere", plant.coordinates)
+
+
+@pytest.mark.parametrize(
+    ("name", "called", "how"),
+    [
+        ("double_pendulum", {"shoulder": "arm_2_shoulder_joint", "elbow": "arm_1_Elbow_joint"}, "by their name"),
+        ("acrobot", {"shoulder": "a", "elbow": "b"}, "by which joints are driven"),
+    ],
+)
+def test_a_bag_with_other_names_of_joints_is_read_where_names_or_efforts_show_which_is_which(
+    tmp_path, name, called, how
+):
+    plant = truth(name)
+    t = 0.01 * np.arange(300.0)
+    position = np.stack([np.sin(3.0 * t), 0.3 * np.cos(7.0 * t)], axis=1)
+    effort = np.stack([np.cos(2.0 * t), np.sin(5.0 * t)], axis=1)
+    run = JointRecording("run", t, position, effort, ("zero", "zero"))
+    own, other = (record(tmp_path / key, run, plant, called=names) for key, names in (("own", None), ("o", called)))
+    found, expected = (read_joints(bag, plant.coordinates) for bag in (other, own))
+    np.testing.assert_array_equal(found.position, expected.position)
+    np.testing.assert_array_equal(found.effort, expected.effort)
+    theirs = ", ".join(called[joint] for joint in plant.coordinates.names)
+    assert (found.renamed, expected.renamed) == (f"joints {theirs} are taken for shoulder, elbow, {how}", "")
+
+
+def test_the_next_step_of_several_joints_is_the_experiment_that_recorded_them(both_driven):
+    command = "python -m pendulum_bags experiment joints --plant acrobot --seed 3"
+    told = {"pendulum.run": {"command": command, "seed": 3}}
+    start = truth("double_pendulum")
+    result = identify_mechanism(start, [replace(both_driven[0], meta=told)], extras="friction")
+    assert result.next_step("my.yaml")[1] == ("python -m pendulum_bags experiment joints --plant my.yaml --seed 4")
 
 
 def test_the_starts_of_windows_are_fitted_in_metres_and_radians_by_what_each_joint_does():

@@ -240,6 +240,13 @@ def find_shared(simulation: Sequence[RunData], hardware: Sequence[RunData]) -> S
             period = min(ours.window.period, theirs.window.period)
             if not (reason := _unlike(kind, one, moved, correlation, period)):
                 return Shared(kind, shift, correlation)
+            turned = Signal(other.t, -other.value, other.name)
+            if (opposite := _best_shift([(one, turned)], ours, theirs)[1]) > _ALIKE:
+                reason = (
+                    f"the {kind}s of both have opposite signs (correlation {-opposite:.2f}): where that is a matter of "
+                    f"the column, write the guess with --write-mapping, set `sign: -1` for the {kind} of one, and give "
+                    "it as --mapping"
+                )
             reasons.append(reason)
     free = not any(run.applied is not None and np.any(run.applied.value) for run in (*simulation, *hardware))
     if free or not reasons:

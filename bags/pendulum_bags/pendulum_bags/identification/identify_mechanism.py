@@ -179,6 +179,7 @@ def _notes(recordings: Sequence[JointRecording], pushed: Sequence[tuple[str, flo
     notes = [
         f"{r.name}: {r.left_out} rows with a NaN or a repeated stamp are left out." for r in recordings if r.left_out
     ]
+    notes += [f"{r.name}: {r.renamed}." for r in recordings if r.renamed]
     passive = {joint for r in recordings for joint in r.passive_effort}
     if passive:
         notes.append(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.recordings.guess import Guess
 from pendulum_bags.recordings.mapping import JointMotion
 from pendulum_bags.recordings.reading import Reading
 from pendulum_bags.runs.datasets import Recording, check_consistency, recording_of, unwrap
@@ -42,6 +44,8 @@ class JointRecording:
         velocity: Shape (s, n) [rad/s or m/s]; None where it was not measured, or is made of the positions.
         left_out: Rows with a NaN or a repeated stamp that were left out.
         passive_effort: Joints without an actuator in the plant at which an effort was recorded all the same.
+        meta: What a bag says about its run.
+        renamed: Which joints are taken for those of the plant, and why; empty where they have its names.
     """
 
     name: str
@@ -53,6 +57,8 @@ class JointRecording:
     left_out: int = 0
     passive_effort: tuple[str, ...] = ()
     velocity: Array | None = None
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    renamed: str = ""
 
     def __post_init__(self) -> None:
         """Check that the arrays fit together."""
@@ -158,7 +164,10 @@ def read_joints(
 
 
 def _ordered(reading: Reading, coordinates: Coordinates) -> list[JointMotion]:
-    """Return the joints of a recording in the order of the plant's: by their names, guessed ones as they stand."""
+    """Return the joints of a recording in the order of the plant's.
+
+    They go by their names, or by which are driven; guessed columns by their places where neither decides.
+    """
     found = {joint.name: joint for joint in reading.motion.joints}
     names = coordinates.names
     if sorted(found) == sorted(names):
@@ -166,7 +175,30 @@ def _ordered(reading: Reading, coordinates: Coordinates) -> list[JointMotion]:
     if len(found) != len(names) or not reading.rules.guessed:
         known = ", ".join(name or "one without a name" for name in found)
         raise DataError(f"{reading.rules.origin} of {reading.name}: joints are {known}; expected {', '.join(names)}")
-    return list(found.values())
+    driven = [one for one, joint in found.items() if joint.drive is not None and np.any(joint.drive.values)]
+    sure = _matched(list(found), driven, coordinates)
+    order, how = sure or (list(found), "by its place in the file")
+    for name, one in zip(names, order, strict=True):
+        reading.add_guess(Guess(name, one, "", f"{how}, of the plant's joints", sure is None))
+    return [found[one] for one in order]
+
+
+def _matched(found: Sequence[str], driven: Sequence[str], coordinates: Coordinates) -> tuple[list[str], str] | None:
+    """Return other names of a plant's joints in its order, and how they were matched; None where nothing decides.
+
+    Args:
+        found: Their names.
+        driven: Those that an effort drives.
+        coordinates: Joints of the plant, and which are driven.
+    """
+    names = coordinates.names
+    by_name = [[one for one in found if name.casefold() in one.casefold()] for name in names]
+    moved = [index in coordinates.driven for index in range(len(names))]
+    by_drive = [[one for one in found if (one in driven) is drive] for drive in moved]
+    for ones, how in ((by_name, "by its name"), (by_drive, "by which joints are driven")):
+        if all(len(one) == 1 for one in ones) and len({one for (one,) in ones}) == len(names):
+            return [one for (one,) in ones], how
+    return None
 
 
 def _at(part: Recording, time: Array) -> Array:
@@ -189,30 +221,37 @@ def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
         applied = bag.joints(applied_topic) if applied_topic in bag.topics else None
         if push_topic in bag.topics and np.any(bag.joints(push_topic).effort):
             raise DataError(f"topic {push_topic} of bag {source} pushes links from outside; expected none of that")
-    if sorted(states.names) != sorted(coordinates.names):
-        way = " (`pendulum export` makes a CSV file of it, in which a mapping file names the joints)"
-        raise DataError(
-            f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(coordinates.names)}"
-            f"{way * (len(states.names) == len(coordinates.names))}"
-        )
-    columns = [states.names.index(name) for name in coordinates.names]
+        meta = dict(bag.metadata)
+    order, how = list(coordinates.names), ""
+    if sorted(states.names) != sorted(order):
+        pairs = zip(states.names, states.effort.T, strict=True)
+        driven = [name for name, effort in pairs if np.any(effort)] if applied is None else list(applied.names)
+        same = len(states.names) == len(order)
+        if not same or (matched := _matched(states.names, driven, coordinates)) is None:
+            way = ", and neither names nor efforts show which is which: `--mapping FILE` names their columns"
+            raise DataError(
+                f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(order)}{way * same}"
+            )
+        order, how = matched
+    columns = [states.names.index(name) for name in order]
     # A plant in lockstep sends a state again when its answer was missed: the same stamp is the same state.
     stamps, first = np.unique(states.stamp_ns, return_index=True)
     position, effort = states.position[first][:, columns], np.zeros((stamps.size, len(columns)))
-    driven = list(coordinates.driven)
     if applied is None:
-        effort[:, driven] = states.effort[first][:, columns][:, driven]
+        rows_of = list(coordinates.driven)
+        effort[:, rows_of] = states.effort[first][:, columns][:, rows_of]
     else:
-        if not set(coordinates.driven_names) <= set(applied.names) <= set(coordinates.names):
+        motors = {order[index] for index in coordinates.driven}
+        if not motors <= set(applied.names) <= set(order):
             raise DataError(
                 f"topic {applied_topic} of bag {source} is of {', '.join(applied.names)}; expected the driven joints, "
-                f"{', '.join(coordinates.driven_names)}"
+                f"{', '.join(sorted(motors, key=order.index))}"
             )
-        driven = [coordinates.names.index(name) for name in applied.names]
+        rows_of = [order.index(name) for name in applied.names]
         told, rows = np.unique(applied.stamp_ns, return_index=True)
         newest = np.searchsorted(told, stamps, side="right") - 1
         # Before the first of them nothing was applied yet.
-        effort[:, driven] = np.where((newest >= 0)[:, None], applied.effort[rows][np.maximum(newest, 0)], 0.0)
+        effort[:, rows_of] = np.where((newest >= 0)[:, None], applied.effort[rows][np.maximum(newest, 0)], 0.0)
     return JointRecording(
         source.resolve().name,
         (stamps - stamps[0]) * 1e-9,
@@ -223,6 +262,9 @@ def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
         int(states.stamp_ns.size - stamps.size),
         _passive(coordinates, np.any(effort, axis=0).tolist()),
         _tracks_position((stamps - stamps[0]) * 1e-9, position, states.velocity[first][:, columns]),
+        meta,
+        how
+        and f"joints {', '.join(order)} are taken for {', '.join(coordinates.names)}, {how.replace('its', 'their')}",
     )
 
 

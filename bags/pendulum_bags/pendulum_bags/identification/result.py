@@ -157,7 +157,8 @@ class IdentificationResult:
 
     def _records(self) -> list[Mapping[str, Any]]:
         """Return what the bags of the fit say of their runs."""
-        return []
+        assert isinstance(self.fit, MechanismFit)
+        return [run_record(data.recording.meta) for data in self.fit.data]
 
     def tables(self) -> list[Table]:
         """Return parameters, candidates and recordings, for terminal and page."""

@@ -56,6 +56,10 @@ _NEVER = frozenset(
 )  # fmt: skip
 _WEAK = frozenset({"y", "q", "x", "th", "control", "motor", "current", "encoder", "angular", "action", "force", "cart"})
 """Words that mean something else where a plainer one is there."""
+_ANGLES = _WORDS["angle"] - _WEAK - {"pos", "position", "qpos"}
+"""Words that only an angle has."""
+_LEAST_MISFIT = 0.2
+"""Share of the acceleration that radians leave unexplained where the angle is in degrees."""
 _NAMING = frozenset({"theta", "alpha", "phi", "psi", "beta", "x", "cart", "distance", "angle", "slider"})
 """Words that are the name of a joint, too."""
 _MEASURED, _FILTERED = (
@@ -77,7 +81,8 @@ _MOST_ROWS = 400_000
 """Rows that a guess is tested on."""
 _EQUAL_STEPS = 0.05
 """Largest spread of the steps of a clock, by their median."""
-_ASSUMED = "assumed, for the file does not say, and small angles in degrees move alike"
+_ASSUMED = "assumed, for the file does not say: small angles in degrees, and a place in m, move alike"
+_ASSUMED_ANGLE = "that it is an angle, and no place, is assumed"
 _ASSUMED_PLACE = "m: assumed, for the file does not say"
 
 
@@ -485,12 +490,18 @@ class _Guesser:
         section["unit"] = section["unit"] or wanted
         if why:
             how += f"; {section['unit']}: {why}"
+        if why and section["unit"] == "deg" and "jumps" not in why and not set(_words(joint.position)) & _ANGLES:
+            how += f"; {_ASSUMED_ANGLE}"
         turn = self._turn(joint.position)
         if turn:
             how += f"; it is wrapped (jumps of {turn:.4g}), and is unwrapped"
         how += "".join(f"; {text}, left out" for text in tried)
         joint.rows[0] = Guess(
-            "position", joint.position, str(section["unit"]), how, _ASSUMED in how or _ASSUMED_PLACE in how
+            "position",
+            joint.position,
+            str(section["unit"]),
+            how,
+            any(one in how for one in (_ASSUMED, _ASSUMED_ANGLE, _ASSUMED_PLACE)),
         )
 
     def _turn(self, column: str) -> float:
@@ -537,7 +548,8 @@ class _Guesser:
             balance = balance_of(time, values * UNITS["angle"][unit], drives)
             left[unit] = 1.0 if balance is None else 1.0 - balance.explained
         unit, other = sorted(left, key=lambda one: left[one])
-        if left[unit] < 0.5 and left[unit] < 0.25 * left[other]:
+        # A line fits small degrees as it fits a spring: degrees are found where radians fail.
+        if left[unit] < 0.5 and left[unit] < 0.25 * left[other] and (unit == "rad" or left[other] > _LEAST_MISFIT):
             shares = f"{1.0 - left[unit]:.0%} of its acceleration against {1.0 - left[other]:.0%} in {other}"
             return unit, f"tested: gravity and input explain {shares}"
         return "rad", _ASSUMED
@@ -712,6 +724,10 @@ def _tokens(name: str) -> list[str]:
     return found
 
 
+def _words(name: str) -> set[str]:
+    return {word.casefold() for word in _tokens(name)}
+
+
 def _is_derivative(words: Sequence[str]) -> bool:
     """Return whether a capital or a separate d marks the derivative of an angle: ``angleD``, ``d_theta``."""
     angles = _WORDS["angle"] | _WORDS["place"]
@@ -724,13 +740,12 @@ def _is_derivative(words: Sequence[str]) -> bool:
 
 def _slides(name: str, *, alone: bool) -> bool:
     """Return whether a name is that of a place; an x alone may be an angle."""
-    words = {word.casefold() for word in _tokens(name)}
-    angles = _WORDS["angle"] - _WEAK - {"pos", "position", "qpos"}
-    return bool(words & (_WORDS["place"] - ({"x"} if alone else set()))) and not words & angles
+    words = _words(name)
+    return bool(words & (_WORDS["place"] - ({"x"} if alone else set()))) and not words & _ANGLES
 
 
 def _is_command(name: str) -> bool:
-    return bool({word.casefold() for word in _tokens(name)} & {"con", "cmd", "command", "u", "control", "action"})
+    return bool(_words(name) & {"con", "cmd", "command", "u", "control", "action"})
 
 
 def _label(name: str, stem: str) -> str:

@@ -124,6 +124,11 @@ class Reading:
         """What was guessed; nothing with a mapping."""
         return self._rules_and_guesses[1]
 
+    def add_guess(self, guess: Guess) -> None:
+        """Show a further guess with those of the columns."""
+        rules, guesses = self._rules_and_guesses
+        self._cache["rules"] = (rules, [*guesses, guess])
+
     @property
     def _rules_and_guesses(self) -> tuple[Rules, Sequence[Guess]]:
         if "rules" not in self._cache:

@@ -34,6 +34,7 @@ class JointReplay:
         score: Errors by joint.
         time: Of the samples in windows, shape (k,) [s].
         measured, simulated: Positions, shape (k, n) [rad or m].
+        renamed: Which of its joints are taken for those of the plant; empty where they have its names.
     """
 
     name: str
@@ -44,6 +45,7 @@ class JointReplay:
     time: Array
     measured: Array
     simulated: Array
+    renamed: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON."""
@@ -75,6 +77,7 @@ class JointReplay:
         return (
             f"Driven by the efforts of {self.name}, the plant {self.plant!r} errs over windows of {self.window:g} s by "
             f"{errors} rms, {100.0 * self.score.share:.2g} % of what straight lines miss."
+            + (f" Its {self.renamed}." if self.renamed else "")
         )
 
     def figure(self) -> Figure:
@@ -134,4 +137,5 @@ def replay_joints(
         data.time[inside] - recording.time[0],
         measured,
         measured + found.residuals[0][inside],
+        recording.renamed,
     )
