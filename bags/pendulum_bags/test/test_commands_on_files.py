@@ -11,8 +11,15 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.io
+import yaml
 
+from pendulum_bags.commands.analyse_cli import main as analyse_main
+from pendulum_bags.commands.compare_cli import main as compare_main
+from pendulum_bags.commands.frequency_response_cli import main as response_main
 from pendulum_bags.commands.ranking_cli import main as ranking_main
+from pendulum_bags.commands.replay_cli import main as replay_main
+from pendulum_bags.commands.report_cli import main as report_main
+from pendulum_bags.recordings.reading import Reading
 from pendulum_testing.synthetic_runs import regulate
 
 TIMES = {"stiff": 1.0, "mid": 1.2, "soft": 1.5, "slack": 2.0}
@@ -157,3 +164,98 @@ def test_a_trial_that_cannot_be_ranked_is_named(tmp_path: Path, capsys: Any) -> 
     assert "1 of 8 recordings cannot be ranked" in said
     assert "0.csv has no input; expected the torque, or --weights with a third of 0" in said
     assert ranked(capsys, tmp_path, "--weights", "100", "0.01", "0")["pick"] == "stiff"
+
+
+# -- two recordings ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """Return a simulation as MATLAB file and a machine as CSV, under one noise."""
+    folder = tmp_path_factory.mktemp("two")
+    simulation = upright(folder / "simulation.mat", duration=8.0)
+    return str(simulation), str(upright(folder / "machine.csv", hardware=True, duration=8.0))
+
+
+def test_a_report_of_two_files_shows_what_was_guessed(two: tuple[str, str], tmp_path: Path, capsys: Any) -> None:
+    written = tmp_path / "columns.yaml"
+    out = ["--out", str(tmp_path / "page"), "--png-only", "--write-mapping", str(written)]
+    assert report_main([*two, *out, "--start", "1"]) == 0
+    text = (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
+    assert "What was guessed" in text
+    assert text.count("(assumed)") >= 2
+    assert "tested: 0 hangs down" in text
+    assert "recording of the hardware" in text
+    assert "unknown" not in text[text.index("Provenance") :].split("cite as")[0]
+    assert compare_main([*two, "--mapping", str(written), "--json"]) == 0
+    assert "What was guessed" not in capsys.readouterr().out
+
+
+def test_two_files_have_a_frequency_response(two: tuple[str, str], tmp_path: Path, capsys: Any) -> None:
+    assert response_main([*two, "--out", str(tmp_path / "out"), "--json", "--start", "0.5"]) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert [layer["layer"] for layer in found["layers"]] == ["same_plant", "which_controllers"]
+    assert found["responses"]["hw"]["largest_torque_nm"] > 1.0
+    assert "Designs are made on the preset thesis" in said.err
+    assert "Guessed from names" in said.err
+    # A reference that moves excites the loop, too.
+    followed = response_main([*two, "--json", "--topic", "reference=noise", "--plant", "thesis"])
+    assert (followed, len(json.loads(capsys.readouterr().out)["layers"])) == (0, 2)
+    assert response_main([two[0], "--topic", "input=noise", "--plant", "thesis"]) == 2
+    assert "holds no disturbance during the noise; expected columns of both" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_files_are_analysed_beside_bags(two: tuple[str, str], tmp_path: Path, capsys: Any) -> None:
+    assert analyse_main([*two, "--out", str(tmp_path / "tables"), "--json"]) == 0
+    rows = {row["bag"]: row for row in json.loads(capsys.readouterr().out)["bags"]}
+    run = np.loadtxt(two[1], delimiter=",", skiprows=1)
+    found = rows["machine.csv"]
+    assert found["rms_error"] == pytest.approx(float(np.sqrt(np.mean((run[:, 1] - np.pi) ** 2))), rel=1e-6)
+    assert (found["states_count"], found["states_missing"], found["error"]) == (1600, 0, "")
+    assert found["states_rate"] == pytest.approx(200.0)
+    assert "position: theta [rad] (assumed)" in found["guessed"]
+    folder = str(Path(two[0]).parent)
+    assert analyse_main([folder, "--out", str(tmp_path / "tables"), "--json", "--stop", "4"]) == 0
+    rows = {row["bag"]: row for row in json.loads(capsys.readouterr().out)["bags"]}
+    assert rows.keys() == {"machine.csv", "simulation.mat"}
+    assert rows["machine.csv"]["duration_s"] == pytest.approx(4.0, abs=0.01)
+
+
+def test_a_file_is_replayed(two: tuple[str, str], capsys: Any) -> None:
+    assert replay_main([two[0], "--params", "thesis", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rms_rad"] < 1e-3
+
+
+def test_a_disturbance_of_the_other_sign_is_called_so_and_the_hint_mends_it(
+    two: tuple[str, str], tmp_path: Path, capsys: Any
+) -> None:
+    table_ = np.loadtxt(two[1], delimiter=",", skiprows=1)[:, [0, 1, 2, 4]] * np.array([1.0, 1.0, 1.0, -1.0])
+    turned = tmp_path / "turned.csv"
+    np.savetxt(turned, table_, delimiter=",", header="t,theta,omega,noise", comments="", fmt="%.9g")
+    written = tmp_path / "columns.yaml"
+    assert compare_main([two[0], str(turned), "--json", "--write-mapping", str(written)]) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert any("the disturbances of both have opposite signs (correlation -1.00)" in note for note in notes)
+    content = yaml.safe_load(written.read_text(encoding="utf-8"))
+    content["recordings"]["turned.csv"]["disturbance"]["sign"] = -1
+    written.write_text(yaml.safe_dump(content), encoding="utf-8")
+    assert compare_main([two[0], str(turned), "--json", "--mapping", str(written)]) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert any("where the disturbances of both are most alike (correlation 1.000)" in note for note in notes)
+
+
+def test_a_cart_on_a_spring_is_not_found_to_be_an_angle_in_degrees(tmp_path: Path) -> None:
+    dt, rows = 0.005, []
+    place, speed = 0.4, 0.0
+    for push in np.repeat(np.random.default_rng(0).normal(0.0, 2.0, 200), 20):
+        rows.append((place, speed, push))
+        speed += dt * (-9.0 * place - 0.3 * speed + push)
+        place += dt * speed
+    table_ = np.column_stack([dt * np.arange(len(rows)), rows])
+    np.savetxt(tmp_path / "y.csv", table_, delimiter=",", header="time,y1_position,y1_velocity,u", comments="")
+    (guess,) = [one for one in Reading(tmp_path / "y.csv").guesses if one.quantity == "position"]
+    assert guess.assumed
+    assert "rad: assumed, for the file does not say: small angles in degrees, and a place in m, move alike" in guess.how

@@ -1,4 +1,4 @@
-"""The same questions to many bags: one row for each plant of each bag, one for each run folder; here or on a cluster.
+"""The same questions to many recordings: a row for each plant of each, one for each run folder; here or on a cluster.
 
 :data:`~pendulum_bags.analyse.questions.QUESTIONS` lists the questions. Each bag is a piece of its own: finished pieces
 survive an interruption, and are computed again only when the bag has changed.
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from pendulum_bags.analyse.questions import QUESTIONS
+from pendulum_bags.recordings.reading import FOUND, Reading
 from pendulum_bags.runs.find_bags import bags_below
 from pendulum_bags.runs.run_folder import is_repeat, write_json
 from pendulum_bags.runs.run_record import run_record
@@ -42,17 +43,24 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Piece:
-    """One bag, or one run folder with the bags ``sim`` and ``hw``.
+    """One recording, or one run folder with the bags ``sim`` and ``hw``.
 
     Attributes:
         name: Its path below the folder that was given.
         path: Absolute path.
         is_run: Whether it is a run folder.
+        how: How a recording is read that is no bag of ours: mapping, topics, time between rows, beginning and end.
     """
 
     name: str
     path: str
     is_run: bool
+    how: tuple[Any, ...] = ()
+
+    @property
+    def reading(self) -> Reading:
+        """The recording."""
+        return Reading(Path(self.path), *self.how)
 
     def fingerprint(self, questions: Sequence[str]) -> str:
         """Return a hash of what it holds, by sizes and times of its files, of the questions, and of the program."""
@@ -60,7 +68,8 @@ class Piece:
         inside = (file for file in path.rglob("*") if file.name == METADATA_NAME or is_storage_file(file))
         files = [path] if path.is_file() else sorted(filter(Path.is_file, inside))
         seen = [(str(file.relative_to(path)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-        content = json.dumps([self.name, self.is_run, list(questions), seen, program_hash()])
+        given = [*map(str, self.how)]
+        content = json.dumps([self.name, self.is_run, given, list(questions), seen, program_hash()])
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
@@ -102,8 +111,15 @@ class Table:
         return sum(bool(row["error"]) for row in (*self.bags, *self.runs))
 
 
-def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece]:
+def find_pieces(folders: Sequence[Path], questions: Sequence[str], how: Reading | None = None) -> list[Piece]:
     """Return every bag, and every run folder where a question needs them, below some folders, ordered by name.
+
+    Recordings of other formats are taken where a folder has no bag, or where they are given themselves.
+
+    Args:
+        folders: Folders, bags and other recordings.
+        questions: Names of ``QUESTIONS``.
+        how: How recordings are read that are no bags of ours.
 
     Raises:
         BagError: A folder does not exist, or there is no bag in any of them.
@@ -116,7 +132,7 @@ def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece
     for folder in folders:
         if not folder.exists():
             raise BagError(f"{folder} does not exist; expected a folder of bags, or a bag")
-        for path in bags_below(folder):
+        for path in [*bags_below(folder)] or bags_below(folder, FOUND):
             own = folder.resolve().name
             below = own if path == folder else str(path.relative_to(folder))
             name = f"{own}/{below}" if len(folders) > 1 and path != folder else below
@@ -125,7 +141,8 @@ def find_pieces(folders: Sequence[Path], questions: Sequence[str]) -> list[Piece
     found: list[Piece] = []
     for path, name in _distinct(bags).items():
         if False in kinds:
-            found.append(Piece(name, str(path), False))
+            given = () if how is None else (how.mapping, how.topics, how.dt, how.start, how.stop)
+            found.append(Piece(name, str(path), False, given))
         run = path.parent
         if True in kinds and path.name == "sim" and (run / "hw").is_dir() and not is_repeat(run):
             found.append(Piece(str(Path(name).parent) if len(Path(name).parts) > 1 else run.name, str(run), True))
@@ -199,10 +216,12 @@ def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: 
         row: Row = {"bag": piece.name, "plant": "", "error": ""}
         _answer(row, chosen, Path(piece.path), Path(out), piece.name)
         return [row]
+    reading = piece.reading
     try:
-        with read_bag(piece.path) as bag:
-            plants = _plants(bag)
-            facts = _told(bag)
+        plants, facts = [""], {}
+        if reading.has_states:
+            with read_bag(piece.path) as bag:
+                plants, facts = _plants(bag), _told(bag)
     except Exception as error:  # noqa: BLE001  # one bag must not cost the table of a thousand others
         return [{"bag": piece.name, "plant": "", "error": _sentence(error)}]
     if not plants:
@@ -210,7 +229,8 @@ def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: 
     rows = []
     for plant in plants:
         row = {"bag": piece.name, "plant": plant, "error": "", **facts}
-        _answer(row, chosen, Path(piece.path), plant)
+        _answer(row, chosen, reading, plant)
+        row |= {"guessed": _guessed(reading)} if reading.was_mapped and not row["error"] else {}
         rows.append(row)
     return rows
 
@@ -230,6 +250,13 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, PendulumError):
         return str(error)
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
+def _guessed(reading: Reading) -> str:
+    """Return what was guessed of a recording, in one cell."""
+    return "; ".join(
+        f"{one.quantity}: {one.column} [{one.unit}]{' (assumed)' * one.assumed}" for one in reading.guesses if one.unit
+    )
 
 
 def _plants(bag: Bag) -> list[str]:

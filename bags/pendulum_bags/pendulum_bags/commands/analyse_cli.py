@@ -1,4 +1,4 @@
-"""``analyse``: ask many bags the same questions, and print one table."""
+"""``analyse``: ask many recordings the same questions, and print one table."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from pendulum_bags.analyse.questions import QUESTIONS
+from pendulum_bags.commands.recording_options import Dt, Mappings, Start, Stop, Topics, readings_of
 from pendulum_bags.figures.terminal_table import number_table
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counted_progress
@@ -38,6 +39,7 @@ _SHOWN = {
     "gravity": "gravity [N m]",
     "outcome": "outcome",
     "report": "report",
+    "guessed": "guessed",
 }
 """Columns that are printed, with their headings; the CSV file has all."""
 _MOST_ROWS = 40
@@ -49,7 +51,7 @@ def _named(*, of_runs: bool) -> str:
 
 @app.command(epilog="Example: python -m pendulum_bags analyse bags/examples --ask metrics,timing --out /tmp/analysed")
 def analyse(
-    folders: Annotated[list[Path], typer.Argument(help="Folders with bags below them, or bags.")],
+    folders: Annotated[list[Path], typer.Argument(help="Folders with bags below them, or recordings of any format.")],
     ask: Annotated[
         str,
         typer.Option(help=f"Questions: {_named(of_runs=False)} of each plant; {_named(of_runs=True)} of run folders."),
@@ -63,14 +65,20 @@ def analyse(
     scheduler: Annotated[
         str, typer.Option(help="Dask scheduler, tcp://HOST:PORT; its workers see the bags under the same paths.")
     ] = "",
+    mapping: Mappings = None,
+    topic: Topics = None,
+    dt: Dt = None,
+    start: Start = None,
+    stop: Stop = None,
     json_output: Json = False,
 ) -> None:
-    """Ask many bags the same questions: metrics, timing, identified parameters, equivalence; one table."""
+    """Ask many recordings the same questions: metrics, timing, identified parameters, equivalence; one table."""
     from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
     from pendulum_bags.studies.chunks import cluster_client
 
     questions = [name.strip() for name in ask.split(",") if name.strip()]
-    pieces = find_pieces(folders, questions)
+    (how,) = readings_of([Path()], mapping, topic, dt, start, stop)
+    pieces = find_pieces(folders, questions, how)
     console = make_console(stderr=json_output, highlight=False)
     started = time.monotonic()
     connect = partial(cluster_client, scheduler, workers)
@@ -106,7 +114,7 @@ def _print(console: Console, found: BagTable, out: Path, elapsed: float) -> None
 
 
 def _cell(value: Any) -> str:
-    return "–" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+    return "–" if value is None else f"{value:.4g}" if isinstance(value, float) else escape(str(value))
 
 
 main = partial(cli_main, app, name="python -m pendulum_bags analyse")

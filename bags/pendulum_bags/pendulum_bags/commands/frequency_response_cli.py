@@ -12,6 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from pendulum_bags.commands.recording_options import (
+    Dt,
+    Mappings,
+    Start,
+    Stop,
+    Topics,
+    WriteMapping,
+    readings_of,
+    show_guesses,
+)
 from pendulum_bags.experiments.plant_options import (
     AcceptDifferences,
     MappingFile,
@@ -51,23 +61,32 @@ GapMargin = Annotated[
 def frequency_response(
     context: typer.Context,
     bags: Annotated[
-        list[Path], typer.Argument(help="A bag, a simulation and a hardware bag, or a run folder with both.")
+        list[Path],
+        typer.Argument(help="A recording of any format, those of simulation and hardware, or a run folder with both."),
     ],
     out: Annotated[
         Path | None,
         out_option("Folder for page, figures and measured responses; none by default."),
     ] = None,
-    plant: Annotated[str, typer.Option(help="Plant of the designs: preset or file; default: that of the bag.")] = "",
+    plant: Annotated[
+        str, typer.Option(help="Plant of the designs: preset or file; default: that of the bag, of files thesis.")
+    ] = "",
     design: Design = None,
     angle: Angle = 0.03,
     velocity: Velocity = 3.0,
     torque: Torque = 1.0,
     gap_margin: GapMargin = 0.2,
+    mapping: Mappings = None,
+    write_mapping: WriteMapping = None,
+    topic: Topics = None,
+    dt: Dt = None,
+    start: Start = None,
+    stop: Stop = None,
     json_output: Json = False,
 ) -> None:
     """Measure a plant's frequency response under feedback, and say which designs are safe to carry over to it.
 
-    Any bag with a known, rich disturbance serves; a multisine tells most. Example:
+    Any recording with a known, rich disturbance or reference serves; a multisine tells most. Example:
 
         python -m pendulum_bags frequency_response bags/runs/today --design "q=100,0.01 r=0.1" --design pid
     """
@@ -75,7 +94,14 @@ def frequency_response(
     from pendulum_lqr.responses.gap_metric import Scaling
 
     scaling = Scaling(angle, velocity, torque)
-    responses, recorded, ran = read_responses(bags)
+    readings = readings_of(bags, mapping, topic, dt, start, stop)
+    console = make_console(stderr=json_output, highlight=False)
+    context.call_on_close(partial(show_guesses, console, readings, write_mapping))
+    responses, recorded, ran = read_responses(readings)
+    if not plant and any(reading.was_mapped for reading in readings):
+        if responses[0].joints:
+            raise ParameterError("recordings of several joints do not name their plant; expected --plant")
+        console.print("Designs are made on the preset thesis; --plant names another.", style="yellow")
     several = bool(responses[0].joints)
     if several and (typed := typed_options(context, {"angle", "velocity", "torque"})):
         raise ParameterError(f"{typed[0]} is for plants of one joint; of several the LQR weights are the units")
@@ -87,7 +113,7 @@ def frequency_response(
         margin=None if several and not typed_options(context, {"gap_margin"}) else gap_margin,
         recorded=not design,
     )
-    _tell(make_console(stderr=json_output, highlight=False), analysis, out, json_output=json_output)
+    _tell(console, analysis, out, json_output=json_output)
 
 
 def experiment(

@@ -4,19 +4,33 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pendulum_bags.commands.compare_cli import DesignOption, LayersOption, MachineOption
-from pendulum_bags.commands.recording_options import Mappings, readings_of, show_guesses
+from pendulum_bags.commands.recording_options import (
+    Dt,
+    Mappings,
+    Start,
+    Stop,
+    Topics,
+    WriteMapping,
+    readings_of,
+    show_guesses,
+)
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.programs.terminal import make_console
 from pendulum_rosbag.reader.open_source import is_bag_folder, is_storage_file
+
+if TYPE_CHECKING:
+    from pendulum_bags.recordings.reading import Reading
+    from pendulum_bags.report.page import Page
 
 __all__ = ["main"]
 
@@ -28,7 +42,10 @@ def report(
     context: typer.Context,
     folders: Annotated[
         list[Path],
-        typer.Argument(help="Run folders (each with sim and hw), or two recordings; folders of trials join in."),
+        typer.Argument(
+            help="Run folders (each with sim and hw), or recordings of simulation and hardware in any format "
+            "(several of a run that was repeated); folders of trials join in."
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -47,6 +64,11 @@ def report(
         typer.Option(help="Recording of a real pendulum to replay in the report (CSV or bag)."),
     ] = None,
     mapping: Mappings = None,
+    write_mapping: WriteMapping = None,
+    topic: Topics = None,
+    dt: Dt = None,
+    start: Start = None,
+    stop: Stop = None,
     png_only: Annotated[bool, typer.Option("--png-only", help="Leave out the PDF figures.")] = False,
 ) -> None:
     """Write report.html and figures/ for one run, or for several runs pooled; joint by joint where there are several.
@@ -54,11 +76,13 @@ def report(
     Example: python -m pendulum_bags report bags/runs/2026-01-31T12-00-00Z_thesis
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
+    from pendulum_bags.figures.table import Table
     from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
+    from pendulum_bags.recordings.reading import GUESS_HEAD, guess_rows
     from pendulum_bags.report import write_report
     from pendulum_bags.report.write import margin_of, write_joint_report
     from pendulum_bags.runs.kept_bags import KeptBags
-    from pendulum_bags.runs.run_data import joints_of
+    from pendulum_bags.runs.run_data import joints_of, shared_joints
     from pendulum_bags.verdict.answer import answer_of
 
     started = time.monotonic()
@@ -71,11 +95,12 @@ def report(
     margins = Margins.of(margins_file, margin)
     if not margins.stated and len(folders) == 1:
         margins = Margins.of_run(folders[0]) or margins
+    readings: list[Reading] = []
     if pooled := all((folder / "sim").exists() and (folder / "hw").exists() for folder in folders):
         run = partial(compare_folders, folders)
-    elif len(folders) == 2:
-        readings = readings_of(folders, mapping)
-        context.call_on_close(partial(show_guesses, make_console(stderr=True), readings, None))
+    elif len(folders) > 1 and not any((folder / "sim").exists() for folder in folders):
+        readings = readings_of(folders, mapping, topic, dt, start, stop)
+        context.call_on_close(partial(show_guesses, make_console(stderr=True), readings, write_mapping))
         run = partial(compare_runs, *readings)
     else:
         bad = next(folder for folder in folders if not ((folder / "sim").exists() and (folder / "hw").exists()))
@@ -91,8 +116,17 @@ def report(
     target = out or alone or folders[0].resolve().parent / "report"
     kept = [*([alone] if alone else ()), *(layers or ())]
     formats = ("png",) if png_only else ("png", "pdf")
+
+    def extend(page: Page) -> Page:
+        rows = guess_rows([reading for reading in readings if reading.was_mapped])
+        shown = [(*cells[:-1], f"{cells[-1]} (assumed)" if assumed else cells[-1]) for cells, assumed in rows]
+        sentence = "Names proposed it, the data tested it; what no test shows is marked as assumed."
+        guessed = [Table("What was guessed", sentence, GUESS_HEAD, shown, "Provenance")] if rows else []
+        return replace(page, provenance=[*guessed, *page.provenance])
+
     with KeptBags() as bags:
-        if joints := joints_of(folders[0] / "sim" if pooled else folders[0], open_bag=bags):
+        names = shared_joints(readings, open_bag=bags) if readings else {}
+        if joints := tuple(names) if readings else joints_of(folders[0] / "sim", open_bag=bags):
             if trials or machine or design or recording:
                 raise DataError(
                     "folders of trials, --machine, --design and --recording are of plants of one joint; expected none "
@@ -100,9 +134,12 @@ def report(
                 )
             if alone and not margins.stated:
                 margins = Margins.parse(margin_of(_of_joint(alone, joints[0])))
+            run = partial(run, joints=names) if readings else run
             comparisons = {joint: run(margin=margins, joint=joint, open_bag=bags) for joint in joints}
             answer = answer_of(comparisons, kept)
-            page = write_joint_report(target, comparisons, folders=folders, formats=formats, answer=answer)
+            page = write_joint_report(
+                target, comparisons, folders=folders, formats=formats, answer=answer, extend=extend
+            )
         else:
             summary = _summary(alone) if alone and not margins.stated else None
             if summary is not None:
@@ -121,6 +158,7 @@ def report(
                 formats=formats,
                 answer=answer,
                 certified=certified,
+                extend=extend,
                 open_bag=bags,
             )
     print(answer.sentence)

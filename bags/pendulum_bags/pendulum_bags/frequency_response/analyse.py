@@ -8,12 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from pendulum_bags.frequency_response.compare import compare_responses
 from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, policies_of
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, LONGER, same_plant, which_controllers
 from pendulum_bags.frequency_response.record import Record, record_of_joints, record_of_run
 from pendulum_bags.frequency_response.result import Analysis
+from pendulum_bags.recordings.reading import Reading
 from pendulum_bags.runs.case import IDENTITY, Case
 from pendulum_bags.runs.run_record import run_record, stands_in
 from pendulum_bags.verdict import LayerResult, name_in
@@ -35,24 +38,27 @@ NUMBERS = "frequency_response.json"
 """Results, in a run folder."""
 
 
-def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, list[str]]:
-    """Return the measured responses of one or two bags or of a folder with ``sim`` and ``hw``, and their plant.
+def read_responses(paths: Sequence[Path | Reading]) -> tuple[list[MeasuredResponse], str, list[str]]:
+    """Return the measured responses of one or two recordings or of a folder with ``sim`` and ``hw``, and their plant.
 
     The simulation comes first; the plant is the one that controllers were designed on. A BagError if a bag cannot be
     read, a DataError if it holds no excited plant or both are of one side.
     """
-    if len(paths) == 1 and (paths[0] / "sim").is_dir() and (paths[0] / "hw").is_dir():
-        paths = [paths[0] / "sim", paths[0] / "hw"]
-    if len(paths) not in {1, 2}:
-        raise DataError(f"got {len(paths)} bags; expected one, a simulation and a hardware bag, or a run folder")
+    readings = [Reading.of(path) for path in paths]
+    if len(readings) == 1 and all((readings[0].path / side).is_dir() for side in ("sim", "hw")):
+        readings = [replace(readings[0], path=readings[0].path / side, _cache={}) for side in ("sim", "hw")]
+    if len(readings) not in {1, 2}:
+        raise DataError(
+            f"got {len(readings)} recordings; expected one, those of simulation and hardware, or a run folder"
+        )
     found = []
     plant = "thesis"
     policies: dict[str, None] = {}
-    for i, path in enumerate(paths):
-        record, facts = _read(path)
+    for i, reading in enumerate(readings):
+        record, facts = _read(reading)
         side = str(facts.get("side") or str(facts.get("namespace", "")).strip("/"))
-        label = side if side in {"sim", "hw"} else ("hw" if len(paths) == 1 or i else "sim")
-        plant = _design_plant(path, facts) or plant
+        label = side if side in {"sim", "hw"} else ("hw" if len(readings) == 1 or i else "sim")
+        plant = _design_plant(reading.path, facts) or plant
         policies |= dict.fromkeys(policies_of(facts))
         measured = estimate(record)
         added = {"emulated": label == "hw" and stands_in(facts), IDENTITY: facts.get(IDENTITY, "")}
@@ -63,18 +69,21 @@ def read_responses(paths: Sequence[Path]) -> tuple[list[MeasuredResponse], str, 
     return sorted(found, key=lambda response: response.label, reverse=True), plant, list(policies)
 
 
-def _read(path: Path) -> tuple[Record, Mapping[str, Any]]:
+def _read(path: Reading) -> tuple[Record, Mapping[str, Any]]:
     from pendulum_bags.runs.kept_bags import KeptBags
     from pendulum_bags.runs.run_data import joints_of, read_run
 
     with KeptBags() as bags:
         joints = joints_of(path, open_bag=bags)
         if not joints:
-            run = read_run(path, open_bag=bags)
+            run = read_run(path, or_all=not path.is_bag, open_bag=bags)
             return record_of_run(run), run_record(run.metadata)
-        runs = {joint: read_run(path, joint=joint, open_bag=bags) for joint in joints}
+        runs = {joint: read_run(path, joint=joint, or_all=not path.is_bag, open_bag=bags) for joint in joints}
     facts = run_record(runs[joints[0]].metadata)
     disturbed = (facts.get("disturbance") or {}).get("joints") or []
+    if runs[joints[0]].of_file:
+        excited = {joint: run.disturbance or run.followed for joint, run in runs.items()}
+        disturbed = [joint for joint, signal in excited.items() if signal is not None and np.ptp(signal.value) > 0.0]
     if len(disturbed) != 1:
         found = ", ".join(disturbed) or "no recorded joint"
         raise DataError(f"{path} has {found} disturbed; expected one joint, so that excitation and response are known")

@@ -85,14 +85,27 @@ def record_of_joints(runs: Mapping[str, RunData], driven: str) -> Record:
 
 def _record(run: RunData, motions: Sequence[RunData]) -> Record:
     """Return the record of motions under the torque of one of them; all are from the same messages."""
-    for signal, what in ((run.disturbance, "disturbance"), (run.applied, "applied torque")):
+    # A reference that moves excites a loop as a disturbance does.
+    followed = run.followed if run.followed is not None and np.ptp(run.followed.value) > 0.0 else None
+    excitation = run.disturbance if run.disturbance is not None else followed
+    for signal, what in ((excitation, "disturbance"), (run.applied, "applied torque")):
         if signal is None:
-            raise DataError(
-                f"{run.source or run.label} holds no {what} during the noise; expected the topics "
-                "disturbance and applied_effort, so that excitation and response are known"
+            expected = (
+                "expected columns of both (--topic disturbance=COLUMN, --topic input=COLUMN name them)"
+                if run.of_file
+                else "expected the topics disturbance and applied_effort"
             )
-    assert run.disturbance is not None
+            raise DataError(
+                f"{run.source or run.label} holds no {what} during the noise; {expected}, so that excitation and "
+                "response are known"
+            )
+    assert excitation is not None
     assert run.applied is not None
+    if run.window.effort_unit not in {"N m", "N"}:
+        raise DataError(
+            f"{run.source or run.label} has its input in {run.window.effort_unit}; expected N m or N: a mapping file "
+            "states its unit"
+        )
     t = run.window.t
     period = _nominal_period(t)
     longest = float(np.max(np.diff(t)))
@@ -119,7 +132,7 @@ def _record(run: RunData, motions: Sequence[RunData]) -> Record:
     return Record(
         run.label,
         period,
-        _held_mean(run.disturbance, raster, period),
+        _held_mean(excitation, raster, period),
         _held_mean(run.applied, raster, period),
         outputs,
         dict(disturbance) if isinstance(disturbance, Mapping) else {},

@@ -14,7 +14,7 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.ranking.joint_choice import cost_of_motion
-from pendulum_bags.recordings.reading import Reading
+from pendulum_bags.recordings.reading import FOUND, Reading
 from pendulum_bags.runs.find_bags import bags_below
 from pendulum_bags.runs.run_data import RunData, read_run
 from pendulum_bags.runs.run_record import run_record
@@ -40,8 +40,6 @@ __all__ = [
 TABLES = (".csv", ".tsv", ".yaml", ".yml")
 """Files that are tables of trials."""
 _SIDES = {"sim": "sim", "simulation": "sim", "hw": "hw", "hardware": "hw", "machine": "hw"}
-_FILES = frozenset({".csv", ".tsv", ".mat", ".h5", ".hdf5", ".npz", ".parquet", ".hebilog"})
-"""Files that are recordings where a folder is searched."""
 _COLUMNS = {"controller", "side", "seed", "file", "cost", "score"}
 _HANGING = 0.5
 
@@ -103,7 +101,7 @@ def names_its_run(facts: Mapping[str, Any]) -> str:
 def trials_below(folder: Path, template: Reading) -> list[Trial]:
     """Return the recordings below a folder that say nothing of their run, and of which a folder names the side."""
     found = []
-    for path in bags_below(folder, _FILES):
+    for path in bags_below(folder, FOUND):
         named = side_and_controller(folder, path)
         # What studies keep is theirs.
         if named is None or any((parent / "spec.json").is_file() for parent in path.parents):

@@ -29,10 +29,14 @@ from pendulum_rosbag.reader.open_source import is_bag_folder, is_ros1
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["SUFFIXES", "Reading", "holds_states", "print_guesses", "write_mapping"]
+__all__ = ["FOUND", "GUESS_HEAD", "SUFFIXES", "Reading", "guess_rows", "holds_states", "print_guesses", "write_mapping"]
+
+GUESS_HEAD = ("recording", "quantity", "column", "unit", "how")
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".mat", ".h5", ".hdf5", ".npz", ".npy", ".parquet", ".json", ".hebilog")
 """Files that are recordings, beside bags and LeRobot datasets."""
+FOUND = frozenset({".csv", ".tsv", ".mat", ".h5", ".hdf5", ".npz", ".parquet", ".hebilog"})
+"""Files that are taken for recordings where a folder is searched."""
 _TEXT = (".csv", ".txt", ".tsv", ".dat")
 _BAGS = (".mcap", ".db3", ".bag", ".zstd")
 _EACH = 4
@@ -319,23 +323,30 @@ def write_mapping(path: Path, readings: Sequence[Reading]) -> None:
     write_whole(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
 
 
-def print_guesses(console: Console, readings: Sequence[Reading]) -> None:
-    """Print what was guessed of some recordings, in one table."""
-    from pendulum_msgs_py.programs.terminal import WholeTable
-
+def guess_rows(readings: Sequence[Reading]) -> list[tuple[tuple[str, ...], bool]]:
+    """Return what was guessed of some recordings, as rows under ``GUESS_HEAD``, and whether part of each is assumed."""
     alike: dict[str, list[Reading]] = {}
     for reading in readings:
         if reading.guesses:
             key = json.dumps(reading.rules.to_yaml()) if len(readings) > _EACH else str(reading)
             alike.setdefault(key, []).append(reading)
     rows = [(same, guess) for same in alike.values() for guess in same[0].guesses]
-    if not rows:
-        return
-    table = WholeTable("recording", "quantity", "column", "unit", "how", title="Guessed from names, tested by the data")
+    found: list[tuple[tuple[str, ...], bool]] = []
     last = None
     for same, guess in rows:
-        style = "yellow" if guess.assumed else None
         name = same[0].name + (f" and {len(same) - 1} mapped alike" if len(same) > 1 else "")
-        table.add_row("" if same is last else name, guess.quantity, guess.column, guess.unit, guess.how, style=style)
+        cells = ("" if same is last else name, guess.quantity, guess.column, guess.unit, guess.how)
+        found.append((cells, guess.assumed))
         last = same
-    console.print(table)
+    return found
+
+
+def print_guesses(console: Console, readings: Sequence[Reading]) -> None:
+    """Print what was guessed of some recordings, in one table."""
+    from pendulum_msgs_py.programs.terminal import WholeTable
+
+    if rows := guess_rows(readings):
+        table = WholeTable(*GUESS_HEAD, title="Guessed from names, tested by the data")
+        for cells, assumed in rows:
+            table.add_row(*cells, style="yellow" if assumed else None)
+        console.print(table)

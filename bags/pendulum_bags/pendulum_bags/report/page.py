@@ -189,6 +189,8 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     comparison = data.comparison
     facts = [("runs", str(len(comparison.pairs))), *facts_of_tests(comparison)]
     seeds = [seed_of(pair.hardware) for pair in comparison.pairs]
+    if comparison.of_files:
+        return facts
     if len(seeds) == 1:
         facts.append(("seed", str(data.summary.get("seed", "unknown"))))
     else:

@@ -39,6 +39,8 @@ def provenance_table(data: ReportData) -> Table:
         ("revision", revision),
         *_occasion(data),
     ]
+    if data.comparison.of_files:
+        rows = [row for row in rows if row[1] != "unknown"]
     rows += _runs(data.comparison.pairs)
     for run_data in data.comparison.own:
         if all(run_data is not pair.simulation for pair in data.comparison.pairs):
@@ -76,8 +78,10 @@ def _runs(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
             rows.append((f"{of}seed", " and ".join(dict.fromkeys(seed_of(one) for one in sides))))
         for one in sides:
             name = run_record(one.metadata).get("plant", "unknown")
-            rows.append((f"{of}bag of the {one.label}", f"{_short_path(one.source)} (plant {name})"))
-            rows += [(f"{of}damage of the {one.label}'s bag", text) for text in one.damage]
+            plant = "" if one.of_file else f" (plant {name})"
+            what = "recording" if one.of_file else "bag"
+            rows.append((f"{of}{what} of the {one.label}", f"{_short_path(one.source)}{plant}"))
+            rows += [(f"{of}damage of the {one.label}'s {what}", text) for text in one.damage]
         if of:
             found = [str(run_record(one.metadata).get("command", "")) for one in sides]
             rows += [(f"{of}command", command) for command in dict.fromkeys(found) if command not in commands]

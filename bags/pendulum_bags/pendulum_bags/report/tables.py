@@ -56,7 +56,9 @@ _PLANT_ROWS = (
 def _plants(data: ReportData) -> Table:
     plants = data.comparison.plants
     rows = [
-        (label, *(_cell(plant.get(key), digits) for plant in plants.values())) for label, key, digits in _PLANT_ROWS
+        (label, *(_cell(plant.get(key), digits) for plant in plants.values()))
+        for label, key, digits in _PLANT_ROWS
+        if not (data.comparison.of_files and all(plant.get(key) is None for plant in plants.values()))
     ]
     sim, hw = plants["sim"], plants["hw"]
     runs = len(data.comparison.pairs)

@@ -13,8 +13,8 @@ class Question(NamedTuple):
     """A question.
 
     Attributes:
-        module: Where its function ``answer`` is, imported when it is asked. Of a bag it takes the bag's path and the
-            plant's namespace, of a run folder its path, the folder of the tables and the run's name; it returns
+        module: Where its function ``answer`` is, imported when it is asked. Of a recording it takes a ``Reading`` and
+            the plant's namespace, of a run folder its path, the folder of the tables and the run's name; it returns
             columns by name.
         of_runs: Whether it is asked of run folders with the bags ``sim`` and ``hw``, and not of each plant in a bag.
     """

@@ -1,12 +1,12 @@
-"""What a controller did in a bag: spread, damage, control metrics."""
+"""What a controller did in a recording: spread, damage, control metrics."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from pendulum_bags.comparison import read_run
 from pendulum_bags.comparison.metrics import episode_of, metrics_of
+from pendulum_bags.recordings.reading import Reading
 from pendulum_bags.runs.run_data import joints_of, plant_summary
 from pendulum_bags.runs.run_record import run_record
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -15,10 +15,12 @@ from pendulum_rosbag.reader import read_bag
 __all__ = ["answer"]
 
 
-def answer(path: Path, plant: str) -> dict[str, Any]:
-    """Return spread, damage and metrics of a plant in a bag, by name."""
-    with read_bag(path) as bag:
-        set_point = run_record(bag.metadata).get("set_point", 0.0)
+def answer(path: Reading, plant: str) -> dict[str, Any]:
+    """Return spread, damage and metrics of a plant in a recording, by name."""
+    set_point: Any = 0.0
+    if path.has_states:
+        with read_bag(path) as bag:
+            set_point = run_record(bag.metadata).get("set_point", 0.0)
     # A recording without noise has no window: all of it is what the controller did.
     if joints := joints_of(path, plant):
         # What upright is for each joint is not in the bag, so that there is no error to measure.
