@@ -15,6 +15,7 @@ from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
 from pendulum_bags.analyse.questions import timing
 from pendulum_bags.commands.analyse_cli import main
 from pendulum_bags.comparison import compare_runs
+from pendulum_bags.recordings.reading import Reading
 from pendulum_bags.runs.run_data import plant_summary, read_run
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_rosbag.reader import read_bag
@@ -134,8 +135,8 @@ def test_a_bag_whose_files_are_gone_and_a_program_that_stumbles_have_rows_that_s
     for file in (runs / "monday" / "hw").glob("*.mcap"):
         file.unlink()
 
-    def stumble(path: Path, plant: str) -> dict[str, object]:
-        if path.parent.name == "tuesday":
+    def stumble(reading: Reading, plant: str) -> dict[str, object]:
+        if reading.path.parent.name == "tuesday":
             raise KeyError("noise")
         return {"fine": 1}
 

@@ -40,7 +40,7 @@ def provenance_table(data: ReportData) -> Table:
         *_occasion(data),
     ]
     if data.comparison.of_files:
-        rows = [row for row in rows if row[1] != "unknown"]
+        rows = [row for row in rows if row[1] not in {"unknown", "None"}]
     rows += _runs(data.comparison.pairs)
     for run_data in data.comparison.own:
         if all(run_data is not pair.simulation for pair in data.comparison.pairs):

@@ -103,7 +103,8 @@ def layers_of_files(comparison: Comparison) -> list[LayerResult]:
     runs = comparison.pairs[0].simulation, comparison.pairs[0].hardware
     lacks = []
     for run in runs:
-        what = [name for name, signal in (("disturbance", run.recorded), ("input", run.applied)) if signal is None]
+        added = run.recorded or (run.followed if run.followed and len(set(run.followed.value)) > 1 else None)
+        what = [name for name, signal in (("disturbance", added), ("input", run.applied)) if signal is None]
         if run.applied is not None and run.window.effort_unit not in {"N m", "N"}:
             what.append(f"input in N m (it is in {run.window.effort_unit})")
         if what:
