@@ -16,6 +16,7 @@ from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, LONGER, same_plant, which_controllers
 from pendulum_bags.frequency_response.record import Record, record_of_joints, record_of_run
 from pendulum_bags.frequency_response.result import Analysis
+from pendulum_bags.identification.joint_recordings import matched_joints
 from pendulum_bags.recordings.reading import Reading
 from pendulum_bags.runs.case import IDENTITY, Case
 from pendulum_bags.runs.run_record import run_record, stands_in
@@ -129,6 +130,11 @@ def analyse_responses(
     own: PlantParameters
     if responses[0].joints:
         own = mechanism = load_mechanism(plant)
+        measured = responses[0]
+        matched = matched_joints(measured.joints, [measured.joints[measured.driven]], own.coordinates)
+        if matched and tuple(matched[0]) == measured.joints:
+            responses = [replace(response, joints=own.coordinates.names) for response in responses]
+            by_label = {response.label: response for response in responses}
         _refuse_other_joints(mechanism, responses[0])
         model, (q, r) = linearise(mechanism), mechanism.mechanism.weights
         joints, effort_unit = mechanism.coordinates.joints, mechanism.coordinates.drive_unit

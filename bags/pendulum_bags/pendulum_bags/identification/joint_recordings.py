@@ -21,7 +21,7 @@ from pendulum_msgs_py.contract.names import APPLIED_EFFORT, JOINT_STATES, PUSH
 from pendulum_msgs_py.errors import DataError
 from pendulum_rosbag.reader import read_bag
 
-__all__ = ["JointRecording", "read_joints"]
+__all__ = ["JointRecording", "matched_joints", "read_joints"]
 
 _FOLLOWED = 0.1
 """Time over which a velocity has to lead to the position [s]."""
@@ -176,14 +176,16 @@ def _ordered(reading: Reading, coordinates: Coordinates) -> list[JointMotion]:
         known = ", ".join(name or "one without a name" for name in found)
         raise DataError(f"{reading.rules.origin} of {reading.name}: joints are {known}; expected {', '.join(names)}")
     driven = [one for one, joint in found.items() if joint.drive is not None and np.any(joint.drive.values)]
-    sure = _matched(list(found), driven, coordinates)
+    sure = matched_joints(list(found), driven, coordinates)
     order, how = sure or (list(found), "by its place in the file")
     for name, one in zip(names, order, strict=True):
         reading.add_guess(Guess(name, one, "", f"{how}, of the plant's joints", sure is None))
     return [found[one] for one in order]
 
 
-def _matched(found: Sequence[str], driven: Sequence[str], coordinates: Coordinates) -> tuple[list[str], str] | None:
+def matched_joints(
+    found: Sequence[str], driven: Sequence[str], coordinates: Coordinates
+) -> tuple[list[str], str] | None:
     """Return other names of a plant's joints in its order, and how they were matched; None where nothing decides.
 
     Args:
@@ -227,7 +229,7 @@ def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
         pairs = zip(states.names, states.effort.T, strict=True)
         driven = [name for name, effort in pairs if np.any(effort)] if applied is None else list(applied.names)
         same = len(states.names) == len(order)
-        if not same or (matched := _matched(states.names, driven, coordinates)) is None:
+        if not same or (matched := matched_joints(states.names, driven, coordinates)) is None:
             way = ", and neither names nor efforts show which is which: `--mapping FILE` names their columns"
             raise DataError(
                 f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(order)}{way * same}"

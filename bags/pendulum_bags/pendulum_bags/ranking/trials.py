@@ -13,6 +13,7 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.run_spec import SIDES
+from pendulum_bags.identification.joint_recordings import matched_joints
 from pendulum_bags.ranking.joint_choice import cost_of_motion
 from pendulum_bags.recordings.reading import FOUND, Reading
 from pendulum_bags.runs.find_bags import bags_below
@@ -245,6 +246,10 @@ def joint_parts(reading: Reading, joints: Sequence[str], plant: str) -> Array | 
         raise DataError(f"{reading} has the joints {', '.join(joints)}; expected --plant, whose LQR weighs them")
     own = load_mechanism(plant)
     names = own.coordinates.names
+    if sorted(names) != sorted(joints):
+        moved = [one.name for one in reading.motion.joints if one.drive is not None] if not reading.has_states else []
+        found = matched_joints(joints, moved, own.coordinates)
+        names = tuple(found[0]) if found else names
     if sorted(names) != sorted(joints):
         raise DataError(f"{reading} has the joints {', '.join(joints)}; expected {', '.join(names)}, as {own.name} has")
     runs = [read_run(reading, joint=joint, or_all=True) for joint in names]
