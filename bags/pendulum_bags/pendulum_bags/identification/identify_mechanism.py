@@ -128,8 +128,6 @@ def identify_mechanism(
     alone = _alone(found, weights)
     sizes = dict.fromkeys((name for name in tellable(plant) if name in found.free), _ONE_MACHINE)
     two = excluding(alone, sizes, found.model.unit)
-    if refused is not None and two is not None:
-        refused = f"{REFUSED}: {two[0].lower()}{two[1:]}"
     uncertainty = _uncertainty(found, held, alone)
     if refused is None:
         try:
@@ -141,6 +139,8 @@ def identify_mechanism(
             refused = f"{REFUSED}: the recordings do not determine {', '.join(lost)}" if lost else None
         except ParameterError as error:
             refused = f"{REFUSED}: {error}"
+    if refused is not None and two is not None:
+        refused = f"{REFUSED}: {two[0].lower()}{two[1:]}"
     doubt = None
     if refused is None and found.worst > DOUBTFUL_SHARE:
         doubt = (
@@ -151,7 +151,7 @@ def identify_mechanism(
         tuple(np.sqrt(np.mean(np.square(values), axis=0)).tolist())
         for values in zip(*((one.rms, one.lines) for one in found.scores), strict=True)
     )
-    notes = [*([two] if two is not None else []), *_notes(recordings, pushed)]
+    notes = [*([two] if two is not None and refused is None else []), *_notes(recordings, pushed)]
     if found.own:
         zeros = OwnOffsets(found.own, found.offsets - found.offsets.mean(axis=0))
         notes.append(zeros.sentence(names[: len(recordings)], found.model.unit))
