@@ -327,24 +327,30 @@ def distance(name: str, seed: int) -> tuple[Interval, float] | None:
     return found.nu_gap, float(np.sqrt(np.max(np.maximum(1.0 - inner**2, 0.0))))
 
 
-def choice(seed: int, runs: int = 3, count: int = 6) -> tuple[Interval, float] | None:
+def choice(seed: int, runs: int = 3, *, shared: bool = False, count: int = 6) -> tuple[Interval, float] | None:
     """Return the regret of a simulation's pick that the product measures, and the true one, as shares.
 
     None where a regulator does not hold the machine.
+
+    Args:
+        seed: Of plants, regulators and noise.
+        runs: Of each regulator, on each side.
+        shared: Whether the simulation has the machine's noise.
+        count: Regulators.
     """
     model, truth, _, _ = pendulum(np.random.default_rng([1, seed]))
     random = np.random.default_rng([11, seed])
-    noise = random.uniform(-1.0, 1.0, (runs, 500))
+    noise, other = random.uniform(-1.0, 1.0, (2, runs, 500))
     costs: dict[str, dict[str, list[tuple[int, Any]]]] = {}
     expected = {}
     for i in range(count):
         K = model.regulator(np.array([100.0, 0.01]) * 10.0 ** random.uniform(-1.5, 1.5, 2), 0.1)
         if truth.modulus(K) >= 1.0 or model.modulus(K) >= 1.0:
             return None
-        (own, _), (theirs, expected[f"{i}"]) = (one.costs(K, noise) for one in (model, truth))
+        (own, _), (theirs, expected[f"{i}"]) = model.costs(K, noise if shared else other), truth.costs(K, noise)
         costs[f"{i}"] = {
-            side: [(k, np.array([cost, 0.0, 0.0])) for k, cost in enumerate(side_costs)]
-            for side, side_costs in (("sim", own), ("hw", theirs))
+            side: [(k, np.array([cost, 0.0, 0.0])) for k, cost in enumerate(side_costs, start=first)]
+            for side, side_costs, first in (("sim", own, 0 if shared else runs), ("hw", theirs, 0))
         }
     found = rank(contenders_of(costs))
     return found.regret_share, expected[found.pick] / min(expected.values()) - 1.0

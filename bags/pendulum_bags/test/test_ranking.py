@@ -272,6 +272,26 @@ def test_a_pick_that_ran_once_is_predicted_from_the_scatter_of_the_other():
     assert limits(found) == pytest.approx(expected, rel=1e-9)
 
 
+def test_a_pick_is_made_under_other_noise_than_judges_it_or_has_a_wider_limit():
+    def campaign(seeds):
+        sim = [*np.full((3, 1), 5.0), *np.full((3, 1), 0.5)]
+        rows = [np.pad(np.array(sim[: len(seeds)]), ((0, 0), (0, 2))), np.full((len(seeds), 3), 1.0)]
+        judged = [np.diag([1.1, 1.0, 1.2]), np.diag([1.0, 1.05, 1.0])]
+        judged = [np.pad(one.sum(axis=1)[:, None], ((0, 0), (0, 2))) for one in judged]
+        both = [
+            Contender(name, own, theirs, sim_seeds=seeds, hw_seeds=(1, 2, 3))
+            for name, own, theirs in zip("ab", rows, judged, strict=True)
+        ]
+        return rank([*both, *FAR])
+
+    # Under the hardware's noise "b" is cheaper in simulation, under other noise "a".
+    assert campaign((1, 2, 3)).pick == "b"
+    assert campaign((1, 2, 3, 11, 12, 13)).pick == "a"
+    own, shared = campaign((11, 12, 13)).regret_share, campaign((1, 2, 3)).regret_share
+    assert own.value == shared.value == 0.0
+    assert 3.0 * own.high < shared.high
+
+
 def test_runs_are_pairs_by_their_seeds_and_not_by_their_number():
     noise = {1: 1.0, 2: 2.0, 3: 5.0, 4: 2.0, 5: 3.0, 6: 6.0, 7: 9.0}
     a = costing("a", 1.0, [noise[seed] for seed in (1, 2, 3)], (1, 2, 3))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["PARTS", "Contender", "compared_runs", "contenders_of", "refuse_no_number"]
+__all__ = ["PARTS", "Contender", "compared_runs", "contenders_of", "refuse_no_number", "with_noise_of_their_own"]
 
 PARTS = ("angle", "velocity", "torque")
 """Parts of the cost: q11 e^2, q22 v^2 and r u^2, each a mean over the run."""
@@ -78,6 +78,22 @@ def _side(runs: Sequence[tuple[int, Array | None]]) -> tuple[Array, int, tuple[i
     kept = sorted(((seed, parts) for seed, parts in runs if parts is not None), key=lambda run: run[0])
     rows = np.array([parts for _, parts in kept], dtype=np.float64).reshape(len(kept), -1 if kept else len(PARTS))
     return rows, len(runs) - len(kept), tuple(seed for seed, _ in kept)
+
+
+def with_noise_of_their_own(contenders: Sequence[Contender]) -> tuple[Sequence[Contender], bool]:
+    """Return the contenders without simulated runs whose noise the hardware had too, and whether such are left.
+
+    They are left where a contender has no others: a simulation that picks under the noise that judges its pick picks
+    what this noise favours.
+    """
+    shared = any(set(one.sim_seeds) & set(one.hw_seeds) for one in contenders)
+    if not shared or any(one.sim_seeds and not set(one.sim_seeds) - set(one.hw_seeds) for one in contenders):
+        return contenders, shared
+    found = []
+    for one in contenders:
+        own = [i for i, seed in enumerate(one.sim_seeds) if seed not in one.hw_seeds]
+        found.append(replace(one, sim=one.sim[own], sim_seeds=tuple(one.sim_seeds[i] for i in own)))
+    return found, False
 
 
 def refuse_no_number(contenders: Sequence[Contender]) -> None:

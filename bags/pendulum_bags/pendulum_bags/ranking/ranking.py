@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import Interval, mean_interval
-from pendulum_bags.ranking.contender import PARTS, Contender, compared_runs, refuse_no_number
+from pendulum_bags.ranking.contender import PARTS, Contender, compared_runs, refuse_no_number, with_noise_of_their_own
 from pendulum_bags.ranking.regret import regret_share
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import without_nan
@@ -151,6 +151,7 @@ def rank(
         raise DataError(f"got {len(contenders)} controllers with runs on both sides; expected at least {_LEAST}")
     refuse_no_number(contenders)
     generator = generator or np.random.default_rng(0)
+    contenders, favoured = with_noise_of_their_own(contenders)
     raw = {side: np.array([one.cost(side) for one in contenders]) for side in ("sim", "hw")}
     able = np.isfinite(raw["sim"]) & np.isfinite(raw["hw"])
     if able.sum() < 2:
@@ -166,7 +167,7 @@ def rank(
     ]
     low, high = np.percentile(_violations(contenders, generator), [2.5, 97.5])
     chosen = contenders[pick]
-    share, no_interval = regret_share(contenders, pick, of_scores=of_scores)
+    share, no_interval = regret_share(contenders, pick, of_scores=of_scores, favoured=favoured)
     least = float(hw.min())
     regret = Interval(float(raw["hw"][pick]) - least, *(abs(least) * end for end in (share.low, share.high)))
     sign = -1.0 if of_scores else 1.0

@@ -13,9 +13,14 @@ from pendulum_bags.ranking.contender import Contender, compared_runs
 __all__ = ["regret_share"]
 
 _NAMED = 3
+_TAIL, _FAVOURED = 0.025, 0.0025
+"""Error above the upper limit, and the one that it is taken at where simulation and hardware shared their noise: the
+pick is then one that this noise favours, and on the margin 7 % of picks passed by the first."""
 
 
-def regret_share(contenders: Sequence[Contender], pick: int, *, of_scores: bool = False) -> tuple[Interval, str]:
+def regret_share(
+    contenders: Sequence[Contender], pick: int, *, of_scores: bool = False, favoured: bool = False
+) -> tuple[Interval, str]:
     """Return the regret of a pick as a share of the best's cost with its 95 % interval, and why there is none.
 
     The regret is the largest of the pick's shares over all others. Its upper limit is the largest of their upper
@@ -30,6 +35,7 @@ def regret_share(contenders: Sequence[Contender], pick: int, *, of_scores: bool 
         contenders: All, one more than the pick at least without a failure on the hardware.
         pick: Index of the simulation's pick.
         of_scores: Whether costs are the negatives of scores; the share is that of the best score which is lost.
+        favoured: Whether the simulated runs that made the pick shared their noise with those on the hardware.
     """
     chosen = contenders[pick]
     if not math.isfinite(chosen.cost("hw")):
@@ -45,7 +51,7 @@ def regret_share(contenders: Sequence[Contender], pick: int, *, of_scores: bool 
     if least <= 0.0:
         return Interval(math.inf, math.inf, math.inf), ""
     value = max(0.0, own / least - 1.0)
-    limits = np.array([_limits(chosen, one, len(others)) for one in others])
+    limits = np.array([_limits(chosen, one, len(others), favoured=favoured) for one in others])
     if np.isnan(limits).any():
         return Interval(value, math.nan, math.nan), _ran_once(chosen, others)
     low, high = np.maximum(np.expm1(limits.max(axis=0)), 0.0)
@@ -82,7 +88,9 @@ def _ran_once(chosen: Contender, others: Sequence[Contender]) -> str:
     return f"{chosen.name}, the pick, ran once on the hardware, and so did {named}"
 
 
-def _limits(chosen: Contender, another: Contender, comparisons: int, *, of_scores: bool = False) -> tuple[float, float]:
+def _limits(
+    chosen: Contender, another: Contender, comparisons: int, *, of_scores: bool = False, favoured: bool = False
+) -> tuple[float, float]:
     """Return the limits of the logarithm of two mean costs' ratio, the lower corrected for comparisons; NaN of one run.
 
     The logarithm of the ratio of means is taken as linear in the deviations of the runs from them: runs scatter by
@@ -110,5 +118,6 @@ def _limits(chosen: Contender, another: Contender, comparisons: int, *, of_score
         deviation = float(np.sqrt(parts.sum()))
         # Welch and Satterthwaite.
         freedom = float(parts.sum() ** 2 / max(1e-300, np.sum(parts**2 / (np.array([own.size, other.size]) - 1.0))))
-    low, high = (-float(student_quantile(tail, freedom)) for tail in (0.025 / comparisons, 0.025))
+    tails = _TAIL / comparisons, _FAVOURED if favoured else _TAIL
+    low, high = (-float(student_quantile(tail, freedom)) for tail in tails)
     return ratio - low * deviation, ratio + high * deviation

@@ -38,7 +38,7 @@ _KEYS = (
 )  # fmt: skip
 _PLANT_KEYS = (
     "side", "plant", "design_plant", "simulation", "mapping", "strategy", "method", "engine", "parameters", "hardware",
-    "lab",
+    "lab", "seed_offset",
 )  # fmt: skip
 _MAX_RUNS = 100_000
 _LARGEST = 1e300  # whole numbers in YAML have no end
@@ -273,6 +273,9 @@ def _plain_runs(
     ):
         settings = plants[plant].values
         kind, parameters = laws[controller]
+        offset = plants[plant].get("seed_offset", int, 0, "a whole number >= 0")
+        if offset < 0:
+            plants[plant].fail(f"seed_offset is {offset}; expected a whole number >= 0", "seed_offset")
         try:
             spec = RunSpec(
                 side=settings.get("side", "sim"),
@@ -289,7 +292,7 @@ def _plain_runs(
                 theta=_start_angle(start, seed),
                 set_point=float(set_point),
                 duration=duration,
-                seed=seed,
+                seed=seed + offset,
                 clock=clock,
             )
         except ParameterError as error:

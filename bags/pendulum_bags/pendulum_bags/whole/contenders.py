@@ -29,6 +29,8 @@ SEEDS = 3
 """Seeds of the noise under which each runs."""
 _FIRST = ("lqr", "lqi", "pid", "sliding_mode", "lqr_q1_0.01_r1", "lqr_q10000_0.01_r0.1")
 """The thesis's LQR, laws of other kinds, and an LQR much softer and one much stiffer."""
+OWN_NOISE = 3_000_000
+"""Added to the seeds of the simulation: it picks under other noise than that which judges its pick."""
 _COSTS, _VELOCITIES, _POSITIONS = (1.0, 100.0, 10.0, 0.1, 1e3, 0.01), (1.0, 30.0), (1.0, 10.0, 0.1)
 """By what the weights of several joints' own LQR are multiplied: those of efforts, velocities and positions."""
 _LENGTH = 5.0
@@ -73,7 +75,7 @@ def contender_specs(
         sim: The simulation under any controller and disturbance.
         hw: The hardware likewise.
         count: Number of contenders, fewer where fewer differ.
-        seed: First seed.
+        seed: First seed of the hardware.
         seeds: Number of seeds.
     """
     found: dict[str, list[tuple[RunSpec, RunSpec]]] = {}
@@ -90,7 +92,7 @@ def contender_specs(
             continue
         seen.append(commands)
         numbers = range(seed, seed + seeds)
-        found[name] = [(replace(own, seed=number), replace(theirs, seed=number)) for number in numbers]
+        found[name] = [(replace(own, seed=OWN_NOISE + number), replace(theirs, seed=number)) for number in numbers]
     return found
 
 
