@@ -160,6 +160,11 @@ def test_layers_say_yes_for_the_same_plant_and_name_the_designs_that_do_not_carr
         assert layer.mark is mark
         assert f"unstable on the model already: row {len(designs)};" in layer.sentence
         assert any("--design" in step for step in layer.next_steps) is (mark is Mark.UNDECIDED)
+    # A simulation at 500 Hz shows nothing of a design that is unstable on hardware at 100 Hz.
+    quick = replace(measured["sim"], period=0.002)
+    layer = analyse_responses([quick, measured["hw"]], "thesis", ["q=100,0.01 r=0.1", "k=33,15"]).layers[1]
+    assert layer.mark is Mark.NO
+    assert "not row 2" in layer.sentence
     page = write_analysis(tmp_path, same, formats=("png",))
     text = page.read_text(encoding="utf-8")
     assert "Which designs carry over" in text

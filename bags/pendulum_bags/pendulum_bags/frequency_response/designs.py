@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from pendulum_lqr.design_command.design_cli import THESIS_WEIGHTS
 from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import LinearModel
+from pendulum_lqr.linear.sampled_design import discretise
 from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy
-from pendulum_lqr.responses.certificate import Certificate, Certifier
+from pendulum_lqr.responses.certificate import Certificate, Certifier, is_stable
 from pendulum_lqr.responses.controller_response import controller_response
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -32,6 +33,8 @@ __all__ = [
     "read_designs",
 ]
 
+SIMULATED = 0.002
+"""Period of a simulation that was not recorded [s]: the simulator's default."""
 _NUMBERS = r"[-+0-9.eE]+(?:,[-+0-9.eE]+)*"
 _WEIGHTS = re.compile(rf"q=({_NUMBERS})(?:[ ;]+r=({_NUMBERS}))?")
 _GAIN = re.compile(rf"k=({_NUMBERS})")
@@ -60,6 +63,7 @@ class DesignResult:
         K: Gain on [theta, theta_dot] [N m/rad, N m s/rad], or on those of k joints; None if the controller is no gain.
         unknown: Why it has no certificate, as text, or empty.
         text: Its text for :func:`certify_designs`, if that is not the name.
+        rejected: Whether the simulation rejects it: unstable on the model at the periods of both sides.
     """
 
     name: str
@@ -67,6 +71,7 @@ class DesignResult:
     certificate: Certificate
     unknown: str = ""
     text: str = ""
+    rejected: bool = False
 
     @property
     def certified(self) -> bool:
@@ -107,7 +112,12 @@ def read_designs(texts: Sequence[str], plant: PlantParameters, model: LinearMode
 
 
 def certify_designs(
-    texts: Sequence[str], plant: PlantParameters, certifier: Certifier, *, recorded: bool = False
+    texts: Sequence[str],
+    plant: PlantParameters,
+    certifier: Certifier,
+    *,
+    recorded: bool = False,
+    period: float = SIMULATED,
 ) -> list[DesignResult]:
     """Return the certificates of designs that were made on a plant.
 
@@ -118,23 +128,30 @@ def certify_designs(
         plant: The plant.
         certifier: Of its linear model and the measured machine.
         recorded: Whether they are from an earlier run: an unreadable policy file is then unknown.
+        period: Of the simulation [s], which may stabilise what the hardware's longer one cannot.
 
     Raises:
         ParameterError: A text is no design, or a policy is not for the plant.
         DataError: A policy file cannot be read.
     """
     cost = plant.mechanism.weights[1]
+    simulated = discretise(certifier.plant, period)
     found = []
     for text in _asked(texts, plant):
         if not plant.is_pendulum or text.startswith(("q=", "k=")):
             one = _static(text, cost, certifier.plant)
-            found.append(DesignResult(one.name, tuple(map(float, one.K)), certifier.gain(one.K), text=text))
+            certificate = certifier.gain(one.K)
+            rejected = not (certificate.stable_on_model or is_stable(simulated, one.K))
+            gain = tuple(map(float, one.K))
+            found.append(DesignResult(one.name, gain, certificate, text=text, rejected=rejected))
         elif text.endswith(POLICY_SUFFIX):
             found.append(_policy(text, plant, certifier, recorded=recorded))
         else:
             machine = certifier.machine
             response, stable = controller_response(text, plant, machine.frequency, machine.period)
-            found.append(DesignResult(text, None, certifier.feedback(response, stable=stable)))
+            certificate = certifier.feedback(response, stable=stable)
+            rejected = not (stable or controller_response(text, plant, machine.frequency[:1], period)[1])
+            found.append(DesignResult(text, None, certificate, rejected=rejected))
     return found
 
 

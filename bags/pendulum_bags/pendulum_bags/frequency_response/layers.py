@@ -98,16 +98,15 @@ def same_plant(
 
 
 def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, longer: str = LONGER) -> LayerResult:
-    """Return layer 3: yes if all designs that the model stabilises carry over, no if one does not.
+    """Return layer 3: yes if all designs that the simulation does not reject carry over, no if one does not.
 
-    The simulation itself rejects a design that is unstable on the model: it carries nothing over. ``longer`` is the
-    command to measure longer.
+    ``longer`` is the command to measure longer.
     """
     profile = certifier.profile
     unstable = int(np.sum(np.linalg.eigvals(certifier.plant.A).real > _UNSTABLE))
     good = [design for design in designs if design.certified]
     damping = max(LEAST_DAMPING, *(design.certificate.hidden_damping for design in good), 0.0)
-    rejected = [design for design in designs if not (design.unknown or design.certificate.stable_on_model)]
+    rejected = [design for design in designs if design.rejected]
     bad = [design for design in designs if not (design.certified or design in rejected)]
     mark = Mark.YES if good and not bad else Mark.UNDECIDED if all(design.undecided for design in bad) else Mark.NO
     count = len(designs)
